@@ -55,6 +55,23 @@ class DetectabilityError(ProblemError):
     eigenvalue: complex | None = None
 
 
+class RecordError(ProblemError):
+    """A record contradicts itself: no model is fitted to it.
+
+    Attributes
+    ----------
+    explanation : str
+        What explains the record better than what was given.
+    options : str
+        Options of the command line that repair it; empty if nothing does.
+    """
+
+    def __init__(self, message: str, *, explanation: str, options: str = "") -> None:
+        super().__init__(message)
+        self.explanation = explanation
+        self.options = options
+
+
 class ConfigError(ProblemError):
     """A configuration file is refused.
 

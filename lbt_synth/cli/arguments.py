@@ -193,6 +193,7 @@ def league(parser: ArgumentParser) -> None:
     _add_engine(parser)
     add_switch(parser, "--pdf", "write the page as a PDF, too (league.pdf)")
     _add_missing_facts(parser)
+    _add_repairs(parser)
     _add_prior_knowledge(parser)
 
 
@@ -218,12 +219,15 @@ def _add_series(parser: ArgumentParser) -> None:
         "and commands, or an open-loop series (identify: or a spectrum)",
     )
     _add_missing_facts(parser)
+    _add_repairs(parser)
     _add_prior_knowledge(parser)
     add_option(parser, "--wavelength-um", float, "of Strehl ratios", 2.2)
 
 
 def _add_record(parser: ArgumentParser) -> None:
     _add_series(parser)
+    text = "go on although the commands do not reach the measurements as given"
+    add_switch(parser, "--accept-record", text)
     add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
     add_switch(parser, "--no-figure", "write no figure")
 
@@ -242,6 +246,23 @@ def _add_missing_facts(parser: ArgumentParser) -> None:
     text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4"
     add_option(facts, "--columns", str, text, nargs="+", metavar="ROLE=NAME")
     add_option(facts, "--axes", int, "which of several columns or modes, from 0", nargs="+")
+
+
+def _add_repairs(parser: ArgumentParser) -> None:
+    text = "what the commands need, in this order, to be those that the mirror followed"
+    needs = parser.add_argument_group("what the commands need", text)
+    add_switch(needs, "--command-increments", "they are increments: add them up")
+    text = "frames by which they move to later frames, or to earlier ones below 0"
+    add_option(needs, "--command-shift-frames", int, text, 0)
+    text = "largest command that was applied [nm], of both axes or of each"
+    add_option(needs, "--command-limit-nm", float, text, nargs="+", metavar="NM")
+    add_switch(needs, "--swap-axes", "exchange those of the two axes")
+    add_option(needs, "--command-sign", int, "1 or -1, of both axes or of each", nargs="+")
+    text = "turn them, from the first axis to the second [deg]"
+    add_option(needs, "--command-rotation-deg", float, text, 0.0)
+    text = "matrix from them to the axes of the measurements, row after row"
+    add_option(needs, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
+    add_option(needs, "--command-scale", float, "factor", 1.0)
 
 
 def _add_prior_knowledge(parser: ArgumentParser) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from lbt_synth.cli import loop_records
+from lbt_synth.cli import command_repairs, loop_records
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
@@ -29,15 +29,20 @@ def run(arguments: Namespace) -> Report:
             "auto tests its design on the recorded series; got a spectrum. Try lbt-synth identify "
             "and lbt-synth design."
         )
-    with count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count:
+    with (
+        count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count,
+        command_repairs.explain_refusals(arguments),
+    ):
         found = design_from_record(
             record,
             method=arguments.method,
             gamma_ratio=arguments.gamma_ratio,
             imaging=loop_records.record_imaging(arguments, record),
+            accept_record=arguments.accept_record,
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
+    found = command_repairs.with_repair(arguments, found)
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, found.model)
@@ -48,6 +53,8 @@ def run(arguments: Namespace) -> Report:
         f"certified: spectral radius of the loop {loop.spectral_radius:.6f}, modulus margin "
         f"{loop_margins(loop).modulus:.3f}."
     )
+    report.notes += [f"assumes: {assumption}." for assumption in found.design.assumptions]
+    report.data["assumptions"] = found.design.assumptions
     loop_records.write_files(report, places, arguments, record, found.model, found)
     return report
 

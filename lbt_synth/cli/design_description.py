@@ -62,6 +62,8 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
     printed = fact_table("Design", *facts, *([] if margins is None else [margins]))
     report.tables.append(_without_units(printed) if margins is None else printed)
     report.notes += described.notes
+    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
+    report.data["assumptions"] = design.assumptions
     for table in described.tables:
         report.add_rows(table.key, table.title, table.rows)
     report.add_rows("checks", "Certificate", design.certificate.checks)

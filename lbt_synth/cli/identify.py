@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from lbt_synth.cli import loop_records
+from lbt_synth.cli import command_repairs, loop_records
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.identification import SpectrumRecord, identify
+from lbt_synth.identification import LoopRecord, SpectrumRecord, identify
 
 
 def run(arguments: Namespace) -> Report:
@@ -15,6 +15,9 @@ def run(arguments: Namespace) -> Report:
     places = loop_records.find_places(arguments, arguments.output)
     record = loop_records.read_record(arguments)
     options = loop_records.identification_options(arguments, record)
+    notes: tuple[str, ...] = ()
+    if isinstance(record, LoopRecord):
+        notes = command_repairs.judge_record(arguments, record)
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
     with show_spinner("identifying", quiet=arguments.json):
@@ -22,5 +25,6 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, model)
+    report.notes += [loop_records.marked_note(note) for note in notes]
     loop_records.write_files(report, places, arguments, record, model)
     return report

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.loop_inputs import given_options
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
@@ -26,6 +27,7 @@ from lbt_synth.identification import (
     require_length,
 )
 from lbt_synth.identification.auto import RecordedDesign
+from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.line_priors import load_accelerations
 from lbt_synth.identification.records.record import LEAST_SECONDS
@@ -60,13 +62,19 @@ def load_series(
     if axes is not None:
         chosen = facts["axes"]
         facts["axes"] = list(axes) if chosen is None else [chosen[axis] for axis in axes]
-    return load_record(
+    record = load_record(
         arguments.file,
         kind=None if kind is None else kind.replace("-", "_"),
         frame_rate_hz=None if kind == "spectrum" else arguments.frame_rate_hz,
         columns=_parse_columns(arguments.columns),
         **facts,
     )
+    repair = given_repair(arguments)
+    if not repair.options:
+        return record
+    if isinstance(record, SpectrumRecord):
+        raise ProblemError(f"a spectrum has no commands; leave {repair.options} out.")
+    return repair_commands(record, repair)
 
 
 def record_imaging(arguments: Namespace, record: LoopRecord) -> Imaging:

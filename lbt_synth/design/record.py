@@ -57,6 +57,7 @@ class DesignRecord:
             "controller": self.controller(),
             "certificate": _unpack_certificate(self.meta["certificate"]),
             "solver": SolverReport(**self.meta["solver"]),
+            "assumptions": tuple(map(str, self.meta.get("assumptions", ()))),
         }
 
     def hardware(self) -> LoopHardware:
@@ -108,6 +109,8 @@ def record_common(design: Design) -> DesignRecord:
         "certificate": _pack_certificate(design.certificate),
         "units": {"commands": "1", "measurements": "1", "phase": "1"},
     }
+    if design.assumptions:
+        meta["assumptions"] = list(design.assumptions)
     hardware = design.hardware
     if hardware is not None:
         arrays |= {"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}

@@ -57,12 +57,15 @@ class Design:
         Checks that were passed.
     solver : SolverReport
         How it was computed.
+    assumptions : tuple of str
+        What the design rests on and no certificate shows, such as where a sensor gain is from.
     """
 
     method: str
     controller: Controller
     certificate: Certificate
     solver: SolverReport
+    assumptions: tuple[str, ...] = ()
 
     @property
     def hardware(self) -> LoopHardware | None:

@@ -4,7 +4,12 @@ from .commands.axis_matrix import AxisMatrix as AxisMatrix
 from .commands.control_law import ControlLaw as ControlLaw
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.control_law import record_control_law as record_control_law
+from .commands.gain_interval import allowed_gains as allowed_gains
 from .commands.law_controller import law_controller as law_controller
+from .commands.repair import CommandRepair as CommandRepair
+from .commands.repair import repair_commands as repair_commands
+from .commands.verdict import CommandVerdict as CommandVerdict
+from .commands.verdict import explain_commands as explain_commands
 from .diagnosis.diagnosis import Diagnosis as Diagnosis
 from .diagnosis.diagnosis import diagnose as diagnose
 from .diagnosis.verdict import diagnosis_verdict as diagnosis_verdict

@@ -11,6 +11,8 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError
+from lbt_synth.identification.commands.gain_interval import allowed_gains, unstable_gains
+from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.comparison import (
@@ -21,13 +23,14 @@ from lbt_synth.identification.prediction.comparison import (
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
-from lbt_synth.loop import Imaging, close_loop
+from lbt_synth.loop import Imaging
 from lbt_synth.methods.registry import default_method, record_methods
 from lbt_synth.methods.request import DesignRequest, PlantInputs, design_request
-from lbt_synth.validation import choice, number, require_instance
+from lbt_synth.validation import FloatArray, choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
 _APART = 3.0  # standard errors between gains that disagree
+_CAREFUL = 1.4  # by which a design's gain is below the largest that a record allows
 LEAST_SECONDS = 8.0  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 
@@ -71,14 +74,16 @@ def design_from_record(
     announced: Sequence[LinePrior] = (),
     imaging: Imaging | None = None,
     taps: int = 32,
+    accept_record: bool = False,
     progress: Callable[[int], None] | None = None,
     **options: Any,
 ) -> RecordedDesign:
     """Identify a loop from its record, design a controller, and test it on unseen data.
 
-    The test is honest and conservative: a model of the first half of the usable frames gives a
-    design, and that is replayed on the second half. The design that is returned is made the
-    same way from all frames.
+    Before anything is fitted, the commands must explain the measurements as they are given
+    (:func:`explain_commands`). The test is honest and conservative: a model of the first half of
+    the usable frames gives a design, and that is replayed on the second half. The design that is
+    returned is made the same way from all frames.
 
     Parameters
     ----------
@@ -94,6 +99,8 @@ def design_from_record(
         The camera, for Strehl ratios; 2.2 um by default.
     taps : int, optional
         Coefficients of the predictor by least squares.
+    accept_record : bool, optional
+        Go on although something else explains the record better; the design says so.
     progress : callable, optional
         Called with 1 after each of 3 steps.
     **options
@@ -109,9 +116,11 @@ def design_from_record(
     ProblemError
         If less than 8 s of the record, or 4096 frames, are usable, its delay is missing, or a
         value is out of range.
+    RecordError
+        If the commands do not reach the measurements as the record says.
     NumericalError, CertificateError
-        If a fit fails; or if a design does not pass its checks, or its loop is unstable at one
-        of the sensor gains that were found.
+        If a fit fails; or if a design does not pass its checks, or none is stable at all
+        sensor gains that the record allows.
 
     Examples
     --------
@@ -142,6 +151,7 @@ def design_from_record(
     )
     _ = record.hardware  # refuses a record without a delay
     usable = require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
+    notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
     fit_model = partial(identify, record, announced=announced, **gains, **options)
@@ -165,14 +175,21 @@ def design_from_record(
     step(1)
     model = fit_model(start=half)
     design = _design(request, model, gamma_ratio)
+    if record.commands is not None and sensor_gain is None:
+        intervals = _possible_gains(record, model, half)
+        if unstable_gains(design, intervals) is not None:  # a larger gain gives a slower loop
+            slow = float(np.max(intervals)) / _CAREFUL
+            model = fit_model(start=model, sensor_gain=slow)
+            design = _design(request, model, gamma_ratio)
+        assumptions.append(_require_stable(design, intervals))
     step(1)
     return RecordedDesign(
         model=model,
-        design=design,
+        design=replace(design, assumptions=tuple(assumptions)),
         half_model=half,
         held_out=held_out,
         name=name,
-        notes=(*_check_gains(model, half, design), *_note_short(usable, model, held_out[name])),
+        notes=(*notes, *_compare_gains(model, half), *_note_short(usable, model, held_out[name])),
     )
 
 
@@ -200,24 +217,58 @@ def _note_short(seconds: float, model: IdentifiedModel, row: PredictionRow) -> I
     )
 
 
-def _check_gains(model: IdentifiedModel, half: IdentifiedModel, design: Design) -> tuple[str, ...]:
-    """Warn of sensor gains that disagree; refuse a design that is unstable at one of them."""
-    out = []
+def _judge_commands(
+    record: LoopRecord, sensor_gain: float | Sequence[float] | None, accept: bool
+) -> tuple[list[str], list[str]]:
+    """Return notes on the commands and what is assumed of them; refuse a record that is wrong."""
+    if record.commands is None:
+        return [], ["the sensor gain is 1: a record of an open loop does not show it"]
+    verdict = explain_commands(record, sensor_gain=sensor_gain)
+    if not accept:
+        verdict.require_accepted()
+    given = [] if sensor_gain is None else [f"the sensor gain is {sensor_gain}, as it was given"]
+    return list(verdict.notes), [*verdict.overruled, *given]
+
+
+def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[str]:
+    """Warn of sensor gains that disagree."""
     for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
         if whole.sensor_gain_error is None or first.sensor_gain_error is None:
             continue
         apart = abs(whole.sensor_gain - first.sensor_gain)
         if apart > _APART * float(np.hypot(whole.sensor_gain_error, first.sensor_gain_error)):
-            out.append(
+            yield (
                 f"warning: axis {i} has a sensor gain of {first.sensor_gain:.3f} in the first half "
                 f"of the record, and of {whole.sensor_gain:.3f} in all of it"
             )
-    for gain in sorted({*half.sensor_gains, *model.sensor_gains}):
-        path = replace(model.hardware, sensor_matrix=gain * np.eye(len(model.axes)))
-        if not close_loop(path, design.controller).is_stable:
-            raise CertificateError(
-                f"the loop of the design is unstable at the sensor gain {gain:.3f}, which was "
-                "found as well, in a half of the record or on the other axis. Look for jumps in "
-                "the record, and for commands that do not belong to it, or give the sensor gain."
-            )
-    return tuple(out)
+
+
+def _possible_gains(
+    record: LoopRecord, model: IdentifiedModel, half: IdentifiedModel
+) -> FloatArray:
+    """Return the interval of gains of each axis that record, model and half model allow."""
+    found = []
+    for each in (model, half):
+        errors = [_APART * (axis.sensor_gain_error or 0.0) for axis in each.axes]
+        gains = np.array(each.sensor_gains)
+        found += [gains - np.minimum(errors, gains / 2), gains + errors]
+    all_gains = np.column_stack([allowed_gains(record), np.array(found).T])
+    return np.column_stack([np.min(all_gains, axis=1), np.max(all_gains, axis=1)])
+
+
+def _require_stable(design: Design, intervals: FloatArray) -> str:
+    """Return what is assumed of the sensor gains; refuse a design that they make unstable."""
+    bad = unstable_gains(design, intervals)
+    each = [f"{low:.3g} to {high:.3g}" for low, high in intervals]
+    words = " and ".join(dict.fromkeys(each))
+    if bad is not None:
+        gain = ", ".join(f"{value:.3g}" for value in bad)
+        raise CertificateError(
+            f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
+            f"{words}. Record with a higher loop gain, look for jumps in the record, or give the "
+            "sensor gain."
+        )
+    return (
+        f"the sensor gain lies within {words}, as the record and its model allow; the loop is "
+        "stable at all of these"
+    )

@@ -153,7 +153,7 @@ def record_control_law(record: LoopRecord) -> ControlLaw:
     >>> record = lbt.identification.loop_record(
     ...     night.measurements[0], -night.commands[0], frame_rate_hz=1000, unit="nm"
     ... )
-    >>> law = record_control_law(record)
+    >>> law = lbt.identification.record_control_law(record)
     >>> law.kind, law.lag_frames, law.gain.round(6).tolist()
     ('pure integrator', 0, [[-0.4]])
     """

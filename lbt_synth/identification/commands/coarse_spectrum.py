@@ -1,0 +1,369 @@
+"""A coarse spectrum of the pseudo-open loop, for many guesses of its corrections at once.
+
+The measurement is ``y = z - g c``, with z what an open loop would have measured and c the
+correction. Each guess of c gives another z, and z has a simple spectrum only if the guess is
+right: white noise, turbulence that falls, a few resonances, lines with their skirts. The
+likelihood is Whittle's, as in the fit of the model; its Jacobian is 1 because c follows from the
+past of y.
+
+Frequencies are merged into bands, except around peaks. There each frequency has a power of its
+own: a band without a model still counts, because a wrong filter that makes one band smaller makes
+another larger (Jensen's formula).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from lbt_synth.identification.fit.periodogram import half_angle_square, tukey
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
+
+_SEGMENT_S = 6.0
+_MOST_SEGMENTS = 24
+_BAND, _WIDEST_BAND = 0.06, 0.02  # of its frequency, and of the frame rate
+_SLOWEST_HZ, _FASTEST_HZ = 0.15, 6.0  # corners of the turbulence
+_CORNERS, _ORDERS = 5, (1, 2, 3)  # slopes of -2, -4, -6
+_BUMPS_HZ, _BUMPS, _BUMP_DAMPING = (1.5, 25.0), 8, 0.18
+_LINE_DAMPING = 0.004  # only the skirts of a line are compared, which do not show it
+_PEAK, _SKIRT = 3.0, 1.25  # over the surroundings
+_SURROUNDINGS, _REACH, _MOST_PEAKS = 81, 40, 16  # frequencies, frequencies, peaks
+_SMALLEST = 1e-9  # of the measured power
+_FIRST_PASSES, _MOST_PASSES, _SETTLED = 20, 40, 0.05
+
+
+class Quadratic(NamedTuple):
+    """Powers of ``y + g c`` as ``measured + 2 g crossed + g^2 corrected``."""
+
+    measured: FloatArray  # (f,)
+    crossed: FloatArray  # (guesses, f)
+    corrected: FloatArray  # (guesses, f)
+
+    def take(self, guess: IntArray) -> Quadratic:
+        """Return the quadratics of some guesses, one per row."""
+        return Quadratic(self.measured, self.crossed[guess], self.corrected[guess])
+
+    def power(self, gain: FloatArray) -> FloatArray:
+        """Return the power of each row at its gain, (rows, f)."""
+        g = gain[:, None]
+        power = self.measured + g * (2 * self.crossed + g * self.corrected)
+        return np.asarray(np.maximum(power, _SMALLEST * self.measured))
+
+    def slope(self, gain: FloatArray) -> FloatArray:
+        """Return its derivative by the gain, (rows, f)."""
+        return np.asarray(2 * (self.crossed + gain[:, None] * self.corrected))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CoarseAxis:
+    """Powers of one axis in bands and at peaks, and the shapes that may explain them."""
+
+    count: FloatArray  # (b,): independent periodograms of each band
+    bands: Quadratic
+    peak_count: float  # the same of each frequency at a peak
+    peaks: Quadratic
+    shapes: FloatArray  # (k, b): noise, turbulence and resonances, at most 1
+    square: FloatArray  # (b,): frequency squared, warped as that of a sampled process [Hz^2]
+    lines: FloatArray  # (l,): logarithms of the frequencies of the peaks
+    line_width: FloatArray  # (l,): how far each may be off
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CoarseFit:
+    """The best gain of each guess."""
+
+    contrast: FloatArray  # (guesses,): minus the logarithm of the likelihood
+    gain: FloatArray  # (guesses,)
+    misfit: FloatArray  # (guesses,): mean deviance of a band, about 1 if the shapes suffice
+
+
+def segment_transforms(
+    series: FloatArray, stretches: Sequence[tuple[int, int]], frame_rate_hz: float
+) -> tuple[FloatArray, ComplexArray, float]:
+    """Return frequencies (f,), scaled transforms (n, segments, f) and independent values of each.
+
+    The series (frames, n) is differenced, as in the periodogram of the fit, and loses its mean
+    slope. The square of a transform is a one-sided density.
+    """
+    from scipy.fft import rfft
+
+    longest = max(stop - start for start, stop in stretches)
+    length = int(min(_SEGMENT_S * frame_rate_hz, max(longest // 2, 512), longest))
+    starts = [
+        start + i * length for start, stop in stretches for i in range((stop - start) // length)
+    ]
+    chosen = np.unique(np.linspace(0, len(starts) - 1, _MOST_SEGMENTS).astype(np.intp))
+    rows = np.array(starts)[chosen][:, None] + np.arange(length)
+    taper, size = tukey(length - 1), length - 1
+    frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
+    scale = np.sqrt(2 / frame_rate_hz / np.sum(taper**2))
+    scale = scale / np.sqrt(half_angle_square(frequency, frame_rate_hz))
+    steps = np.diff(series[rows], axis=1)
+    steps -= np.mean(steps, axis=1, keepdims=True)
+    transforms = rfft(taper[:, None] * steps, axis=1)[:, 1 : (size + 1) // 2]
+    independent = len(rows) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
+    return frequency, np.moveaxis(transforms, 2, 0) * scale, float(independent)
+
+
+def coarse_axis(
+    frequency_hz: FloatArray,
+    measured: ComplexArray,
+    guesses: ComplexArray,
+    *,
+    independent: float,
+    frame_rate_hz: float,
+) -> CoarseAxis:
+    """Return the powers of one axis, given (segments, f) and guesses (n, segments, f)."""
+    power = np.mean(abs(measured) ** 2, axis=0)
+    is_peak, lines, width = _find_peaks(frequency_hz, power)
+    band = _bands(frequency_hz[~is_peak], frame_rate_hz)
+    size = np.bincount(band)
+    quadratic = Quadratic(
+        power,
+        np.mean((measured * guesses.conj()).real, axis=1),
+        np.mean(abs(guesses) ** 2, axis=1),
+    )
+
+    def merge(values: FloatArray) -> FloatArray:
+        rows = np.atleast_2d(values[..., ~is_peak])
+        means = np.array([np.bincount(band, weights=row) / size for row in rows])
+        return means.reshape((*values.shape[:-1], size.size))
+
+    f = merge(frequency_hz)
+    square = half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
+    return CoarseAxis(
+        count=np.asarray(size * independent, dtype=np.float64),
+        bands=Quadratic(*map(merge, quadratic)),
+        peak_count=independent,
+        peaks=Quadratic(*(part[..., is_peak] for part in quadratic)),
+        shapes=_background_shapes(square, frequency_hz[0]),
+        square=square,
+        lines=np.log(lines),
+        line_width=width,
+    )
+
+
+def _find_peaks(
+    frequency_hz: FloatArray, power: FloatArray
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Return the frequencies at peaks (f,), where the peaks are (l,), and their widths (l,)."""
+    from scipy.ndimage import median_filter, uniform_filter1d
+    from scipy.signal import find_peaks
+
+    log = np.log(uniform_filter1d(power, 3, mode="nearest"))
+    above = log - median_filter(log, size=_SURROUNDINGS, mode="nearest")
+    tops, _ = find_peaks(above, height=np.log(_PEAK), distance=4)
+    highest = np.argsort(-above[tops], kind="stable")[:_MOST_PEAKS]
+    is_peak = np.zeros(power.size, dtype=np.bool_)
+    for top in tops[highest]:
+        low, high = max(top - _REACH, 0), min(top + _REACH + 1, power.size)
+        ends = np.flatnonzero(above[low:high] <= np.log(_SKIRT)) + low
+        start = np.max(ends[ends < top], initial=low)
+        stop = np.min(ends[ends > top], initial=high - 1)
+        is_peak[max(start - 1, 0) : stop + 2] = True
+    edges = np.flatnonzero(np.diff(np.r_[False, is_peak, False].astype(int))).reshape(-1, 2)
+    lines = np.array([frequency_hz[a + np.argmax(power[a:b])] for a, b in edges])
+    step = frequency_hz[1] - frequency_hz[0]
+    width = np.array([max(2.0, 0.3 * (b - a)) * step for a, b in edges])
+    return is_peak, lines, width / lines
+
+
+def _bands(frequency_hz: FloatArray, frame_rate_hz: float, *, least: int = 1) -> IntArray:
+    """Return the band of each frequency, (f,), of at least some frequencies."""
+    step = frequency_hz[1] - frequency_hz[0]
+    width = np.minimum(_BAND * frequency_hz, _WIDEST_BAND * frame_rate_hz)
+    width = np.maximum(width, least * step)
+    _, band = np.unique(np.floor(np.cumsum(step / width) - 1e-9), return_inverse=True)
+    return np.asarray(band)
+
+
+def _background_shapes(square: FloatArray, lowest_hz: float) -> FloatArray:
+    """Return the shapes of noise, turbulence and wide resonances over the bands, (k, b).
+
+    Nothing but noise and the skirts of slower parts has a place at high frequencies: there the
+    corrections of a wrong guess show.
+    """
+    corners = np.geomspace(max(lowest_hz / 2, _SLOWEST_HZ), _FASTEST_HZ, _CORNERS)
+    falls = [(1 + square / corner**2) ** -order for corner in corners for order in _ORDERS]
+    bumps = [
+        resonance(square, centre, _BUMP_DAMPING) for centre in np.geomspace(*_BUMPS_HZ, _BUMPS)
+    ]
+    shapes = np.array([np.ones_like(square), *falls, *bumps])
+    return np.asarray(shapes / np.max(shapes, axis=1, keepdims=True))
+
+
+def resonance(square: FloatArray, centre_hz: FloatArray | float, damping: float) -> FloatArray:
+    """Return the spectrum of a second-order process, 1 at low frequencies."""
+    centre = np.asarray(centre_hz) ** 2
+    return np.asarray(centre**2 / ((square - centre) ** 2 + 4 * damping**2 * centre * square))
+
+
+def fit_guesses(axis: CoarseAxis, starts: FloatArray, *, free: bool = True) -> CoarseFit:
+    """Fit spectrum and gain of each guess, from each of its starting gains (guesses, s).
+
+    The gains stay at their starts unless they are ``free``.
+    """
+    guesses, each = starts.shape
+    guess = np.repeat(np.arange(guesses), each)
+    found = _Fit(axis, guess, free).minimise(starts.ravel())
+    best = np.argmin(found.contrast.reshape(guesses, each), axis=1) + each * np.arange(guesses)
+    return CoarseFit(
+        contrast=found.contrast[best], gain=found.gain[best], misfit=found.misfit[best]
+    )
+
+
+class _Fit:
+    """Fits of all guesses of one axis: gain, logarithms of the amplitudes, places of the lines."""
+
+    def __init__(self, axis: CoarseAxis, guess: IntArray, free: bool) -> None:
+        self.axis, self.guess, self.free = axis, guess, free
+        self.fixed, self.lines = len(axis.shapes), axis.lines.size
+        self.amplitudes = self.fixed + self.lines
+
+    def minimise(self, gain: FloatArray) -> CoarseFit:
+        """Return the least contrast of each row, by damped scoring."""
+        theta = self._begin(gain)
+        rows = np.arange(gain.size)
+        value, damping = self._contrast(theta, rows), np.full(gain.size, 1e-2)
+        for _ in range(_MOST_PASSES):
+            gradient, information = self._derivatives(theta[rows], rows)
+            diagonal = np.einsum("rii->ri", information)
+            more = damping[rows, None] * diagonal
+            more += 1e-9 * np.max(diagonal, axis=1, keepdims=True)
+            more[:, 1 : 1 + self.amplitudes] += 1e-3
+            stiff = information + np.eye(theta.shape[1]) * more[:, :, None]
+            step = -np.linalg.solve(stiff, gradient[:, :, None])[:, :, 0]
+            trial = self._limit(theta[rows], step)
+            new = self._contrast(trial, rows)
+            better = new < value[rows]
+            saved = np.where(better, value[rows] - new, np.inf)
+            moved = rows[better]
+            theta[moved], value[moved] = trial[better], new[better]
+            damping[rows] = np.where(better, np.maximum(damping[rows] / 5, 1e-6), damping[rows] * 6)
+            rows = rows[(saved > _SETTLED) & (damping[rows] < 1e4)]
+            if not rows.size:
+                break
+        return CoarseFit(contrast=value, gain=theta[:, 0], misfit=self._misfit(theta))
+
+    def _misfit(self, theta: FloatArray) -> FloatArray:
+        """Return the mean deviance of the bands of each row."""
+        gain, a, lines = self._split(theta)
+        model = np.einsum("rk,rkb->rb", a, self._shapes(lines)[0])
+        ratio = self.axis.bands.take(self.guess).power(gain) / model
+        return np.asarray(np.mean(2 * self.axis.count * (ratio - 1 - np.log(ratio)), axis=1))
+
+    def _begin(self, gain: FloatArray) -> FloatArray:
+        """Return starting values, with amplitudes by multiplicative updates."""
+        lines = np.tile(self.axis.lines, (gain.size, 1))
+        shapes, _ = self._shapes(lines[:1])
+        power, count = self.axis.bands.take(self.guess).power(gain), self.axis.count
+        level = np.median(power, axis=1)[:, None] / self.amplitudes
+        a = level / np.mean(shapes[0], axis=1)
+        for _ in range(_FIRST_PASSES):
+            model = a @ shapes[0]
+            weight = count / model
+            a *= np.sqrt(((weight * power / model) @ shapes[0].T) / (weight @ shapes[0].T))
+            a = np.maximum(a, 1e-12 * np.max(a, axis=1, keepdims=True))
+        return np.column_stack([gain, np.log(a), lines])
+
+    def _shapes(self, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return all shapes (rows, k, b), and the log derivative of the lines by their places."""
+        square = self.axis.square
+        centre = np.exp(lines)[:, :, None]
+        skirt = 1e-3 * resonance(square, centre, _LINE_DAMPING)
+        shift = square - centre**2
+        stretch = 4 * _LINE_DAMPING**2 * centre**2 * square
+        slope = 4 - (2 * stretch - 4 * centre**2 * shift) / (shift**2 + stretch)
+        fixed = np.broadcast_to(self.axis.shapes, (len(lines), *self.axis.shapes.shape))
+        return np.concatenate([fixed, skirt], axis=1), slope
+
+    def _split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return gains, amplitudes and places of the lines."""
+        k = 1 + self.amplitudes
+        return theta[:, 0], np.exp(theta[:, 1:k]), theta[:, k:]
+
+    def _contrast(self, theta: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the contrast of each row."""
+        axis, guess = self.axis, self.guess[rows]
+        gain, a, lines = self._split(theta)
+        model = np.einsum("rk,rkb->rb", a, self._shapes(lines)[0])
+        ratio = axis.bands.take(guess).power(gain) / model
+        at_peaks = np.log(axis.peaks.take(guess).power(gain)) + 1
+        away = (lines - axis.lines) / axis.line_width
+        return np.asarray(
+            (np.log(model) + ratio) @ axis.count
+            + axis.peak_count * np.sum(at_peaks, axis=1)
+            + 0.5 * np.sum(away**2, axis=1)
+        )
+
+    def _derivatives(self, theta: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return gradients (rows, p) and information (rows, p, p) of the contrast."""
+        axis, guess = self.axis, self.guess[rows]
+        gain, a, lines = self._split(theta)
+        shapes, slope = self._shapes(lines)
+        model = np.einsum("rk,rkb->rb", a, shapes)
+        share = a[:, :, None] * shapes / model[:, None, :]
+        log_slopes = np.concatenate([share, share[:, self.fixed :] * slope], axis=1)
+        bands, peaks = axis.bands.take(guess), axis.peaks.take(guess)
+        by_gain = bands.slope(gain) / model
+        at_peaks = peaks.slope(gain) / peaks.power(gain)
+        weighted = log_slopes * axis.count
+        n = theta.shape[1]
+        gradient, information = np.empty((len(rows), n)), np.empty((len(rows), n, n))
+        gradient[:, 0] = by_gain @ axis.count + axis.peak_count * np.sum(at_peaks, axis=1)
+        excess = 1 - bands.power(gain) / model
+        gradient[:, 1:] = np.einsum("rkb,rb->rk", weighted, excess)
+        information[:, 0, 0] = (bands.corrected / model) @ (2 * axis.count)
+        information[:, 0, 0] += axis.peak_count * np.sum(at_peaks**2, axis=1)
+        information[:, 0, 1:] = -np.einsum("rb,rkb->rk", by_gain, weighted)
+        information[:, 1:, 0] = information[:, 0, 1:]
+        information[:, 1:, 1:] = weighted @ log_slopes.transpose(0, 2, 1)
+        k = 1 + self.amplitudes
+        if not self.free:
+            gradient[:, 0] = information[:, 0, 1:] = information[:, 1:, 0] = 0.0
+            information[:, 0, 0] = 1.0
+        gradient[:, k:] += (lines - axis.lines) / axis.line_width**2
+        information[:, range(k, n), range(k, n)] += 1 / axis.line_width**2
+        return gradient, information
+
+    def _limit(self, theta: FloatArray, step: FloatArray) -> FloatArray:
+        """Return the parameters after a step of bounded size, the gain still above 0."""
+        k = 1 + self.amplitudes
+        size = np.max(abs(step[:, 1:k]), axis=1)
+        moves = abs(step[:, k:]) / self.axis.line_width
+        size = np.maximum(size, 2 * np.max(moves, axis=1, initial=0))
+        trial = theta + step * np.minimum(1, 2 / np.maximum(size, 1e-9))[:, None]
+        trial[:, 0] = np.maximum(trial[:, 0], 0.2 * theta[:, 0])
+        level = np.max(trial[:, 1:k], axis=1, keepdims=True)
+        trial[:, 1:k] = np.maximum(trial[:, 1:k], level - 40)
+        return np.asarray(trial)
+
+
+def coherence_credit(
+    one: ComplexArray,
+    other: ComplexArray,
+    frequency_hz: FloatArray,
+    *,
+    independent: float,
+    frame_rate_hz: float,
+) -> float:
+    """Return the contrast that the coherence of two axes saves, given (segments, f) of each.
+
+    A line along a diagonal is in both axes; a guess that removes it from one of them must not
+    count as an explanation. What shakes along a direction has no phase between the axes; the
+    coupling that a wrong guess leaves has one, and no credit.
+    """
+    from scipy.ndimage import uniform_filter1d
+
+    band = _bands(frequency_hz, frame_rate_hz, least=3)
+    power = [uniform_filter1d(np.mean(abs(x) ** 2, axis=0), 3) for x in (one, other)]
+    x, y = (each / np.sqrt(p) for each, p in zip((one, other), power, strict=True))
+    cross = np.mean((x * y.conj()).real, axis=0)
+    sums = [np.bincount(band, weights=np.mean(abs(each) ** 2, axis=0)) for each in (x, y)]
+    mixed = np.bincount(band, weights=cross) ** 2
+    coherent = np.minimum(mixed / (sums[0] * sums[1]), 1 - 1e-6)
+    gained = np.bincount(band) * independent * np.log1p(-coherent) + 0.5
+    return float(np.sum(np.minimum(gained, 0)))

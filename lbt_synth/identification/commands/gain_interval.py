@@ -1,0 +1,91 @@
+"""The sensor gains that a record allows, and the designs that are stable at all of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from lbt_synth.design import Design
+from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.loop import close_loop, stable_sensor_gains
+from lbt_synth.validation import FloatArray
+
+_LEAST, _MOST = 0.08, 2.5  # of a sensor
+_FAR_STEPS = 16
+_NEAR = np.geomspace(0.7, 1.43, 21)  # of the best gain, itself included
+_FAR = 6.0  # nats below the best gain that a record still allows
+_ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
+
+
+def allowed_gains(record: LoopRecord) -> FloatArray:
+    """Return the interval of sensor gains of each axis that a closed-loop record allows.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        A closed-loop record with its delay.
+
+    Returns
+    -------
+    (axes, 2) ndarray
+        Least and largest gain whose profile likelihood, by a coarse model of the spectrum, is
+        within 6 of the best, more where the model misfits; 0.08 to 2.5 at most.
+
+    Raises
+    ------
+    ProblemError
+        If the record has no delay.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=500)
+    >>> truth = lbt.Truth(turbulence=slow, noise_nm=5.0, sensor_gain=0.6)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    >>> run = lbt.simulate(
+    ...     lbt.integrator(path, gain=0.4).controller, truth, hardware=path, frames=10_000
+    ... )
+    >>> record = lbt.identification.loop_record(
+    ...     run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
+    ... )
+    >>> low, high = lbt.identification.allowed_gains(record)[0]
+    >>> bool(low < 0.6 < high < 2)
+    True
+    """
+    everything = np.tile([_LEAST, _MOST], (record.axes, 1))
+    coarse = CoarseRecord(record)
+    if not coarse.stretches:
+        return everything
+    given = Guess(kind="as given")
+    best = coarse.compare([given])
+    far = np.geomspace(_LEAST, _MOST, _FAR_STEPS)
+    grid = np.array([[*far, *(gain * _NEAR)] for gain in best.gain[:, 0]])
+    profile = coarse.compare([given] * grid.shape[1], grid)
+    excess = profile.axis_contrast - best.axis_contrast
+    allowed = excess < _FAR * max(1.0, float(best.misfit[0]) / _ENOUGH)
+    ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
+    return np.asarray(np.clip(ends, _LEAST, _MOST), dtype=np.float64)
+
+
+def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
+    """Return sensor gains within intervals (axes, 2) at which a design's loop is unstable.
+
+    Each corner of the box is tried, and all common factors on the design's own gains that its
+    sides allow: exact for axes that decouple. None if the loop is stable at all of them.
+    """
+    hardware = design.hardware
+    assert hardware is not None
+    for corner in product(*gains):
+        path = replace(hardware, sensor_matrix=np.diag(corner))
+        if not close_loop(path, design.controller).is_stable:
+            return np.array(corner)
+    own = np.diag(hardware.sensor)
+    factors = gains / own[:, None]
+    low, high = stable_sensor_gains(hardware, design.controller)
+    for factor in (np.min(factors), np.max(factors)):
+        if not low < factor < high:
+            return np.asarray(factor * own)
+    return None

@@ -1,0 +1,225 @@
+"""Guesses of how the commands of a record reach its measurements, and the likelihood of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from lbt_synth.identification.commands.coarse_spectrum import (
+    CoarseAxis,
+    CoarseFit,
+    coarse_axis,
+    coherence_credit,
+    fit_guesses,
+    segment_transforms,
+)
+from lbt_synth.identification.commands.repair import rotation
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.models.loop_hardware import past_corrections
+from lbt_synth.validation import ComplexArray, FloatArray
+
+GuessKind: TypeAlias = Literal["as given", "matrix", "shift", "increments", "clipped"]
+SHIFTS = tuple(float(shift) for shift in np.arange(-3, 3.1, 0.5) if shift)
+_ROTATIONS_DEG = (-150.0, -120.0, -90.0, -60.0, -30.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
+_MIRRORS_DEG = (-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0)
+_LEVELS = (0.99, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.12, 0.06, 0.03)  # of the largest command
+_MARGIN = 5  # frames of a stretch, on either side, that no shift leaves
+_SHORTEST = 512
+_NATURAL_GAINS = np.array([0.2, 0.7, 2.0])  # starts, of the natural gain
+_NATURAL = 0.4
+_ORTHOGONAL = 1e-6
+_MIRROR = np.diag([1.0, -1.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Guess:
+    """How recorded commands may reach the measurements.
+
+    Attributes
+    ----------
+    kind : str
+        "as given", "matrix", "shift", "increments" or "clipped".
+    matrix : (axes, axes) ndarray or None
+        From recorded commands to the axes of the measurements.
+    shift_frames : float
+        Frames by which the delay is longer than given.
+    limit_nm : (axes,) ndarray or None
+        Stroke beyond which requests were not applied [nm].
+    """
+
+    kind: GuessKind
+    matrix: FloatArray | None = None
+    shift_frames: float = 0.0
+    limit_nm: FloatArray | None = None
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether the matrix, if there is one, is a rotation, with a mirror or without."""
+        return self.matrix is None or is_orthogonal(self.matrix)
+
+    def corrections(self, record: LoopRecord, shift: int = 0) -> FloatArray:
+        """Return the corrections in the measurements, but for the matrix, (frames, axes) [nm].
+
+        A shift that is not whole mixes those of two whole ones, ``shift`` is one of them.
+        """
+        assert record.commands is not None
+        u = record.commands
+        if self.kind == "increments":
+            u = np.cumsum(u, axis=0)
+        if self.limit_nm is not None:
+            u = np.clip(u, -self.limit_nm, self.limit_nm)
+        return np.roll(past_corrections(record.mirror_taps, u), shift, axis=0)
+
+
+def is_orthogonal(matrix: FloatArray) -> bool:
+    """Return whether a matrix is a rotation, with a mirror or without."""
+    return bool(np.max(abs(matrix @ matrix.T - np.eye(len(matrix)))) < _ORTHOGONAL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Comparison:
+    """Guesses on one record.
+
+    Attributes
+    ----------
+    guesses : tuple of Guess
+        The guesses.
+    contrast : (guesses,) ndarray
+        Minus the logarithm of the likelihood of each.
+    axis_contrast : (axes, guesses) ndarray
+        The part of each axis, without the coherence of the axes.
+    gain : (axes, guesses) ndarray
+        Best gain of the sensor.
+    misfit : (guesses,) ndarray
+        Mean deviance of a band: about 1 if the coarse spectrum can describe the record.
+    """
+
+    guesses: tuple[Guess, ...]
+    contrast: FloatArray
+    axis_contrast: FloatArray
+    gain: FloatArray
+    misfit: FloatArray
+
+    def join(self, other: Comparison) -> Comparison:
+        """Return the guesses of both."""
+        return Comparison(
+            guesses=self.guesses + other.guesses,
+            contrast=np.append(self.contrast, other.contrast),
+            axis_contrast=np.hstack([self.axis_contrast, other.axis_contrast]),
+            gain=np.hstack([self.gain, other.gain]),
+            misfit=np.append(self.misfit, other.misfit),
+        )
+
+
+def list_guesses(record: LoopRecord, *, earliest_frames: float) -> list[Guess]:
+    """Return the guesses for a record, the first as given.
+
+    ``earliest_frames`` is the least total delay at which a correction still follows from the
+    past of the measurements.
+    """
+    assert record.commands is not None
+    assert record.delay_frames is not None
+    out = [Guess(kind="as given")]
+    out += [Guess(kind="matrix", matrix=matrix) for matrix in _matrices(record.axes)]
+    least = earliest_frames - record.delay_frames
+    out += [Guess(kind="shift", shift_frames=shift) for shift in SHIFTS if shift >= least]
+    out.append(Guess(kind="increments"))
+    largest = np.max(abs(record.commands[record.usable]), axis=0)
+    if np.all(largest > 0):
+        out += [Guess(kind="clipped", limit_nm=level * largest) for level in _LEVELS]
+    return out
+
+
+def _matrices(axes: int) -> Iterator[FloatArray]:
+    """Yield matrices from commands to the axes of the measurements."""
+    if axes == 1:
+        yield -np.eye(1)
+        return
+    yield from map(rotation, _ROTATIONS_DEG)
+    yield from (rotation(angle) @ _MIRROR for angle in _MIRRORS_DEG)
+
+
+class CoarseRecord:
+    """The transforms of one record, on which guesses are compared; none without ``stretches``."""
+
+    def __init__(self, record: LoopRecord) -> None:
+        self.record = record
+        trimmed = [(a + _MARGIN, b - _MARGIN) for a, b in record.stretches()]
+        self.stretches = [(a, b) for a, b in trimmed if b - a >= _SHORTEST]
+        self._known: dict[tuple[object, ...], ComplexArray] = {}
+        if self.stretches:
+            every = self._transform(record.measurements)
+            self.frequency_hz, self.measured, self.independent = every
+
+    def _transform(self, series: FloatArray) -> tuple[FloatArray, ComplexArray, float]:
+        return segment_transforms(series, self.stretches, self.record.frame_rate_hz)
+
+    def _shifted(self, guess: Guess, shift: int) -> ComplexArray:
+        """Return the transforms of a guess without its matrix, at a whole shift."""
+        limit = None if guess.limit_nm is None else tuple(guess.limit_nm.tolist())
+        key = (guess.kind == "increments", limit, shift)
+        if key not in self._known:
+            self._known[key] = self._transform(guess.corrections(self.record, shift))[1]
+        return self._known[key]
+
+    def transform(self, guess: Guess) -> ComplexArray:
+        """Return the transforms of the corrections of a guess, (axes, segments, f)."""
+        whole = int(np.floor(guess.shift_frames))
+        part = guess.shift_frames - whole
+        out = self._shifted(guess, whole)
+        if part:
+            out = (1 - part) * out + part * self._shifted(guess, whole + 1)
+        return out if guess.matrix is None else np.tensordot(guess.matrix, out, 1)
+
+    def compare(self, guesses: Sequence[Guess], gains: FloatArray | None = None) -> Comparison:
+        """Return the likelihood of each guess, at its best gains or at fixed ones (axes, guesses).
+
+        ``gains`` of 0 are those of commands that do not reach the measurements.
+        """
+        corrections = np.array([self.transform(guess) for guess in guesses])
+        fits = [
+            self._fit_axis(i, corrections[:, i], None if gains is None else gains[i])
+            for i in range(self.record.axes)
+        ]
+        gain = np.array([fit.gain for fit in fits])
+        own = np.array([fit.contrast for fit in fits])
+        total = own.sum(axis=0)
+        if self.record.axes == 2:
+            total = total + [self._credit(c, g) for c, g in zip(corrections, gain.T, strict=True)]
+        return Comparison(
+            guesses=tuple(guesses),
+            contrast=total,
+            axis_contrast=own,
+            gain=gain,
+            misfit=np.mean([fit.misfit for fit in fits], axis=0),
+        )
+
+    def _fit_axis(self, i: int, corrections: ComplexArray, fixed: FloatArray | None) -> CoarseFit:
+        """Fit all guesses of one axis, each scaled to a natural gain of 1."""
+        axis: CoarseAxis = coarse_axis(
+            self.frequency_hz,
+            self.measured[i],
+            corrections,
+            independent=self.independent,
+            frame_rate_hz=self.record.frame_rate_hz,
+        )
+        high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
+        level = np.mean(abs(self.measured[i][:, high]) ** 2)
+        steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
+        natural = _NATURAL * np.sqrt(level / np.maximum(steps, np.finfo(float).tiny))
+        starts = natural[:, None] * _NATURAL_GAINS if fixed is None else fixed[:, None]
+        return fit_guesses(axis, starts, free=fixed is None)
+
+    def _credit(self, corrections: ComplexArray, gain: FloatArray) -> float:
+        """Return what the coherence of the axes saves."""
+        one, other = self.measured + gain[:, None, None] * corrections
+        return coherence_credit(
+            one,
+            other,
+            self.frequency_hz,
+            independent=self.independent,
+            frame_rate_hz=self.record.frame_rate_hz,
+        )

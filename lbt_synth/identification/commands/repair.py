@@ -1,0 +1,181 @@
+"""What turns the commands of a record into those that its mirror followed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.validation import FloatArray, integer, number, read_only, real_array
+
+_SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
+_MOST_SHIFT = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandRepair:
+    """A correction of recorded commands, in the order of the fields.
+
+    Parameters
+    ----------
+    increments : bool, optional
+        The record has increments: they are added up.
+    shift_frames : int, optional
+        Frames by which the commands move to later frames; negative to earlier ones.
+    limit_nm : tuple of float, optional
+        Stroke of each axis, or of both: what was requested beyond was not applied [nm].
+    swap_axes : bool, optional
+        The commands of the two axes change places.
+    sign : tuple of int, optional
+        1 or -1 for each axis, or for both.
+    rotation_deg : float, optional
+        Angle by which the commands turn, from the first axis to the second [deg].
+    matrix : tuple of float, optional
+        Matrix from commands to the axes of the measurements, in rows.
+    scale : float, optional
+        Factor of the commands.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.identification.CommandRepair(sign=(-1,), scale=0.001).options
+    '--command-sign -1 --command-scale 0.001'
+    """
+
+    increments: bool = False
+    shift_frames: int = 0
+    limit_nm: tuple[float, ...] = ()
+    swap_axes: bool = False
+    sign: tuple[int, ...] = ()
+    rotation_deg: float = 0.0
+    matrix: tuple[float, ...] = ()
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        shift = integer(self.shift_frames, "command_shift_frames", at_least=-_MOST_SHIFT)
+        number(shift, "command_shift_frames", at_most=_MOST_SHIFT)
+        for limit in self.limit_nm:
+            number(limit, "command_limit_nm", above=0)
+        if any(sign not in (-1, 1) for sign in self.sign):
+            raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
+        number(self.rotation_deg, "command_rotation_deg", at_least=-180, at_most=180)
+        real_array(self.matrix, "command_matrix")
+        number(self.scale, "command_scale", above=0)
+
+    @property
+    def options(self) -> str:
+        """The options of the command line that do the same."""
+
+        def values(each: tuple[float, ...]) -> str:
+            return " ".join(f"{value:g}" for value in each)
+
+        words = [
+            "--command-increments" if self.increments else "",
+            f"--command-shift-frames {self.shift_frames}" if self.shift_frames else "",
+            f"--command-limit-nm {values(self.limit_nm)}" if self.limit_nm else "",
+            "--swap-axes" if self.swap_axes else "",
+            f"--command-sign {values(self.sign)}" if self.sign else "",
+            f"--command-rotation-deg {self.rotation_deg:g}" if self.rotation_deg else "",
+            f"--command-matrix {values(self.matrix)}" if self.matrix else "",
+            f"--command-scale {self.scale:g}" if self.scale != 1 else "",
+        ]
+        return " ".join(filter(None, words))
+
+    def turn(self, axes: int) -> FloatArray:
+        """Return the matrix that swap, sign, rotation, matrix and scale are together."""
+        if axes != 2 and (self.swap_axes or self.rotation_deg):
+            raise ProblemError(
+                "swapped or rotated commands need two axes; the record has one. Leave "
+                f"{self.options} out, or choose two columns."
+            )
+        out = self.scale * np.eye(axes)
+        if self.matrix:
+            if len(self.matrix) != axes**2:
+                raise ProblemError(
+                    f"command_matrix must have {axes**2} numbers for {axes} axes, row after row; "
+                    f"got {len(self.matrix)}."
+                )
+            out = out @ np.reshape(self.matrix, (axes, axes))
+        if self.rotation_deg:
+            out = out @ rotation(self.rotation_deg)
+        if self.sign:
+            if len(self.sign) not in (1, axes):
+                raise ProblemError(
+                    f"command_sign must be one sign, or {axes}; got {list(self.sign)}."
+                )
+            out = out @ np.diag(np.broadcast_to(np.array(self.sign, dtype=float), axes))
+        return out @ _SWAP if self.swap_axes else out
+
+
+def rotation(angle_deg: float) -> FloatArray:
+    """Return the matrix of a rotation, (2, 2)."""
+    angle = np.deg2rad(angle_deg)
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
+    """Return a record with the commands that the mirror followed.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        A closed-loop record.
+    repair : CommandRepair
+        What its commands need.
+
+    Returns
+    -------
+    LoopRecord
+        With other commands, and the frames that are usable with them.
+
+    Raises
+    ------
+    ProblemError
+        If the record has no commands, or the repair does not fit its axes.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> seen = lbt.identification.loop_record(
+    ...     [[4.0], [3.0], [1.0], [2.0]],
+    ...     [[0.0], [5.0], [1.0], [1.0]],
+    ...     frame_rate_hz=800,
+    ...     unit="nm",
+    ... )
+    >>> repair = lbt.identification.CommandRepair(increments=True, sign=(-1,))
+    >>> lbt.identification.repair_commands(seen, repair).commands[:, 0].tolist()
+    [0.0, -5.0, -6.0, -7.0]
+    """
+    if record.commands is None:
+        raise ProblemError("the record is of an open loop: it has no commands to repair.")
+    commands = np.array(record.commands)
+    good = np.ones(record.frames, dtype=np.bool_)
+    if record.commanded is not None:
+        good = np.array(record.commanded)
+    if repair.increments:
+        commands = np.cumsum(commands, axis=0)
+        good &= np.logical_and.accumulate(good)
+    if repair.shift_frames:
+        commands = np.roll(commands, repair.shift_frames, axis=0)
+        good = np.roll(good, repair.shift_frames)
+        late = repair.shift_frames > 0
+        unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
+        commands[unknown], good[unknown] = 0.0, False
+    if repair.limit_nm:
+        if len(repair.limit_nm) not in (1, record.axes):
+            raise ProblemError(
+                f"command_limit_nm must be one number, or {record.axes}; got "
+                f"{list(repair.limit_nm)}."
+            )
+        limit = np.broadcast_to(np.array(repair.limit_nm), record.axes)
+        commands = np.clip(commands, -limit, limit)
+    commands = commands @ repair.turn(record.axes).T
+    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
+    return repaired if record.delay_frames is None else repaired.with_delay(record.delay_frames)

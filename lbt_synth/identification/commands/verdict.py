@@ -1,0 +1,316 @@
+"""The verdict on the commands of a record: whether they reach its measurements as given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError, RecordError
+from lbt_synth.identification.commands.axis_matrix import classify_matrix
+from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
+from lbt_synth.identification.commands.explanations import (
+    invert_axes,
+    recorded_early,
+    refine_guess,
+    repair_guess,
+    wrong_scale,
+)
+from lbt_synth.identification.commands.guesses import (
+    CoarseRecord,
+    Comparison,
+    Guess,
+    list_guesses,
+)
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.validation import FloatArray, frozen_copy, one_or_each, require_instance
+
+AS_GIVEN = "as given"
+PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
+_CLEAR = 20.0  # nats that decide
+_FRACTION = 2.0  # times more for half a frame, which the dynamics of a mirror may imitate
+_UNUSUAL = 10.0  # nats that a law asks for which no one would run
+_GENERAL = 5.0  # nats by which a matrix without a name must be likelier than others
+_RELATED = 60.0  # nats by which commands without a law must be likelier than none
+_ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
+_FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
+_USUAL_GAIN = 0.7
+_SURE = 0.05  # most that a law leaves unexplained whose lag counts
+_WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CommandVerdict:
+    """How the commands of a record reach its measurements.
+
+    Attributes
+    ----------
+    explanation : str
+        What explains the record best, in words; "as given" if that is what was given.
+    accepted : bool
+        Whether a model may be fitted.
+    repair : CommandRepair or None
+        What the commands need; None where nothing is wrong or nothing helps.
+    delay_frames : float or None
+        The delay that fits, where another was given.
+    nats : float
+        Logarithm of the likelihood of the explanation over that of the record as given.
+    gain : (axes,) ndarray
+        Coarse sensor gain of the explanation.
+    law : ControlLaw or None
+        The control law of the record; None where too few frames show it.
+    notes : tuple of str
+        What to look at although the record is accepted.
+    """
+
+    explanation: str
+    accepted: bool
+    repair: CommandRepair | None = None
+    delay_frames: float | None = None
+    nats: float = 0.0
+    gain: FloatArray
+    law: ControlLaw | None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def options(self) -> str:
+        """The options of the command line that repair the record; empty if there are none."""
+        words = "" if self.repair is None else self.repair.options
+        if self.delay_frames is not None:
+            words += f" --delay-frames {self.delay_frames:g}"
+        return words.strip()
+
+    @property
+    def overruled(self) -> tuple[str, ...]:
+        """What a design from a record rests on that was accepted nevertheless."""
+        if self.accepted:
+            return ()
+        return (f"the record is right although it looks as if of the commands {self.explanation}",)
+
+    def require_accepted(self) -> None:
+        """Refuse a record that is explained better by something else.
+
+        Raises
+        ------
+        RecordError
+            With the explanation, and the options that repair the record.
+        """
+        if not self.accepted:
+            advice = f" Repair it as the options {self.options} do." if self.options else ""
+            raise RecordError(
+                f"the commands do not reach the measurements as the record says: "
+                f"{self.explanation}.{advice}",
+                explanation=self.explanation,
+                options=self.options,
+            )
+
+
+def explain_commands(
+    record: LoopRecord, *, sensor_gain: float | Sequence[float] | None = None
+) -> CommandVerdict:
+    """Compare explanations of how the commands of a record reach its measurements.
+
+    Each explanation gives another pseudo-open-loop series, and only the right one has the simple
+    spectrum of turbulence, lines and noise: Whittle's likelihood on a coarse model decides between
+    the commands as given, turned, exchanged or rotated ones, other delays, increments, requests
+    beyond the stroke, other units, and commands that have nothing to do with the measurements.
+    The control law that computed the commands tells a shifted record from a wrong delay.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        A closed-loop record with its delay.
+    sensor_gain : float or one per axis, optional
+        Known gain of the sensor; by default anything from 0.2 to 1.25 is plausible.
+
+    Returns
+    -------
+    CommandVerdict
+        The best explanation, and what repairs the record.
+
+    Raises
+    ------
+    ProblemError
+        If the record has no commands or no delay.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=500)
+    >>> truth = lbt.Truth(turbulence=slow, noise_nm=5.0)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500)
+    >>> run = lbt.simulate(
+    ...     lbt.integrator(path, gain=0.4).controller, truth, hardware=path, frames=10_000
+    ... )
+    >>> record = lbt.identification.loop_record(
+    ...     run.measurements[0], -run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
+    ... )
+    >>> lbt.identification.explain_commands(record).options
+    '--command-sign -1'
+    """
+    require_instance(record, LoopRecord)
+    delay = record.hardware.delay_frames  # refuses a record without one
+    if record.commands is None:
+        raise ProblemError("the record is of an open loop: it has no commands to explain.")
+    law = _find_law(record)
+    lag = 0 if law is None or law.residual > _SURE else law.lag_frames
+    early = max(-lag, 0)
+    if early:  # corrections that follow from the future have no likelihood: they are moved first
+        record = repair_commands(record, CommandRepair(shift_frames=early))
+    coarse = CoarseRecord(record)
+    if not coarse.stretches:
+        note = "the commands were not tested: no stretch of usable frames is long enough"
+        nothing = np.full(record.axes, np.nan)
+        return CommandVerdict(
+            explanation=AS_GIVEN, accepted=True, gain=nothing, law=law, notes=(note,)
+        )
+    found = _find_best(coarse, law, max(lag, 0))
+    if found is None:
+        return CommandVerdict(
+            explanation="they have nothing to do with the measurements, as if of another night",
+            accepted=False,
+            gain=np.zeros(record.axes),
+            law=law,
+        )
+    gains = PLAUSIBLE_GAINS
+    if sensor_gain is not None:
+        known = one_or_each(sensor_gain, "sensor_gain", above=0)
+        gains = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
+    scale = _find_scale(coarse, found, gains)
+    words = [] if not early else [recorded_early(early)]
+    repair, other_delay, why = repair_guess(found.guess, delay, max(lag, 0))
+    words += why
+    if scale != 1:
+        words.append(wrong_scale(1 / scale, found.gain))
+    repair = replace(repair, shift_frames=repair.shift_frames or early, scale=scale)
+    return CommandVerdict(
+        explanation=" and ".join(words) or AS_GIVEN,
+        accepted=not words,
+        repair=repair if repair.options else None,
+        delay_frames=other_delay,
+        nats=found.nats,
+        gain=frozen_copy(found.gain * scale),
+        law=law,
+        notes=_notes(found, delay, lag) if not words else (),
+    )
+
+
+def _find_law(record: LoopRecord) -> ControlLaw | None:
+    """Return the control law; None where the frames are too few."""
+    try:
+        return record_control_law(record)
+    except ProblemError:
+        return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Best:
+    """The best explanation of a record, and what decides about it."""
+
+    guess: Guess
+    nats: float  # over the record as given
+    contrast: float
+    gain: FloatArray  # (axes,)
+    clear: float  # nats that decide
+    rival: Guess | None = None  # a likelier one that is not clearly so
+    rival_nats: float = 0.0
+
+
+def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best | None:
+    """Return the best explanation; None where commands do not reach the measurements."""
+    record = coarse.record
+    no_law = law is None or law.kind == "none"
+    guesses = list_guesses(record, earliest_frames=1.0 - lag)
+    if law is not None and law.axis_matrix.kind not in ("diagonal", "swapped", "zero"):
+        inverse = invert_axes(law.gain)
+        guesses += [] if inverse is None else [Guess(kind="matrix", matrix=inverse)]
+    compared = coarse.compare(guesses)
+    if any(guess.kind == "clipped" for guess in guesses):
+        guesses.append(_best_limits(compared))
+        compared = compared.join(coarse.compare(guesses[-1:]))
+    unusual = np.array([_is_unusual(guess, law, lag) for guess in guesses])
+    score = compared.contrast + _UNUSUAL * unusual
+    score[[i for i, guess in enumerate(guesses) if not guess.is_simple]] += _GENERAL
+    best = int(np.argmin(score))
+    clear = _CLEAR * max(1.0, float(compared.misfit[best]) / _ENOUGH)
+    unrelated = coarse.compare(guesses[:1], np.zeros((record.axes, 1)))
+    if no_law and unrelated.contrast[0] - np.min(compared.contrast) < _RELATED * clear / _CLEAR:
+        return None
+    nats = float(score[0] - score[best])
+    fraction = abs(guesses[best].shift_frames) % 1 > 0 and abs(guesses[best].shift_frames) < 1
+    given = _Best(
+        guess=guesses[0],
+        nats=0.0,
+        contrast=float(compared.contrast[0]),
+        gain=compared.gain[:, 0],
+        clear=clear,
+    )
+    if best == 0:
+        return given
+    if nats < clear * (_FRACTION if fraction else 1.0):
+        return replace(given, rival=guesses[best], rival_nats=nats)
+    guess = refine_guess(coarse, guesses[best], law)
+    fine = coarse.compare([guess])
+    return _Best(
+        guess=guess,
+        nats=nats,
+        contrast=float(fine.contrast[0]),
+        gain=fine.gain[:, 0],
+        clear=clear,
+    )
+
+
+def _best_limits(compared: Comparison) -> Guess:
+    """Return the guess of clipped commands with the best limit of each axis."""
+    places = [i for i, guess in enumerate(compared.guesses) if guess.limit_nm is not None]
+    limits = np.array([compared.guesses[i].limit_nm for i in places])
+    best = np.argmin(compared.axis_contrast[:, places], axis=1)
+    return Guess(kind="clipped", limit_nm=limits[best, np.arange(best.size)])
+
+
+def _is_unusual(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
+    """Return whether a guess makes the control law one that no one would run."""
+    if law is None or law.kind == "none":
+        return guess.shift_frames != 0
+    if guess.kind == "shift":
+        return guess.shift_frames != -lag or lag == 0
+    matrix = np.eye(len(law.gain)) if guess.matrix is None else guess.matrix
+    turned = classify_matrix(matrix @ law.gain)
+    return turned.kind != "diagonal" or min(turned.signs) < 0
+
+
+def _find_scale(coarse: CoarseRecord, found: _Best, plausible: tuple[float, float]) -> float:
+    """Return the factor of the commands that makes an implausible gain a plausible one."""
+    low, high = plausible
+    bounded = np.clip(found.gain, low, high)
+    if np.all(bounded == found.gain):
+        return 1.0
+    at_bounds = coarse.compare([found.guess], bounded[:, None])
+    if at_bounds.contrast[0] - found.contrast < found.clear:
+        return 1.0
+    gain = float(np.exp(np.mean(np.log(found.gain))))
+    usual = float(np.clip(_USUAL_GAIN, low, high))
+    fits = [f for f in _FACTORS if low <= gain / f <= high]
+    if fits:
+        return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
+    return float(f"{gain / usual:.2g}")
+
+
+def _notes(found: _Best, delay_frames: float, lag: int) -> tuple[str, ...]:
+    """Return what to look at although the record is accepted."""
+    out = []
+    if lag > 0:
+        out.append(
+            f"warning: the commands follow measurements {lag} frame{'s' * (lag > 1)} earlier. If "
+            "the real-time computer takes that long, the total delay of a new design is "
+            f"{delay_frames + lag:g} frames"
+        )
+    if found.rival is not None and found.rival.kind == "shift" and found.rival_nats > _UNUSUAL:
+        fitting = delay_frames + found.rival.shift_frames
+        out.append(
+            f"warning: a delay of {fitting:g} frames fits better than {delay_frames:g} (by "
+            f"{found.rival_nats:.0f} in the logarithm of the likelihood). Check the delay"
+        )
+    return tuple(out)

@@ -1,0 +1,102 @@
+"""The coarse spectrum: transforms, bands, and the likelihood of guesses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lbt_synth.identification.commands import coarse_spectrum as coarse
+from lbt_synth.identification.commands.coarse_spectrum import (
+    coarse_axis,
+    coherence_credit,
+    fit_guesses,
+    segment_transforms,
+)
+
+RATE, FRAMES = 1000.0, 24_000
+
+
+def white(seed: int, n: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((FRAMES, n))
+
+
+def axis_of(y: np.ndarray, guesses: np.ndarray) -> coarse.CoarseAxis:
+    """The coarse axis of one measurement (frames,) and guesses (frames, n)."""
+    f, z, n = segment_transforms(np.column_stack([y, guesses]), [(0, FRAMES)], RATE)
+    return coarse_axis(f, z[0], z[1:], independent=n, frame_rate_hz=RATE)
+
+
+def test_the_square_of_a_transform_is_a_density() -> None:
+    f, z, _ = segment_transforms(3.0 * white(0), [(0, FRAMES)], RATE)
+    density = np.mean(abs(z[0]) ** 2, axis=0)
+    assert np.mean(density) == pytest.approx(2 * 9.0 / RATE, rel=0.03)
+    t = np.arange(FRAMES) / RATE
+    f, z, _ = segment_transforms(50 * np.sin(2 * np.pi * 40 * t)[:, None], [(0, FRAMES)], RATE)
+    power = np.sum(np.mean(abs(z[0]) ** 2, axis=0)) * (f[1] - f[0])
+    assert power == pytest.approx(50**2 / 2, rel=0.01)
+
+
+def test_a_mean_slope_does_not_show() -> None:
+    y = white(1)
+    sloped = y + 0.5 * np.arange(FRAMES)[:, None] + 1e4
+    one, other = (segment_transforms(x, [(0, FRAMES)], RATE)[1] for x in (y, sloped))
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
+    axis = axis_of(white(2)[:, 0], white(3))
+    found = fit_guesses(axis, np.zeros((1, 1)), free=False)
+    power, count = axis.bands.measured, axis.count
+    rest = axis.peak_count * np.sum(np.log(axis.peaks.measured) + 1)
+    least = np.sum(count * (np.log(power) + 1)) + rest
+    mean = np.average(power, weights=count)
+    only_noise = np.sum(count) * (np.log(mean) + 1) + rest
+    assert least < found.contrast[0] <= only_noise + 0.1
+    assert found.misfit[0] == pytest.approx(1.0, abs=0.4)
+
+
+def test_the_right_correction_is_found_with_its_gain() -> None:
+    slow = np.zeros(FRAMES)
+    w = 20 * white(4)[:, 0]
+    for k in range(1, FRAMES):
+        slow[k] = 0.99 * slow[k - 1] + w[k]
+    noise = 5 * white(5)[:, 0]
+    y, u = np.zeros((2, FRAMES))
+    for k in range(2, FRAMES):
+        y[k] = 0.6 * (slow[k - 1] - u[k - 2]) + noise[k]
+        u[k] = u[k - 1] + 0.5 * y[k]
+    guesses = np.column_stack([np.roll(u, 2), 1e-3 * np.roll(u, 2), np.roll(u, 3), -np.roll(u, 2)])
+    starts = np.array([[0.3, 1.0], [300.0, 1000.0], [0.3, 1.0], [0.3, 1.0]])
+    found = fit_guesses(axis_of(y, guesses), starts)
+    assert found.gain[0] == pytest.approx(0.6, rel=0.1)
+    assert found.gain[1] == pytest.approx(1000 * found.gain[0], rel=0.01)
+    assert found.contrast[1] == pytest.approx(found.contrast[0], abs=0.5)
+    assert np.all(found.contrast[2:] > found.contrast[0] + 100)
+
+
+def test_derivatives_of_the_contrast() -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(FRAMES) / RATE
+    y = white(7)[:, 0] + 4 * np.sin(2 * np.pi * 33 * t)
+    fit = coarse._Fit(axis_of(y, white(8)), np.zeros(1, dtype=np.intp), True)
+    theta = fit._begin(np.array([0.4]))
+    assert fit.lines == 1
+    theta = theta + 0.01 * rng.standard_normal(theta.shape)
+    rows = np.zeros(1, dtype=np.intp)
+    gradient = fit._derivatives(theta, rows)[0][0]
+    steps = 1e-5 * np.eye(theta.size)
+    numeric = [
+        (fit._contrast(theta + h, rows)[0] - fit._contrast(theta - h, rows)[0]) / 2e-5
+        for h in steps
+    ]
+    np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-3 * np.max(abs(gradient)))
+
+
+def test_the_coherence_of_two_axes_is_credited() -> None:
+    f, z, n = segment_transforms(white(9, 2), [(0, FRAMES)], RATE)
+    options = {"independent": n, "frame_rate_hz": RATE}
+    assert -80 < coherence_credit(z[0], z[1], f, **options) <= 0
+    # two values of coherence r^2 in each of N frequencies save N log(1 - r^2)
+    mixed = 0.6 * z[0] + 0.8 * z[1]
+    saved = f.size * n * np.log(1 - 0.36)
+    assert coherence_credit(z[0], mixed, f, **options) == pytest.approx(saved, rel=0.1)

@@ -1,0 +1,69 @@
+"""Guesses of how commands reach measurements, on one record."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.control_laws import ordinary_loop
+from support.wrong_commands import record
+
+from lbt_synth.identification.commands.guesses import CoarseRecord, Guess, list_guesses
+
+
+@pytest.fixture(scope="module")
+def coarse() -> CoarseRecord:
+    return CoarseRecord(record(*ordinary_loop()))
+
+
+def test_the_first_guess_is_the_record_as_given() -> None:
+    guesses = list_guesses(record(*ordinary_loop()), earliest_frames=1.0)
+    assert guesses[0].kind == "as given"
+    assert [g.kind for g in guesses].count("as given") == 1
+    shifts = [g.shift_frames for g in guesses if g.kind == "shift"]
+    assert min(shifts) == -1.0  # a total delay of one frame is the least
+    assert max(shifts) == 3.0
+    early = list_guesses(record(*ordinary_loop()), earliest_frames=-1.0)
+    assert min(g.shift_frames for g in early) == -3.0
+
+
+def test_one_axis_may_only_be_turned() -> None:
+    y, u = ordinary_loop()
+    guesses = list_guesses(record(y[:, :1], u[:, :1]), earliest_frames=1.0)
+    matrices = [g.matrix for g in guesses if g.matrix is not None]
+    assert [m.tolist() for m in matrices] == [[[-1.0]]]
+
+
+def test_half_a_frame_is_the_mean_of_two(coarse) -> None:
+    whole = [coarse.transform(Guess(kind="shift", shift_frames=s)) for s in (0.0, 1.0)]
+    half = coarse.transform(Guess(kind="shift", shift_frames=0.5))
+    np.testing.assert_allclose(half, np.mean(whole, axis=0))
+
+
+def test_a_matrix_mixes_the_axes(coarse) -> None:
+    plain = coarse.transform(Guess(kind="as given"))
+    mixed = coarse.transform(Guess(kind="matrix", matrix=np.array([[0.0, 1.0], [2.0, 1.0]])))
+    np.testing.assert_allclose(mixed[0], plain[1])
+    np.testing.assert_allclose(mixed[1], 2 * plain[0] + plain[1])
+
+
+def test_the_record_as_given_is_the_likeliest(coarse) -> None:
+    guesses = list_guesses(coarse.record, earliest_frames=1.0)
+    found = coarse.compare(guesses)
+    others = [i for i, g in enumerate(guesses) if g.kind not in ("as given", "clipped")]
+    assert np.all(found.contrast[others] > found.contrast[0] + 5)
+    assert np.all(found.contrast > found.contrast[0] - 5)  # hardly any command beyond 99 %
+    np.testing.assert_allclose(found.gain[:, 0], 0.7, rtol=0.1)
+    assert found.misfit[0] < 2
+
+
+def test_other_gains_are_less_likely(coarse) -> None:
+    given = Guess(kind="as given")
+    best = coarse.compare([given])
+    fixed = coarse.compare([given] * 3, np.array([[0.35, 0.7, 1.4]] * 2))
+    assert fixed.gain.tolist() == [[0.35, 0.7, 1.4]] * 2
+    more = fixed.axis_contrast - best.axis_contrast
+    assert np.all(more > -0.5)
+    assert np.all(more[:, [0, 2]] > 25)
+    joined = best.join(fixed)
+    assert joined.contrast.tolist() == [*best.contrast, *fixed.contrast]
+    assert len(joined.guesses) == 4

@@ -1,0 +1,96 @@
+"""Repairs of recorded commands: each undoes its fault."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.control_laws import ordinary_loop
+from support.wrong_commands import FAULTS, record, repair_of, wrong_record
+
+import lbt_synth as lbt
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands, rotation
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_repair_undoes_its_fault(fault) -> None:
+    y, u = ordinary_loop()
+    repaired = repair_commands(wrong_record(fault), repair_of(fault))
+    assert repair_of(fault).options == FAULTS[fault][1]
+    good = record(y, u)
+    start = 1 if fault == "late" else 0  # the measurement of the first frame was lost with it
+    usable = np.flatnonzero(repaired.usable)
+    assert usable.size > 9980
+    c, expected = repaired.corrections(), good.corrections()[start:]
+    np.testing.assert_allclose(c[usable], expected[usable], atol=1e-9 * np.max(abs(u)))
+    np.testing.assert_array_equal(repaired.measurements[usable], good.measurements[start:][usable])
+
+
+def test_frames_whose_command_is_not_known_are_not_usable() -> None:
+    y, u = ordinary_loop()
+    u = u.copy()
+    u[5000] = np.nan
+    seen = record(y, u)
+    later = repair_commands(seen, CommandRepair(shift_frames=3))
+    assert not later.usable[5005]
+    assert later.usable[5004]
+    assert later.usable[5006]
+    assert not later.usable[:5].any()  # three frames of the shift and two of the delay
+    summed = repair_commands(seen, CommandRepair(increments=True))
+    assert summed.usable[5001]
+    assert not summed.usable[5002:].any()  # every later position depends on the lost increment
+
+
+def test_requests_are_clipped() -> None:
+    y, u = ordinary_loop()
+    limits = (100.0, 50.0)
+    clipped = repair_commands(record(y, u), CommandRepair(limit_nm=limits))
+    assert np.max(abs(clipped.commands), axis=0).tolist() == list(limits)
+
+
+def test_the_matrix_of_a_repair_is_applied_in_the_order_of_its_fields() -> None:
+    both = CommandRepair(swap_axes=True, sign=(1, -1), rotation_deg=30.0, scale=2.0)
+    swap, sign = np.array([[0, 1], [1, 0]]), np.diag([1, -1])
+    np.testing.assert_allclose(both.turn(2), 2 * rotation(30.0) @ sign @ swap)
+    assert CommandRepair(matrix=(1.0, 2.0, 3.0, 4.0)).turn(2).tolist() == [[1, 2], [3, 4]]
+    assert both.options == (
+        "--swap-axes --command-sign 1 -1 --command-rotation-deg 30 --command-scale 2"
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"sign": (2,)}, "command_sign must be 1 or -1"),
+        ({"scale": 0.0}, "command_scale must be above 0"),
+        ({"limit_nm": (-1.0,)}, "command_limit_nm must be above 0"),
+        ({"shift_frames": 101}, "command_shift_frames must be at most 100"),
+        ({"rotation_deg": 181.0}, "command_rotation_deg must be at most 180"),
+        ({"matrix": (1.0, np.nan, 0.0, 1.0)}, "command_matrix"),
+    ],
+)
+def test_values_out_of_range(fields, why) -> None:
+    with pytest.raises(lbt.errors.ProblemError, match=why):
+        CommandRepair(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"swap_axes": True}, "need two axes"),
+        ({"rotation_deg": 10.0}, "need two axes"),
+        ({"sign": (1, -1)}, "must be one sign, or 1"),
+        ({"matrix": (1.0, 0.0, 0.0, 1.0)}, "must have 1 numbers"),
+        ({"limit_nm": (1.0, 1.0)}, "must be one number, or 1"),
+    ],
+)
+def test_a_repair_must_fit_the_axes(fields, why) -> None:
+    y, u = ordinary_loop()
+    with pytest.raises(lbt.errors.ProblemError, match=why):
+        repair_commands(record(y[:, :1], u[:, :1]), CommandRepair(**fields))
+
+
+def test_an_open_loop_has_nothing_to_repair() -> None:
+    y, _ = ordinary_loop()
+    seen = lbt.identification.loop_record(y, frame_rate_hz=1000, unit="nm")
+    with pytest.raises(lbt.errors.ProblemError, match="open loop"):
+        repair_commands(seen, CommandRepair(sign=(-1,)))

@@ -1,0 +1,122 @@
+"""The verdict on commands: faults are named with what repairs them, good records pass."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.control_laws import PATH, TRUTH, ordinary_loop
+from support.recorded_loops import RATE
+from support.wrong_commands import FAULTS, LIMIT_NM, record, requested_loop, wrong_record
+
+import lbt_synth as lbt
+from lbt_synth.identification.commands.repair import repair_commands
+from lbt_synth.identification.commands.verdict import AS_GIVEN, explain_commands
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_good_record_is_accepted(seed) -> None:
+    verdict = explain_commands(record(*ordinary_loop(seed)))
+    assert (verdict.explanation, verdict.accepted, verdict.options) == (AS_GIVEN, True, "")
+    assert verdict.overruled == ()
+    np.testing.assert_allclose(verdict.gain, 0.7, rtol=0.25)
+    verdict.require_accepted()
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_named_and_repaired(fault) -> None:
+    wrong = wrong_record(fault)
+    verdict = explain_commands(wrong)
+    assert verdict.options == FAULTS[fault][1]
+    with pytest.raises(lbt.errors.RecordError, match=verdict.explanation[:20]) as caught:
+        verdict.require_accepted()
+    assert caught.value.options == verdict.options
+    assert verdict.explanation in verdict.overruled[0]
+    good = repair_commands(wrong, verdict.repair)
+    assert explain_commands(good).accepted
+
+
+def test_a_general_matrix_is_that_of_the_law() -> None:
+    y, u = ordinary_loop()
+    mix = np.array([[1.0, 1.0], [-0.6, 0.9]])
+    verdict = explain_commands(record(y, u @ mix.T))
+    assert verdict.options.startswith("--command-matrix")
+    product = verdict.repair.turn(2) @ mix @ np.diag([0.4, 0.3])
+    np.testing.assert_allclose(product, product[0, 0] * np.eye(2), atol=1e-3)
+
+
+def test_a_rotated_mirror_is_found_without_the_law() -> None:
+    turned = lbt.LoopHardware(
+        frame_rate_hz=RATE, influence_matrix=np.array([[0.866, -0.5], [0.5, 0.866]])
+    )
+    law = lbt.integrator(PATH, gain=0.4).controller
+    run = lbt.simulate(law, TRUTH, hardware=turned, frames=20_000)
+    verdict = explain_commands(record(run.measurements[0], run.commands[0]))
+    assert verdict.repair.rotation_deg == pytest.approx(30, abs=8)
+
+
+def test_requests_that_were_not_applied() -> None:
+    verdict = explain_commands(record(*requested_loop()))
+    assert verdict.options.startswith("--command-limit-nm")
+    np.testing.assert_allclose(verdict.repair.limit_nm, LIMIT_NM, rtol=0.4)
+
+
+def test_commands_of_another_night() -> None:
+    (y, _), (_, u) = ordinary_loop(1), ordinary_loop(2)
+    verdict = explain_commands(record(y, u))
+    assert not verdict.accepted
+    assert verdict.options == ""
+    assert "nothing to do with the measurements" in verdict.explanation
+
+
+def test_a_wrong_delay() -> None:
+    verdict = explain_commands(record(*ordinary_loop(), delay_frames=3.0))
+    assert verdict.options == "--delay-frames 2"
+    assert verdict.delay_frames == 2
+
+
+def test_commands_that_are_shaken_need_no_law() -> None:
+    rng = np.random.default_rng(7)
+    u = 40 * np.repeat(rng.standard_normal((500, 2)), 20, axis=0)
+    y = np.zeros((10_000, 2))
+    y[2:] = -0.5 * u[:-2]
+    y += 5 * rng.standard_normal(y.shape)
+    verdict = explain_commands(record(y, u))
+    assert verdict.accepted
+    np.testing.assert_allclose(verdict.gain, 0.5, rtol=0.05)
+
+
+def test_a_slow_computer_is_not_a_late_record() -> None:
+    """The law uses old measurements, and the mirror follows the commands as recorded."""
+    law = lbt.Controller(
+        A=[[1.0, 0.3], [0.0, 0.0]], B=[[0.0], [1.0]], C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE
+    )
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    truth = lbt.Truth(turbulence=TRUTH.turbulence, noise_nm=8.0, sensor_gain=0.7)
+    run = lbt.simulate(law, truth, hardware=path, frames=10_000)
+    verdict = explain_commands(record(run.measurements[0], run.commands[0]))
+    assert verdict.accepted
+    assert verdict.law.lag_frames == 1
+    assert "the total delay of a new design is 3 frames" in verdict.notes[0]
+
+
+def test_a_known_gain_decides_on_the_scale() -> None:
+    y, u = ordinary_loop()
+    assert explain_commands(record(y, u / 2), sensor_gain=1.4).accepted
+    assert explain_commands(record(y, u), sensor_gain=[0.6, 0.8]).accepted
+    assert explain_commands(record(y, u), sensor_gain=0.1).options.startswith("--command-scale")
+
+
+def test_a_record_without_long_stretches_is_not_tested() -> None:
+    y, u = ordinary_loop()
+    y = y.copy()
+    y[::400] = np.nan
+    verdict = explain_commands(record(y, u))
+    assert verdict.accepted
+    assert "not tested" in verdict.notes[0]
+
+
+def test_an_open_loop_has_no_commands() -> None:
+    y, _ = ordinary_loop()
+    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    with pytest.raises(lbt.errors.ProblemError, match="no commands to explain"):
+        explain_commands(seen)
