@@ -17,6 +17,7 @@ from lbt_synth.identification.records.faults import fill, find_outliers, runs
 from lbt_synth.identification.tracking.identifiers import LoopIdentifier
 from lbt_synth.identification.tracking.switching import SwitchedController, require_same_loop
 from lbt_synth.identification.tracking.trend import LineTrack, match_tracks
+from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 from lbt_synth.validation import BoolArray, FloatArray, number, require_instance
@@ -102,8 +103,9 @@ class TrackingController(SwitchedController):
     frequency of its middle, but the filter needs that of the middle of the time to the next
     update: the trend of the last fits is extrapolated as far as it is significant.
 
-    No update can stop the loop: if a window has too few good measurements, the fit fails or the
-    design does not pass its certificate, the running filter stays, and :attr:`history` says why.
+    No update can stop the loop: if a window has too few good measurements, the fit fails, the
+    design does not pass its certificate, or its loop would be unstable at the sensor gain that the
+    running filter assumes, the running filter stays, and :attr:`history` says why.
     Frames that are not finite are left out and the command held. Single outliers of the
     pseudo-open-loop series are left out of the fit in the same way, though the mirror has followed
     them.
@@ -219,6 +221,7 @@ class TrackingController(SwitchedController):
             plant = self._extrapolate_lines(found, time_s)
             with _keep_filter_if_fails("design"):
                 designed = self._design_filter(plant)
+            self._require_stable(designed)
             clock.append(time.perf_counter())
             self.switch(designed)
         except _KeepFilterError as kept:
@@ -242,6 +245,17 @@ class TrackingController(SwitchedController):
             switch_s=switch_s,
         )
         self._history.append(update)
+
+    def _require_stable(self, designed: FilterDesign) -> None:
+        """Refuse a filter whose loop would be unstable at the sensor gain of the running one.
+
+        A short window may be explained by a wrong gain. The real one is between updates where it
+        was, so that it can still be followed in steps.
+        """
+        if not close_loop(self._plant.hardware, designed.controller).is_stable:
+            raise _KeepFilterError(
+                "the new filter's loop is unstable at the sensor gain that the running one assumes"
+            )
 
     def _identify_window(self) -> TipTiltPlant:
         """Return the plant of the last window."""

@@ -75,6 +75,7 @@ def test_without_a_change_the_commands_are_those_of_the_fixed_filter():
         (broken, "the fit failed: LinAlgError: no inverse today"),
         (lambda _y, _c: 20.0, "gave a float, not a TipTiltPlant"),
         (lambda _y, _c: axis(20, delay_frames=3), "must be for the running loop"),
+        (lambda _y, _c: axis(20, sensor_gain=0.1), "unstable at the sensor gain that the running"),
     ],
 )
 def test_a_fit_that_fails_keeps_the_filter_and_is_noted(identifier, words):
@@ -115,6 +116,16 @@ def test_a_design_that_fails_keeps_the_filter():
     assert "CertificateError: not today" in reasons[1]
     assert "ZeroDivisionError: nor now" in reasons[2]
     assert tracker.kept == 2
+
+
+def test_a_gain_that_moves_in_steps_is_followed():
+    plants = iter([axis(18, sensor_gain=gain) for gain in (0.8, 0.64, 0.5, 0.4)])
+    tracker = lbt.identification.TrackingController(
+        axis(18), lambda _y, _c: next(plants), window_s=0.5, update_s=0.125
+    )
+    simulated(tracker, frames=0 + 300)
+    assert [update.switched for update in tracker.history[:4]] == [True] * 4
+    assert tracker.design.problem.hardware.sensor.item() == 0.4
 
 
 def test_a_window_with_holes_is_not_identified():
