@@ -20,6 +20,7 @@ from lbt_synth.identification import (
 )
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.diagnosis.channels import live_axes
+from lbt_synth.identification.diagnosis.command_doubt import command_row
 from lbt_synth.report.diagnosis.page import write_diagnosis
 from lbt_synth.report.diagnosis.tables import diagnosis_tables
 from lbt_synth.report.page.page_files import require_page_names
@@ -78,6 +79,7 @@ def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:
         "doubt": found.doubt or None,
         "record": loop_records.record_data(record),
         "channels": [json_record(row) for row in found.channels],
+        "commands": None if found.commands is None else json_record(command_row(found.commands)),
         "control_law": None if found.law is None else _law_data(found.law),
         "loop": None if found.loop is None else json_record(found.loop),
         "lines": [json_record(line.row) for line in found.lines],

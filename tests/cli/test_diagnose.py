@@ -66,8 +66,8 @@ def test_a_record_that_lies_is_still_diagnosed(capsys, tmp_path):
     status, text, _ = run(capsys, "diagnose", write(tmp_path / "n.npz", -1.0, 3000), *FACTS)
     assert status == 0
     assert text.startswith(
-        "Do not use this record as it is: the commands have the opposite sign.\n"
-        "Nothing can be said of its residual.\nFirst turn the sign of the commands.\n"
+        "The commands are not those that the mirror followed: they have the opposite sign.\n"
+        "Nothing can be said of its residual.\nFirst read the record with --command-sign -1.\n"
     )
     assert "-0.2" in text
     assert "Vibrations" not in text

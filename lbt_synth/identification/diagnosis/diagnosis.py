@@ -8,9 +8,11 @@ from typing import Any
 
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
+from lbt_synth.identification.commands.control_law import ControlLaw
+from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
 from lbt_synth.identification.diagnosis.candidates import candidate_designs, stable_designs
 from lbt_synth.identification.diagnosis.channels import ChannelRow, judge_channels
+from lbt_synth.identification.diagnosis.command_doubt import doubt_commands
 from lbt_synth.identification.diagnosis.costs import CostRow, disturbance_costs
 from lbt_synth.identification.diagnosis.given_design import (
     GivenDesignRow,
@@ -21,7 +23,6 @@ from lbt_synth.identification.diagnosis.given_design import (
 from lbt_synth.identification.diagnosis.line_origins import LineOrigin, line_origins
 from lbt_synth.identification.diagnosis.running_loop import (
     LoopRow,
-    count_frames,
     loop_row,
     running_controller,
 )
@@ -52,8 +53,10 @@ class Diagnosis:
         The record.
     imaging : Imaging
         The camera of Strehl ratios.
+    commands : CommandVerdict or None
+        How the commands reach the measurements; None of an open loop.
     doubt : str
-        Why the commands are not those of this loop; empty if they are.
+        What is wrong with the commands; empty if nothing is.
     repair : str
         What to do about that.
     channels : tuple of ChannelRow
@@ -82,6 +85,7 @@ class Diagnosis:
 
     record: LoopRecord
     imaging: Imaging
+    commands: CommandVerdict | None = None
     doubt: str = ""
     repair: str = ""
     channels: tuple[ChannelRow, ...] = ()
@@ -165,14 +169,17 @@ def diagnose(
     require_instance(record, LoopRecord)
     step = progress or (lambda _: None)
     notes: list[str] = []
-    law = None
+    commands = None
     if record.commands is not None:
-        law = _attempt(lambda: record_control_law(record), "control law", notes)
-    doubt, repair = doubt_commands(law)
+        commands = explain_commands(record, sensor_gain=options.get("sensor_gain"))
+        notes += commands.notes
+    law = None if commands is None else commands.law
+    doubt, repair = doubt_commands(commands)
     camera = Imaging() if imaging is None else imaging
     found = Diagnosis(
         record=record,
         imaging=camera,
+        commands=commands,
         doubt=doubt,
         repair=repair,
         channels=judge_channels(record if whole is None else whole),
@@ -184,35 +191,8 @@ def diagnose(
     if not found.doubt:
         found = _examine_loop(found, dict(given or {}), options, notes, step)
     elif given:
-        notes.append("the given design was not tried: the commands are not those of this loop")
+        notes.append("the given design was not tried: the commands are not right")
     return replace(found, notes=tuple(notes))
-
-
-def doubt_commands(law: ControlLaw | None) -> tuple[str, str]:
-    """Say why commands are not those of the loop, and what to do; empty if nothing is wrong."""
-    if law is None:
-        return "", ""
-    matrix = law.axis_matrix
-    if law.kind == "none":
-        return (
-            "the commands do not follow from the measurements",
-            "find the commands that belong to these measurements",
-        )
-    if matrix.kind == "diagonal" and min(matrix.signs) < 0:
-        return "the commands have the opposite sign", "turn the sign of the commands"
-    if matrix.kind == "swapped":
-        return "the axes of the commands are swapped", "exchange the columns of the commands"
-    if law.lag_frames < 0:
-        return (
-            f"the commands are {count_frames(-law.lag_frames)} early, and know the future",
-            f"shift the commands by {count_frames(-law.lag_frames)}",
-        )
-    if law.kind == "proportional":
-        return (
-            "the commands are increments, not positions",
-            "record the positions, or add the increments up",
-        )
-    return "", ""
 
 
 def _examine_loop(

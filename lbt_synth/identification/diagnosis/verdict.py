@@ -43,8 +43,9 @@ def diagnosis_verdict(found: Diagnosis) -> tuple[str, str, str]:
     >>> u = np.random.default_rng(1).standard_normal((5000, 1))
     >>> record = lbt.identification.loop_record(y, u, frame_rate_hz=500, delay_frames=2, unit="nm")
     >>> for sentence in lbt.identification.diagnosis_verdict(lbt.identification.diagnose(record)):
-    ...     print(sentence)
-    Do not use this record as it is: the commands do not follow from the measurements.
+    ...     print(sentence)  # doctest: +NORMALIZE_WHITESPACE
+    The commands are not those that the mirror followed: they have nothing to do with the
+    measurements, as if of another night.
     Nothing can be said of its residual.
     First find the commands that belong to these measurements.
     """
@@ -53,11 +54,12 @@ def diagnosis_verdict(found: Diagnosis) -> tuple[str, str, str]:
 
 def _state_sentence(found: Diagnosis) -> str:
     """Say whether the record can be used, and what ran."""
+    faults = "; ".join(_faults(found))
     if found.doubt:
-        return f"Do not use this record as it is: {found.doubt}."
-    faults = _faults(found)
+        other = f" The record has faults, too: {faults}." if faults else ""
+        return f"The commands are not those that the mirror followed: {found.doubt}.{other}"
     if faults:
-        return f"The record has faults: {'; '.join(faults)}."
+        return f"The record has faults: {faults}."
     delays = [note for note in found.notes if note.startswith(_DELAY_WARNING)]
     if delays:
         return f"The delay of the record is doubtful: {delays[0].removeprefix('warning: ')}."
@@ -129,11 +131,11 @@ def _join(items: list[str]) -> str:
 
 def _advice_sentence(found: Diagnosis) -> str:
     """Say what to change first."""
-    if found.doubt:
-        return f"First {found.repair}."
     bad = next((row for row in found.channels if row.serious), None)
     if bad is not None:
         return f"First look at the {bad.channel}, which is {bad.state}."
+    if found.doubt:
+        return f"First {found.repair}."
     if any(note.startswith(_DELAY_WARNING) for note in found.notes):
         return "First check the delay, on which sensor gain and designs depend."
     ran, best, slow = found.row(RAN), found.row(found.best), found.row(INTEGRATOR)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.channels import AXES
+from lbt_synth.identification.diagnosis.command_doubt import command_row
 from lbt_synth.identification.diagnosis.running_loop import law_row
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
@@ -38,6 +39,9 @@ def record_tables(found: Diagnosis) -> list[Table]:
 def loop_tables(found: Diagnosis) -> list[Table]:
     """Return the tables of the loop that ran."""
     tables = []
+    if found.commands is not None:
+        caption = "How the commands reach the measurements"
+        tables.append(row_table(caption, [command_row(found.commands)]))
     if found.law is not None:
         tables.append(row_table("Control law in use, from y to u", [law_row(found.law)]))
     if found.loop is not None:

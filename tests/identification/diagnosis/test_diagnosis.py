@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.control_laws import ordinary_loop
 from support.diagnoses import GAIN, given_design, line_diagnosis, line_record, short_record
 from support.recorded_loops import LINE, RATE
 
@@ -47,7 +48,7 @@ def test_a_given_design():
 
 @pytest.mark.parametrize(
     ("change", "doubt", "repair"),
-    [(-1.0, "have the opposite sign", "turn the sign"), (1.0, "", "")],
+    [(-1.0, "they have the opposite sign", "--command-sign -1"), (1.0, "", "")],
 )
 def test_a_short_record_has_channels_and_a_law(change, doubt, repair):
     found = lbt.identification.diagnose(short_record(change), given={"mine": given_design()})
@@ -63,23 +64,28 @@ def test_a_short_record_has_channels_and_a_law(change, doubt, repair):
 
 
 @pytest.mark.parametrize(
-    ("make", "doubt"),
+    ("make", "doubt", "repair"),
     [
-        (lambda y, u: (y, u[:, ::-1]), "axes of the commands are swapped"),
-        (lambda y, u: (y[:-1], u[1:]), "1 frame early"),
-        (lambda y, u: (y[1:], np.diff(u, axis=0)), "increments"),
-        (lambda y, u: (y[:3000], u[-3000:]), "do not follow from the measurements"),
+        (lambda y, u: (y, u[:, ::-1]), "axes are exchanged", "--swap-axes"),
+        (lambda y, u: (y[:-1], u[1:]), "1 frame early", "--command-shift-frames 1"),
+        (lambda y, u: (y[1:], np.diff(u, axis=0)), "increments", "--command-increments"),
+        (lambda y, u: (y[:3000], u[-3000:]), "nothing to do with", "find the commands"),
     ],
 )
-def test_commands_of_another_kind(make, doubt):
-    from support.control_laws import ordinary_loop
-
+def test_commands_of_another_kind(make, doubt, repair):
     y, u = make(*ordinary_loop())
     record = lbt.identification.loop_record(y, u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     found = lbt.identification.diagnose(record)
     assert doubt in found.doubt
-    assert found.repair
+    assert repair in found.repair
     assert found.model is None
+    assert found.commands.law is found.law
+
+
+def test_a_record_too_short_for_a_likelihood_has_a_law():
+    found = lbt.identification.diagnose(short_record(-1.0, frames=900))
+    assert found.commands.accepted
+    assert found.doubt == "by their law they have the opposite sign"
 
 
 def test_an_open_loop():

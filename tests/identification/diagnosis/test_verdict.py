@@ -26,9 +26,9 @@ def test_of_a_good_record():
 def test_of_one_that_must_not_be_used():
     found = lbt.identification.diagnose(short_record(-1.0))
     assert diagnosis_verdict(found) == (
-        "Do not use this record as it is: the commands have the opposite sign.",
+        "The commands are not those that the mirror followed: they have the opposite sign.",
         "Nothing can be said of its residual.",
-        "First turn the sign of the commands.",
+        "First read the record with --command-sign -1.",
     )
 
 
@@ -37,6 +37,14 @@ def test_of_one_with_a_fault():
     state, _, advice = diagnosis_verdict(replace(line_diagnosis(), channels=(channel,)))
     assert state == "The record has faults: the measurement is stuck (12 %)."
     assert advice == "First look at the measurement, which is stuck (12 %)."
+
+
+def test_a_fault_of_a_channel_may_be_what_is_wrong_with_the_commands():
+    found = lbt.identification.diagnose(short_record(-1.0))
+    channel = replace(found.channels[0], state="noisy")
+    state, _, advice = diagnosis_verdict(replace(found, channels=(channel,)))
+    assert state.endswith("The record has faults, too: the measurement is noisy.")
+    assert advice == "First look at the measurement, which is noisy."
 
 
 def test_of_a_short_one():
@@ -79,7 +87,8 @@ def test_a_loop_of_a_law_that_is_late():
     record = lbt.identification.loop_record(
         y[1:], u[:-1], frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
-    state = diagnosis_verdict(lbt.identification.diagnose(record))[0]
+    found = replace(lbt.identification.diagnose(record), doubt="")
+    state = diagnosis_verdict(found)[0]
     assert (
         state
         == "The record shows no fault, and a pure integrator of gain 0.3, 0.2 ran, 1 frame late."

@@ -74,7 +74,7 @@ def test_what_is_wrong_comes_first_and_loudly(tmp_path):
     first = page.sections[0].blocks[0]
     assert (first.tone, first.text) == (
         "bad",
-        "Do not use this record as it is: the commands have the opposite sign.",
+        "The commands are not those that the mirror followed: they have the opposite sign.",
     )
     assert page.charts == []
     assert [section.key for section in page.sections][:3] == ["verdict", "record", "loop"]
