@@ -194,7 +194,13 @@ def league(parser: ArgumentParser) -> None:
     add_switch(parser, "--pdf", "write the page as a PDF, too (league.pdf)")
     _add_missing_facts(parser)
     _add_repairs(parser)
+    _add_acceptance(parser)
     _add_prior_knowledge(parser)
+
+
+def _add_acceptance(parser: ArgumentParser) -> None:
+    text = "go on although the commands do not reach the measurements as given"
+    add_switch(parser, "--accept-record", text)
 
 
 def _add_engine(parser: ArgumentParser) -> None:
@@ -226,8 +232,7 @@ def _add_series(parser: ArgumentParser) -> None:
 
 def _add_record(parser: ArgumentParser) -> None:
     _add_series(parser)
-    text = "go on although the commands do not reach the measurements as given"
-    add_switch(parser, "--accept-record", text)
+    _add_acceptance(parser)
     add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
     add_switch(parser, "--no-figure", "write no figure")
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from lbt_synth import studies
 from lbt_synth.cli import loop_records
+from lbt_synth.cli.command_repairs import judge_record
 from lbt_synth.cli.engine import choose_engine, require_jobs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
@@ -38,7 +39,7 @@ def run(arguments: Namespace) -> Report:
     pdf = folder / _PRINT if arguments.pdf else None
     refuse_replacing([*paths, *([pdf] if pdf else [])], arguments.files)
     with show_spinner("reading", quiet=arguments.json):
-        records, options = _read_records(arguments)
+        records, options, notes = _read_records(arguments)
     make_directory(folder)
     total = len(records) * arguments.splits * len(able)
     with (
@@ -65,13 +66,17 @@ def run(arguments: Namespace) -> Report:
         write_atomically(paths[1], csv_rows(found.scores)),
         *write_league_page(found, records, paths[2], sources=arguments.files, pdf=pdf),
     ]
-    return _make_report(found, files, able=len(able))
+    report = _make_report(found, files, able=len(able))
+    report.notes = [*notes, *report.notes]
+    return report
 
 
 def _make_report(found: studies.LeagueResult, files: Sequence[Path], *, able: int) -> Report:
     report = Report(data={"records": [scores.name for scores in found.records]})
     splits = len(found.records[0].splits)
-    caption = f"League: {able} entries, {splits} splits of each record"
+    entries = "1 entry" if able == 1 else f"{able} entries"
+    parts = "1 split" if splits == 1 else f"{splits} splits"
+    caption = f"League: {entries}, {parts} of each record"
     report.add_rows("standings", caption, found.standings, hidden=("note",))
     report.data["failures"] = dict(found.failures)
     report.notes += [
@@ -85,8 +90,8 @@ def _make_report(found: studies.LeagueResult, files: Sequence[Path], *, able: in
 
 def _read_records(
     arguments: Namespace,
-) -> tuple[dict[str, LoopRecord], dict[str, dict[str, Any]]]:
-    """Return the records and the options of their identification, by name."""
+) -> tuple[dict[str, LoopRecord], dict[str, dict[str, Any]], list[str]]:
+    """Return the records and the options of their identification by name, and notes on them."""
     if arguments.commands is not None and len(arguments.files) > 1:
         raise ProblemError(
             f"--commands goes with one record; got {len(arguments.files)}. Join each record and "
@@ -94,17 +99,20 @@ def _read_records(
         )
     records: dict[str, LoopRecord] = {}
     options: dict[str, dict[str, Any]] = {}
+    notes: list[str] = []
     for path in arguments.files:
         own = Namespace(**(vars(arguments) | {"file": path}))
         try:
             record = _read_series(own)
             settings = loop_records.identification_options(own, record)
+            judged = judge_record(own, record)
         except ProblemError as error:
             text = str(error)
             raise ProblemError(text if str(path) in text else f"{path}: {text}") from error
         name = _name_record(path, records)
         records[name], options[name] = record, settings
-    return records, options
+        notes += [loop_records.marked_note(f"{note} ({name})") for note in judged]
+    return records, options, notes
 
 
 def _read_series(arguments: Namespace) -> LoopRecord:

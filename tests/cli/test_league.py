@@ -122,6 +122,21 @@ def test_a_record_without_a_delay_is_named(capsys, nights, tmp_path):
     assert "delay" in error
 
 
+def test_commands_of_the_opposite_sign_are_named(capsys, tmp_path):
+    record, turned = short_record(), tmp_path / "turned.npz"
+    np.savez(turned, measurements=record.measurements, commands=-record.commands)
+    words = ("league", turned, "-o", tmp_path / "out", "--entries", "ran", "--splits", 1, *FACTS)
+    status, _, error = run(capsys, *words)
+    assert status == 2
+    assert "turned.npz" in error
+    assert "--command-sign -1" in error
+    assert not (tmp_path / "out").exists()
+    status, text, _ = run(capsys, *words, "--command-sign", -1)
+    assert status == 0
+    assert "League: 1 entry, 1 split of each record" in text
+    assert "First: what ran." in text
+
+
 def test_a_record_that_is_not_there(capsys, tmp_path):
     status, _, error = run(capsys, "league", tmp_path / "none.npz", "-o", tmp_path / "out")
     assert status == 2
