@@ -174,6 +174,15 @@ class CoarseRecord:
             out = (1 - part) * out + part * self._shifted(guess, whole + 1)
         return out if guess.matrix is None else np.tensordot(guess.matrix, out, 1)
 
+    def corrections(self, guess: Guess) -> FloatArray:
+        """Return the corrections of a guess as series, (frames, axes) [nm]."""
+        whole = int(np.floor(guess.shift_frames))
+        part = guess.shift_frames - whole
+        out = guess.corrections(self.record, whole)
+        if part:
+            out = (1 - part) * out + part * guess.corrections(self.record, whole + 1)
+        return out if guess.matrix is None else out @ guess.matrix.T
+
     def compare(self, guesses: Sequence[Guess], gains: FloatArray | None = None) -> Comparison:
         """Return the likelihood of each guess, at its best gains or at fixed ones (axes, guesses).
 

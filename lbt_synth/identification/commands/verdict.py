@@ -23,14 +23,20 @@ from lbt_synth.identification.commands.guesses import (
     Guess,
     list_guesses,
 )
+from lbt_synth.identification.commands.plausibility import (
+    already_integrates,
+    could_have_run,
+    finer_saving,
+    finer_saving_of_gain,
+)
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import FloatArray, frozen_copy, one_or_each, require_instance
+from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each, require_instance
 
 AS_GIVEN = "as given"
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 _CLEAR = 20.0  # nats that decide
-_FRACTION = 2.0  # times more for half a frame, which the dynamics of a mirror may imitate
+_PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _GENERAL = 5.0  # nats by which a matrix without a name must be likelier than others
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
@@ -38,6 +44,7 @@ _ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _USUAL_GAIN = 0.7
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
+_INSIDE = 8  # gains that are tried of the plausible ones
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 
 
@@ -155,10 +162,12 @@ def explain_commands(
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     law = _find_law(record)
-    lag = 0 if law is None or law.residual > _SURE else law.lag_frames
+    lag = law.lag_frames if law is not None and _is_sure(law) else 0
     early = max(-lag, 0)
     if early:  # corrections that follow from the future have no likelihood: they are moved first
+        assert law is not None
         record = repair_commands(record, CommandRepair(shift_frames=early))
+        law = replace(law, lag_frames=0)
     coarse = CoarseRecord(record)
     if not coarse.stretches:
         note = "the commands were not tested: no stretch of usable frames is long enough"
@@ -205,13 +214,17 @@ def _find_law(record: LoopRecord) -> ControlLaw | None:
         return None
 
 
+def _is_sure(law: ControlLaw) -> bool:
+    return law.kind != "none" and law.residual < _SURE
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Best:
     """The best explanation of a record, and what decides about it."""
 
     guess: Guess
     nats: float  # over the record as given
-    contrast: float
+    own_contrast: float  # of the axes, without their coherence
     gain: FloatArray  # (axes,)
     clear: float  # nats that decide
     rival: Guess | None = None  # a likelier one that is not clearly so
@@ -221,7 +234,6 @@ class _Best:
 def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best | None:
     """Return the best explanation; None where commands do not reach the measurements."""
     record = coarse.record
-    no_law = law is None or law.kind == "none"
     guesses = list_guesses(record, earliest_frames=1.0 - lag)
     if law is not None and law.axis_matrix.kind not in ("diagonal", "swapped", "zero"):
         inverse = invert_axes(law.gain)
@@ -230,36 +242,58 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     if any(guess.kind == "clipped" for guess in guesses):
         guesses.append(_best_limits(compared))
         compared = compared.join(coarse.compare(guesses[-1:]))
-    unusual = np.array([_is_unusual(guess, law, lag) for guess in guesses])
-    score = compared.contrast + _UNUSUAL * unusual
-    score[[i for i, guess in enumerate(guesses) if not guess.is_simple]] += _GENERAL
+    score, surprising = _score(compared, record, law, lag)
     best = int(np.argmin(score))
     clear = _CLEAR * max(1.0, float(compared.misfit[best]) / _ENOUGH)
-    unrelated = coarse.compare(guesses[:1], np.zeros((record.axes, 1)))
-    if no_law and unrelated.contrast[0] - np.min(compared.contrast) < _RELATED * clear / _CLEAR:
-        return None
-    nats = float(score[0] - score[best])
-    fraction = abs(guesses[best].shift_frames) % 1 > 0 and abs(guesses[best].shift_frames) < 1
+    if law is None or law.kind == "none":
+        unrelated = coarse.compare(guesses[:1], np.zeros((record.axes, 1)))
+        if unrelated.contrast[0] - np.min(compared.contrast) < _RELATED * clear / _CLEAR:
+            return None
     given = _Best(
         guess=guesses[0],
         nats=0.0,
-        contrast=float(compared.contrast[0]),
+        own_contrast=float(np.sum(compared.axis_contrast[:, 0])),
         gain=compared.gain[:, 0],
         clear=clear,
     )
     if best == 0:
         return given
-    if nats < clear * (_FRACTION if fraction else 1.0):
-        return replace(given, rival=guesses[best], rival_nats=nats)
+    nats = float(min(score[0], compared.contrast[0]) - compared.contrast[best])
+    part_of_a_frame = abs(guesses[best].shift_frames) == _PART
     guess = refine_guess(coarse, guesses[best], law)
+    shown = nats >= clear / 2 or np.isinf(score[0])
+    if not surprising[0] or surprising[best]:  # the law does not ask for it
+        nats = min(nats, finer_saving(record, guess)) if nats >= clear else 0.0
+        shown = nats >= clear and not part_of_a_frame
+    if not shown:
+        return replace(given, rival=guesses[best], rival_nats=nats)
     fine = coarse.compare([guess])
     return _Best(
         guess=guess,
         nats=nats,
-        contrast=float(fine.contrast[0]),
+        own_contrast=float(np.sum(fine.axis_contrast[:, 0])),
         gain=fine.gain[:, 0],
         clear=clear,
     )
+
+
+def _score(
+    compared: Comparison, record: LoopRecord, law: ControlLaw | None, lag: int
+) -> tuple[FloatArray, BoolArray]:
+    """Return the contrast of guesses with what their laws cost, and which laws are surprising.
+
+    A loop that would have been unstable has not run.
+    """
+    surprising = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
+    simple = np.array([guess.is_simple for guess in compared.guesses])
+    score = compared.contrast + _UNUSUAL * surprising + _GENERAL * ~simple
+    if law is not None and _is_sure(law):
+        each = zip(compared.guesses, compared.gain.T, strict=True)
+        possible = np.array([could_have_run(guess, gain, record, law) for guess, gain in each])
+        if possible.any():
+            score = np.where(possible, score, np.inf)
+            surprising |= ~possible
+    return score, surprising
 
 
 def _best_limits(compared: Comparison) -> Guess:
@@ -270,12 +304,16 @@ def _best_limits(compared: Comparison) -> Guess:
     return Guess(kind="clipped", limit_nm=limits[best, np.arange(best.size)])
 
 
-def _is_unusual(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
+def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
     """Return whether a guess makes the control law one that no one would run."""
     if law is None or law.kind == "none":
         return guess.shift_frames != 0
     if guess.kind == "shift":
         return guess.shift_frames != -lag or lag == 0
+    if guess.kind in (AS_GIVEN, "clipped") and lag:
+        return True
+    if (guess.kind == "increments") == already_integrates(law):
+        return True
     matrix = np.eye(len(law.gain)) if guess.matrix is None else guess.matrix
     turned = classify_matrix(matrix @ law.gain)
     return turned.kind != "diagonal" or min(turned.signs) < 0
@@ -287,15 +325,18 @@ def _find_scale(coarse: CoarseRecord, found: _Best, plausible: tuple[float, floa
     bounded = np.clip(found.gain, low, high)
     if np.all(bounded == found.gain):
         return 1.0
-    at_bounds = coarse.compare([found.guess], bounded[:, None])
-    if at_bounds.contrast[0] - found.contrast < found.clear:
+    inside = np.geomspace(low, high, _INSIDE)
+    near = coarse.compare([found.guess] * _INSIDE, np.tile(inside, (len(bounded), 1)))
+    if np.sum(np.min(near.axis_contrast, axis=1)) - found.own_contrast < found.clear:
         return 1.0
     gain = float(np.exp(np.mean(np.log(found.gain))))
     usual = float(np.clip(_USUAL_GAIN, low, high))
     fits = [f for f in _FACTORS if low <= gain / f <= high]
+    factor = float(f"{gain / usual:.2g}")
     if fits:
-        return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
-    return float(f"{gain / usual:.2g}")
+        factor = float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
+    shown = finer_saving_of_gain(coarse.record, found.guess, (low, usual, high)) >= found.clear
+    return factor if shown else 1.0
 
 
 def _notes(found: _Best, delay_frames: float, lag: int) -> tuple[str, ...]:

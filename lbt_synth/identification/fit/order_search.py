@@ -45,7 +45,7 @@ class Candidate:
 
 def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
     """Find the model of one axis."""
-    return fitting.add_evidence(search, _find_components(search, start))
+    return fitting.add_evidence(search, find_components(search, start))
 
 
 def gain_ambiguity(search: Search, best: FittedModel) -> float:
@@ -59,7 +59,7 @@ def gain_ambiguity(search: Search, best: FittedModel) -> float:
         if abs(float(np.log(trial)) - gain) < _SAME_GAIN:
             continue
         try:
-            other = _find_components(replace(search, gain=trial), None, rounds=_FEW_ROUNDS)
+            other = find_components(replace(search, gain=trial), None, rounds=_FEW_ROUNDS)
         except NumericalError:
             continue
         made = fitting.fit(search, other.spectrum)
@@ -68,7 +68,7 @@ def gain_ambiguity(search: Search, best: FittedModel) -> float:
     return away
 
 
-def _find_components(
+def find_components(
     search: Search, start: SpectrumModel | None, *, rounds: int = _MOST_ROUNDS
 ) -> FittedModel:
     """Find the model: add components, move them, prune them."""

@@ -1,0 +1,89 @@
+"""What a guess about commands must pass beside the coarse likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lbt_synth.errors import NumericalError
+from lbt_synth.identification.commands.control_law import ControlLaw
+from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
+from lbt_synth.identification.commands.law_controller import law_controller
+from lbt_synth.identification.fit.fitting import Search, cost
+from lbt_synth.identification.fit.order_search import find_components
+from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.loop import close_loop
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray
+
+_NEAR_ONE = 0.2  # distance from 1 of the pole of a law that adds up
+_SLOWER = (1.0, 0.3)  # of the coarse gain
+_SEGMENT_S = 6.0
+_ROUNDS, _LINES = 3, 10  # of the search for lines
+
+
+def already_integrates(law: ControlLaw) -> bool:
+    """Return whether a law adds up measurements, as positions do and increments do not."""
+    return bool(law.order > 0 and np.all(abs(law.poles[:, 0] - 1) < _NEAR_ONE))
+
+
+def could_have_run(guess: Guess, gain: FloatArray, record: LoopRecord, law: ControlLaw) -> bool:
+    """Return whether the recorded law would have been stable if a guess (gain (axes,)) is right.
+
+    The coarse gain may be too large: a third of it is tried as well.
+    """
+    if guess.kind == "increments":
+        return True  # another law computes the positions
+    assert record.delay_frames is not None
+    controller = law_controller(law, record.frame_rate_hz)
+    axes = record.axes
+    for slower in _SLOWER:
+        path = LoopHardware(
+            frame_rate_hz=record.frame_rate_hz,
+            delay_frames=max(record.delay_frames + guess.shift_frames, 1.0),
+            sensor_matrix=np.diag(slower * gain),
+            influence_matrix=np.eye(axes) if guess.matrix is None else guess.matrix,
+            mirror=record.mirror,
+        )
+        if close_loop(path, controller).is_stable:
+            return True
+    return False
+
+
+def finer_saving(record: LoopRecord, guess: Guess) -> float:
+    """Return how much likelier a guess is than the record as given, by the model of the fit.
+
+    Both have the lines and the wide resonances that they need, at the price of the criterion: the
+    coarse spectrum has few.
+    """
+    coarse = CoarseRecord(record)
+    return _cost(coarse, Guess(kind="as given")) - _cost(coarse, guess)
+
+
+def finer_saving_of_gain(record: LoopRecord, guess: Guess, gains: Sequence[float]) -> float:
+    """Return how much likelier any gain is than the best of some, by the model of the fit."""
+    coarse = CoarseRecord(record)
+    return min(_cost(coarse, guess, gain) for gain in gains) - _cost(coarse, guess)
+
+
+def _cost(coarse: CoarseRecord, guess: Guess, gain: float | None = None) -> float:
+    """Return the criterion of the best model of a guess, over all axes, at any gain or at one."""
+    record = coarse.record
+    corrections = coarse.corrections(guess)
+    length = int(_SEGMENT_S * record.frame_rate_hz)
+    pieces = [
+        (start, min(start + length, b))
+        for a, b in coarse.stretches
+        for start in range(a, max(b - length, a) + 1, length)
+    ]
+    total = 0.0
+    for y, c in zip(record.measurements.T, corrections.T, strict=True):
+        data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
+        search = Search(data=data, gain=gain, most_lines=_LINES)
+        try:
+            total += cost(search, find_components(search, None, rounds=_ROUNDS))
+        except NumericalError:
+            return np.inf
+    return total
