@@ -3,8 +3,8 @@
     python benchmarks/league.py [--records 12] [--jobs 2] [--seconds 30] -o league_benchmark/
 
 Record k has the change number k modulo 7; 0 is none. Two axes, an integrator runs. The table is
-that of ``lbt-synth league``; below it, for each entry, the share of records on which it is within
-1 % of the best (residual with noise), and where it is worst. It resumes.
+that of ``lbt-synth league``; below it, for each entry, how far it is above the best on each record
+(residual with noise, %), and the share of records on which it is within 1 %. It resumes.
 """
 
 from __future__ import annotations
@@ -108,17 +108,18 @@ def main() -> None:
     table = row_table("League", found.standings, without=("note",))
     for row in (table.headings, *table.rows):
         print(f"{row[0]:>4}  {row[1]:30s}", *(f"{cell:>18}" for cell in row[2:]))
+    names = [each.name for each in found.records]
+    print(f"\n{'above the best [%]':30s}", *(f"{name:>12}" for name in names), "within 1 %")
     for row in found.standings:
-        above = {
-            scores.name: relative_residual(scores.total, row.name)[0]
-            for scores in found.records
-            if row.name in scores.total.squares_nm2
-        }
-        if above:
-            worst = max(above, key=lambda name: above[name])
-            near = np.mean([value <= 0.01 for value in above.values()])
-            print(f"{row.entry:30s} within 1 %: {100 * near:3.0f} %; worst {worst}, "
-                  f"{100 * above[worst]:.1f} %")  # fmt: skip
+        if row.records:
+            above = [
+                100 * relative_residual(each.total, row.name)[0]
+                if row.name in each.total.squares_nm2
+                else np.nan
+                for each in found.records
+            ]
+            near = 100 * np.mean([value <= 1 for value in above])
+            print(f"{row.entry:30s}", *(f"{value:12.2f}" for value in above), f"{near:8.0f} %")
         if row.note:
             print(f"{row.entry:30s} {row.note}")
 
