@@ -24,7 +24,7 @@ def split():
 
 @pytest.mark.parametrize(
     "name",
-    ["optimised-gain", "least-squares-32", "data-driven-2", "kalman", "robust", "tracking", "auto"],
+    ["optimised-gain", "least-squares-32", "data-driven-2", "kalman", "robust", "auto"],
 )
 def test_an_entry_does_not_look_ahead(split, name, monkeypatch):
     monkeypatch.setattr(entries, "_ORDERS", (2,))
