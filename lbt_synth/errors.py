@@ -43,6 +43,10 @@ class DefinitenessError(ProblemError):
     """A matrix is not symmetric, or not (semi)definite, where it has to be."""
 
 
+class CoupledModesError(ProblemError):
+    """No rotation of the modes makes disturbance and noise diagonal."""
+
+
 class DetectabilityError(ProblemError):
     """A mode that does not decay cannot be seen, or is not driven, as it must be.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import CoupledModesError, ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
 from lbt_synth.loop.closed_loop import require_loop_rate
@@ -220,7 +220,7 @@ def _common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
     axes = axes[np.argsort(largest, kind="stable")]
     name = coupled(axes)
     if name is not None:
-        raise ProblemError(
+        raise CoupledModesError(
             "a limit needs modes that decouple: vibrations parallel or at right angles to each "
             "other, along principal axes of the sensor's noise and within modes of one turbulence; "
             f"got {name} across them. Turn the directions, take equal noise on all modes, or treat "

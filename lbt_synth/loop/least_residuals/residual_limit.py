@@ -7,6 +7,8 @@ from typing import assert_never
 
 import numpy as np
 
+from lbt_synth.errors import CoupledModesError
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_modes, plant_modes
 from lbt_synth.loop.least_residuals.prediction import Prediction
 from lbt_synth.models import (
@@ -90,11 +92,26 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
 
 
 def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
-    """Least residual that any linear controller leaves where a plant's model is the truth."""
+    """Least residual that any linear controller leaves where a plant's model is the truth.
+
+    Coupled modes have a limit where nothing but whole frames of delay is between command and
+    mirror: the error of the best estimate, from a Riccati equation.
+    """
     if isinstance(plant, FullStatePlant):
         return _residual_limit(*plant_modes(plant))
-    lines = [(checked_direction(line, plant.hardware), line) for line in plant.vibrations]
-    return _residual_limit(*decoupled_modes(plant.hardware, plant.R, plant.turbulence, lines))
+    hardware = plant.hardware
+    lines = [(checked_direction(line, hardware), line) for line in plant.vibrations]
+    try:
+        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines)
+    except CoupledModesError:
+        if hardware.mirror is not None or hardware.delay_frames % 1:
+            raise
+        error = plant.L @ kalman_riccati(plant).P @ plant.L.T
+        variance, axes = np.linalg.eigh(error)
+        return ResidualLimit(
+            variance_nm2=frozen_copy(variance), directions=frozen_copy(axes.T), change=0.0
+        )
+    return _residual_limit(*modes)
 
 
 def truth_modes(

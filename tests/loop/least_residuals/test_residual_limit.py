@@ -255,3 +255,30 @@ def test_kolmogorov_turbulence(air):
         for a in (air, endless)
     )
     assert one < other < 1.2 * one
+
+
+def coupled_plant(ratio=2.0, **options):
+    """A line along a diagonal over turbulence of another size on either axis."""
+    slow = [ar(1.98, -0.9805, driving=driving) for driving in (1.0, ratio)]
+    line = lbt.Vibration(frequency_hz=30, damping=0.01, rms_nm=50, direction=(1, 1))
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=slow, vibrations=[line], noise_nm=10.0, **options
+    )
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 3.0])
+def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
+    plant = coupled_plant(delay_frames=delay)
+    limit = least_model_residual(plant)
+    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
+    along = limit.directions.T * limit.variance_nm2 @ limit.directions
+    assert along == pytest.approx(lbt.loop.model_budget(loop, plant).total_nm2, rel=1e-7)
+    # a little coupling changes little
+    alone, nearly = (least_model_residual(coupled_plant(r, delay_frames=delay)) for r in (1, 1.001))
+    assert nearly.rms_nm == pytest.approx(alone.rms_nm, rel=1e-3)
+    assert nearly.rms_nm > alone.rms_nm
+
+
+def test_coupled_modes_without_a_limit_are_refused():
+    with pytest.raises(lbt.errors.CoupledModesError, match="modes that decouple"):
+        least_model_residual(coupled_plant(delay_frames=2.4))
