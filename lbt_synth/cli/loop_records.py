@@ -8,6 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.loop_inputs import given_options
 from lbt_synth.cli.output import Report
@@ -17,6 +19,7 @@ from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
     IdentifiedAxis,
+    IdentifiedLine,
     IdentifiedModel,
     LinePrior,
     LoopRecord,
@@ -268,9 +271,9 @@ def _axis_names(count: int) -> list[str]:
 
 @table_row
 class VibrationRow:
-    """A vibration found on one axis."""
+    """A vibration on one axis, or along a direction over both."""
 
-    axis: str = column("axis")
+    axis: str = column("axis")  # or the direction
     frequency_hz: float = column("f", unit="Hz", format=".3f")
     frequency_error_hz: float = column("+-", unit="Hz", format=".2g")
     damping: str = column("damping")  # one that is not resolved has a bound, and no error
@@ -299,13 +302,12 @@ def add_model(report: Report, model: IdentifiedModel) -> None:
         fill_row(
             VibrationRow,
             line,
-            axis=name,
+            axis=_direction_text(line, names),
             damping=f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
             damping_error=line.damping_error if line.resolved else None,
             origin=line.kind + ", announced" * line.announced,
         )
-        for name, axis in named_axes
-        for line in axis.parts
+        for line in model.parts
     ]
     if lines:
         report.tables.append(row_table("Vibrations", lines))
@@ -317,7 +319,17 @@ def add_model(report: Report, model: IdentifiedModel) -> None:
         report.notes.append(f"{where}sensor gain {axis.sensor_gain_note}.")
         report.notes.append(f"{where}{_whiteness_note(axis)}")
     report.data["axes"] = [_axis_record(axis) for axis in model.axes]
+    report.data["vibrations"] = [asdict(line) for line in model.parts]
     report.data["model_notes"] = model.notes
+
+
+def _direction_text(line: IdentifiedLine, names: Sequence[str]) -> str:
+    """Return the axis of a line, or the direction of one that both axes share."""
+    assert line.direction is not None  # of the parts of a model
+    if np.count_nonzero(line.direction) == 1:
+        return names[int(np.argmax(line.direction))]
+    error = line.direction_error_deg
+    return f"{line.direction_deg:.4g}{'' if error is None else f' +- {error:.1g}'} deg"
 
 
 def _background(

@@ -12,10 +12,11 @@ from pydantic import ValidationError
 from lbt_synth.config.schema import FileSection, describe_error
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
+from lbt_synth.identification import IdentifiedModel
 from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")
+_DIRECTIONS = {(1.0, 0.0): "tip", (0.0, 1.0): "tilt"}
 _KIND_COMMENTS = {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}
 
 
@@ -91,7 +92,7 @@ def identified_config(
         "frame_rate_hz": number(model.frame_rate_hz, "frame_rate_hz", above=0),
         "delay_frames": number(model.delay_frames, "delay_frames", at_least=1),
     }
-    vibrations = _vibration_sections(axes, comments)
+    vibrations = _vibration_sections(model, comments)
     content["model"] = {"turbulence": []}
     for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
         turbulence = axis.turbulence
@@ -119,22 +120,25 @@ def identified_config(
     return settings, {key: text for key, text in comments.items() if text}
 
 
-def _vibration_sections(
-    axes: Sequence[IdentifiedAxis], comments: dict[str, str]
-) -> list[dict[str, Any]]:
-    """Return the vibrations of all axes, tip first, and add their errors to ``comments``."""
+def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> list[dict[str, Any]]:
+    """Return all vibrations, tip first, and add their errors to ``comments``."""
     sections: list[dict[str, Any]] = []
-    for name, axis in zip(_AXES, axes, strict=False):
-        for part in axis.parts:
-            path = f"model.vibrations[{len(sections)}]"
-            frequency_error = _error_comment("Hz", [part.frequency_error_hz])
-            comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[part.kind] + frequency_error
-            comments[f"{path}.damping"] = _error_comment("", [part.damping_error])
-            comments[f"{path}.rms_nm"] = _error_comment("nm", [part.rms_error_nm])
-            entry: dict[str, Any] = {} if len(axes) == 1 else {"axis": name}
-            for key in ("frequency_hz", "damping", "rms_nm"):
-                entry[key] = float(getattr(part, key))
-            sections.append(entry)
+    for part in model.parts:
+        path = f"model.vibrations[{len(sections)}]"
+        frequency_error = _error_comment("Hz", [part.frequency_error_hz])
+        comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[part.kind] + frequency_error
+        comments[f"{path}.damping"] = _error_comment("", [part.damping_error])
+        comments[f"{path}.rms_nm"] = _error_comment("nm", [part.rms_error_nm])
+        entry: dict[str, Any] = {}
+        if len(model.axes) > 1 and part.direction in _DIRECTIONS:
+            entry["axis"] = _DIRECTIONS[part.direction]
+        elif len(model.axes) > 1:
+            entry["direction_deg"] = part.direction_deg
+            error = _error_comment("degrees", [part.direction_error_deg or 0.0])
+            comments[f"{path}.direction_deg"] = error
+        for key in ("frequency_hz", "damping", "rms_nm"):
+            entry[key] = float(getattr(part, key))
+        sections.append(entry)
     return sections
 
 

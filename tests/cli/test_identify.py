@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.night import GAIN, LINE_HZ
-from support.recorded_loops import RATE
+from support.recorded_loops import RATE, open_record
 
 import lbt_synth as lbt
 
@@ -64,6 +64,22 @@ def test_series_of_any_format(tmp_path, capsys, recorded_loop, ending):
     assert (status, error) == (0, "")
     tip = json.loads(text)["axes"][0]
     assert tip["vibrations"][0]["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
+
+
+def test_a_line_along_a_diagonal_is_one_row(tmp_path, capsys):
+    line = lbt.Vibration(frequency_hz=31, damping=0.006, rms_nm=60, direction=(0.8, -0.6))
+    file = tmp_path / "night.npy"
+    np.save(file, open_record(((line, 0),), frames=8192).measurements)
+    options = ("--columns", "measurements=0,1", "--frame-rate-hz", 1000, "--unit", "nm")
+    options += ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "m.yaml")
+    status, text, _ = run(capsys, "identify", file, *options)
+    assert status == 0
+    (row,) = [row for row in text.splitlines() if "+- 0.1 deg" in row]
+    assert float(row.split()[0]) == pytest.approx(-36.87, abs=0.5)
+    assert float(row.split()[4]) == pytest.approx(31, abs=0.3)
+    status, text, _ = run(capsys, "identify", file, *options, "--json")
+    (found,) = json.loads(text)["vibrations"]
+    assert found["direction"] == pytest.approx([0.8, -0.6], abs=0.01)
 
 
 def test_a_spectrum(tmp_path, capsys):

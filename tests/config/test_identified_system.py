@@ -48,6 +48,27 @@ def test_what_was_identified_is_what_is_read(tmp_path, model):
     assert truth.sensor_gain == 1.0
 
 
+def test_a_line_of_both_axes_is_written_once_with_its_direction(tmp_path):
+    angle = np.radians(-34.2)
+    line = Line(
+        frequency_hz=31.0,
+        damping=0.004,
+        rms_nm=60.0,
+        direction=(np.cos(angle), np.sin(angle)),
+        direction_error_deg=0.8,
+    )
+    share = replace(line, rms_nm=60 * np.cos(angle))  # of tip: no line of its own
+    model = replace(TWO, axes=(replace(TIP, parts=(share, *TIP.parts)), TILT), shared=(line,))
+    file = save_identified(tmp_path, model)
+    made = lbt.load_config(file).plant.vibrations
+    assert [one.frequency_hz for one in made] == [20.123456789, 47.0, 13.7, 31.0]
+    assert made[-1].direction == pytest.approx(line.direction, abs=1e-15)
+    assert made[-1].rms_nm == 60
+    (row,) = [row for row in file.read_text().splitlines() if "direction_deg" in row]
+    assert float(row.split("#")[0].split(":")[1]) == pytest.approx(-34.2)
+    assert row.endswith("# standard error 0.8 degrees")
+
+
 def test_the_residual_of_the_kalman_filter_is_the_estimation_error(tmp_path):
     """The truth is the model: an exact check of the whole chain."""
     config = lbt.load_config(save_identified(tmp_path, TWO))

@@ -18,6 +18,9 @@ class Line:
     damping_error: float = 0.0004
     rms_error_nm: float = 1.5
     kind: str = "line"
+    direction: tuple | None = None
+    direction_error_deg: float | None = None
+    direction_deg = lbt.identification.IdentifiedLine.direction_deg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +36,8 @@ class Axis:
 @dataclass(frozen=True, kw_only=True)
 class Model:
     axes: tuple
+    shared: tuple = ()
+    parts = lbt.identification.IdentifiedModel.parts
     frame_rate_hz: float = RATE
     delay_frames: float = 2.0
     mirror: lbt.models.PositionLoop | None = None

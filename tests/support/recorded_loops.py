@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.models.resonance_spectrum import coefficients
@@ -61,3 +62,31 @@ def spliced_record(
     y, u = (np.vstack([one[i] for one in series]) for i in range(2))
     assert path.delay_frames == 2
     return lbt.identification.loop_record(y, u, frame_rate_hz=RATE, delay_frames=delay, unit="nm")
+
+
+def open_record(
+    lines: tuple[tuple[lbt.Vibration, int], ...] = (),
+    *,
+    shared_nm: float = 0.0,
+    noise: float = 6.0,
+    frames: int = FRAMES,
+    seed: int = 0,
+) -> lbt.identification.LoopRecord:
+    """An open loop of two axes whose turbulence has a part in common.
+
+    Lines come with the frames by which tilt follows tip.
+    """
+    rng = np.random.default_rng(seed)
+    air, settle = slow(), 4000
+
+    def process(model: lbt.models.ARModel) -> np.ndarray:
+        drive = model.driving_rms_nm * rng.standard_normal(frames + settle)
+        return lfilter([1.0], np.append(1.0, -model.coefficients), drive)[settle // 2 :]
+
+    y = np.stack([process(air) for _ in range(2)]) + shared_nm / air.rms_nm * process(air)
+    for line, late in lines:
+        x = process(line.ar_model(RATE))
+        y += np.outer(line.direction, x)
+        y[1] += line.direction[1] * (np.roll(x, late) - x)
+    y = y[:, -frames:].T + noise * rng.standard_normal((frames, 2))
+    return lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")

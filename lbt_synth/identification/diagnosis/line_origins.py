@@ -12,7 +12,7 @@ from lbt_synth.identification.diagnosis.channels import AXES
 from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models import Vibration
-from lbt_synth.storage.rows import column, nm_column, table_row
+from lbt_synth.storage.rows import column, fill_row, nm_column, table_row
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _SAME = 3.0  # standard errors between frequencies of one line
@@ -56,7 +56,12 @@ def line_origins(
     model: IdentifiedModel, series: FloatArray, stretches: Stretches
 ) -> tuple[LineOrigin, ...]:
     """Return the lines of a model by frequency, with their origin in a series (frames, axes)."""
-    found = [(i, part) for i, axis in enumerate(model.axes) for part in axis.parts]
+    found = [
+        (i, part)
+        for i, axis in enumerate(model.axes)
+        for part in axis.parts
+        if part.direction is None
+    ]
     groups: list[list[tuple[int, IdentifiedLine]]] = []
     for i, part in sorted(found, key=lambda each: each[1].frequency_hz):
         if part.kind == "turbulence":
@@ -66,7 +71,32 @@ def line_origins(
             last.append((i, part))
         else:
             groups.append([(i, part)])
-    return tuple(_describe(group, model, series, stretches) for group in groups)
+    lines = [_describe(group, model, series, stretches) for group in groups]
+    lines += [_describe_shared(line) for line in model.shared if line.kind != "turbulence"]
+    return tuple(sorted(lines, key=lambda line: line.row.frequency_hz))
+
+
+def _describe_shared(line: IdentifiedLine) -> LineOrigin:
+    """Return a line that the model has along a direction."""
+    error = np.nan if line.direction_error_deg is None else line.direction_error_deg
+    angle, origin = _name_direction(line.direction_deg or 0.0, error)
+    row = fill_row(
+        LineRow,
+        line,
+        damping=_damping_text(line),
+        direction_deg=angle,
+        direction_error_deg=error,
+        origin=_origin_text(line, origin),
+    )
+    return LineOrigin(row=row, vibrations=(line.vibration(),))
+
+
+def _damping_text(line: IdentifiedLine) -> str:
+    return f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}"
+
+
+def _origin_text(line: IdentifiedLine, origin: str) -> str:
+    return origin if line.kind == "line" else f"{origin}, broad"
 
 
 def _is_same(one: IdentifiedLine, other: IdentifiedLine, model: IdentifiedModel) -> bool:
@@ -97,11 +127,11 @@ def _describe(
         row=LineRow(
             frequency_hz=frequency,
             frequency_error_hz=float(1 / np.sqrt(weights.sum())),
-            damping=f"{first.damping:.3g}" if first.resolved else f"< {first.damping:.2g}",
+            damping=_damping_text(first),
             rms_nm=float(np.sqrt(sum(part.rms_nm**2 for part in parts))),
             direction_deg=angle,
             direction_error_deg=error,
-            origin=origin if first.kind == "line" else f"{origin}, broad",
+            origin=_origin_text(first, origin),
         ),
         vibrations=tuple(part.vibration(tuple(each[i])) for i, part in group),
     )
@@ -126,17 +156,23 @@ def _origin(
     noise = max(float(beside @ rest @ beside), 0.0) / float(values[1])
     error = float(np.degrees(np.sqrt((across + noise) / (2 * averages))))
     if across < _LINEAR:
-        near = max(_NEAR_AXIS_DEG, _SIGMAS * error)
-        if abs(angle) < near:
-            return angle, error, AXES[0]
-        if abs(angle) > 90 - near:
-            return angle % 180, error, AXES[1]
-        return angle, error, "a diagonal"
+        angle, words = _name_direction(angle, error)
+        return angle, error, words
     both = float(power[0, 0].real * power[1, 1].real)
     coherence = float(abs(power[0, 1]) ** 2 / both) if both > 0 else 0.0
     if coherence > _RELATED:
         return np.nan, np.nan, "both axes, out of phase"
     return np.nan, np.nan, "both axes, unrelated"
+
+
+def _name_direction(angle_deg: float, error_deg: float) -> tuple[float, str]:
+    """Return a direction [deg], near tilt from 0 to 180, and what it is along."""
+    near = max(_NEAR_AXIS_DEG, _SIGMAS * error_deg)
+    if abs(angle_deg) < near:
+        return angle_deg, AXES[0]
+    if abs(angle_deg) > 90 - near:
+        return angle_deg % 180, AXES[1]
+    return angle_deg, "a diagonal"
 
 
 def _power_at(

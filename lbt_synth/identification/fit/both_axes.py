@@ -12,8 +12,13 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.fit.axis import estimate_averages, identify_axis, identify_spectrum
+from lbt_synth.identification.fit.coupled_axes import couple_axes
 from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES
-from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
+from lbt_synth.identification.fit.identified_model import (
+    IdentifiedAxis,
+    IdentifiedLine,
+    IdentifiedModel,
+)
 from lbt_synth.identification.fit.record_doubts import (
     better_delay,
     cut_at_jumps,
@@ -30,6 +35,7 @@ _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _APART = 3.0  # standard errors between gains that differ
+_BOTH = 2  # axes that may share resonances
 
 
 def identify(
@@ -139,14 +145,20 @@ def identify(
     if len(axes) > 1 and found_gain and gains == [None] * len(axes):
         axes, note = _pool_gains(axes, found_gain, partial(fit, cut))
         notes.append(note)
+    notes += _find_doubts(record, axes, found_gain, cut, most_lines)
+    shared: tuple[IdentifiedLine, ...] = ()
+    if len(axes) == _BOTH:
+        axes, shared, more = couple_axes(record, axes, cut, lowest_line_hz)
+        notes += more
     if progress is not None and next(fits) <= total:
         progress(total, total)
     return IdentifiedModel(
         axes=tuple(axes),
+        shared=shared,
         frame_rate_hz=record.frame_rate_hz,
         delay_frames=next(d for d in (record.delay_frames, delay_frames, _DELAY) if d is not None),
         mirror=record.mirror,
-        notes=(*notes, *_find_doubts(record, axes, found_gain, cut, most_lines)),
+        notes=tuple(notes),
     )
 
 

@@ -23,7 +23,7 @@ from lbt_synth.identification.fit.whittle import (
     observe_information,
 )
 from lbt_synth.models.resonance_spectrum import PARAMETERS
-from lbt_synth.validation import integer, number
+from lbt_synth.validation import IntArray, integer, number
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
@@ -114,6 +114,10 @@ class Search:
 
     def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
+        return self.data.merge(self.groups(spectrum))
+
+    def groups(self, spectrum: SpectrumModel) -> IntArray:
+        """Return where groups of bins begin within which a model is nearly constant."""
         f, step = self.data.frequency_hz, self.data.step_hz
         size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
         for line in spectrum.lines:
@@ -122,7 +126,7 @@ class Search:
             away = np.maximum(np.abs(f - centre) - fine * step, 0)
             size = np.minimum(size, np.maximum(step, 0.1 * np.maximum(half_width, 2 * away)))
         group = np.floor(np.cumsum(step / size) - 1e-9)
-        return self.data.merge(np.flatnonzero(np.diff(group, prepend=-np.inf) > 0))
+        return np.flatnonzero(np.diff(group, prepend=-np.inf) > 0)
 
 
 def fit(search: Search, start: SpectrumModel) -> FittedModel | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -47,6 +47,12 @@ class IdentifiedLine:
         What it adds to the logarithm of the likelihood.
     announced : bool
         Whether its frequency was given beforehand.
+    direction : tuple of float or None
+        Unit vector over the axes along which it shakes, the first number at least 0. None on an
+        axis that has the line for itself.
+    direction_error_deg : float or None
+        Standard error of the direction [degrees] of a line that both axes share. None for
+        turbulence along the direction of the rms of the axes.
     """
 
     kind: Kind
@@ -60,14 +66,24 @@ class IdentifiedLine:
     prominence: float
     evidence: float
     announced: bool
+    direction: tuple[float, ...] | None = None
+    direction_error_deg: float | None = None
 
-    def vibration(self, direction: tuple[float, ...] = (1.0, 0.0)) -> Vibration:
+    @property
+    def direction_deg(self) -> float | None:
+        """Its direction from tip towards tilt [degrees], from -90 to 90; None without one."""
+        if self.direction is None:
+            return None
+        first, second = (*self.direction, 0.0)[:2]
+        return float(np.degrees(np.arctan2(second, first)))
+
+    def vibration(self, direction: tuple[float, ...] | None = None) -> Vibration:
         """Return the resonance as a part of a plant.
 
         Parameters
         ----------
         direction : tuple of float, optional
-            Direction over the modes.
+            Direction over the modes; by default the line's own, and tip for one without.
 
         Returns
         -------
@@ -78,7 +94,7 @@ class IdentifiedLine:
             frequency_hz=self.frequency_hz,
             damping=self.damping,
             rms_nm=self.rms_nm,
-            direction=direction,
+            direction=direction or self.direction or (1.0, 0.0),
         )
 
 
@@ -157,7 +173,8 @@ class IdentifiedAxis:
     turbulence_fit : IdentifiedTurbulence
         Its parameters with standard errors.
     parts : tuple of IdentifiedLine
-        All other resonances, by frequency.
+        All other resonances, by frequency. One that has a direction is this axis's share of a
+        resonance of both axes.
     noise_nm, noise_error_nm : float
         Measurement noise per frame on y, at least a hundredth of the innovations' deviation, and
         its standard error [nm].
@@ -221,6 +238,8 @@ class IdentifiedModel:
     ----------
     axes : tuple of IdentifiedAxis
         One per axis: tip, or tip and tilt.
+    shared : tuple of IdentifiedLine
+        Resonances that shake both axes along a direction, by frequency.
     frame_rate_hz : float
         Frame rate [Hz].
     delay_frames : float
@@ -232,6 +251,7 @@ class IdentifiedModel:
     """
 
     axes: tuple[IdentifiedAxis, ...]
+    shared: tuple[IdentifiedLine, ...] = ()
     frame_rate_hz: float
     delay_frames: float
     mirror: PositionLoop | None = None
@@ -252,9 +272,17 @@ class IdentifiedModel:
             mirror=self.mirror,
         )
 
-    def _vibrations(self) -> list[Vibration]:
+    @property
+    def parts(self) -> tuple[IdentifiedLine, ...]:
+        """All resonances, each once and with its direction: those of each axis, then the shared."""
         each = zip(np.eye(len(self.axes)).tolist(), self.axes, strict=True)
-        return [part.vibration(tuple(along)) for along, axis in each for part in axis.parts]
+        own = [
+            replace(part, direction=tuple(along))
+            for along, axis in each
+            for part in axis.parts
+            if part.direction is None
+        ]
+        return (*own, *self.shared)
 
     def plant(self) -> TipTiltPlant:
         """Return the plant of a design.
@@ -262,13 +290,13 @@ class IdentifiedModel:
         Returns
         -------
         TipTiltPlant
-            Turbulence and resonances of each axis, independent of the other's.
+            Turbulence and resonances, independent of each other; those of both axes once.
         """
         return tip_tilt_plant(
             frame_rate_hz=self.frame_rate_hz,
             delay_frames=self.delay_frames,
             turbulence=[axis.turbulence for axis in self.axes],
-            vibrations=self._vibrations() or None,
+            vibrations=[part.vibration() for part in self.parts] or None,
             noise_nm=np.diag([axis.noise_nm**2 for axis in self.axes]),
             sensor_matrix=np.diag(self.sensor_gains),
             mirror=self.mirror,
@@ -284,6 +312,6 @@ class IdentifiedModel:
         """
         return Truth(
             turbulence=tuple(axis.turbulence for axis in self.axes),
-            vibrations=tuple(self._vibrations()),
+            vibrations=tuple(part.vibration() for part in self.parts),
             noise_nm=np.array([axis.noise_nm for axis in self.axes]),
         )

@@ -171,6 +171,40 @@ def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatAr
     return np.asarray(4 * np.sin(np.pi * frequency_hz / frame_rate_hz) ** 2)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Segments:
+    """Segments of one length, cut from all stretches, and their transform."""
+
+    rows: IntArray  # (segments, length): frames
+    taper: FloatArray  # (length - 1,)
+    size: int  # of the transform
+    scale: FloatArray  # (f,): from squared moduli to densities
+    frequency_hz: FloatArray  # (f,)
+
+    @classmethod
+    def cut(cls, stretches: Sequence[tuple[int, int]], frame_rate_hz: float) -> _Segments:
+        """Cut the segments; that length uses most of the data."""
+        from scipy.fft import next_fast_len
+
+        length = _segment_length([stop - start for start, stop in stretches])
+        starts: list[int] = []
+        for start, stop in stretches:
+            many, spare = divmod(stop - start, length)
+            starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
+        taper = tukey(length - 1)
+        size = int(next_fast_len(length - 1, real=True))
+        frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
+        scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
+        return cls(np.array(starts)[:, None] + np.arange(length), taper, size, scale, frequency)
+
+    def transform(self, series: FloatArray) -> ComplexArray:
+        """Return the transform of the differences of a series (frames,), (segments, f)."""
+        from scipy.fft import rfft
+
+        tapered = self.taper * np.diff(series[self.rows], axis=1)
+        return np.asarray(rfft(tapered, self.size, axis=1)[:, 1 : (self.size + 1) // 2])
+
+
 def loop_periodogram(
     measurement: FloatArray,
     correction: FloatArray | None,
@@ -183,28 +217,14 @@ def loop_periodogram(
     Segments of one length are cut from all stretches. That length uses most of the data, and is
     the whole stretch where there is one of at most 2^16 frames.
     """
-    from scipy.fft import next_fast_len, rfft
-
-    length = _segment_length([stop - start for start, stop in stretches])
-    starts: list[int] = []
-    for start, stop in stretches:
-        many, spare = divmod(stop - start, length)
-        starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
-    rows = np.array(starts)[:, None] + np.arange(length)
-    taper = tukey(length - 1)
-    size = int(next_fast_len(length - 1, real=True))
-    frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
-    scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
-
-    def transform(series: FloatArray) -> ComplexArray:
-        tapered = taper * np.diff(series[rows], axis=1)
-        return np.asarray(rfft(tapered, size, axis=1)[:, 1 : (size + 1) // 2])
-
-    y = transform(measurement)
-    c = np.zeros_like(y) if correction is None else transform(correction)
+    segments = _Segments.cut(stretches, frame_rate_hz)
+    count, length = segments.rows.shape
+    frequency, taper, scale = segments.frequency_hz, segments.taper, segments.scale
+    y = segments.transform(measurement)
+    c = np.zeros_like(y) if correction is None else segments.transform(correction)
     measured = scale * np.mean(np.abs(y) ** 2, axis=0)
     # neighbours of a padded or tapered transform are not independent
-    independent = len(starts) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
+    independent = count * np.sum(taper**2) ** 2 / np.sum(taper**4) / segments.size
     return LoopPeriodogram(
         frequency_hz=frequency,
         measured=measured + _FLOOR * np.mean(measured),
@@ -215,6 +235,22 @@ def loop_periodogram(
         resolution_hz=frame_rate_hz / length,
         duration_s=(length - 1) / frame_rate_hz,
     )
+
+
+def cross_periodogram(
+    first: FloatArray,
+    second: FloatArray,
+    *,
+    frame_rate_hz: float,
+    stretches: Sequence[tuple[int, int]],
+) -> ComplexArray:
+    """Return the cross-periodogram ``Z1 Z2*`` of two series (frames,), (f,).
+
+    Its frequencies are those of :func:`loop_periodogram` over the same stretches.
+    """
+    segments = _Segments.cut(stretches, frame_rate_hz)
+    product = segments.transform(first) * segments.transform(second).conj()
+    return np.asarray(segments.scale * np.mean(product, axis=0))
 
 
 def _segment_length(lengths: list[int]) -> int:

@@ -12,7 +12,13 @@ from lbt_synth.identification.fit.identified_model import (
     Whiteness,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whittle import GAIN, FittedModel, SpectrumModel, densities
+from lbt_synth.identification.fit.whittle import (
+    GAIN,
+    FittedModel,
+    SpectrumModel,
+    densities,
+    invert_information,
+)
 from lbt_synth.models import ARModel
 from lbt_synth.models.resonance_spectrum import coefficients
 from lbt_synth.validation import FloatArray, frozen_copy
@@ -27,13 +33,7 @@ _LOWEST = 3  # bins in which the ends of the taper show
 
 def parameter_covariance(model: FittedModel) -> FloatArray:
     """Return the covariance of the packed parameters, the inverse of the information, (p, p)."""
-    moves = np.flatnonzero(np.diag(model.information) > 0)
-    block = model.information[np.ix_(moves, moves)]
-    scale = 1 / np.sqrt(np.diag(block))
-    both = np.outer(scale, scale)
-    out = np.zeros_like(model.information)
-    out[np.ix_(moves, moves)] = np.linalg.pinv(block * both, hermitian=True) * both
-    return out
+    return invert_information(model.information)
 
 
 def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> SpectrumModel:

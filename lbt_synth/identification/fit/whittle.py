@@ -252,6 +252,21 @@ def contrast(data: LoopPeriodogram, spectrum: SpectrumModel) -> float:
     return float(np.sum(data.count * (np.log(model) + power / model)))
 
 
+def log_slopes(
+    each: FloatArray, slopes: FloatArray, by_corner: FloatArray, model: FloatArray
+) -> FloatArray:
+    """Return the slopes of a spectrum, by all parameters, over a density (f,), (p, f).
+
+    The first three arguments are those of :func:`densities`. The gain changes the data, not the
+    spectrum.
+    """
+    rows = [np.zeros_like(model), each[0] / model, by_corner * each[1] / model]
+    for own, (by_frequency, by_damping) in zip(each[1:], slopes, strict=True):
+        share = own / model
+        rows += [by_frequency * share, by_damping * share, share]
+    return np.array(rows)
+
+
 def derivatives(
     data: LoopPeriodogram, spectrum: SpectrumModel
 ) -> tuple[float, FloatArray, FloatArray]:
@@ -260,14 +275,10 @@ def derivatives(
     each, slopes, by_corner = densities(data, spectrum)
     model = each.sum(axis=0)
     ratio = data.power(gain) / model
-    rows = [np.zeros_like(model), each[0] / model, by_corner * each[1] / model]
-    for own, (by_frequency, by_damping) in zip(each[1:], slopes, strict=True):
-        share = own / model
-        rows += [by_frequency * share, by_damping * share, share]
-    log_slopes = np.array(rows)
-    weighted = log_slopes * count
+    rows = log_slopes(each, slopes, by_corner, model)
+    weighted = rows * count
     gradient = weighted @ (1 - ratio)
-    information = weighted @ log_slopes.T
+    information = weighted @ rows.T
     # the gain changes the data, not the model
     cross, square = 2 * gain * data.crossed, 2 * gain**2 * data.corrected
     by_gain = (cross + square) / model
@@ -277,27 +288,35 @@ def derivatives(
     return float(np.sum(count * (np.log(model) + ratio))), gradient, information
 
 
-def minimise(data: LoopPeriodogram, start: SpectrumModel, priors: Priors) -> FittedModel | None:
-    """Minimise L by scoring in a trust region; None if L is not finite."""
+def scoring_minimum(
+    differentiate: Callable[[FloatArray], tuple[float, FloatArray, FloatArray]],
+    start: FloatArray,
+    priors: Priors,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Minimise a contrast of the free parameters and their priors by scoring in a trust region.
+
+    ``differentiate`` returns the contrast, its gradient and its information matrix. Return the
+    parameters (free,) and the information (free, free); None if the contrast is not finite.
+    """
     from scipy.optimize import minimize
 
-    free, theta = priors.free, start.pack()
+    free = priors.free
     centre, precision = priors.centre[free], 1 / priors.width[free] ** 2
 
     @lru_cache(maxsize=1)  # scipy asks for value, gradient and Hessian one after the other
     def evaluate(raw: bytes) -> tuple[float, FloatArray, FloatArray]:
-        theta[free] = x = np.clip(np.frombuffer(raw), -_FARTHEST, _FARTHEST)
-        value, gradient, information = derivatives(data, start.unpack(theta))
+        x = np.clip(np.frombuffer(raw), -_FARTHEST, _FARTHEST)
+        value, gradient, information = differentiate(x)
         away = x - centre
         return (
             value + 0.5 * float(np.sum(precision * away**2)),
-            gradient[free] + precision * away,
-            information[np.ix_(free, free)] + np.diag(precision),
+            gradient + precision * away,
+            information + np.diag(precision),
         )
 
     found = minimize(  # type: ignore[call-overload]
         lambda x: evaluate(x.tobytes())[0],
-        theta[free],
+        start,
         jac=lambda x: evaluate(x.tobytes())[1],
         hess=lambda x: evaluate(x.tobytes())[2],
         method="trust-exact",
@@ -308,7 +327,22 @@ def minimise(data: LoopPeriodogram, start: SpectrumModel, priors: Priors) -> Fit
     left = 0.5 * float(gradient @ np.linalg.lstsq(reduced, gradient, rcond=None)[0])
     if not (np.isfinite(found.fun) and np.isfinite(left)):
         return None
-    theta[free] = found.x
+    return found.x, reduced
+
+
+def minimise(data: LoopPeriodogram, start: SpectrumModel, priors: Priors) -> FittedModel | None:
+    """Minimise L by scoring in a trust region; None if L is not finite."""
+    free, theta = priors.free, start.pack()
+
+    def differentiate(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        theta[free] = x
+        value, gradient, information = derivatives(data, start.unpack(theta))
+        return value, gradient[free], information[np.ix_(free, free)]
+
+    found = scoring_minimum(differentiate, theta[free], priors)
+    if found is None:
+        return None
+    theta[free], reduced = found
     spectrum = start.unpack(theta)
     information = np.zeros((theta.size, theta.size))
     information[np.ix_(free, free)] = reduced
@@ -335,3 +369,14 @@ def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Prior
     information = np.zeros_like(model.information)
     information[np.ix_(free, free)] = exact
     return replace(model, information=information)
+
+
+def invert_information(information: FloatArray) -> FloatArray:
+    """Return the covariance of parameters, (p, p); 0 for those without information."""
+    moves = np.flatnonzero(np.diag(information) > 0)
+    block = information[np.ix_(moves, moves)]
+    scale = 1 / np.sqrt(np.diag(block))
+    both = np.outer(scale, scale)
+    out = np.zeros_like(information)
+    out[np.ix_(moves, moves)] = np.linalg.pinv(block * both, hermitian=True) * both
+    return out

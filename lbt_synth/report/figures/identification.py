@@ -8,7 +8,7 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import IdentifiedAxis, IdentifiedModel
+from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedModel
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.report.charts.description import Area, Axis, Curve, Flags, Panel, Span
@@ -183,13 +183,17 @@ def _spectrum_panel(model: IdentifiedModel, i: int, density: Axis) -> Panel:
             Flags(
                 x=np.array([line.frequency_hz for line in axis.lines]),
                 y=_line_heights(axis),
-                texts=tuple(
-                    f"{line.frequency_hz:.2f} Hz, {line.rms_nm:.3g} nm" for line in axis.lines
-                ),
+                texts=tuple(_line_text(line) for line in axis.lines),
             ),
         ),
         height_in=3.0,
     )
+
+
+def _line_text(line: IdentifiedLine) -> str:
+    """Return frequency and rms of a line on its axis, and the direction if both axes share it."""
+    along = "" if line.direction is None else f", {line.direction_deg:.0f}°"
+    return f"{line.frequency_hz:.2f} Hz, {line.rms_nm:.3g} nm{along}"
 
 
 def _cumulative_curves(axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -> list[Curve]:

@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from lbt_synth.identification.fit.periodogram import TAPER, WIDE, log_smearing, loop_periodogram
+from lbt_synth.identification.fit.periodogram import (
+    TAPER,
+    WIDE,
+    cross_periodogram,
+    log_smearing,
+    loop_periodogram,
+)
 
 
 def correlation(t: float) -> float:
@@ -108,3 +114,17 @@ def test_a_gap_shortens_the_segments_and_keeps_most_frames() -> None:
     data = loop_periodogram(y, None, frame_rate_hz=RATE, stretches=[(0, 9990), (10_010, 30_000)])
     assert np.mean(data.power(1.0)) == pytest.approx(2 / RATE, rel=0.03)
     assert 0.8 * 15_000 < np.sum(data.count) < 15_000
+
+
+def test_the_cross_periodogram_belongs_to_those_of_the_axes() -> None:
+    rng = np.random.default_rng(3)
+    x, y = np.cumsum(rng.standard_normal((2, 3000)), axis=1)
+    options = {"frame_rate_hz": 500.0, "stretches": [(0, 1400), (1410, 3000)]}
+    one, other, both = (
+        loop_periodogram(series, None, **options).measured for series in (x, y, x + y)
+    )
+    crossed = cross_periodogram(x, y, **options)
+    assert one + other + 2 * crossed.real == pytest.approx(both, rel=1e-9)
+    assert cross_periodogram(y, x, **options) == pytest.approx(crossed.conj())
+    assert cross_periodogram(x, x, **options).real == pytest.approx(one, rel=1e-9)
+    assert np.all(np.abs(crossed) ** 2 < 1.000001 * one * other)

@@ -1,0 +1,121 @@
+"""Two identified axes with the resonances that they share, each of these with its direction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
+from lbt_synth.identification.fit.joint_whittle import JointFit, JointPeriodogram, JointSearch
+from lbt_synth.identification.fit.periodogram import cross_periodogram
+from lbt_synth.identification.fit.physical_parameters import describe_axis
+from lbt_synth.identification.fit.shared_lines import find_shared
+from lbt_synth.identification.fit.whittle import FittedModel, contrast, invert_information
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.stretches import Stretches
+
+
+def couple_axes(
+    record: LoopRecord, axes: Sequence[IdentifiedAxis], stretches: Stretches, lowest_line_hz: float
+) -> tuple[list[IdentifiedAxis], tuple[IdentifiedLine, ...], list[str]]:
+    """Return two axes with what they share, the shared resonances, and notes.
+
+    Axes that share nothing are returned as they are.
+    """
+    search = _joint_search(record, axes, stretches, lowest_line_hz)
+    fit, ellipses = find_shared(search, [axis.fitted_model for axis in axes])
+    notes = [
+        f"the lines of both axes at {frequency:.4g} Hz move on an ellipse, with a phase between "
+        "the axes: they stay two lines"
+        for frequency in ellipses
+    ]
+    fit = None if fit is None else search.fit(fit.joint, exact=True)
+    if fit is None:
+        return list(axes), (), notes
+    coupled = [_describe_axis(search, fit, i, axis) for i, axis in enumerate(axes)]
+    parts, shared = [list(axis.parts) for axis in coupled], []
+    for k, tie in enumerate(fit.joint.ties):
+        places = [_rank(fit, axis, place) for axis, place in enumerate(tie.parts)]
+        shares = [own[place] for own, place in zip(parts, places, strict=True)]
+        line = _describe_line(fit, k, shares, coupled)
+        for own, place, share in zip(parts, places, shares, strict=True):
+            own[place] = replace(
+                share, direction=line.direction, direction_error_deg=line.direction_error_deg
+            )
+        shared.append(line)
+    shared.sort(key=lambda line: line.frequency_hz)
+    each = zip(coupled, parts, strict=True)
+    return [replace(axis, parts=tuple(own)) for axis, own in each], tuple(shared), notes
+
+
+def _joint_search(
+    record: LoopRecord, axes: Sequence[IdentifiedAxis], stretches: Stretches, lowest_line_hz: float
+) -> JointSearch:
+    """Return the periodograms of two identified axes, each at its sensor gain."""
+    gains = np.array([axis.sensor_gain for axis in axes])
+    first, second = (record.measurements + gains * record.corrections()).T
+    crossed = cross_periodogram(
+        first, second, frame_rate_hz=record.frame_rate_hz, stretches=sorted(stretches)
+    )
+    one, other = (
+        Search(data=axis.data, gain=axis.sensor_gain, lowest_line_hz=lowest_line_hz)
+        for axis in axes
+    )
+    return JointSearch(
+        searches=(one, other),
+        data=JointPeriodogram(axes=(axes[0].data, axes[1].data), crossed=crossed),
+    )
+
+
+def _describe_axis(
+    search: JointSearch, fit: JointFit, i: int, alone: IdentifiedAxis
+) -> IdentifiedAxis:
+    """Return axis i of a joint fit in the units of the phase."""
+    spectrum, start = fit.joint.axes[i], fit.joint.starts[i]
+    own = slice(start, start + fit.joint.sizes[i])
+    others = range(1, len(spectrum.components))
+    evidence = [fit.lost(fit.joint.drop(i, place)) for place in others]
+    model = FittedModel(
+        spectrum=spectrum,
+        contrast=contrast(alone.data, spectrum),
+        information=invert_information(fit.covariance[own, own]),  # the other axis left open
+        evidence=(float("inf"), *evidence),
+    )
+    error = alone.sensor_gain_error
+    relative = None if error is None else error / alone.sensor_gain
+    return describe_axis(search.searches[i], model, relative, alone.sensor_gain_note)
+
+
+def _rank(fit: JointFit, axis: int, place: int) -> int:
+    """Return which of the parts of an axis, by frequency, a component is."""
+    components = fit.joint.axes[axis].components
+    order = sorted(range(1, len(components)), key=lambda i: components[i].log_frequency)
+    return order.index(place)
+
+
+def _describe_line(
+    fit: JointFit, k: int, shares: Sequence[IdentifiedLine], axes: Sequence[IdentifiedAxis]
+) -> IdentifiedLine:
+    """Return the resonance of tie k, with its size along its direction, from its shares."""
+    tie = fit.joint.ties[k]
+    first, second = (share.rms_nm for share in shares)
+    rms = float(np.hypot(first, second))
+    along = np.array([first, second * np.sign(np.cos(tie.phase))]) / rms
+    places = [fit.joint.place(axis, part) + 2 for axis, part in enumerate(tie.parts)]
+    logs = fit.covariance[np.ix_(places, places)] / 4  # of the logarithms of both rms
+    gains = [(axis.sensor_gain_error or 0.0) / axis.sensor_gain for axis in axes]
+    one_gain = axes[0].sensor_gain == axes[1].sensor_gain
+    logs = logs + (np.full((2, 2), gains[0] * gains[1]) if one_gain else np.diag(gains) ** 2)
+    size, turn = along**2, along[0] * along[1] * np.array([-1.0, 1.0])
+    error = None if tie.whole else float(np.degrees(np.sqrt(max(turn @ logs @ turn, 0.0))))
+    return replace(
+        max(shares, key=lambda share: share.prominence),
+        rms_nm=rms,
+        rms_error_nm=rms * float(np.sqrt(size @ logs @ size)),
+        announced=any(share.announced for share in shares),
+        direction=(float(along[0]), float(along[1])),
+        direction_error_deg=error,
+    )

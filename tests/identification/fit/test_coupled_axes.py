@@ -1,0 +1,78 @@
+"""Shared lines in the model of both axes: shares, directions, errors, plant and truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.recorded_loops import RATE, open_record, slow
+
+import lbt_synth as lbt
+from lbt_synth.models.plant.tip_tilt import with_vibrations
+
+ANGLE = 30.0
+ALONG = (float(np.cos(np.radians(ANGLE))), float(np.sin(np.radians(ANGLE))))
+DIAGONAL = lbt.Vibration(frequency_hz=31, damping=0.006, rms_nm=60, direction=ALONG)
+TILT = lbt.Vibration(frequency_hz=52, damping=0.006, rms_nm=40, direction=(0, 1))
+
+
+@pytest.fixture(scope="module")
+def model() -> lbt.identification.IdentifiedModel:
+    return lbt.identify(open_record(((DIAGONAL, 0), (TILT, 0)), seed=1))
+
+
+def test_each_axis_shows_its_share(model):
+    (line,) = model.shared
+    shares = [axis.lines[0] for axis in model.axes]
+    assert [share.direction for share in shares] == [line.direction] * 2
+    for share, part in zip(shares, line.direction, strict=True):
+        assert share.rms_nm == pytest.approx(part * line.rms_nm)
+        assert share.frequency_hz == line.frequency_hz
+        assert share.damping == line.damping
+        assert share.evidence == line.evidence > 100
+    own = model.axes[1].lines[1]
+    assert own.direction is None
+    assert own.direction_deg is None
+    assert own.vibration().direction == (1.0, 0.0)
+
+
+def test_the_plant_has_each_line_once(model):
+    own, shared = model.parts
+    assert own.direction == (0.0, 1.0)
+    assert own.direction_deg == 90
+    assert shared is model.shared[0]
+    plant = model.plant()
+    assert [line.direction for line in plant.vibrations] == [own.direction, shared.direction]
+    assert model.truth().vibrations == plant.vibrations
+    assert plant.n_states == 2 * 2 + 2 * (1 + max(a.turbulence.order for a in model.axes))
+
+
+def test_the_filter_uses_both_axes(model):
+    """It comes closer to the filter of the truth than one with a line on either axis."""
+    each = zip(model.axes, ((1, 0), (0, 1)), strict=True)
+    apart = [axis.lines[0].vibration(direction) for axis, direction in each]
+    path = lbt.LoopHardware(frame_rate_hz=RATE)
+    truth = lbt.Truth(turbulence=slow(), vibrations=(DIAGONAL, TILT), noise_nm=6.0)
+
+    def left(vibrations):
+        plant = with_vibrations(model.plant(), vibrations)
+        loop = lbt.close_loop(path, lbt.kalman(plant).controller)
+        return lbt.residual_budget(loop, truth).rms_nm ** 2
+
+    together = left(model.plant().vibrations)
+    assert together < 0.95 * left([*apart, TILT])
+    assert together < 1.02 * left([DIAGONAL, TILT])
+
+
+def test_errors_of_direction_frequency_and_size():
+    deviations = []
+    for seed in range(8):
+        (line,) = lbt.identify(open_record(((DIAGONAL, 0),), seed=seed, frames=8192)).shared
+        deviations.append(
+            [
+                (line.direction_deg - ANGLE) / line.direction_error_deg,
+                (line.frequency_hz - 31) / line.frequency_error_hz,
+                np.log(line.rms_nm / 60) * line.rms_nm / line.rms_error_nm,
+            ]
+        )
+    size = np.sqrt(np.mean(np.square(deviations), axis=0))
+    assert np.all((size > 0.5) & (size < 1.6))
