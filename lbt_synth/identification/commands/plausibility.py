@@ -19,7 +19,7 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
 _NEAR_ONE = 0.2  # distance from 1 of the pole of a law that adds up
-_SLOWER = (1.0, 0.3)  # of the coarse gain
+_STABLE = 1 - 1e-9  # spectral radius below which a loop has run
 _SEGMENT_S = 6.0
 _ROUNDS, _LINES = 3, 10  # of the search for lines
 
@@ -29,25 +29,22 @@ def already_integrates(law: ControlLaw) -> bool:
     return bool(law.order > 0 and np.all(abs(law.poles[:, 0] - 1) < _NEAR_ONE))
 
 
-def could_have_run(guess: Guess, gain: FloatArray, record: LoopRecord, law: ControlLaw) -> bool:
-    """Return whether the recorded law would have been stable if a guess (gain (axes,)) is right.
-
-    The coarse gain may be too large: a third of it is tried as well.
-    """
+def could_have_run(guess: Guess, gains: FloatArray, record: LoopRecord, law: ControlLaw) -> bool:
+    """Return whether the recorded law would have been stable at any gains (n, axes) of a guess."""
     if guess.kind == "increments":
         return True  # another law computes the positions
     assert record.delay_frames is not None
     controller = law_controller(law, record.frame_rate_hz)
     axes = record.axes
-    for slower in _SLOWER:
+    for gain in gains:
         path = LoopHardware(
             frame_rate_hz=record.frame_rate_hz,
             delay_frames=max(record.delay_frames + guess.shift_frames, 1.0),
-            sensor_matrix=np.diag(slower * gain),
+            sensor_matrix=np.diag(gain),
             influence_matrix=np.eye(axes) if guess.matrix is None else guess.matrix,
             mirror=record.mirror,
         )
-        if close_loop(path, controller).is_stable:
+        if close_loop(path, controller).spectral_radius < _STABLE:
             return True
     return False
 

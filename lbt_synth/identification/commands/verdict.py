@@ -45,6 +45,7 @@ _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units,
 _USUAL_GAIN = 0.7
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _INSIDE = 8  # gains that are tried of the plausible ones
+_TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 
 
@@ -63,7 +64,8 @@ class CommandVerdict:
     delay_frames : float or None
         The delay that fits, where another was given.
     nats : float
-        Logarithm of the likelihood of the explanation over that of the record as given.
+        Logarithm of the likelihood of the explanation over that of the record as given; 0 where
+        the control law alone decides.
     gain : (axes,) ndarray
         Coarse sensor gain of the explanation.
     law : ControlLaw or None
@@ -187,7 +189,7 @@ def explain_commands(
     if sensor_gain is not None:
         known = one_or_each(sensor_gain, "sensor_gain", above=0)
         gains = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
-    scale = _find_scale(coarse, found, gains)
+    scale = _find_scale(coarse, law, found, gains)
     words = [] if not early else [recorded_early(early)]
     repair, other_delay, why = repair_guess(found.guess, delay, max(lag, 0))
     words += why
@@ -199,7 +201,7 @@ def explain_commands(
         accepted=not words,
         repair=repair if repair.options else None,
         delay_frames=other_delay,
-        nats=found.nats,
+        nats=max(found.nats, 0.0),
         gain=frozen_copy(found.gain * scale),
         law=law,
         notes=_notes(found, delay, lag) if not words else (),
@@ -288,11 +290,19 @@ def _score(
     simple = np.array([guess.is_simple for guess in compared.guesses])
     score = compared.contrast + _UNUSUAL * surprising + _GENERAL * ~simple
     if law is not None and _is_sure(law):
+        ones = np.ones((1, record.axes))
         each = zip(compared.guesses, compared.gain.T, strict=True)
-        possible = np.array([could_have_run(guess, gain, record, law) for guess, gain in each])
+        possible = np.array(
+            [
+                could_have_run(guess, np.vstack([gain, 0.3 * gain, *_TRIED * ones]), record, law)
+                for guess, gain in each
+            ]
+        )
         if possible.any():
             score = np.where(possible, score, np.inf)
             surprising |= ~possible
+    if surprising[0] and not surprising.all():  # the law says what is wrong
+        score[1:][surprising[1:]] = np.inf
     return score, surprising
 
 
@@ -319,7 +329,9 @@ def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
     return turned.kind != "diagonal" or min(turned.signs) < 0
 
 
-def _find_scale(coarse: CoarseRecord, found: _Best, plausible: tuple[float, float]) -> float:
+def _find_scale(
+    coarse: CoarseRecord, law: ControlLaw | None, found: _Best, plausible: tuple[float, float]
+) -> float:
     """Return the factor of the commands that makes an implausible gain a plausible one."""
     low, high = plausible
     bounded = np.clip(found.gain, low, high)
@@ -335,7 +347,11 @@ def _find_scale(coarse: CoarseRecord, found: _Best, plausible: tuple[float, floa
     factor = float(f"{gain / usual:.2g}")
     if fits:
         factor = float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
-    shown = finer_saving_of_gain(coarse.record, found.guess, (low, usual, high)) >= found.clear
+    tried = inside[:, None] * np.ones(len(bounded))
+    record = coarse.record
+    if law is not None and _is_sure(law) and not could_have_run(found.guess, tried, record, law):
+        return factor
+    shown = finer_saving_of_gain(record, found.guess, (low, usual, high)) >= found.clear
     return factor if shown else 1.0
 
 
