@@ -4,7 +4,8 @@ The standard error of a mean of correlated values is that of a circular block bo
 b neighbours, drawn with replacement from the series closed to a circle (D. N. Politis, J. P.
 Romano, in R. LePage, L. Billard (eds.), Exploring the Limits of Bootstrap, Wiley (1992), p. 263).
 The variance of the mean over all draws is that of the means of all blocks over the number of
-blocks in the series: nothing has to be drawn. The length b is that of least error of this variance
+blocks in the series: nothing has to be drawn. The length b is a second or, where the
+autocorrelation asks for more, that of least error of this variance
 (D. N. Politis, H. White, Econometric Reviews 23, 53 (2004), doi:10.1081/ETC-120028836; corrected
 by A. Patton, D. N. Politis, H. White, ibid. 28, 372 (2009), doi:10.1080/07474930802459016).
 """
@@ -23,6 +24,7 @@ from lbt_synth.validation import FloatArray, frozen_copy, integer, number, real_
 CHUNK_S = 0.05  # mean squares are kept of so long: less than most blocks, more than most periods
 _FEWEST = 8  # values that give an error
 _FEWEST_BLOCKS = 4  # in a series
+_LEAST_BLOCK = round(1.0 / CHUNK_S)  # chunks of a second
 _QUIET_LAGS = 5  # insignificant autocorrelations in a row that end it
 
 
@@ -100,7 +102,7 @@ class PairedResiduals:
 
     def error_nm2(self, name: str) -> float:
         """Return the standard error of a mean square [nm^2]."""
-        return bootstrap_error(self._series(name))
+        return _error_of_chunks(self._series(name))
 
     def above(self, name: str, other: str) -> tuple[float, float]:
         """Return by how much a residual is above another, on the same frames.
@@ -118,7 +120,7 @@ class PairedResiduals:
             Difference of the variances and its standard error [nm^2].
         """
         differences = self._series(name) - self._series(other)
-        return float(np.mean(differences)), bootstrap_error(differences)
+        return float(np.mean(differences)), _error_of_chunks(differences)
 
     def _series(self, name: str) -> FloatArray:
         if name not in self.squares_nm2:
@@ -137,6 +139,16 @@ def chunk_squares(measured: FloatArray, frame_rate_hz: float) -> FloatArray:
     count = len(measured) // frames
     squares = np.sum(measured[: count * frames] ** 2, axis=1)
     return np.asarray(np.mean(squares.reshape(count, frames), axis=1))
+
+
+def _error_of_chunks(series: FloatArray) -> float:
+    """Return the error of the mean of chunks, with blocks of a second at least.
+
+    Lines that beat have autocorrelations too small to be seen at one lag, and too many to matter
+    little.
+    """
+    longest = len(series) // _FEWEST_BLOCKS
+    return bootstrap_error(series, min(max(choose_block_length(series), _LEAST_BLOCK), longest))
 
 
 def bootstrap_error(series: ArrayLike, block: int | None = None) -> float:

@@ -81,11 +81,11 @@ def test_a_row_for_each_record_split_and_entry():
 def test_the_error_of_a_ratio_is_that_of_its_root():
     rng = np.random.default_rng(0)
     found = PairedResiduals(
-        squares_nm2={"a": 100 + rng.standard_normal(400), "b": 121 + rng.standard_normal(400)}
+        squares_nm2={"a": 100 + rng.standard_normal(4000), "b": 121 + rng.standard_normal(4000)}
     )
     above, error = relative_residual(found, "b")
     assert above == pytest.approx(0.1, abs=3 * error)
-    assert error == pytest.approx(np.sqrt(2) / 20 / (2 * 110), rel=0.15)
+    assert error == pytest.approx(np.sqrt(2 / 4000) / (2 * 110), rel=0.15)
     assert relative_residual(found, "a") == (0.0, 0.0)
 
 
