@@ -20,10 +20,11 @@ from lbt_synth.identification.prediction.comparison import (
     PredictionTable,
     prediction_against_data,
 )
+from lbt_synth.identification.record_drift import note_drift
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
-from lbt_synth.loop import Imaging
+from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.registry import default_method, record_methods
 from lbt_synth.methods.request import DesignRequest, PlantInputs, design_request
 from lbt_synth.validation import FloatArray, choice, number, require_instance
@@ -183,13 +184,17 @@ def design_from_record(
             design = _design(request, model, gamma_ratio)
         assumptions.append(_require_stable(design, intervals))
     step(1)
+    row = held_out[name]
+    assert row.model_axis_nm is not None
+    loop = close_loop(model.hardware, design.controller)
+    drifts = note_drift(record, loop, row.model_axis_nm)
     return RecordedDesign(
         model=model,
         design=replace(design, assumptions=tuple(assumptions)),
         half_model=half,
         held_out=held_out,
         name=name,
-        notes=(*notes, *_compare_gains(model, half), *_note_short(usable, model, held_out[name])),
+        notes=(*notes, *_compare_gains(model, half), *drifts, *_note_short(usable, model, row)),
     )
 
 

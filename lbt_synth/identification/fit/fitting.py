@@ -40,7 +40,7 @@ _GAIN_PRIOR = (np.log(0.7), 1.0)
 STARTING_CORNER_HZ, _CORNER_WIDTH = 50.0, 2.0
 _SLOWEST = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
-    "turbulence": (np.log(0.45), 0.7),
+    "turbulence": (np.log(0.45), 4.0),
     "slow": (0.0, 1.0),
     "line": (np.log(0.01 / 0.99), 4.0),
 }

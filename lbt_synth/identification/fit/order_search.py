@@ -19,13 +19,24 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whittle import FittedModel, Kind, SpectrumModel, density, minimise
+from lbt_synth.identification.fit.whittle import (
+    NO_CORNER,
+    FittedModel,
+    Kind,
+    SpectrumModel,
+    contrast,
+    damping_parameter,
+    density,
+    minimise,
+)
 from lbt_synth.validation import FloatArray
 
 _WIDEST = 0.3  # band, of its frequency
 _STARTING_GAINS = (0.35, 0.6, 1.0)
-_STARTING_FREQUENCIES_HZ = (0.5, 5.0)  # of the turbulence
-_STARTING_DAMPING = 0.55
+_STARTING_TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz], damping ratio
+_OVERDAMPED = 2.0  # damping ratio of a turbulence that is a drift already
+_LARGEST_DAMPING = 0.9  # of the turbulence beside a drift, when a fit begins
+_CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a first-order drift may meet the noise
 _FEW_ROUNDS = 3
 _MOST_ROUNDS = 12
 _HALF = float(np.log(0.5))
@@ -102,6 +113,11 @@ def _improve(search: Search, model: FittedModel) -> FittedModel | None:
 
 def _trials(search: Search, spectrum: SpectrumModel) -> Iterator[tuple[SpectrumModel, float]]:
     """Yield models with new components or other places of lines, and what each must save."""
+    overdamped = spectrum.components[0].damping_ratio > _OVERDAMPED
+    # where no line can be added, a second turbulence would take the place of one
+    room = len(spectrum.lines) < search.most_lines
+    if room and not overdamped:
+        yield from ((trial, 0.0) for trial in _add_first_order(search, spectrum))
     found = _find_excesses(search, spectrum)
     found = [c for c in found if c.gain > 0.25 * found[0].gain]
     while found:
@@ -110,6 +126,8 @@ def _trials(search: Search, spectrum: SpectrumModel) -> Iterator[tuple[SpectrumM
     for i, component in enumerate(spectrum.components):
         if component.kind == "line":
             yield from ((trial, 1.0) for trial in _line_moves(search, spectrum, i))
+    if room and overdamped and not any(c.kind == "slow" for c in spectrum.components):
+        yield from ((trial, 0.0) for trial in _add_first_order(search, spectrum))
 
 
 def _begin(search: Search, gain: float) -> FittedModel | None:
@@ -135,8 +153,8 @@ def _fit_background(search: Search, gain: float) -> FittedModel | None:
         float(np.log(gain)), float(np.log(white)), known.log_angle(fitting.STARTING_CORNER_HZ), ()
     )
     starts = [
-        ground.add(known.component("turbulence", hz, _STARTING_DAMPING, slow))
-        for hz in _STARTING_FREQUENCIES_HZ
+        ground.add(known.component("turbulence", hz, ratio, slow))
+        for hz, ratio in _STARTING_TURBULENCE
     ]
     return fitting.likeliest(minimise(smooth, start, known.priors(start)) for start in starts)
 
@@ -154,6 +172,27 @@ def _add_candidates(
     for i in range(len(spectrum.components), len(whole.components)):
         whole = fitting.centre_line(search, whole, i)
     return whole
+
+
+def _add_first_order(search: Search, spectrum: SpectrumModel) -> list[SpectrumModel]:
+    """Return models with a first-order drift in the place of the turbulence, which stays.
+
+    Second-order processes cannot fall with the square of the frequency, and lines would have to.
+    """
+    hz, ratio = _STARTING_TURBULENCE[-1]
+    first = search.component("turbulence", hz, ratio, 1.0)  # of a density hz / (pi ratio f^2)
+    old = spectrum.components[0]
+    damping = damping_parameter("slow", min(old.damping_ratio, _LARGEST_DAMPING))
+    turbulence = replace(old, kind="slow", damping=damping)
+    noise = 2 / search.data.frame_rate_hz * float(np.exp(spectrum.log_noise))
+    trials = [
+        replace(
+            spectrum.exchange(0, replace(first, log_power=float(np.log(power)))).add(turbulence),
+            log_corner=float(np.log(2 * NO_CORNER)),
+        )
+        for power in noise * np.array(_CROSSINGS_HZ) ** 2 * np.pi * ratio / hz
+    ]
+    return sorted(trials, key=lambda trial: contrast(search.data, trial))[:2]
 
 
 def _add_announced(search: Search, model: FittedModel) -> FittedModel:
