@@ -188,7 +188,11 @@ def test_replays_are_quick():
 def test_a_limit_that_is_not_known_is_a_note():
     crossed = lbt.Vibration(frequency_hz=25, damping=0.01, rms_nm=50, direction=(1, 1))
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=SLOW, vibrations=[LINES[0], crossed], noise_nm=15.5
+        frame_rate_hz=RATE,
+        turbulence=SLOW,
+        vibrations=[LINES[0], crossed],
+        noise_nm=15.5,
+        delay_frames=2.4,
     )
     z = np.random.default_rng(0).standard_normal((4000, 2)).cumsum(axis=0)
     table = lbt.identification.prediction_against_data(plant, z, {})
