@@ -176,7 +176,11 @@ def auto(parser: ArgumentParser) -> None:
     from lbt_synth.methods.registry import default_method, record_methods
 
     _add_record(parser)
-    add_option(parser, "--method", record_methods(), f"default {default_method()}")
+    text = (
+        f"default: {default_method()}, unless another of the quick ones leaves clearly less of the "
+        "frames after its training"
+    )
+    add_option(parser, "--method", record_methods(), text)
     text = "norm as a multiple of the least norm, for methods with a bound"
     add_option(parser, "--gamma-ratio", float, text, 1.2)
     add_option(parser, "--model", str, "configuration to write (default: the output's name, .yaml)")

@@ -21,6 +21,8 @@ from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identified_model import IdentifiedTurbulence as IdentifiedTurbulence
 from .fit.identified_model import Whiteness as Whiteness
+from .method_choice import MethodChoice as MethodChoice
+from .method_choice import MethodRow as MethodRow
 from .prediction.comparison import PredictionRow as PredictionRow
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data

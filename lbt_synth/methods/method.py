@@ -171,10 +171,12 @@ class Method:
         Whether the design depends on the vibrations of the plant.
     batched : bool
         Whether a study designs it for many samples at once.
+    slow : bool
+        Whether a design takes many seconds; an automatic choice among methods leaves it out.
     reference_rank : int or None
         Rank among the methods that studies compare designs with; None if it is not one.
     reference_options : mapping
-        Options that it has in such a comparison.
+        Options that it has when designs are compared.
 
     Examples
     --------
@@ -198,6 +200,7 @@ class Method:
     configurable: frozenset[str] = frozenset()
     estimator: bool = True
     batched: bool = False
+    slow: bool = False
     reference_rank: int | None = None
     reference_options: Mapping[str, Any] = field(default_factory=dict)
 

@@ -42,4 +42,5 @@ METHOD = filter_method(
     build=_build,
     exclusive=BOUNDS,
     configurable=frozenset({"gamma_ratio"}),
+    slow=True,
 )

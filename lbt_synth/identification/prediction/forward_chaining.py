@@ -7,7 +7,7 @@ all that compete on a split see the same pseudo-open-loop series and the same fr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -72,7 +72,8 @@ def forward_splits(
     count = integer(splits, "splits", at_least=1)
     share = number(first_share, "first_share", above=0, below=1)
     usable = sum(stop - start for start, stop in pairs)
-    cuts = np.round(usable * (share + (1 - share) * np.arange(count + 1) / count)).astype(int)
+    first = int(share * usable)  # as of split_halves
+    cuts = first + (usable - first) * np.arange(count + 1) // count
     if cuts[0] < 1 or np.any(np.diff(cuts) < 1):
         raise ProblemError(
             f"a record must leave frames to train on and to test on; got {usable} usable frames "
@@ -207,7 +208,12 @@ class ForwardSplit:
 
 
 def forward_split(
-    record: LoopRecord, training: Stretches, test: Stretches, **options: Any
+    record: LoopRecord,
+    training: Stretches,
+    test: Stretches,
+    *,
+    model: IdentifiedModel | None = None,
+    **options: Any,
 ) -> ForwardSplit:
     """Identify the past of a split, and find the frames of its test that count.
 
@@ -217,6 +223,8 @@ def forward_split(
         The record; its delay must be known.
     training, test : tuple of (start, stop)
         A pair of :func:`forward_splits`.
+    model : IdentifiedModel, optional
+        Identified from the training with the options, if it is known.
     **options
         Those of :func:`identify`.
 
@@ -247,7 +255,8 @@ def forward_split(
             f"a test needs a stretch of more than {settle} frames ({_START_S:g} s); got "
             f"{max(stop - start for start, stop in test)}. Record more, or split less."
         )
-    model = identify(record, stretches=training, **options)
+    if model is None:
+        model = identify(record, stretches=training, **options)
     return ForwardSplit(
         record=record,
         training=training,
@@ -331,11 +340,22 @@ def forward_chain(
     >>> chain.residuals.best, bool(difference > 2 * error)
     ('filter', True)
     """
+    pairs = record_splits(record, splits, first_share=first_share)
+    found = (forward_split(record, training, test, **options) for training, test in pairs)
+    return compare_on_splits(found, designs, progress=progress)
+
+
+def compare_on_splits(
+    splits: Iterable[ForwardSplit],
+    designs: Mapping[str, Callable[[ForwardSplit], Controller | Design]],
+    *,
+    progress: Callable[[int], None] | None = None,
+) -> ForwardChain:
+    """Compare designs as :func:`forward_chain` does, on splits that are already identified."""
     squares: dict[str, list[FloatArray]] = {name: [] for name in designs}
     failures: dict[str, str] = {}
     noise: list[tuple[float, int]] = []
-    for training, test in record_splits(record, splits, first_share=first_share):
-        split = forward_split(record, training, test, **options)
+    for split in splits:
         for name, build in designs.items():
             if name in failures:
                 continue
@@ -345,7 +365,7 @@ def forward_chain(
             except LbtSynthError as error:
                 failures[name] = str(error)
                 continue
-            squares[name].append(chunk_squares(measured, record.frame_rate_hz))
+            squares[name].append(chunk_squares(measured, split.hardware.frame_rate_hz))
         noise.append((split.noise_nm2, sum(stop - start for start, stop in split.test)))
         if progress is not None:
             progress(1)

@@ -1,0 +1,155 @@
+"""The method that a record asks for, and when the default one stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.night import GAIN, simulated_night
+
+import lbt_synth as lbt
+from lbt_synth.errors import CertificateError
+from lbt_synth.identification import method_choice
+from lbt_synth.identification.method_choice import choose_method, quick_methods
+from lbt_synth.identification.prediction.forward_chaining import (
+    ForwardChain,
+    forward_split,
+    record_splits,
+)
+from lbt_synth.methods import method_named, register, unregister
+from lbt_synth.methods.registry import default_method
+
+KNOWN = {"sensor_gain": GAIN, "most_lines": 1}
+
+
+@pytest.fixture(scope="module")
+def record():
+    run, path, _ = simulated_night()
+    return lbt.identification.loop_record(
+        run.measurements[0],
+        run.commands[0],
+        frame_rate_hz=path.frame_rate_hz,
+        delay_frames=path.delay_frames,
+        unit="nm",
+    )
+
+
+@pytest.fixture(scope="module")
+def models(record):
+    """Models of the first half and of three quarters."""
+    return [
+        lbt.identify(record, stretches=training, **KNOWN)
+        for training, _ in record_splits(record, 2)
+    ]
+
+
+def worse(plant):
+    """An integrator."""
+    return lbt.integrator(plant.hardware, gain=0.3)
+
+
+def choose(record, models, designs, *, is_safe=lambda _: True):
+    """Choose among methods that stand for other designs; return what was identified, too."""
+    asked = []
+
+    def identify_past(**given):
+        asked.append(given)
+        return models[1]
+
+    def design(name, model, _options):
+        if name not in designs:
+            raise CertificateError("it was not asked for.")
+        return designs[name](model.plant())
+
+    found = choose_method(
+        record, models[0], identify_past=identify_past, design=design, is_safe=is_safe
+    )
+    return found, asked
+
+
+def test_a_method_that_leaves_clearly_less_is_chosen(record, models):
+    found, asked = choose(record, models, {"kalman": worse, "hinf": lbt.kalman})
+    assert found.method == "hinf"
+    assert [row.name for row in found.rows] == ["H-infinity filter", "Kalman filter"]
+    # the first half is not identified again
+    pairs = record_splits(record, 2)
+    assert asked == [{"stretches": pairs[1][0], "start": models[0]}]
+    left = []
+    for (training, test), model in zip(pairs, models, strict=True):
+        split = forward_split(record, training, test, model=model)
+        assert split.model is model
+        left += [
+            np.sum(split.replay(make(model.plant()).controller) ** 2, axis=1)
+            for make in (worse, lbt.kalman)
+        ]
+    bad, good = (np.mean(np.concatenate(left[i::2])) for i in range(2))
+    assert found.rows[1].above_nm2 == pytest.approx(bad - good, rel=0.02)  # but for part chunks
+    assert found.rows[1].above == pytest.approx((bad - good) / good, rel=0.02)
+    assert found.rows[1].above_nm2 > 2 * found.rows[1].above_error_nm2
+    assert (found.rows[0].above_nm2, found.rows[0].above_error_nm2) == (0, 0)
+    assert "H-infinity filter is chosen" in found.notes[0]
+    assert "less than the Kalman filter, by" in found.notes[0]
+    assert "LQG controller is left out: it was not asked for." in found.notes[1]
+
+
+def test_a_method_that_a_possible_gain_makes_unstable_is_not_chosen(record, models):
+    designs = {"kalman": worse, "hinf": lbt.kalman, "lqg": worse}
+    found, _ = choose(record, models, designs, is_safe=lambda _: False)
+    assert found.method == "kalman"
+    assert [row.name for row in found.rows] == ["Kalman filter", "LQG controller"]
+    assert any("H-infinity filter is left out: its loop is unstable" in n for n in found.notes)
+
+
+def test_without_the_default_the_best_is_chosen(record, models):
+    found, _ = choose(record, models, {"lqg": worse, "hinf": lbt.kalman})
+    assert found.method == "hinf"
+    assert "of the methods that are left" in found.notes[0]
+    assert "Kalman filter is left out" in " ".join(found.notes)
+
+
+def test_what_cannot_be_compared_leaves_the_default(record, models):
+    found, _ = choose(record, models, {})
+    assert (found.method, found.rows) == ("kalman", ())
+    assert "were not compared: no design can be compared" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("difference", "scatter", "chosen"),
+    [
+        (20.0, 20.0, "hinf"),  # 20 +- 1, as 400 chunks have it
+        (2.5, 20.0, "hinf"),
+        (1.5, 20.0, "kalman"),  # within two errors
+        (0.4, 0.1, "kalman"),  # sure, but less than a thousandth
+        (-20.0, 20.0, "kalman"),
+    ],
+)
+def test_the_default_stays_within_two_errors(
+    record, models, monkeypatch, difference, scatter, chosen
+):
+    random = np.random.default_rng(0)
+    common, own = random.standard_normal((2, 400))
+    own = (own - np.mean(own)) / np.std(own)
+    usual = 1000 + 300 * common**2
+    squares = {"kalman": usual, "hinf": usual - difference + scatter * own}
+    chain = ForwardChain(
+        residuals=lbt.identification.PairedResiduals(squares_nm2=squares), failures={}
+    )
+    monkeypatch.setattr(method_choice, "compare_on_splits", lambda *_: chain)
+    found, _ = choose(record, models, {"hinf": lbt.kalman})
+    assert found.method == chosen
+    row = next(row for row in found.rows if row.above_nm2 != 0)
+    assert abs(row.above_nm2) == pytest.approx(abs(difference))
+    assert row.above_error_nm2 == pytest.approx(scatter / 20, rel=0.2)
+
+
+def test_slow_methods_are_not_tried():
+    assert default_method() in quick_methods()
+    assert not any(method_named(name).slow for name in quick_methods())
+    usual = method_named(default_method())
+    for slow in (False, True):
+        register(replace(usual, name="newcomer", slow=slow))
+        try:
+            assert ("newcomer" in quick_methods()) is not slow
+        finally:
+            unregister("newcomer")
