@@ -36,9 +36,10 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each
 AS_GIVEN = "as given"
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 _CLEAR = 20.0  # nats that decide
+_CLEAR_FINER = 8.0  # the same by the criterion of the fit, beyond its price of resonances
 _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
-_GENERAL = 5.0  # nats by which a matrix without a name must be likelier than others
+_GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
 _ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
@@ -264,11 +265,12 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     part_of_a_frame = abs(guesses[best].shift_frames) == _PART
     guess = refine_guess(coarse, guesses[best], law)
     shown = nats >= clear / 2 or np.isinf(score[0])
+    finer = 0.0
     if not surprising[0] or surprising[best]:  # the law does not ask for it
-        nats = min(nats, finer_saving(record, guess)) if nats >= clear else 0.0
-        shown = nats >= clear and not part_of_a_frame
+        finer = finer_saving(record, guess) if nats >= clear else 0.0
+        shown = finer >= _CLEAR_FINER and not part_of_a_frame
     if not shown:
-        return replace(given, rival=guesses[best], rival_nats=nats)
+        return replace(given, rival=guesses[best], rival_nats=finer)
     fine = coarse.compare([guess])
     return _Best(
         guess=guess,
@@ -287,7 +289,14 @@ def _score(
     A loop that would have been unstable has not run.
     """
     surprising = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
-    simple = np.array([guess.is_simple for guess in compared.guesses])
+    assert record.delay_frames is not None
+    simple = np.array(
+        [
+            guess.is_simple and (record.delay_frames + guess.shift_frames) % 1 == 0
+            for guess in compared.guesses
+        ]
+    )
+    simple[0] = True
     score = compared.contrast + _UNUSUAL * surprising + _GENERAL * ~simple
     if law is not None and _is_sure(law):
         ones = np.ones((1, record.axes))
@@ -364,8 +373,9 @@ def _notes(found: _Best, delay_frames: float, lag: int) -> tuple[str, ...]:
             "the real-time computer takes that long, the total delay of a new design is "
             f"{delay_frames + lag:g} frames"
         )
-    if found.rival is not None and found.rival.kind == "shift" and found.rival_nats > _UNUSUAL:
-        fitting = delay_frames + found.rival.shift_frames
+    rival = found.rival if found.rival_nats > 0.5 * _CLEAR_FINER else None
+    if rival is not None and rival.kind == "shift":
+        fitting = delay_frames + rival.shift_frames
         out.append(
             f"warning: a delay of {fitting:g} frames fits better than {delay_frames:g} (by "
             f"{found.rival_nats:.0f} in the logarithm of the likelihood). Check the delay"

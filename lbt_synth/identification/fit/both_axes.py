@@ -20,7 +20,6 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedModel,
 )
 from lbt_synth.identification.fit.record_doubts import (
-    better_delay,
     cut_at_jumps,
     find_correction_jumps,
     find_jumps,
@@ -145,7 +144,7 @@ def identify(
     if len(axes) > 1 and found_gain and gains == [None] * len(axes):
         axes, note = _pool_gains(axes, found_gain, partial(fit, cut))
         notes.append(note)
-    notes += _find_doubts(record, axes, found_gain, cut, most_lines)
+    notes += _find_doubts(axes, found_gain, most_lines)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == _BOTH:
         axes, shared, more = couple_axes(record, axes, cut, lowest_line_hz)
@@ -251,21 +250,9 @@ def _pool_gains(
 
 
 def _find_doubts(
-    record: LoopRecord,
-    axes: Sequence[IdentifiedAxis],
-    found_gain: Sequence[int],
-    stretches: Stretches,
-    most_lines: int,
+    axes: Sequence[IdentifiedAxis], found_gain: Sequence[int], most_lines: int
 ) -> Iterator[str]:
-    """Yield notes on a delay that fits badly, odd gains, hidden noise, and the limit of lines."""
-    if found_gain and record.commands is not None:
-        first = found_gain[0]
-        other = better_delay(record, first, axes[first], stretches)
-        if other is not None:
-            yield (
-                f"warning: a delay of {other[0]:g} frames fits better than {record.delay_frames:g} "
-                f"(its criterion is better by {other[1]:.0f}). Check the delay"
-            )
+    """Yield notes on odd gains, hidden noise, and the limit of lines."""
     for i in found_gain:
         if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN:
             yield (

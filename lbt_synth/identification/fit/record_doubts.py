@@ -1,26 +1,15 @@
-"""Doubts about a record: jumps, where series go on elsewhere, and a delay that fits better."""
+"""Doubts about a record: jumps, where series go on elsewhere."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 
-from lbt_synth.identification.fit.fitting import Search, refit
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.periodogram import (
-    SHORTEST_SEGMENT,
-    LoopPeriodogram,
-    half_angle_square,
-    loop_periodogram,
-    tukey,
-)
-from lbt_synth.identification.fit.physical_parameters import WIDE_DAMPING
-from lbt_synth.identification.fit.whittle import SpectrumModel
-from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, half_angle_square, tukey
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -31,9 +20,6 @@ _CLUSTER = 20  # frames within which outliers are one jump
 _AROUND = 3  # frames left out on either side
 _SAME_JUMP = 50  # frames within which the axes have one jump
 _MOST_JUMPS = 20  # at which a record is cut
-_SHIFTS = (-1.0, -0.5, 0.5, 1.0)  # frames by which the delay is changed
-_HIGH = 0.6  # of the highest frequency
-_CLEARLY = 5.0  # by which the criterion of another delay must be better
 
 
 class Jump(NamedTuple):
@@ -137,47 +123,3 @@ def cut_around(stretches: Stretches, frames: Sequence[int]) -> Stretches:
         pieces = chain(*(((a, min(b, low)), (max(a, high), b)) for a, b in stretches))
         stretches = tuple((a, b) for a, b in pieces if b > a)
     return stretches
-
-
-def better_delay(
-    record: LoopRecord, i: int, axis: IdentifiedAxis, stretches: Stretches
-) -> tuple[float, float] | None:
-    """Return the delay at which axis i is modelled clearly better, and the gain of the criterion.
-
-    None if there is no such delay. A wrong delay looks like wide resonances: they are left out
-    where another delay is tried.
-    """
-    assert record.delay_frames is not None
-    later = [(a + 2, b) for a, b in stretches if b - a > 2 * SHORTEST_SEGMENT]
-    if not later:
-        return None
-    whole = axis.fitted_model.spectrum
-    found: dict[float, float] = {}
-    for delay in record.delay_frames + np.array([0.0, *_SHIFTS]):
-        if delay < 1:
-            continue
-        shifted = record.with_delay(delay, mirror=record.mirror)
-        data = loop_periodogram(
-            record.measurements[:, i],
-            shifted.corrections()[:, i],
-            frame_rate_hz=record.frame_rate_hz,
-            stretches=later,
-        )
-        # the model keeps its parts; its gain is free
-        search = Search(data=data, lowest_line_hz=0.0)
-        simple = _set_noise(whole.drop_wide(WIDE_DAMPING), data)
-        model = refit(search, whole if delay == record.delay_frames else simple)
-        if model is not None:
-            found[delay] = model.contrast + search.price * len(model.spectrum.components)
-    here = found.pop(record.delay_frames, None)
-    best = min(found, key=lambda delay: found[delay], default=None)
-    if here is None or best is None or here - found[best] <= _CLEARLY:
-        return None
-    return best, here - found[best]
-
-
-def _set_noise(spectrum: SpectrumModel, data: LoopPeriodogram) -> SpectrumModel:
-    """Return the model with the noise that the highest frequencies show."""
-    high = data.frequency_hz > _HIGH * data.frequency_hz[-1]
-    density = float(np.median(data.power(spectrum.gain)[high]))
-    return replace(spectrum, log_noise=float(np.log(density * data.frame_rate_hz / 2)))

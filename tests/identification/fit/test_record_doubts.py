@@ -42,13 +42,3 @@ def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> No
 def test_stretches_are_cut() -> None:
     assert cut_around(((0, 100), (200, 300)), [50, 200]) == ((0, 47), (53, 100), (203, 300))
     assert cut_around(((0, 4),), [1]) == ()
-
-
-@pytest.mark.parametrize("delay", [1.0, 2.5, 3.0])
-def test_a_wrong_delay_is_noted(delay: float) -> None:
-    record = spliced_record(lines=LINE, frames=30_000).with_delay(delay)
-    found = lbt.identify(record)
-    better = [note for note in found.notes if "fits better than" in note]
-    if delay != 2.5:
-        assert f"a delay of 2 frames fits better than {delay:g}" in better[0]
-    assert found.notes or not found.axes[0].whiteness.white
