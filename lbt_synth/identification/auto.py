@@ -14,8 +14,8 @@ from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError
 from lbt_synth.identification.commands.gain_interval import allowed_gains, unstable_gains
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.likeliest_gain import agrees, identify_likeliest
 from lbt_synth.identification.method_choice import MethodChoice, choose_method
 from lbt_synth.identification.prediction.comparison import (
     PredictionRow,
@@ -165,8 +165,10 @@ def design_from_record(
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
-    fit_model = partial(identify, record, announced=announced, **gains, **options)
-    gain_is_open = record.commands is not None and sensor_gain is None
+    open_gain = record.commands is not None and sensor_gain is None
+    allowed = allowed_gains(record) if open_gain else None
+    gains |= {"announced": announced, "allowed": allowed}
+    fit_model = partial(identify_likeliest, record, **gains, **options)
     design = partial(_design, gamma_ratio=gamma_ratio)
     fit, test = split_halves(record.stretches(), record.frames)
     half = fit_model(stretches=fit)
@@ -177,7 +179,7 @@ def design_from_record(
             half,
             identify_past=fit_model,
             design=design,
-            is_safe=lambda made: not gain_is_open or _is_stable_at_gains(made, record, half),
+            is_safe=lambda made: allowed is None or _is_stable_at_gains(made, allowed, half),
         )
         method = found.method
     step(1)
@@ -197,12 +199,15 @@ def design_from_record(
     step(1)
     model = fit_model(start=half)
     made = design(method, model)
-    if gain_is_open:
-        intervals = _possible_gains(record, model, half)
-        if unstable_gains(made, intervals) is not None:  # a larger gain gives a slower loop
-            slow = float(np.max(intervals)) / _CAREFUL
-            model = fit_model(start=model, sensor_gain=slow)
+    if allowed is not None:
+        intervals = _possible_gains(allowed, model, half)
+        # a larger gain gives a slower loop
+        careful = [] if unstable_gains(made, intervals) is None else _careful_gains(intervals)
+        for gain in careful:
+            model = fit_model(start=model, sensor_gain=gain)
             made = design(method, model)
+            if unstable_gains(made, intervals) is None:
+                break
         assumptions.append(_require_stable(made, intervals))
     step(1)
     row = held_out[name]
@@ -231,9 +236,9 @@ def _design(
     return design_request(method, options).build(inputs)
 
 
-def _is_stable_at_gains(design: Design, record: LoopRecord, model: IdentifiedModel) -> bool:
+def _is_stable_at_gains(design: Design, allowed: FloatArray, model: IdentifiedModel) -> bool:
     """Return whether a design is stable at all sensor gains that record and model allow."""
-    return unstable_gains(design, _possible_gains(record, model)) is None
+    return unstable_gains(design, _possible_gains(allowed, model)) is None
 
 
 def _note_short(seconds: float, model: IdentifiedModel, row: PredictionRow) -> Iterator[str]:
@@ -281,15 +286,26 @@ def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[st
             )
 
 
-def _possible_gains(record: LoopRecord, *models: IdentifiedModel) -> FloatArray:
-    """Return the interval of gains of each axis that the record and its models allow."""
+def _possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
+    """Return the interval of gains of each axis that the record and its models allow.
+
+    Where the fit finds the gains, near those that the record allows, its errors decide.
+    """
     found = []
     for each in models:
         errors = [_APART * (axis.sensor_gain_error or 0.0) for axis in each.axes]
         gains = np.array(each.sensor_gains)
         found += [gains - np.minimum(errors, gains / 2), gains + errors]
-    all_gains = np.column_stack([allowed_gains(record), np.array(found).T])
-    return np.column_stack([np.min(all_gains, axis=1), np.max(all_gains, axis=1)])
+    known = all(axis.sensor_gain_error is not None for each in models for axis in each.axes)
+    if not (known and all(agrees(each, allowed) for each in models)):
+        found += list(allowed.T)
+    return np.column_stack([np.min(found, axis=0), np.max(found, axis=0)])
+
+
+def _careful_gains(intervals: FloatArray) -> list[float]:
+    """Return gains for designs that may be stable within intervals, the slowest first."""
+    low, high = float(np.min(intervals)), float(np.max(intervals))
+    return [high / _CAREFUL, float(np.sqrt(low * high)) * _CAREFUL, float(np.sqrt(low * high))]
 
 
 def _require_stable(design: Design, intervals: FloatArray) -> str:

@@ -8,10 +8,13 @@ from itertools import product
 import numpy as np
 
 from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.commands.control_law import record_control_law
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
+from lbt_synth.identification.commands.plausibility import could_have_run
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import close_loop, stable_sensor_gains
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import BoolArray, FloatArray
 
 _LEAST, _MOST = 0.08, 2.5  # of a sensor
 _FAR_STEPS = 16
@@ -32,7 +35,8 @@ def allowed_gains(record: LoopRecord) -> FloatArray:
     -------
     (axes, 2) ndarray
         Least and largest gain whose profile likelihood, by a coarse model of the spectrum, is
-        within 6 of the best, more where the model misfits; 0.08 to 2.5 at most.
+        within 6 of the best, more where the model misfits, and at which the recorded law is
+        stable; 0.08 to 2.5 at most.
 
     Raises
     ------
@@ -67,7 +71,25 @@ def allowed_gains(record: LoopRecord) -> FloatArray:
     excess = profile.axis_contrast - best.axis_contrast
     allowed = excess < _FAR * max(1.0, float(best.misfit[0]) / _ENOUGH)
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
-    return np.asarray(np.clip(ends, _LEAST, _MOST), dtype=np.float64)
+    intervals = np.asarray(np.clip(ends, _LEAST, _MOST), dtype=np.float64)
+    running = far[_has_run(record, far)]
+    if not running.size:
+        return intervals
+    inside = np.clip(intervals, running[0], running[-1])
+    apart = (intervals[:, 0] > running[-1]) | (intervals[:, 1] <= running[0])
+    return np.where(apart[:, None], [running[0], running[-1]], inside)
+
+
+def _has_run(record: LoopRecord, gains: FloatArray) -> BoolArray:
+    """Return at which gains (n,) the recorded law is stable; at all where there is no law."""
+    try:
+        law = record_control_law(record)
+    except ProblemError:
+        return np.ones(gains.size, dtype=np.bool_)
+    if law.kind == "none" or law.lag_frames < 0:
+        return np.ones(gains.size, dtype=np.bool_)
+    given, one = Guess(kind="as given"), np.ones((1, record.axes))
+    return np.array([could_have_run(given, gain * one, record, law) for gain in gains])
 
 
 def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:

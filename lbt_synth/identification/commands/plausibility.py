@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,11 +15,13 @@ from lbt_synth.identification.fit.fitting import Search, cost
 from lbt_synth.identification.fit.order_search import find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
 _NEAR_ONE = 0.2  # distance from 1 of the pole of a law that adds up
+_HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _STABLE = 1 - 1e-9  # spectral radius below which a loop has run
 _SEGMENT_S = 6.0
 _ROUNDS, _LINES = 3, 10  # of the search for lines
@@ -44,9 +47,22 @@ def could_have_run(guess: Guess, gains: FloatArray, record: LoopRecord, law: Con
             influence_matrix=np.eye(axes) if guess.matrix is None else guess.matrix,
             mirror=record.mirror,
         )
-        if close_loop(path, controller).spectral_radius < _STABLE:
+        if _moving_radius(path, controller) < _STABLE:
             return True
     return False
+
+
+def _moving_radius(path: LoopHardware, controller: Controller) -> float:
+    """Return the largest modulus of the poles of a loop that depend on its sensor gain.
+
+    A law that was found from series has poles and zeros that cancel, outside of the circle too.
+    """
+    weaker = replace(path, sensor_matrix=0.8 * path.sensor)
+    poles, others = (
+        np.linalg.eigvals(close_loop(each, controller).system.A) for each in (path, weaker)
+    )
+    moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
+    return float(np.max(abs(poles[moves]), initial=0.0))
 
 
 def finer_saving(record: LoopRecord, guess: Guess) -> float:

@@ -47,6 +47,7 @@ _USUAL_GAIN = 0.7
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _INSIDE = 8  # gains that are tried of the plausible ones
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
+_ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 
 
@@ -178,19 +179,20 @@ def explain_commands(
         return CommandVerdict(
             explanation=AS_GIVEN, accepted=True, gain=nothing, law=law, notes=(note,)
         )
+    gains = PLAUSIBLE_GAINS
+    if sensor_gain is not None:
+        known = one_or_each(sensor_gain, "sensor_gain", above=0)
+        gains = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
     found = _find_best(coarse, law, max(lag, 0))
-    if found is None:
+    scale = 1.0 if found is None else _find_scale(coarse, law, found, gains)
+    no_law = law is None or law.kind == "none"
+    if found is None or (no_law and not 1 / _ABSURD < scale < _ABSURD):
         return CommandVerdict(
             explanation="they have nothing to do with the measurements, as if of another night",
             accepted=False,
             gain=np.zeros(record.axes),
             law=law,
         )
-    gains = PLAUSIBLE_GAINS
-    if sensor_gain is not None:
-        known = one_or_each(sensor_gain, "sensor_gain", above=0)
-        gains = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
-    scale = _find_scale(coarse, law, found, gains)
     words = [] if not early else [recorded_early(early)]
     repair, other_delay, why = repair_guess(found.guess, delay, max(lag, 0))
     words += why
@@ -358,8 +360,11 @@ def _find_scale(
         factor = float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
     tried = inside[:, None] * np.ones(len(bounded))
     record = coarse.record
-    if law is not None and _is_sure(law) and not could_have_run(found.guess, tried, record, law):
-        return factor
+    if law is not None and _is_sure(law):
+        if not could_have_run(found.guess, tried, record, law):
+            return factor
+        if gain < low:  # commands that are too large come from a law that is too strong
+            return 1.0
     shown = finer_saving_of_gain(record, found.guess, (low, usual, high)) >= found.clear
     return factor if shown else 1.0
 

@@ -314,14 +314,17 @@ def scoring_minimum(
             information + np.diag(precision),
         )
 
-    found = minimize(  # type: ignore[call-overload]
-        lambda x: evaluate(x.tobytes())[0],
-        start,
-        jac=lambda x: evaluate(x.tobytes())[1],
-        hess=lambda x: evaluate(x.tobytes())[2],
-        method="trust-exact",
-        options=_OPTIONS,
-    )
+    try:
+        found = minimize(  # type: ignore[call-overload]
+            lambda x: evaluate(x.tobytes())[0],
+            start,
+            jac=lambda x: evaluate(x.tobytes())[1],
+            hess=lambda x: evaluate(x.tobytes())[2],
+            method="trust-exact",
+            options=_OPTIONS,
+        )
+    except OverflowError:  # a step of the trust region that is not finite
+        return None
     _, gradient, reduced = evaluate(found.x.tobytes())
     # what a Newton step would still gain
     left = 0.5 * float(gradient @ np.linalg.lstsq(reduced, gradient, rcond=None)[0])
