@@ -70,6 +70,7 @@ def allowed_gains(record: LoopRecord) -> FloatArray:
     profile = coarse.compare([given] * grid.shape[1], grid)
     excess = profile.axis_contrast - best.axis_contrast
     allowed = excess < _FAR * max(1.0, float(best.misfit[0]) / _ENOUGH)
+    allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
     intervals = np.asarray(np.clip(ends, _LEAST, _MOST), dtype=np.float64)
     running = far[_has_run(record, far)]

@@ -185,6 +185,7 @@ def _add_first_order(search: Search, spectrum: SpectrumModel) -> list[SpectrumMo
     damping = damping_parameter("slow", min(old.damping_ratio, _LARGEST_DAMPING))
     turbulence = replace(old, kind="slow", damping=damping)
     noise = 2 / search.data.frame_rate_hz * float(np.exp(spectrum.log_noise))
+    noise = max(noise, float(np.finfo(float).tiny))
     trials = [
         replace(
             spectrum.exchange(0, replace(first, log_power=float(np.log(power)))).add(turbulence),
