@@ -197,18 +197,7 @@ def design_from_record(
         taps=taps,
     )
     step(1)
-    model = fit_model(start=half)
-    made = design(method, model)
-    if allowed is not None:
-        intervals = _possible_gains(allowed, model, half)
-        # a larger gain gives a slower loop
-        careful = [] if unstable_gains(made, intervals) is None else _careful_gains(intervals)
-        for gain in careful:
-            model = fit_model(start=model, sensor_gain=gain)
-            made = design(method, model)
-            if unstable_gains(made, intervals) is None:
-                break
-        assumptions.append(_require_stable(made, intervals))
+    model, made, held = _design_for_gains(fit_model, partial(design, method), half, allowed)
     step(1)
     row = held_out[name]
     assert row.model_axis_nm is not None
@@ -216,13 +205,33 @@ def design_from_record(
     drifts = note_drift(record, loop, row.model_axis_nm)
     return RecordedDesign(
         model=model,
-        design=replace(made, assumptions=tuple(assumptions)),
+        design=replace(made, assumptions=(*assumptions, *held)),
         half_model=half,
         held_out=held_out,
         name=name,
         notes=(*notes, *_compare_gains(model, half), *drifts, *_note_short(usable, model, row)),
         choice=found,
     )
+
+
+def _design_for_gains(
+    fit_model: Callable[..., IdentifiedModel],
+    design: Callable[[IdentifiedModel], Design],
+    half: IdentifiedModel,
+    allowed: FloatArray | None,
+) -> tuple[IdentifiedModel, Design, tuple[str, ...]]:
+    """Return model and design, stable at all possible gains, and what is assumed of them."""
+    model = fit_model(start=half)
+    made = design(model)
+    if allowed is None:
+        return model, made, ()
+    intervals = _possible_gains(allowed, model, half)
+    for gain in _careful_gains(intervals):
+        if unstable_gains(made, intervals) is None:
+            break
+        model = fit_model(start=model, sensor_gain=gain)
+        made = design(model)
+    return model, made, (_require_stable(made, intervals),)
 
 
 def _design(

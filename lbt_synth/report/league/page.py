@@ -157,7 +157,7 @@ def standing_notes(found: LeagueResult) -> list[str]:
 
 
 def verdict_text(rows: Sequence[StandingRow]) -> str:
-    """Say which entry leads, and which of the others it cannot be told from."""
+    """Say which entry leads, and which of the others are as good within their errors."""
     ranked = [row for row in rows if row.records]
     first, *others = ranked
     text = f"First: {first.entry}."
