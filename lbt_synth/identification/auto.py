@@ -165,8 +165,7 @@ def design_from_record(
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
-    open_gain = record.commands is not None and sensor_gain is None
-    allowed = allowed_gains(record) if open_gain else None
+    allowed = None if record.commands is None or sensor_gain is not None else allowed_gains(record)
     gains |= {"announced": announced, "allowed": allowed}
     fit_model = partial(identify_likeliest, record, **gains, **options)
     design = partial(_design, gamma_ratio=gamma_ratio)
