@@ -19,3 +19,15 @@ def simulated_night():
     truth = lbt.Truth(turbulence=slow(), vibrations=(line,), noise_nm=NOISE, sensor_gain=GAIN)
     ran = lbt.integrator(path, gain=0.4)
     return lbt.simulate(ran.controller, truth, hardware=path, frames=12_000, seed=1), path, ran
+
+
+def night_record():
+    """The record of the simulated night, as telemetry would hold it."""
+    run, path, _ = simulated_night()
+    return lbt.identification.loop_record(
+        run.measurements[0],
+        run.commands[0],
+        frame_rate_hz=path.frame_rate_hz,
+        delay_frames=path.delay_frames,
+        unit="nm",
+    )

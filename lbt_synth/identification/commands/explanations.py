@@ -6,7 +6,7 @@ import numpy as np
 
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess, is_orthogonal
-from lbt_synth.identification.commands.repair import CommandRepair, rotation
+from lbt_synth.identification.commands.repair import MIRROR, CommandRepair, rotation
 from lbt_synth.validation import FloatArray
 
 _FINE_DEG = np.arange(-24.0, 25.0, 6.0)
@@ -15,7 +15,6 @@ _LAW_DEG = 25.0  # within which it is that of the control law
 _FINE_LEVELS = (0.86, 0.9, 0.95, 1.0, 1.05, 1.1)
 _WORST_CONDITION = 100.0
 _RIGHT_DEG = 0.5  # from a right angle
-_MIRROR = np.diag([1.0, -1.0])
 
 
 def invert_axes(gain: FloatArray) -> FloatArray | None:
@@ -51,12 +50,12 @@ def refine_guess(coarse: CoarseRecord, guess: Guess, law: ControlLaw | None) -> 
 def _angle_deg(matrix: FloatArray) -> tuple[float, bool]:
     """Return the angle of a rotation, after a mirror of the second axis or without one."""
     mirrored = bool(np.linalg.det(matrix) < 0)
-    turn = matrix @ _MIRROR if mirrored else matrix
+    turn = matrix @ MIRROR if mirrored else matrix
     return float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0]))), mirrored
 
 
 def _turn(angle_deg: float, mirrored: bool) -> FloatArray:
-    return rotation(angle_deg) @ _MIRROR if mirrored else rotation(angle_deg)
+    return rotation(angle_deg) @ MIRROR if mirrored else rotation(angle_deg)
 
 
 def _snap(angle_deg: float, mirrored: bool, law: ControlLaw | None) -> float:

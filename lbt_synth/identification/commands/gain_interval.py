@@ -20,7 +20,6 @@ _LEAST, _MOST = 0.08, 2.5  # of a sensor
 _FAR_STEPS = 16
 _NEAR = np.geomspace(0.7, 1.43, 21)  # of the best gain, itself included
 _FAR = 6.0  # nats below the best gain that a record still allows
-_ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 
 
 def allowed_gains(record: LoopRecord) -> FloatArray:
@@ -69,7 +68,7 @@ def allowed_gains(record: LoopRecord) -> FloatArray:
     grid = np.array([[*far, *(gain * _NEAR)] for gain in best.gain[:, 0]])
     profile = coarse.compare([given] * grid.shape[1], grid)
     excess = profile.axis_contrast - best.axis_contrast
-    allowed = excess < _FAR * max(1.0, float(best.misfit[0]) / _ENOUGH)
+    allowed = excess < _FAR * best.dispersion(0)
     allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
     intervals = np.asarray(np.clip(ends, _LEAST, _MOST), dtype=np.float64)

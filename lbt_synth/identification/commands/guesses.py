@@ -16,7 +16,7 @@ from lbt_synth.identification.commands.coarse_spectrum import (
     fit_guesses,
     segment_transforms,
 )
-from lbt_synth.identification.commands.repair import rotation
+from lbt_synth.identification.commands.repair import MIRROR, rotation
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import ComplexArray, FloatArray
@@ -31,7 +31,7 @@ _SHORTEST = 512
 _NATURAL_GAINS = np.array([0.2, 0.7, 2.0])  # starts, of the natural gain
 _NATURAL = 0.4
 _ORTHOGONAL = 1e-6
-_MIRROR = np.diag([1.0, -1.0])
+_ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,6 +103,10 @@ class Comparison:
     gain: FloatArray
     misfit: FloatArray
 
+    def dispersion(self, i: int) -> float:
+        """Return the factor by which a misfit of guess i raises what decides, at least 1."""
+        return max(1.0, float(self.misfit[i]) / _ENOUGH)
+
     def join(self, other: Comparison) -> Comparison:
         """Return the guesses of both."""
         return Comparison(
@@ -139,7 +143,7 @@ def _matrices(axes: int) -> Iterator[FloatArray]:
         yield -np.eye(1)
         return
     yield from map(rotation, _ROTATIONS_DEG)
-    yield from (rotation(angle) @ _MIRROR for angle in _MIRRORS_DEG)
+    yield from (rotation(angle) @ MIRROR for angle in _MIRRORS_DEG)
 
 
 class CoarseRecord:

@@ -65,19 +65,17 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     return float(np.max(abs(poles[moves]), initial=0.0))
 
 
-def finer_saving(record: LoopRecord, guess: Guess) -> float:
+def finer_saving(coarse: CoarseRecord, guess: Guess) -> float:
     """Return how much likelier a guess is than the record as given, by the model of the fit.
 
     Both have the lines and the wide resonances that they need, at the price of the criterion: the
     coarse spectrum has few.
     """
-    coarse = CoarseRecord(record)
     return _cost(coarse, Guess(kind="as given")) - _cost(coarse, guess)
 
 
-def finer_saving_of_gain(record: LoopRecord, guess: Guess, gains: Sequence[float]) -> float:
+def finer_saving_of_gain(coarse: CoarseRecord, guess: Guess, gains: Sequence[float]) -> float:
     """Return how much likelier any gain is than the best of some, by the model of the fit."""
-    coarse = CoarseRecord(record)
     return min(_cost(coarse, guess, gain) for gain in gains) - _cost(coarse, guess)
 
 

@@ -11,6 +11,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import FloatArray, integer, number, read_only, real_array
 
 _SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
+MIRROR = np.diag([1.0, -1.0])
 _MOST_SHIFT = 100
 
 

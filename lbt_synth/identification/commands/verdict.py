@@ -41,7 +41,6 @@ _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
-_ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _USUAL_GAIN = 0.7
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
@@ -249,7 +248,7 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
         compared = compared.join(coarse.compare(guesses[-1:]))
     score, surprising = _score(compared, record, law, lag)
     best = int(np.argmin(score))
-    clear = _CLEAR * max(1.0, float(compared.misfit[best]) / _ENOUGH)
+    clear = _CLEAR * compared.dispersion(best)
     if law is None or law.kind == "none":
         unrelated = coarse.compare(guesses[:1], np.zeros((record.axes, 1)))
         if unrelated.contrast[0] - np.min(compared.contrast) < _RELATED * clear / _CLEAR:
@@ -269,7 +268,7 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     shown = nats >= clear / 2 or np.isinf(score[0])
     finer = 0.0
     if not surprising[0] or surprising[best]:  # the law does not ask for it
-        finer = finer_saving(record, guess) if nats >= clear else 0.0
+        finer = finer_saving(coarse, guess) if nats >= clear else 0.0
         shown = finer >= _CLEAR_FINER and not part_of_a_frame
     if not shown:
         return replace(given, rival=guesses[best], rival_nats=finer)
@@ -365,7 +364,7 @@ def _find_scale(
             return factor
         if gain < low:  # commands that are too large come from a law that is too strong
             return 1.0
-    shown = finer_saving_of_gain(record, found.guess, (low, usual, high)) >= found.clear
+    shown = finer_saving_of_gain(coarse, found.guess, (low, usual, high)) >= found.clear
     return factor if shown else 1.0
 
 

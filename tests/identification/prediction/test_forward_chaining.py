@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.night import GAIN, simulated_night
+from support.night import GAIN, night_record, simulated_night
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
@@ -18,14 +18,7 @@ forward_splits = lbt.identification.forward_splits
 
 @pytest.fixture(scope="module")
 def record():
-    run, path, _ = simulated_night()
-    return lbt.identification.loop_record(
-        run.measurements[0],
-        run.commands[0],
-        frame_rate_hz=path.frame_rate_hz,
-        delay_frames=path.delay_frames,
-        unit="nm",
-    )
+    return night_record()
 
 
 @pytest.fixture(scope="module")
