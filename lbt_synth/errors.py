@@ -12,12 +12,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+_LONGEST_MESSAGE = 2_000  # characters; values from a file may have millions
+
+
+def shorten_middle(message: str) -> str:
+    """Return a message, a very long one without its middle."""
+    if len(message) <= _LONGEST_MESSAGE:
+        return message
+    start, end = message[: _LONGEST_MESSAGE // 2], message[-_LONGEST_MESSAGE // 4 :]
+    return f"{start} [... {len(message) - len(start) - len(end)} characters ...] {end}"
+
 
 class LbtSynthError(Exception):
     """Base class of every error that this package raises on purpose."""
 
     def __init__(self, message: str = "", **data: Any) -> None:
-        super().__init__(message)
+        super().__init__(shorten_middle(message))
         for name, value in data.items():
             if not hasattr(type(self), name):
                 raise TypeError(f"{type(self).__name__} has no attribute {name!r}.")

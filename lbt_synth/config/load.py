@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from lbt_synth.config.end_to_end import build_end_to_end_setup
 from lbt_synth.config.plant_and_truth import (
@@ -24,14 +25,18 @@ from lbt_synth.config.plant_and_truth import (
 )
 from lbt_synth.config.schema import FileSection, describe_error
 from lbt_synth.design import Design
-from lbt_synth.errors import ConfigError, ProblemError, name_file
+from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
+from lbt_synth.storage.array_file import error_reason
+from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray
 
 Checked = TypeVar("Checked", bound=BaseModel)
+_LARGEST_BYTES = 2**17  # of a file; ruamel.yaml may read no more than 30 kB per second
+_MOST_NODES, _DEEPEST, _MOST_DIGITS = 2**16, 40, 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,23 +181,46 @@ def validate_sections(schema: type[Checked], raw: Mapping[str, Any], source: Pat
 def read_mapping(source: Path) -> dict[str, Any]:
     """Read a YAML file that holds a mapping."""
     try:
-        text = source.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot read {source}: {error.strerror}.") from error
+        text = read_bytes(source, FileError, most=_LARGEST_BYTES).decode("utf-8-sig")
+    except FileError as error:
+        raise ConfigError(str(error)) from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{source} is not a text file: {error.reason}.") from error
-    except ValueError as error:  # a null character in the name
-        raise ConfigError(f"cannot read {str(source)!r}: {error}.") from error
     try:
-        raw = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, KeyError, RecursionError) as error:
+        raw = _load_yaml(text)
+    except Exception as error:  # the constructors of YAML raise whatever they like
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or str(error).split("\n")[0]
+        problem = getattr(error, "problem", None) or error_reason(error)
         raise ConfigError(f"{source} is not valid YAML{where}: {problem}.") from error
     if not isinstance(raw, dict):
         raise ConfigError(f"{source} must hold a mapping of sections; got {type(raw).__name__}.")
     return raw
+
+
+def _load_yaml(text: str) -> Any:
+    """Return what a text holds; refuse one that is deep, or grows by its aliases."""
+    yaml = YAML(typ="safe", pure=True)
+    node = yaml.compose(text)
+    if node is None:
+        return None
+    if _count_nodes(node, {}, _DEEPEST) > _MOST_NODES:
+        raise ValueError(f"its aliases and merges make more than {_MOST_NODES} values of it")
+    return yaml.constructor.construct_document(node)
+
+
+def _count_nodes(node: Node, known: dict[int, int], depth: int) -> int:
+    """Return how many values a node holds, those of its aliases counted each time."""
+    if depth == 0:
+        raise ValueError(f"it is nested deeper than {_DEEPEST} levels, or in itself")
+    if isinstance(node, ScalarNode):
+        if str(node.tag).endswith(":int") and len(node.value) > _MOST_DIGITS:
+            raise ValueError(f"an integer may have {_MOST_DIGITS} digits; got {len(node.value)}")
+        return 1
+    if id(node) not in known:
+        parts = node.value if isinstance(node, SequenceNode) else chain.from_iterable(node.value)
+        known[id(node)] = 1 + sum(_count_nodes(part, known, depth - 1) for part in parts)
+    return known[id(node)]
 
 
 def build_config(settings: FileSection, source: Path) -> Config:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 
 from lbt_synth.linear.batched import frobenius_norms, symmetrise, transpose
+from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 _SOLVED = 1e-14  # relative residual of an equation solved to rounding
@@ -41,9 +40,8 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     squared, residuals = stationary_covariances(A[None], Q[None])
     if residuals[0] < _SOLVED:
         return np.asarray(squared[0])
-    with warnings.catch_warnings():
-        # from states of very different sizes; the residual is measured below
-        warnings.simplefilter("ignore", (LinAlgWarning, RuntimeWarning))
+    # from states of very different sizes; the residual is measured below
+    with ignore_warnings(LinAlgWarning, RuntimeWarning):
         X = solve_discrete_lyapunov(A, Q)
         X = X + solve_discrete_lyapunov(A, A @ X @ A.T - X + Q)
     X = symmetrise(np.asarray(X, dtype=np.float64))

@@ -9,18 +9,19 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import numpy.typing as npt
 
+from lbt_synth.storage.fits_structure import CARD, check_fits
+from lbt_synth.storage.input_files import LARGEST_BYTES
 from lbt_synth.validation import FloatArray
 
 Cards = Mapping[str, tuple[Any, str]]
 TEXT = "META"
-_CARD = 80
 LONGEST_HEADER = 2880 * 36  # that is looked through
 
 
@@ -76,17 +77,13 @@ def fits_bytes(
 def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
     """Read the arrays and the text of :func:`fits_bytes`."""
     from astropy.io import fits
-    from astropy.utils.exceptions import AstropyWarning
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", AstropyWarning)
-        try:
-            with fits.open(
-                io.BytesIO(content), memmap=False, lazy_load_hdus=False, checksum=True
-            ) as units:
-                data = {unit.name: np.array(unit.data) for unit in units[1:]}
-        except Exception as error:  # astropy raises many kinds on damaged files
-            raise ValueError("its FITS structure or a checksum is broken") from error
+    check_fits(content)
+    try:
+        with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False) as units:
+            data = {unit.name: np.array(unit.data) for unit in units[1:]}
+    except Exception as error:  # astropy raises many kinds on damaged files
+        raise ValueError("its FITS structure is broken") from error
     return _split_text(data)
 
 
@@ -99,12 +96,34 @@ def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> bytes:
 
 def read_npz(content: bytes) -> tuple[dict[str, FloatArray], str]:
     """Read the arrays and the text of :func:`npz_bytes`."""
+    if not is_archive(content):
+        raise ValueError("it is not a NumPy archive")
+    return _split_text(read_numpy(content))
+
+
+def is_archive(content: bytes) -> bool:
+    """Whether content begins as a ZIP archive does."""
+    return content.startswith(b"PK\x03\x04")
+
+
+def read_numpy(content: bytes) -> dict[str, npt.NDArray[Any]]:
+    """Read the arrays of a NumPy archive by their names, or the one of an NPY file as ``""``."""
+    if not is_archive(content) and not content.startswith(b"\x93NUMPY"):
+        raise ValueError("it begins as neither an NPY file nor a ZIP archive does")
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            data = {name: np.array(archive[name]) for name in archive.files}
+        if not is_archive(content):
+            return {"": np.load(io.BytesIO(content), allow_pickle=False)}
+        _require_small(ZipFile(io.BytesIO(content)))
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return {name: np.asarray(arrays[name]) for name in arrays.files}
     except Exception as error:  # zip, zlib and NumPy each raise their own kinds
-        raise ValueError("it is not a NumPy archive") from error
-    return _split_text(data)
+        raise ValueError(f"its NumPy arrays are broken: {error_reason(error)}") from error
+
+
+def _require_small(archive: ZipFile) -> None:
+    """Refuse an archive that unpacks to more than is read."""
+    if sum(member.file_size for member in archive.infolist()) > LARGEST_BYTES:
+        raise ValueError(f"it unpacks to more than {LARGEST_BYTES >> 20} MB")
 
 
 def _with_text(arrays: Mapping[str, Any], text: str) -> dict[str, Any]:
@@ -113,14 +132,17 @@ def _with_text(arrays: Mapping[str, Any], text: str) -> dict[str, Any]:
 
 def _split_text(data: dict[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray], str]:
     text = data.pop(TEXT).astype(np.uint8).tobytes().decode()
+    for name, array in data.items():
+        if array.dtype.kind not in "fiub":
+            raise ValueError(f"{name} holds no real numbers")
     return {name: array.astype(np.float64) for name, array in data.items()}, text
 
 
 def has_card(content: bytes, keyword: str) -> bool:
     """Whether the first header of a FITS file has a card of that keyword."""
     mark = keyword.ljust(8).encode() + b"="
-    for start in range(0, min(len(content), LONGEST_HEADER), _CARD):
-        card = content[start : start + _CARD]
+    for start in range(0, min(len(content), LONGEST_HEADER), CARD):
+        card = content[start : start + CARD]
         if card.startswith(mark):
             return True
         if card.startswith(b"END "):

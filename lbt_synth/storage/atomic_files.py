@@ -1,24 +1,23 @@
-"""Read whole files, write them whole or not at all, and never over an input."""
+"""Write files whole or not at all, never over an input, a link, a device or a pipe."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import os
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
 from lbt_synth.errors import FileError, OutputError
+from lbt_synth.storage.file_locks import CAN_LOCK, lock_file
+from lbt_synth.storage.input_files import error_text, open_regular
 
-
-def read_bytes(path: str | os.PathLike[str], error: type[FileError]) -> bytes:
-    """Return the content of a file; where it cannot be read, raise an error of a kind."""
-    try:
-        return Path(path).read_bytes()
-    except (OSError, ValueError) as why:  # ValueError: a null character in the name
-        shown = path if isinstance(why, OSError) else repr(str(path))
-        raise error(f"cannot read {shown}: {_reason(why)}.", path=Path(path)) from why
+_UNFINISHED = ".lbt_synth.{}.{}.tmp"  # beside a target: digest of its name, and a number
+_MOST_UNFINISHED = 100  # of one target, by as many processes at once
 
 
 def require_ending(
@@ -50,16 +49,16 @@ def require_writable(
     refuse_replacing(paths, inputs)
     for path in paths:
         target = Path(path)
-        if not target.parent.is_dir():
+        if not os.path.isdir(target.parent):  # noqa: PTH112 - False for a name that is too long
             raise OutputError(f"cannot write {target}: no directory {target.parent}.", path=target)
-        _require_no_directory(target)
+        _mode_of(target)
         try:
             with tempfile.TemporaryFile(dir=target.parent):
                 pass
         except (OSError, ValueError) as error:
             raise OutputError(
                 f"cannot write {target}: the directory {target.parent} takes no new files "
-                f"({_reason(error)}).",
+                f"({error_text(error)}).",
                 path=target,
             ) from error
 
@@ -87,9 +86,22 @@ def refuse_replacing(
                 )
 
 
-def _require_no_directory(target: Path) -> None:
-    if target.is_dir():
-        raise OutputError(f"{target} is a directory; expected the name of a file.", path=target)
+def _mode_of(target: Path) -> int | None:
+    """Return the permissions of a file that would be replaced, None if there is none."""
+    try:
+        found = target.lstat()
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise _output_error(target, error) from error
+    if stat.S_ISREG(found.st_mode):
+        return stat.S_IMODE(found.st_mode)
+    kind = "a device or a pipe"
+    if stat.S_ISDIR(found.st_mode):
+        kind = "a directory"
+    elif stat.S_ISLNK(found.st_mode):
+        kind = f"a link to {target.readlink()}"
+    raise OutputError(f"{target} is {kind}; expected the name of a file.", path=target)
 
 
 def _is_same(one: Path, other: Path) -> bool:
@@ -128,15 +140,14 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
     ['a.c', 'a.h']
     """
     targets = {Path(path): content for path, content in contents.items()}
-    for target in targets:
-        _require_no_directory(target)
     staged: dict[Path, Path] = {}
     target = next(iter(targets))
-    with contextlib.ExitStack() as undo:
+    with contextlib.ExitStack() as temporaries, contextlib.ExitStack() as undo:
         try:
             for target, content in targets.items():
-                staged[target] = _stage(target, content)
-                undo.callback(_restore, staged[target], None)
+                stream, staged[target] = temporaries.enter_context(_temporary_file(target))
+                stream.write(content)
+                _finish(stream)
             for target, temporary in staged.items():
                 # kept to undo the change if a later file fails; a single file needs no undoing
                 older = target.read_bytes() if len(targets) > 1 and target.exists() else None
@@ -150,36 +161,80 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
 
 def _restore(target: Path, older: bytes | None) -> None:
     """Give a file its older content again, or delete it."""
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, OutputError):
         if older is None:
             target.unlink()
         else:
-            _stage(target, older).replace(target)
-
-
-def _stage(target: Path, content: bytes) -> Path:
-    """Write a whole file under a temporary name beside its target; leave none if that fails."""
-    with _temporary_file(target) as (stream, temporary):
-        stream.write(content)
-    return temporary
+            write_atomically(target, older)
 
 
 @contextlib.contextmanager
 def _temporary_file(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
-    """Open a temporary file beside a target, which is deleted if the block fails."""
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-    temporary = Path(name)
+    """Open a temporary file beside a target; after the block there is none under its name.
+
+    It is locked to the end of the block, so that another process knows it for unfinished.
+    """
+    mode = _mode_of(target)
+    handle, temporary = _create_temporary(target)
+    lock = os.dup(handle) if CAN_LOCK else None
     try:
         with os.fdopen(handle, "wb") as stream:
+            if mode is not None:
+                temporary.chmod(mode)
             yield stream, temporary
-            stream.flush()
-            os.fsync(stream.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-    except BaseException:
-        _restore(temporary, None)
-        raise
+    finally:
+        if lock is None or _is_open(lock, temporary):
+            _restore(temporary, None)
+        if lock is not None:
+            os.close(lock)
+
+
+def _finish(stream: BinaryIO) -> None:
+    """Bring a whole file to the disk."""
+    stream.flush()
+    os.fsync(stream.fileno())
+    stream.close()
+
+
+def _create_temporary(target: Path) -> tuple[int, Path]:
+    """Create a temporary file and lock it; one that a killed run left is removed."""
+    digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:16]
+    for number in range(_MOST_UNFINISHED):
+        path = target.with_name(_UNFINISHED.format(digest, number))
+        _remove_unlocked(path)
+        with contextlib.suppress(FileExistsError):
+            handle = open_regular(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+            lock_file(handle)
+            if _is_open(handle, path):  # else it was removed before the lock
+                return handle, path
+            os.close(handle)
+    raise OSError(errno.EEXIST, f"{_MOST_UNFINISHED} files {path.name} are in the way")
+
+
+def remove_unfinished_files(folder: Path) -> None:
+    """Remove the temporary files in a directory that no process is writing."""
+    for path in folder.glob(_UNFINISHED.format("*", "*")):
+        _remove_unlocked(path)
+
+
+def _remove_unlocked(path: Path) -> None:
+    """Remove a temporary file whose process is dead."""
+    with contextlib.suppress(OSError):
+        if stat.S_ISREG(path.lstat().st_mode):
+            handle = open_regular(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                if lock_file(handle) and _is_open(handle, path):
+                    path.unlink()
+            finally:
+                os.close(handle)
+
+
+def _is_open(handle: int, path: Path) -> bool:
+    """Whether a file is still under the name by which it was opened."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.lstat())
+    except FileNotFoundError:
+        return False
 
 
 @contextlib.contextmanager
@@ -197,21 +252,17 @@ def open_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     b'part by part'
     """
     target = Path(path)
-    _require_no_directory(target)
     try:
         with _temporary_file(target) as (stream, temporary):
             yield stream
-        temporary.replace(target)
+            _finish(stream)
+            temporary.replace(target)
     except OSError as error:
         raise _output_error(target, error) from error
 
 
 def _output_error(target: Path, error: Exception) -> OutputError:
     return OutputError(
-        f"cannot write {target}: {_reason(error)}. Check the directory and its free space.",
+        f"cannot write {target}: {error_text(error)}. Check the directory and its free space.",
         path=target,
     )
-
-
-def _reason(error: Exception) -> object:
-    return getattr(error, "strerror", None) or error

@@ -19,11 +19,13 @@ from typing import Any
 
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.storage.atomic_files import write_atomically
-from lbt_synth.storage.worker_processes import WorkerPool, exclusive_lock, limit_threads
+from lbt_synth.storage.file_locks import exclusive_lock
+from lbt_synth.storage.input_files import read_json
+from lbt_synth.storage.worker_processes import WorkerPool, limit_threads
 from lbt_synth.validation import integer
 
 Case = Mapping[str, Any]
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*\Z")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}\Z")
 
 
 def run_cases(
@@ -144,7 +146,9 @@ def _processes(workers: int) -> Iterator[Executor]:
 
 def _case_digest(name: str, case: Case) -> str:
     if not isinstance(name, str) or not _NAME.match(name):
-        raise ProblemError(f"the name of a case must be letters, digits and . _ + -; got {name!r}.")
+        raise ProblemError(
+            f"the name of a case must be at most 200 letters, digits and . _ + -; got {name!r}."
+        )
     try:
         return _digest(case)
     except (TypeError, ValueError) as error:
@@ -158,12 +162,12 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 def _read(path: Path, expected: str) -> dict[str, Any] | None:
     """Return the result in a file, or None without a file; refuse a file of another case."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        asked, digest, result = content["asked"], content["digest"], dict(content["result"])
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    try:
+        content = read_json(path, OutputError)
+        asked, digest, result = content["asked"], content["digest"], dict(content["result"])
+    except (ValueError, KeyError, TypeError) as error:
         why = f"is not the result of a run: {error}. Delete it, or name another directory."
         raise OutputError(f"{path} {why}", path=path) from error
     if asked == expected and digest == _digest(result):

@@ -1,4 +1,4 @@
-"""Worker processes with one thread each, and a lock on the directory they write to."""
+"""Worker processes with one thread each."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.process import BaseProcess
-from pathlib import Path
-
-from lbt_synth.errors import OutputError
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _ORPHAN_SECONDS = 1.0
@@ -63,26 +60,3 @@ def _watch_parent(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextlib.contextmanager
-def exclusive_lock(folder: Path, what: str) -> Iterator[None]:
-    """Hold a lock on a directory, which the system releases when this process ends in any way."""
-    try:
-        import fcntl
-    except ImportError:  # on Windows a second one in the directory goes unnoticed
-        yield
-        return
-    try:
-        stream = (folder / ".lock").open("w")
-    except OSError as error:
-        raise OutputError(f"cannot write into {folder}: {error.strerror}.", path=folder) from error
-    with stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise OutputError(
-                f"another {what} is running in {folder}. Wait for it, or name another directory.",
-                path=folder,
-            ) from error
-        yield

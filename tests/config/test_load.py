@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from support.configs import AR, GOOD, change_key, minimal_config, write_config
 from support.plants import ROOT
@@ -127,7 +129,7 @@ def test_other_texts_are_refused(tmp_path, content, text):
 def test_unreadable_files(tmp_path):
     with pytest.raises(lbt.errors.ConfigError, match="cannot read .*No such file"):
         lbt.load_config(tmp_path / "none.yaml")
-    with pytest.raises(lbt.errors.ConfigError, match="cannot read .*directory"):
+    with pytest.raises(lbt.errors.ConfigError, match="cannot read .*Is a directory"):
         lbt.load_config(tmp_path)
     binary = tmp_path / "b.yaml"
     binary.write_bytes(b"\xff\xfe\x00")
@@ -276,3 +278,33 @@ def test_the_smallest_file_of_the_documentation(tmp_path):
     design = lbt.kalman(config.plant)
     loop = lbt.close_loop(config.hardware, design.controller)
     assert lbt.residual_budget(loop, config.truth).rms_nm == pytest.approx(design.rms, rel=1e-8)
+
+
+def multiplied(form):
+    """A text whose twelve levels each name the one before nine times."""
+    lines = ["a: &a {x: 1}"]
+    for one, other in pairwise("abcdefghijkl"):
+        lines.append(f"{other}: &{other} {form.format(', '.join(['*' + one] * 9))}")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (multiplied("{{<<: [{}]}}"), "its aliases and merges make more than"),
+        (multiplied("[{}]"), "its aliases and merges make more than"),
+        ("a: &a [*a]", "nested deeper than 40 levels, or in itself"),
+        ("a: " + "[" * 60 + "]" * 60, "nested deeper than 40 levels"),
+        ("version: !!int ''", "string index out of range"),
+        ("version: !!float ''", "string index out of range"),
+        ("version: 0x" + "f" * 4000, "an integer may have 40 digits; got 4002"),
+        ("# " + "x" * 2**17, "it is larger than 128 kB"),
+    ],
+    ids=lambda value: value[:12],
+)
+def test_small_files_that_would_take_for_ever(tmp_path, text, why):
+    path = tmp_path / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(lbt.errors.ConfigError, match=why) as caught:
+        lbt.load_config(path)
+    assert len(str(caught.value)) < 300

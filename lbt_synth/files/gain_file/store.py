@@ -17,7 +17,8 @@ from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files.file_checks import FileKind
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz
-from lbt_synth.storage.atomic_files import read_bytes, require_ending, write_atomically
+from lbt_synth.storage.atomic_files import require_ending, write_atomically
+from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray, frozen_copy
 
 SCHEMA = "lbt_synth gain file"

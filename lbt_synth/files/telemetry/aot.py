@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import warnings
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -23,6 +22,8 @@ from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
 from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import error_reason, has_card
+from lbt_synth.storage.fits_structure import check_fits
+from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 _OWN_CARD = "LBTSYNTH"  # one card with what the standard has no field for, JSON
@@ -237,14 +238,11 @@ def _to_ascii(text: str) -> str:
 def from_bytes(content: bytes, source: Path) -> Telemetry:
     """Read the first control loop that has series, and what describes it."""
     aotpy = require_aotpy(source, TelemetryError, "read")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # foreign files deviate in many small ways
+    with ignore_warnings():  # foreign files deviate in many small ways
         try:
+            check_fits(content)
             # other files and addresses that this one refers to are not opened
-            warnings.filterwarnings("error", message=".*verification failed")  # of a checksum
-            reader = aotpy.AOTFITSReader(
-                io.BytesIO(content), externals="disallow", memmap=False, checksum=True
-            )
+            reader = aotpy.AOTFITSReader(io.BytesIO(content), externals="disallow", memmap=False)
             system = reader.get_system()
         except Exception as error:  # damage and deviations, in whatever way they show
             raise TelemetryError(

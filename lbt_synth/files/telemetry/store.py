@@ -27,7 +27,8 @@ from lbt_synth.storage.array_file import (
     read_fits,
     read_npz,
 )
-from lbt_synth.storage.atomic_files import read_bytes, write_atomically
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray, choice
 
 PRECISIONS = ("float64", "float32")

@@ -47,8 +47,9 @@ def unit_name(text: str) -> str | None:
 
 def density_unit(text: str) -> tuple[str, int] | None:
     """Split the unit of a spectrum into a unit and its power, 1 or 2; None for others."""
-    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
-        if match := pattern.match(text.strip()):
+    word = text.strip()
+    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)) if len(word) <= _LONGEST_UNIT else ():
+        if match := pattern.match(word):
             unit = unit_name(match["unit"])
             return None if unit is None else (unit, power)
     return None
@@ -124,7 +125,7 @@ FACTS = {
 }
 OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
 _AXES = {"0": 0, "1": 1, "2": 2, "tip": 0, "tilt": 1, "x": 0, "y": 1}
-_BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*(?:\([^)]*\))?[^\])]*)[\])]\s*$")
+_LONGEST_UNIT = 40  # characters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -174,8 +175,13 @@ def _normalise(name: str) -> str:
 
 
 def _split_unit(name: str) -> tuple[str, str | None]:
-    if match := _BRACKETS.match(name):
-        return match["name"], match["unit"].strip() or None
-    ends = (match.start() for match in re.finditer("_", name) if match.start() > 0)
-    at = next((at for at in ends if is_unit(name[at + 1 :])), None)
-    return (name, None) if at is None else (name[:at], name[at + 1 :])
+    if name.endswith(("]", ")")):
+        depth = 0
+        for at in range(len(name) - 1, -1, -1):  # to the bracket that the last one closes
+            depth += (name[at] in "])") - (name[at] in "[(")
+            if depth == 0:
+                return name[:at].rstrip(), name[at + 1 : -1].strip() or None
+    first = max(1, len(name) - _LONGEST_UNIT - 1)
+    ends = (at for at in range(first, len(name)) if name[at] == "_")
+    found = next((at for at in ends if is_unit(name[at + 1 :])), None)
+    return (name, None) if found is None else (name[:found], name[found + 1 :])

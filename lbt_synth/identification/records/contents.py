@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import re
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -17,14 +15,21 @@ import numpy.typing as npt
 
 from lbt_synth.errors import FileError, LbtSynthError, ProblemError, TelemetryError
 from lbt_synth.identification.records.columns import Column, parse_column, recognise_fact
-from lbt_synth.storage.array_file import error_reason
-from lbt_synth.storage.atomic_files import read_bytes, require_ending
+from lbt_synth.storage.array_file import error_reason, read_numpy
+from lbt_synth.storage.atomic_files import require_ending
+from lbt_synth.storage.fits_structure import check_fits
+from lbt_synth.storage.input_files import read_bytes
+from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 FITS = (".fits", ".fit", ".fts")
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
-_SUFFIXES = {"frame_rate_hz": "hz", "delay_frames": "frames?", "diameter_m": "m"}  # of numbers
+_SUFFIXES = {  # of numbers that are texts
+    "frame_rate_hz": ("hz",),
+    "delay_frames": ("frames", "frame"),
+    "diameter_m": ("m",),
+}
 _GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
 _LOOKED_AT = 20  # rows, to find decimal commas
@@ -44,10 +49,8 @@ class Contents:
     def add_fact(self, fact: str, value: Any, where: str) -> None:
         """Add a unit, or a number that may be written as a text; note what is none."""
         if fact != "unit":
-            suffix = rf"\s*{_SUFFIXES.get(fact, '')}\s*$"
-            text = re.sub(suffix, "", value, flags=re.I) if isinstance(value, str) else value
             try:
-                value = float(text)
+                value = _parse_fact(fact, value) if isinstance(value, str) else float(value)
             except (TypeError, ValueError):
                 self.notes.append(f"{where} was not taken for {fact}: {value!r} is no number")
                 return
@@ -71,6 +74,13 @@ class Contents:
             base = parse_column(name, np.empty(0), unit=unit)
             for axis, column in enumerate(table.T.astype(np.float64)):
                 self.columns.append(replace(base, name=f"{name}[{axis}]", values=column, axis=axis))
+
+
+def _parse_fact(fact: str, text: str) -> float:
+    word = text.strip().lower()
+    for suffix in _SUFFIXES.get(fact, ()):
+        word = word.removesuffix(suffix)
+    return float(word)
 
 
 @contextmanager
@@ -111,21 +121,18 @@ def parse_contents(path: Path, content: bytes) -> Contents:
 def _read_fits(out: Contents, content: bytes) -> None:
     from astropy.io import fits
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # foreign headers deviate in many small ways
-        for damage in (".*truncated.*", ".*Error validating header.*"):
-            warnings.filterwarnings("error", message=damage)
-        # without uint, gaps of shifted integers become NaN as well
-        with fits.open(io.BytesIO(content), memmap=False, uint=False) as units:
-            for place, unit in enumerate(units):
-                name = unit.name if unit.name and unit.name != "PRIMARY" else ""
-                for card in unit.header.cards:
-                    _add_card(out, card, name or f"HDU {place}")
-                if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
-                    _add_table(out, unit)
-                elif unit.is_image and unit.data is not None:
-                    own = unit.header.get("BUNIT")
-                    out.add_array(name, unit.data, None if own is None else str(own))
+    check_fits(content)
+    # foreign headers deviate in many small ways; without uint, gaps of shifted integers become NaN
+    with ignore_warnings(), fits.open(io.BytesIO(content), memmap=False, uint=False) as units:
+        for place, unit in enumerate(units):
+            name = unit.name if unit.name and unit.name != "PRIMARY" else ""
+            for card in unit.header.cards:
+                _add_card(out, card, name or f"HDU {place}")
+            if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
+                _add_table(out, unit)
+            elif unit.is_image and unit.data is not None:
+                own = unit.header.get("BUNIT")
+                out.add_array(name, unit.data, None if own is None else str(own))
 
 
 def _add_card(out: Contents, card: Any, where: str) -> None:
@@ -154,12 +161,8 @@ def _add_table(out: Contents, unit: Any) -> None:
 
 
 def _read_numpy(out: Contents, content: bytes) -> None:
-    if not content.startswith((b"\x93NUMPY", b"PK\x03\x04")):
-        raise ValueError("it begins as neither an NPY file nor a ZIP archive does")
-    with io.BytesIO(content) as stream:
-        arrays = np.load(stream, allow_pickle=False)
-        for name in getattr(arrays, "files", [""]):
-            _add_named(out, name, np.asarray(arrays[name] if name else arrays))
+    for name, array in read_numpy(content).items():
+        _add_named(out, name, array)
 
 
 def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
@@ -214,12 +217,13 @@ def _read_text(out: Contents, content: bytes) -> None:
 
 def _add_comment(out: Contents, comment: str) -> None:
     """Add the fact of a comment such as frame_rate_hz = 1000."""
-    match = re.match(r"^([A-Za-z][\w .\-]*?)\s*[:=]\s*(\S.*)$", comment)
-    if match is not None and (fact := recognise_fact(match[1])) is not None:
-        if fact == "unit" and " " in match[2]:
-            out.notes.append(f"the comment {match[1]} was not taken for a unit: {match[2]!r}")
+    sign = min((at for at in map(comment.find, ":=") if at > 0), default=0)
+    key, value = comment[:sign].strip(), comment[sign + 1 :].strip()
+    if value and (fact := recognise_fact(key)) is not None:
+        if fact == "unit" and " " in value:
+            out.notes.append(f"the comment {key} was not taken for a unit: {value!r}")
         else:
-            out.add_fact(fact, match[2], f"the comment {match[1]}")
+            out.add_fact(fact, value, f"the comment {key}")
 
 
 def _split_cells(lines: Iterable[str], sign: str | None) -> Iterator[list[str]]:

@@ -6,11 +6,11 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.identification.records.column_selection import (
     KINDS,
@@ -25,6 +25,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import LONGEST_HEADER, has_card
+from lbt_synth.storage.input_files import open_input
 from lbt_synth.validation import FloatArray, choice, require_instance
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
@@ -142,12 +143,15 @@ def load_record(
 def _is_telemetry(path: Path) -> bool:
     try:
         if path.suffix.lower() in FITS:
-            with path.open("rb") as stream:
+            with open_input(path, TelemetryError) as stream:
                 header = stream.read(LONGEST_HEADER)
             return any(has_card(header, card) for card in _TELEMETRY_CARDS)
-        names = ZipFile(path).namelist() if path.suffix.lower() == ".npz" else []
-    except (BadZipFile, OSError, ValueError):
-        return False  # read_contents reports the error
+        if path.suffix.lower() != ".npz":
+            return False
+        with open_input(path, TelemetryError) as stream:
+            names = ZipFile(stream).namelist()
+    except Exception:  # of zipfile, many kinds; read_contents reports the error
+        return False
     return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
 
 

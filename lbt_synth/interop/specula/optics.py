@@ -11,7 +11,6 @@ import hashlib
 import importlib
 import io
 import logging
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.errors import MissingExtraError, OutputError, ProblemError
+from lbt_synth.errors import FileError, MissingExtraError, OutputError, ProblemError
 from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.storage.fits_structure import check_fits
+from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray
 
 _SUPPORTED = "1.1"
@@ -126,8 +127,9 @@ def _discard_damaged(files: Iterable[Path]) -> None:
 
     for file in files:
         try:
-            with warnings.catch_warnings(), fits.open(io.BytesIO(file.read_bytes())) as units:
-                warnings.simplefilter("error")
+            content = read_bytes(file, FileError)
+            check_fits(content)
+            with fits.open(io.BytesIO(content)) as units:
                 _ = units[0].data.shape
         except Exception:  # astropy has no common class for what damage makes it raise
             file.unlink()

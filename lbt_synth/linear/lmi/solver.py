@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import cvxpy as cp
 
 from lbt_synth.errors import NumericalError
+from lbt_synth.storage.warning_filters import ignore_warnings
 
 # Tighter tolerances end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 _SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
@@ -39,9 +39,8 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
     programme = cp.Problem(objective, constraints)
     for attempt, settings in enumerate(_ATTEMPTS):
         try:
-            with warnings.catch_warnings():
-                # the certificate judges an inaccurate solution, not a warning
-                warnings.filterwarnings("ignore", message="Solution may be inaccurate")
+            # the certificate judges an inaccurate solution, not a warning
+            with ignore_warnings(message="Solution may be inaccurate"):
                 programme.solve(solver=cp.CLARABEL, **_SETTINGS, **settings)
             break
         except cp.error.SolverError as error:

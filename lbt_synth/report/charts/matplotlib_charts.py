@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -29,6 +28,7 @@ from lbt_synth.report.charts.description import (
 )
 from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
 from lbt_synth.report.figures.style import house_style
+from lbt_synth.storage.warning_filters import ignore_warnings
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -54,9 +54,9 @@ def _chart_style() -> Iterator[None]:
     """Set the style of charts for the time of the block."""
     import matplotlib as mpl
 
-    with house_style(), mpl.rc_context({"svg.fonttype": "none"}), warnings.catch_warnings():
-        # a name in a script that the font does not have stays a name
-        warnings.filterwarnings("ignore", message=r"Glyph .* missing")
+    # a name in a script that the font does not have stays a name
+    missing = ignore_warnings(message=r"Glyph .* missing")
+    with house_style(), mpl.rc_context({"svg.fonttype": "none"}), missing:
         yield
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import time
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from typing import Any
 
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
-from lbt_synth.storage.worker_processes import exclusive_lock
+from lbt_synth.storage.file_locks import exclusive_lock
 from lbt_synth.studies.study import store
 from lbt_synth.studies.study.batch_evaluation import evaluate_samples
 from lbt_synth.studies.study.engine import FIRST_ROWS, GROWTH, MOST_ROWS, Evaluate, run_batches
@@ -183,7 +184,7 @@ def run_study(
     computed, computing_s = 0, 0.0
     count = progress or (lambda rows: None)
     with exclusive_lock(folder, "study"):
-        store.remove_unfinished_files(folder, [path.name for path in output_paths(folder, study)])
+        store.remove_unfinished(folder)
         manifest = _begin(folder, study)
         if manifest.finished:
             store.remove_parts(folder)  # a run was killed while it removed them
@@ -260,6 +261,8 @@ def _compute_missing(
     count = sum(stop - start for start, stop in missing)
     try:
         (folder / store.PARTS).mkdir(exist_ok=True)
+        if (folder / store.PARTS).is_symlink():
+            raise NotADirectoryError(errno.ENOTDIR, "it is a link")
     except OSError as error:
         why = f"cannot make the directory {folder / store.PARTS}: {error.strerror}."
         raise OutputError(why, path=folder) from error

@@ -12,7 +12,7 @@ from lbt_synth.methods.method import Positive, Section
 from lbt_synth.validation import FloatArray
 
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
-_CONTROLLER_NAME = r"^[A-Za-z][A-Za-z0-9_-]*$"
+ControllerName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=100)]
 
 
 class NormalSection(Section):
@@ -196,7 +196,7 @@ class StudySection(Section):
     results: Literal["csv", "parquet"] = "csv"
     evaluation: Literal["exact", "simulation"] = "exact"
     controllers: Annotated[
-        dict[Annotated[str, Field(pattern=_CONTROLLER_NAME)], ControllerSection],
+        dict[ControllerName, ControllerSection],
         Field(min_length=1),
     ]
     parameters: Annotated[dict[str, ParameterSection], Field(min_length=1)]

@@ -8,14 +8,14 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 import lbt_synth
 from lbt_synth.design import Design
@@ -23,19 +23,27 @@ from lbt_synth.errors import OutputError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.storage import array_file
-from lbt_synth.storage.atomic_files import open_atomically, write_atomically
+from lbt_synth.storage.atomic_files import (
+    open_atomically,
+    remove_unfinished_files,
+    write_atomically,
+)
+from lbt_synth.storage.input_files import open_input, read_bytes, read_json
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.study.parquet import read_parquet, write_parquet
+from lbt_synth.studies.study.schema import ControllerName
 from lbt_synth.studies.study.study import BatchResult, Failure, Study
 from lbt_synth.validation import FloatArray
 
 MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
-_UNFINISHED = re.compile(r"\.(.+)\.[a-z0-9_]{8}")  # the temporary files of write_atomically
 _DELETE = "Delete it, and it is computed again."
 _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 RowRange = tuple[int, int]
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+TableName = Literal["results.csv", "results.parquet", "failed.csv"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +53,10 @@ class Part:
     start: int
     stop: int
     path: Path
+
+    def holds(self, row: int) -> bool:
+        """Whether a row is in it."""
+        return self.start <= row < self.stop
 
 
 class Manifest(BaseModel):
@@ -61,15 +73,16 @@ class Manifest(BaseModel):
     evaluation: str = ""
     parameters: dict[str, str] = {}  # their distributions in words
     controllers: dict[str, str] = {}  # their origins
-    designs: dict[str, str]  # digests of the gain files of the designs for the whole study
-    tables: dict[str, str]  # digests of the finished tables
+    # digests of the gain files of the designs for the whole study, and of the finished tables
+    designs: dict[ControllerName, Sha256]
+    tables: dict[TableName, Sha256]
     settings: dict[str, Any] = {}
     finished: bool
     failures: int
     retry: int  # failures that are tried again
     computed_last: int = 0  # rows that the last run computed
-    seconds: float  # of all runs
-    computing_seconds: float  # of all batches, summed over processes
+    seconds: Seconds  # of all runs
+    computing_seconds: Seconds  # of all batches, summed over processes
 
     def write(self, folder: Path, **changes: Any) -> Manifest:
         """Write the manifest with some changes, and return it."""
@@ -110,16 +123,11 @@ def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:
 def read_manifest(folder: Path, digest: str) -> Manifest | None:
     """Return the manifest of a study in its directory, None if it was not begun there."""
     path = folder / MANIFEST
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
+    if not path.exists():
         return None
-    except (OSError, ValueError) as error:
-        why = f"cannot read {path}: {error}. Name another directory."
-        raise OutputError(why, path=path) from error
     try:
-        manifest = Manifest.model_validate(content)
-    except ValidationError as error:
+        manifest = Manifest.model_validate(read_json(path, OutputError))
+    except ValueError as error:  # pydantic's errors among them
         why = "is no manifest of a study that this version reads. Name another directory."
         refuse(path, why, error)
     if manifest.digest == digest:
@@ -179,6 +187,17 @@ def missing_rows(parts: list[Part], samples: int) -> list[RowRange]:
     return [(a, b) for a, b in zip(stops, starts, strict=True) if a < b]
 
 
+class PartMeta(BaseModel):
+    """What a part says of its results."""
+
+    model_config = ConfigDict(frozen=True, strict=True)
+
+    study: Sha256
+    failures: list[Failure]
+    seconds: Seconds
+    digest: Sha256
+
+
 def write_part(folder: Path, study: Study, batch: BatchResult, seconds: float) -> Part:
     """Write a finished batch."""
     results = np.column_stack([batch.columns[name] for name in study.result_columns])
@@ -199,38 +218,34 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
     """Return the results of a part, (rows, result columns), its failures and its seconds."""
     path = part.path
     try:
-        arrays, text = array_file.read_npz(path.read_bytes())
-        meta = json.loads(text)
+        arrays, text = array_file.read_npz(read_bytes(path, OutputError))
+        meta = PartMeta.model_validate_json(text)
+        whole = meta.digest == array_file.digest(arrays, json.loads(text))
         results = arrays["RESULTS"]
-        failures = tuple(Failure(**failure) for failure in meta["failures"])
-        seconds = float(meta["seconds"])
-        whole = meta["digest"] == array_file.digest(arrays, meta)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, RecursionError) as error:
         refuse(path, f"is damaged. {_DELETE}", error)
-    if not whole or results.shape != (part.stop - part.start, len(study.result_columns)):
+    names = {each.name for each in study.controllers}
+    if (
+        not whole
+        or results.shape != (part.stop - part.start, len(study.result_columns))
+        or any(f.controller not in names or not part.holds(f.row) for f in meta.failures)
+    ):
         refuse(path, f"is damaged. {_DELETE}")
-    if meta["study"] != study.digest:
+    if meta.study != study.digest:
         refuse(path, "is of another study. Name another directory, or delete it.")
-    return results, failures, seconds
+    return results, tuple(meta.failures), meta.seconds
 
 
-def remove_unfinished_files(folder: Path, names: Collection[str]) -> None:
-    """Remove what a killed process left unfinished: parts, and files of the given names."""
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a killed process left unfinished."""
     for place in (folder, folder / PARTS):
-        with contextlib.suppress(OSError):
-            for path in list(place.iterdir()):
-                found = _UNFINISHED.fullmatch(path.name)
-                if found is not None and (_PART.fullmatch(found[1]) or found[1] in names):
-                    path.unlink()
+        remove_unfinished_files(place)
 
 
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file."""
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise OutputError(f"cannot read {path}: {error.strerror}.", path=path) from error
+    with open_input(path, OutputError) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def require_unchanged(folder: Path, manifest: Manifest) -> None:
@@ -287,8 +302,13 @@ def write_failures(folder: Path, failures: Sequence[Failure]) -> Path:
 
 def read_failures(folder: Path) -> list[tuple[int, str, str]]:
     """Return row, controller and error of each failure, from their table."""
-    with (folder / FAILED).open(encoding="utf-8", newline="") as stream:
-        return [(int(row), name, error) for row, name, error in list(csv.reader(stream))[1:]]
+    path = folder / FAILED
+    try:
+        lines = read_bytes(path, OutputError).decode().splitlines(keepends=True)
+        rows = list(csv.reader(lines, strict=True))[1:]
+        return [(int(row), name, error) for row, name, error in rows]
+    except (ValueError, csv.Error) as error:
+        refuse(path, f"is damaged. {_DELETE}", error)
 
 
 def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict[str, FloatArray]:
@@ -311,19 +331,16 @@ def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict
 
 def _read_csv(path: Path) -> dict[str, FloatArray]:
     """Return all columns of a file, (n,) each."""
-    try:
-        with path.open(encoding="utf-8") as stream:
-            names = stream.readline().rstrip("\n").split(",")
-            content = np.loadtxt(stream, delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot read {path}: {error}.", path=path) from error
+    with open_input(path, OutputError) as stream:  # a ValueError on its content, too
+        names = stream.readline().decode().rstrip("\n").split(",")
+        content = np.loadtxt(stream, delimiter=",", ndmin=2)
     return dict(zip(names, content.T, strict=False))
 
 
 def read_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dict[str, float]:
     """Return the results of one row, none if it is not computed yet."""
     for part in parts:
-        if part.start <= row < part.stop:
+        if part.holds(row):
             found = read_part(part, study)[0][row - part.start]
             return dict(zip(study.result_columns, found.tolist(), strict=True))
     path = results_path(folder, study)
@@ -332,9 +349,9 @@ def read_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dic
     if study.settings.results == "parquet":
         table = read_results(folder, study)
         return {name: float(table[name][row]) for name in study.result_columns}
-    with path.open(encoding="utf-8") as stream:
-        cells = next(itertools.islice(stream, row + 1, None), "").split(",")
-    if len(cells) != len(study.columns) or cells[0] != str(row):
-        refuse(path, f"has no row {row} of this study.")
-    found = dict(zip(study.columns, map(float, cells), strict=True))
+    with open_input(path, OutputError) as stream:
+        cells = next(itertools.islice(stream, row + 1, None), b"").decode().split(",")
+        if len(cells) != len(study.columns) or cells[0] != str(row):
+            refuse(path, f"has no row {row} of this study.")
+        found = dict(zip(study.columns, map(float, cells), strict=True))
     return {name: found[name] for name in study.result_columns}

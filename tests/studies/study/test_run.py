@@ -139,8 +139,18 @@ def test_other_studies_and_damage_are_refused(tmp_path):
     )
     with pytest.raises(OutputError, match="no manifest of a study"):
         lbt.studies.run_study(study, folder)
-    (folder / "study.json").write_text("{")
-    with pytest.raises(OutputError, match="cannot read"):
+    for damage in (
+        "{",
+        "[" * 100_000,
+        manifest.replace('"designs": {', '"designs": {"../x": "0",'),
+    ):
+        (folder / "study.json").write_text(damage)
+        with pytest.raises(OutputError, match="no manifest of a study"):
+            lbt.studies.run_study(study, folder)
+    (folder / "study.json").write_text(
+        manifest.replace('"tables": {', '"tables": {"/dev/zero": "0"')
+    )
+    with pytest.raises(OutputError, match="no manifest of a study"):
         lbt.studies.run_study(study, folder)
     (folder / "study.json").unlink()
     with pytest.raises(OutputError, match=r"parts of a study without its study\.json"):
@@ -222,18 +232,16 @@ def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
     study, folder = load_small_study(tmp_path), make_folder(tmp_path)
     (folder / "parts").mkdir()
     begun = [
-        folder / "parts" / ".0000000004-0000000008.npz.abcd_123",
-        folder / ".results.csv.abcd_123",
-        folder / ".summary.html.abcd_123",
-        folder / ".slow.fits.abcd_123",
+        folder / "parts" / ".lbt_synth.0123456789abcdef.0.tmp",
+        folder / ".lbt_synth.0123456789abcdef.1.tmp",
     ]
     for path in begun:
         path.write_bytes(b"half")
-    (folder / ".mine.csv.abcd_123").write_bytes(b"whole")
+    (folder / ".mine.csv.tmp").write_bytes(b"whole")
     lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
     assert_whole(folder, study)
     assert not any(path.exists() for path in begun)
-    assert (folder / ".mine.csv.abcd_123").exists()
+    assert (folder / ".mine.csv.tmp").exists()
 
 
 def test_jobs_without_number(tmp_path, monkeypatch):

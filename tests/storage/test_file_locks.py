@@ -1,0 +1,45 @@
+"""A lock on a directory touches nothing but its own file."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from lbt_synth.errors import OutputError
+from lbt_synth.storage.file_locks import exclusive_lock
+
+
+def test_a_lock_that_is_a_link_empties_nothing(tmp_path):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine")
+    (tmp_path / ".lock").symlink_to(mine)
+    with pytest.raises(OutputError, match=r"\.lock: it is a link"), exclusive_lock(tmp_path, "run"):
+        pass
+    assert mine.read_text() == "mine"
+
+
+def test_a_lock_with_content_or_another_name_stays(tmp_path):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine")
+    os.link(mine, tmp_path / ".lock")
+    with exclusive_lock(tmp_path, "run"):
+        pass
+    assert mine.read_text() == "mine"
+
+
+def test_a_pipe_is_no_lock(tmp_path):
+    os.mkfifo(tmp_path / ".lock")
+    with pytest.raises(OutputError, match="no regular file"), exclusive_lock(tmp_path, "run"):
+        pass
+
+
+def test_one_at_a_time(tmp_path):
+    with exclusive_lock(tmp_path, "run"):  # noqa: SIM117 - the second is refused
+        with (
+            pytest.raises(OutputError, match="another run is running"),
+            exclusive_lock(tmp_path, "run"),
+        ):
+            pass
+    with exclusive_lock(tmp_path, "run"):
+        pass
