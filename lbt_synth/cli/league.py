@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from lbt_synth.cli.engine import choose_engine, require_jobs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
+from lbt_synth.cli.streams import print_error
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import LoopRecord, SpectrumRecord
 from lbt_synth.report import write_league_page
@@ -59,7 +59,7 @@ def run(arguments: Namespace) -> Report:
             )
         except KeyboardInterrupt:
             note = f"what is finished is kept in {folder}; start it again to continue"
-            print(f"lbt-synth: {note}", file=sys.stderr)
+            print_error(note)
             raise
     files = [
         write_atomically(paths[0], csv_rows(found.standings)),

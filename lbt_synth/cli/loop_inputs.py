@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -24,7 +25,7 @@ def load_designs(paths: list[str]) -> dict[str, Design]:
     """Load designs, named by the stems of their files or, where these repeat, by longer tails."""
     if len({Path(path).resolve() for path in paths}) != len(paths):
         raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
-    stems = [Path(path).stem for path in paths]
+    stems = [printable(Path(path).stem) for path in paths]
     names = stems if len(set(stems)) == len(stems) else _distinct_tails(paths)
     return {name: load_gain(path) for name, path in zip(names, paths, strict=True)}
 
@@ -33,7 +34,7 @@ def _distinct_tails(paths: list[str]) -> list[str]:
     """Return the last parts of different paths, as few as distinguish all of them."""
     whole = [Path(path).resolve().parts for path in paths]
     for count in range(1, max(map(len, whole))):
-        names = ["/".join(parts[-count:]) for parts in whole]
+        names = [printable("/".join(parts[-count:])) for parts in whole]
         if len(set(names)) == len(names):
             return names
     return paths

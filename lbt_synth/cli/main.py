@@ -10,38 +10,44 @@ import importlib
 import json
 import os
 import re
+import signal
 import sys
 from collections.abc import Mapping, Sequence
 
-from lbt_synth.cli.parser import build_parser
+from lbt_synth.cli.streams import discard, print_error, reopen_closed
 from lbt_synth.errors import LbtSynthError, SynthesisError
 
 DONE, FAILED, WRONG = 0, 1, 2
+INTERRUPTED, BROKEN_PIPE = 130, 141  # as shells count signals
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = sys.argv[1:] if argv is None else list(argv)
     named = next((word for word in words if not word.startswith("-")), "")
+    from lbt_synth.cli.parser import build_parser
+
     arguments = build_parser(named).parse_args(words)
     from lbt_synth.report.provenance import creation_time  # slow to import for --help
 
     try:
         creation_time()  # refuses a wrong SOURCE_DATE_EPOCH before the libraries read it
         command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
+        if signal.getsignal(signal.SIGINT) is _stop_loading:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         report = command.run(arguments)
     except LbtSynthError as error:
         message = _name_options(str(error), vars(arguments))
         if arguments.json:
             print(json.dumps({"error": type(error).__name__, "message": message}))
-        print(f"lbt-synth: error: {message}", file=sys.stderr)
+        print_error(f"error: {message}")
         return FAILED if isinstance(error, SynthesisError) else WRONG
     except MemoryError:
-        print("lbt-synth: error: not enough memory; ask for less.", file=sys.stderr)
+        print_error("error: not enough memory; ask for less.")
         return WRONG
     except KeyboardInterrupt:
-        print("lbt-synth: interrupted", file=sys.stderr)
-        return 130
+        print_error("interrupted")
+        return INTERRUPTED
     report.print(as_json=arguments.json)
     return DONE if report.passed else FAILED
 
@@ -62,18 +68,34 @@ def _name_options(message: str, arguments: Mapping[str, object]) -> str:
     return words.sub(name, message)
 
 
+def _stop_loading(*_: object) -> None:
+    """End at once: nothing is written yet, and compiled modules take no interruption."""
+    os.write(2, b"lbt-synth: interrupted\n")
+    os._exit(INTERRUPTED)
+
+
 def entry_point() -> None:
-    """Run the console script, and survive a closed pipe or a full disk."""
+    """Run the console script, and survive interruption, closed pipes and full disks."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored
+        signal.signal(signal.SIGINT, _stop_loading)
+    reopen_closed()
     try:
-        status = main()
+        try:
+            status: int | str | None = main()
+        except SystemExit as stop:  # of the parser
+            status = stop.code
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output went away, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        status = 141
+        discard(1)
+        status = BROKEN_PIPE
     except OSError as error:  # a full disk behind a redirection
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        print(f"lbt-synth: error: cannot write the output: {error.strerror}.", file=sys.stderr)
+        discard(1)
+        print_error(f"error: cannot write the output: {error.strerror}.")
         status = WRONG
+    try:
+        sys.stderr.flush()
+    except OSError:
+        discard(2)
     sys.exit(status)
 
 

@@ -16,6 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.text import Text
 
+from lbt_synth.cli.streams import printable
 from lbt_synth.storage.rows import cell_text, fact_table, json_record, json_units, row_table
 from lbt_synth.storage.tables import Table
 
@@ -90,22 +91,26 @@ class Report:
             print(json.dumps(json_value(self.data), allow_nan=False))
             return
         console = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
-        for line in self.opening:
-            console.print(line, markup=False, soft_wrap=True)
-        for table in self.tables:
-            console.print(_printable(table))
-        for line in self.notes:
-            console.print(line, markup=False, soft_wrap=True)
+        with console.capture() as captured:  # rich ends the process on a broken pipe
+            for line in self.opening:
+                console.print(printable(line), markup=False, soft_wrap=True)
+            for table in self.tables:
+                console.print(_printable(table))
+            for line in self.notes:
+                console.print(printable(line), markup=False, soft_wrap=True)
+        sys.stdout.write(captured.get())
 
 
 def _printable(table: Table) -> rich_table.Table:
     out = rich_table.Table(
-        title=Text(table.caption, style="bold"), title_justify="left", box=SIMPLE_HEAD
+        title=Text(printable(table.caption), style="bold"), title_justify="left", box=SIMPLE_HEAD
     )
     for i, heading in enumerate(table.headings):
-        out.add_column(Text(heading), justify="left" if i in (0, *table.words) else "right")
+        out.add_column(
+            Text(printable(heading)), justify="left" if i in (0, *table.words) else "right"
+        )
     for row in table.cells():
-        out.add_row(*(Text(cell.text) for cell in row))
+        out.add_row(*(Text(printable(cell.text)) for cell in row))
     return out
 
 

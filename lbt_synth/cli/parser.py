@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from typing import NoReturn
 
 import lbt_synth
 from lbt_synth.cli import arguments
+from lbt_synth.cli.streams import printable
 
 # In the order of the help, each with the function that adds its arguments, whose docstring is its
 # help. A command runs in the module of its name, with underscores for dashes.
@@ -22,9 +24,17 @@ COMMANDS = {
 }
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors show what was typed without the control characters in it."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and what is wrong with the words, and exit with status 2."""
+        super().error(printable(message))
+
+
 def build_parser(*named: str) -> argparse.ArgumentParser:
     """Build the parser of all commands, with the arguments of those that are named."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="lbt-synth",
         description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
         epilog="Exit status: 0 done, 1 a design or verification failed, 2 wrong usage or input.",

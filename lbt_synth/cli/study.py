@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -13,6 +12,7 @@ from lbt_synth.cli.engine import choose_engine, require_jobs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
+from lbt_synth.cli.streams import print_error
 from lbt_synth.report import write_study_page
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.rows import column, fill_row, table_row
@@ -116,7 +116,7 @@ def _compute(
                 )
             except KeyboardInterrupt:
                 note = f"what is finished is kept in {folder}; start it again to continue"
-                print(f"lbt-synth: {note}", file=sys.stderr)
+                print_error(note)
                 raise
     [(statistics, new)] = found
     return study_run, statistics, new

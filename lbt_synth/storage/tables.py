@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from lbt_synth.errors import DimensionError
 from lbt_synth.validation import choice, set_fields
 
 TONES = ("plain", "good", "bad", "note")
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how the cells begin that spreadsheets compute
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +77,15 @@ def csv_bytes(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(headings)
-    writer.writerows(rows)
-    return buffer.getvalue().encode()
+    writer.writerows([_plain_cell(cell) for cell in row] for row in (headings, *rows))
+    return buffer.getvalue().encode(errors="backslashreplace")
+
+
+def _plain_cell(cell: Any) -> Any:
+    """Put an apostrophe before a text that a spreadsheet would take for a formula and run."""
+    if not isinstance(cell, str) or not cell.startswith(_FORMULA):
+        return cell
+    with contextlib.suppress(ValueError):
+        float(cell)
+        return cell
+    return cell if cell in _FORMULA else f"'{cell}"

@@ -151,7 +151,7 @@ def loaded_after(code):
     "code",
     [
         "import lbt_synth",
-        "from lbt_synth.cli.main import build_parser; build_parser().format_help()",
+        "from lbt_synth.cli.parser import build_parser; build_parser().format_help()",
     ],
 )
 def test_imports_are_quick(code):

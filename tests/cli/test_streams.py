@@ -1,0 +1,112 @@
+"""Standard streams that are closed, full or broken, and what must not reach a terminal raw."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from support.commands import run
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+from lbt_synth.cli.main import _stop_loading
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.streams import discard, printable
+
+COMMAND = f"{sys.executable} -c 'from lbt_synth.cli.main import entry_point; entry_point()'"
+# what is run, its status, and how many lines it writes to standard error
+CASES = {
+    "--help >&-": (0, 0),
+    "none 2>&-": (2, 0),
+    "none 2>/dev/full": (2, 0),
+    "none >/dev/full 2>/dev/full": (2, 0),
+}
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device is Linux's own")  # noqa: PTH110
+@pytest.mark.parametrize("words", CASES)
+def test_closed_and_full_streams(words):
+    done = subprocess.run(
+        ["bash", "-c", f"{COMMAND} {words}"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr.count("\n")) == CASES[words]
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_a_broken_pipe_is_not_left_to_rich(monkeypatch, as_json):
+    """Rich would end the process with status 1; the entry point makes 141 of the error."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    report = Report(opening=["a line"])
+    with os.fdopen(writer, "w") as stream:
+        monkeypatch.setattr("sys.stdout", stream)
+        report.print(as_json=as_json)
+        with pytest.raises(BrokenPipeError):
+            stream.flush()
+        discard(writer)
+        monkeypatch.undo()
+
+
+def test_control_characters_are_escaped():
+    assert printable("\33[31m\tä\n\x9b\u202e\udcff") == "\\x1b[31m\tä\\n\\x9b\\u202e\\udcff"
+
+
+@pytest.mark.parametrize("name", ["\33[31mred\n.fits", "\udcff.fits", "\u202e.fits"])
+def test_names_of_files_cannot_command_the_terminal(tmp_path, capsys, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    status, _, error = run(capsys, "show", name)
+    assert (status, error) == (
+        2,
+        f"lbt-synth: error: cannot read {printable(name)}: No such file or directory.\n",
+    )
+    design = lbt.integrator(lbt.load_config(LBT_YAML).hardware, gain=0.4)
+    lbt.save_gain(name, design)
+    status, out, _ = run(capsys, "sigma", name, "-o", "a.png")
+    assert status == 0
+    assert printable(name.removesuffix(".fits")) in out
+    status, _, error = run(capsys, "design", LBT_YAML, "--method", name, "-o", "a.fits")
+    assert status == 2
+    for line in (out + error).splitlines():
+        assert printable(line) == line
+
+
+def test_headings_of_records_cannot_command_the_terminal(tmp_path, capsys):
+    path = tmp_path / "a.csv"
+    path.write_text("a\33[2J,b\x9b\n1,2\n2,3\n")
+    status, _, error = run(capsys, "identify", path, "-o", tmp_path / "a.yaml")
+    assert status == 2
+    assert "a\\x1b[2J" in error
+    assert printable(error) == error.replace("\n", "\\n")
+
+
+def test_long_values_are_shortened(tmp_path, capsys):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"version: {'x' * 100_000}\n")
+    status, _, error = run(
+        capsys, "design", path, "--method", "integrator", "-o", tmp_path / "a.fits"
+    )
+    assert status == 2
+    assert len(error) < 3_000
+    assert "characters ...]" in error
+
+
+def test_an_interruption_while_modules_are_loaded_ends_at_once(monkeypatch):
+    ended = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    monkeypatch.setattr(os, "write", lambda handle, text: ended.append((handle, text)))
+    _stop_loading(signal.SIGINT, None)
+    assert ended == [(2, b"lbt-synth: interrupted\n"), 130]
+
+
+def test_the_command_itself_may_be_interrupted(monkeypatch, capsys):
+    before = signal.signal(signal.SIGINT, _stop_loading)
+    try:
+        monkeypatch.setattr("lbt_synth.cli.show.run", lambda _: os.kill(os.getpid(), signal.SIGINT))
+        status, _, error = run(capsys, "show", "none.fits")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (status, error) == (130, "lbt-synth: interrupted\n")
