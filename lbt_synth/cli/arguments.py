@@ -231,7 +231,7 @@ def _add_series(parser: ArgumentParser) -> None:
     _add_missing_facts(parser)
     _add_repairs(parser)
     _add_prior_knowledge(parser)
-    add_option(parser, "--wavelength-um", float, "of Strehl ratios", 2.2)
+    add_option(parser, "--wavelength-um", float, "of Strehl ratios (default: the file's, or 2.2)")
 
 
 def _add_record(parser: ArgumentParser) -> None:

@@ -14,7 +14,7 @@ from lbt_synth.identification.auto import LEAST_SECONDS
 from lbt_synth.identification.method_choice import MethodChoice
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.identification.prediction.residual_row import ResidualRow
-from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.storage.rows import fill_row
 
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
@@ -30,6 +30,7 @@ def run(arguments: Namespace) -> Report:
             "auto tests its design on the recorded series; got a spectrum. Try lbt-synth identify "
             "and lbt-synth design."
         )
+    imaging = loop_records.record_imaging(arguments, record)
     with (
         count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count,
         command_repairs.explain_refusals(arguments),
@@ -38,7 +39,7 @@ def run(arguments: Namespace) -> Report:
             record,
             method=arguments.method,
             gamma_ratio=arguments.gamma_ratio,
-            imaging=loop_records.record_imaging(arguments, record),
+            imaging=imaging,
             accept_record=arguments.accept_record,
             progress=count,
             **loop_records.identification_options(arguments, record),
@@ -49,7 +50,7 @@ def run(arguments: Namespace) -> Report:
     loop_records.add_model(report, found.model)
     if found.choice is not None:
         _add_choice(report, found.choice)
-    _add_comparison(report, found, record)
+    _add_comparison(report, found, record, imaging)
     loop = close_loop(found.model.hardware, found.design.controller)
     report.data["certificate"] = found.design.certificate.passed
     report.notes.append(
@@ -71,22 +72,24 @@ def _add_choice(report: Report, choice: MethodChoice) -> None:
     report.notes += [f"note: {note}." for note in choice.notes]
 
 
-def _add_comparison(report: Report, found: RecordedDesign, record: LoopRecord) -> None:
+def _add_comparison(
+    report: Report, found: RecordedDesign, record: LoopRecord, imaging: Imaging
+) -> None:
     """Add what the second half of the data says of a design from the first."""
     table = found.held_out
     report.add_rows(
         "held_out",
-        "Residual on the second half of the record, by models of the first",
+        f"Residual on the second half of the record, by models of the first; {imaging.label}",
         [fill_row(ResidualRow, entry) for entry in table.entries],
     )
     report.notes += [f"note: {note}" for note in table.notes]
     best = table[found.name]
-    report.data["gain_over_what_ran"] = None
+    report.data |= {"gain_over_what_ran": None, "wavelength_um": imaging.wavelength_um}
     if record.commands is not None:
         ran = table[RAN]
         report.notes.append(
             f"gain over what ran, on unseen data: residual {ran.replayed_nm:.4g} -> "
-            f"{best.replayed_nm:.4g} nm, Strehl ratio of tip and tilt {ran.strehl:.3f} -> "
+            f"{best.replayed_nm:.4g} nm, {imaging.label} (tip and tilt) {ran.strehl:.3f} -> "
             f"{best.strehl:.3f}."
         )
         report.data["gain_over_what_ran"] = {

@@ -7,6 +7,7 @@ from argparse import Namespace
 from lbt_synth.cli.design_description import describe_design
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
+from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config import load_config
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
@@ -23,10 +24,13 @@ def run(arguments: Namespace) -> Report:
     given = {name: value for name, value in options.items() if value is not None}
     request = design_request(arguments.method, given, _WORDING)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
+    config = load_config(arguments.config)
     with show_spinner(f"designing ({request.method.name})", quiet=arguments.json):
-        design = load_config(arguments.config).design(request)
+        design = config.design(request)
     path = save_gain(arguments.output, design)
     report = describe_design(design)
+    with show_spinner("comparing in the truth", quiet=arguments.json):
+        add_truth(report, design, config)
     made_by = method_of_design(design.method)
     if made_by is not request.method:
         report.notes.append(

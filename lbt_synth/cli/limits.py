@@ -34,7 +34,7 @@ def run(arguments: Namespace) -> Report:
     report = Report()
     report.add_rows(
         "rows",
-        "Distance to the limits of any linear controller",
+        f"Distance to the limits of any linear controller; {config.imaging.label}",
         study.rows,
         without=no_band,
         hidden=() if study.shift_hz.size else ("worst_nm",),
@@ -67,7 +67,7 @@ def _limit_notes(study: studies.LimitStudy) -> list[str]:
             "vibrations along principal axes of the sensor's noise."
         ]
     notes = [
-        f"least residual of any linear controller: {study.limit.rms_nm:.6g} nm rms"
+        f"least residual of any linear controller in the truth: {study.limit.rms_nm:.6g} nm rms"
         + (" (sinusoids of known frequency cost nothing)" if study.band is not None else "")
     ]
     if study.band is not None and study.band_hz is not None:

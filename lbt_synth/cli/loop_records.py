@@ -40,6 +40,7 @@ from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 
+WAVELENGTH_UM = 2.2  # of Strehl ratios, where nothing says it
 _FACTS = (  # that a file may not hold
     *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
     *("axes", "averages", "commands"),
@@ -81,12 +82,21 @@ def load_series(
 
 
 def record_imaging(arguments: Namespace, record: LoopRecord) -> Imaging:
-    """Return the camera of the command line and the telescope of the record."""
+    """Return the camera of the command line or the record, and the telescope of the record."""
     return Imaging(
         diameter_m=record.diameter_m,
         obstruction=0.0 if record.obstruction is None else record.obstruction,
-        wavelength_um=arguments.wavelength_um,
+        wavelength_um=imaging_wavelength_um(arguments, record),
     )
+
+
+def imaging_wavelength_um(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> float:
+    """Return the wavelength of Strehl ratios: of the command line, else of the record [um]."""
+    known = record.imaging_wavelength_um if isinstance(record, LoopRecord) else None
+    for value in (arguments.wavelength_um, known):
+        if value is not None:
+            return float(value)
+    return WAVELENGTH_UM
 
 
 def _parse_columns(given: Sequence[str] | None) -> dict[str, list[str | int]] | None:
@@ -200,7 +210,7 @@ def _model_text(
         model,
         diameter_m=record.diameter_m,
         obstruction=obstruction,
-        wavelength_um=arguments.wavelength_um,
+        wavelength_um=imaging_wavelength_um(arguments, record),
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
     )
     return config_text(settings, comments).encode()

@@ -30,7 +30,9 @@ class MirrorFacts:
     settling_frames: float = column("  in frames", unit="frames")
     bandwidth_hz: float = column("bandwidth, -3 dB", unit="Hz")
     frame_s: float = column("one frame", unit="ms", scale=1e3)
-    limit_nm: float = column("least residual of any linear controller", unit="nm rms", format=".2f")
+    limit_nm: float = column(
+        "least residual of any linear controller in the truth", unit="nm rms", format=".2f"
+    )
 
 
 def run(arguments: Namespace) -> Report:
@@ -60,7 +62,7 @@ def run(arguments: Namespace) -> Report:
             limit_nm=limit_or_nan(lambda: least_residual(hardware, config.truth)),
         ),
     )
-    report.add_rows("rows", "Designs on this mirror", rows)
+    report.add_rows("rows", f"Designs on this mirror; {config.imaging.label}", rows)
     report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(shown)}")
     write_outputs(
         report,

@@ -16,7 +16,7 @@ from lbt_synth.cli.progress import count_progress, track_progress
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop import stable_sensor_gains
+from lbt_synth.loop import Imaging, stable_sensor_gains
 from lbt_synth.report.designs.assessment import require_compatible
 from lbt_synth.report.designs.report import refine_values
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
@@ -70,7 +70,8 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
         )
     )
     report = Report()
-    report.add_rows("rows", "Robustness to the vibration frequency", rows)
+    caption = f"Robustness to the vibration frequency; {config.imaging.label}"
+    report.add_rows("rows", caption, rows)
     write_outputs(report, arguments.output, rows, figure=lambda: robustness_figure(rows))
     return report
 
@@ -103,7 +104,7 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     for name, found in maps.items():
         intervals = _stable_gains(designs[name], found, assumed[name])
         report.data["maps"][name] = asdict(found) | {"stable_sensor_gains": intervals}
-        report.tables.append(row_table(_map_title(name, found), _map_lines(found)))
+        report.tables.append(row_table(_map_title(name, found, config.imaging), _map_lines(found)))
         report.notes += _map_notes(name, designs[name], config, found, intervals)
     write_outputs(
         report,
@@ -176,9 +177,9 @@ class MapLine:
     worst_hz: float = column("at", unit="Hz", format="+.2f")
 
 
-def _map_title(name: str, found: RobustnessMap) -> str:
+def _map_title(name: str, found: RobustnessMap, imaging: Imaging) -> str:
     low, high = np.min(found.errors_hz), np.max(found.errors_hz)
-    return f"{name}: Strehl ratio over frequency errors of {low:+g} to {high:+g} Hz"
+    return f"{name}: {imaging.label}, over frequency errors of {low:+g} to {high:+g} Hz"
 
 
 def _map_lines(found: RobustnessMap) -> list[MapLine]:

@@ -21,6 +21,7 @@ from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.loop import (
     ClosedLoop,
+    Imaging,
     Simulation,
     close_loop,
     least_residual,
@@ -48,7 +49,7 @@ class ExactAnswers:
     vibration_nm: float | None = column("  vibration", unit="nm rms", default=None)
     noise_nm: float | None = column("  noise", unit="nm rms", default=None)
     limit_nm: float | None = column(
-        "least residual of any linear controller", unit="nm rms", default=None
+        "least residual in the truth, any controller", unit="nm rms", default=None
     )
     above_limit_percent: float | None = column("  residual above it", unit="%", default=None)
 
@@ -79,7 +80,13 @@ def run(arguments: Namespace) -> Report:
             settle_frames=settle,
         )
         strehls = simulation.strehl(config.imaging)
-    report = _describe_simulation(simulation, strehls, _exact_answers(loop, config, truth), design)
+    report = _describe_simulation(
+        simulation,
+        strehls,
+        _exact_answers(loop, config, truth),
+        design,
+        config.imaging,
+    )
     report.data["sensor_gain"] = config.sensor_gain * truth.sensor_gain
     report.notes += _simulation_notes(config, design, strehls, settle, drifts=truth.drifts)
     if arguments.output is not None:
@@ -95,7 +102,11 @@ def run(arguments: Namespace) -> Report:
 
 
 def _describe_simulation(
-    simulation: Simulation, strehls: FloatArray, exact: ExactAnswers, design: Design
+    simulation: Simulation,
+    strehls: FloatArray,
+    exact: ExactAnswers,
+    design: Design,
+    imaging: Imaging,
 ) -> Report:
     command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
     cases, frames = simulation.residual_nm.shape[:2]
@@ -107,6 +118,7 @@ def _describe_simulation(
             "command_rms": command_rms,
             "units": json_units(exact) | {"residual_nm": "nm rms", "command_rms": "nm rms"},
             "frames": frames,
+            "wavelength_um": imaging.wavelength_um,
             "cases": cases,
             "seed": simulation.seed,
         }
@@ -116,7 +128,8 @@ def _describe_simulation(
         "residual_exact_nm": float(np.sqrt(np.mean(simulation.rms_nm**2))),
     }
     report.add_table(
-        f"{design.method} in the loop: {cases} run{'s' * (cases > 1)} of {frames} frames",
+        f"{design.method} in the loop: {cases} run{'s' * (cases > 1)} of {frames} frames; "
+        f"{imaging.label}",
         ("quantity", "simulated", "exact", "unit"),
         [
             (each.heading, simulated.get(each.name), each.text(exact), each.unit)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
@@ -123,7 +123,13 @@ class Config:
         """
         request = design_request(method, options) if isinstance(method, str) else method
         with name_file(self.source):
-            return request.build(self)
+            design = request.build(self)
+        return replace(design, configuration=self.text)
+
+    @property
+    def text(self) -> str:
+        """What the file gives, as JSON; :func:`config_from_text` reads it."""
+        return self.settings.model_dump_json(exclude_unset=True)
 
     def require_atmosphere(self, reason: str) -> Atmosphere:
         """Return the atmosphere; raise ConfigError with the reason if the file has none."""
@@ -167,6 +173,16 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     """
     source = Path(path)
     return build_config(validate_sections(FileSection, read_mapping(source), source), source)
+
+
+def config_from_text(text: str, source: Path) -> Config:
+    """Build the configuration of ``Config.text``, which came from a file."""
+    try:
+        settings = FileSection.model_validate_json(text)
+    except ValidationError as error:
+        message, key = describe_error(error, FileSection)
+        raise ConfigError(f"the configuration in {source}: {message}", path=key) from error
+    return build_config(settings, source)
 
 
 def validate_sections(schema: type[Checked], raw: Mapping[str, Any], source: Path) -> Checked:

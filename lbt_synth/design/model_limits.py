@@ -14,7 +14,14 @@ from lbt_synth.design.shaping import ResidualVariance, VibrationBand
 from lbt_synth.design.shaping.channel import mode_loop
 from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.loop import BandLimit, ResidualLimit, least_residual, least_worst_residual
+from lbt_synth.loop import (
+    BandLimit,
+    ResidualLimit,
+    close_loop,
+    least_residual,
+    least_worst_residual,
+    model_budget,
+)
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant, Truth
 
@@ -40,20 +47,24 @@ def limit_or_none(limit: Callable[[], T]) -> T | None:
         return None
 
 
-def model_limit(design: EstimatorDesign) -> tuple[float, float]:
-    """Return the limit of a filter's own model [nm rms], and how far its error is above it [%].
+def model_limit(design: EstimatorDesign) -> tuple[float, float, float]:
+    """Return a filter's residual in its own model, the limit there [nm rms], and how far above [%].
 
-    Both are nan where the limit cannot be computed. The second is nan also for a fractional
-    delay or a moving mirror: there only an LQG's estimation error is its residual.
+    What cannot be computed is nan. The residual is the estimation error where the mirror reaches
+    every command at once, or the design commands for its dynamics.
     """
     plant = design.problem
     if not isinstance(plant, TipTiltPlant | FullStatePlant):
-        return np.nan, np.nan
+        return np.nan, np.nan, np.nan
+    hardware, residual_nm = plant.hardware, design.rms
+    settled = hardware.delay_frames % 1 == 0 and hardware.mirror is None
+    if not (settled or design.knows_mirror):
+        residual_nm = np.nan
+        if isinstance(plant, TipTiltPlant):
+            loop = close_loop(hardware, design.controller)
+            residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
-    delay = plant.hardware.delay_frames
-    settled = delay == round(delay) and plant.hardware.mirror is None
-    exact = settled or design.knows_mirror
-    return limit_nm, above_percent(design.rms, limit_nm) if exact else np.nan
+    return residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
 
 
 def shaped_limit(design: ShapedDesign) -> tuple[float, float]:

@@ -58,6 +58,7 @@ class DesignRecord:
             "certificate": _unpack_certificate(self.meta["certificate"]),
             "solver": SolverReport(**self.meta["solver"]),
             "assumptions": tuple(map(str, self.meta.get("assumptions", ()))),
+            "configuration": str(self.meta.get("configuration", "")),
         }
 
     def hardware(self) -> LoopHardware:
@@ -111,6 +112,8 @@ def record_common(design: Design) -> DesignRecord:
     }
     if design.assumptions:
         meta["assumptions"] = list(design.assumptions)
+    if design.configuration:
+        meta["configuration"] = design.configuration
     hardware = design.hardware
     if hardware is not None:
         arrays |= {"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}

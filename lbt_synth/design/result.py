@@ -59,6 +59,8 @@ class Design:
         How it was computed.
     assumptions : tuple of str
         What the design rests on and no certificate shows, such as where a sensor gain is from.
+    configuration : str
+        The configuration that it was made from, as JSON; empty if there was none.
     """
 
     method: str
@@ -66,6 +68,7 @@ class Design:
     certificate: Certificate
     solver: SolverReport
     assumptions: tuple[str, ...] = ()
+    configuration: str = ""
 
     @property
     def hardware(self) -> LoopHardware | None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from lbt_synth.design.loop_shaping import ShapedDesign, noise_per_mode, shape
 from lbt_synth.design.shaping.bounds import ModulusMargin
-from lbt_synth.design.shaping.objectives import ResidualVariance, Total, VibrationBand
+from lbt_synth.design.shaping.objectives import Leaf, ResidualVariance, Total, VibrationBand
 from lbt_synth.design.shaping.specification import Demand, Specification
 from lbt_synth.design.shaping.uncertainty import SensorGainRange
 from lbt_synth.errors import ProblemError
@@ -18,7 +19,7 @@ from lbt_synth.validation import number, require_instance, sequence
 def robust(
     plant: TipTiltPlant,
     *,
-    bands: Sequence[VibrationBand],
+    bands: Sequence[VibrationBand] | Sequence[Sequence[VibrationBand]],
     sensor_gain: tuple[float, float] = (1.0, 1.0),
     scenarios: Sequence[float] = (1.0,),
     modulus_margin: float = 0.45,
@@ -39,8 +40,9 @@ def robust(
     ----------
     plant : TipTiltPlant
         Loop, noise and turbulence; its vibrations are not used, the bands take their place.
-    bands : sequence of VibrationBand
-        Bands, each with the rms of its vibration; every mode may have all of them.
+    bands : sequence of VibrationBand, or one sequence per mode
+        Bands, each with the rms of its vibration. In one sequence, every mode may have all of
+        them.
     sensor_gain : tuple of float, optional
         Interval of sensor gains, around 1, for which the loop stays stable.
     scenarios : sequence of float, optional
@@ -82,9 +84,7 @@ def robust(
     True
     """
     require_instance(plant, TipTiltPlant, "plant")
-    lines = sequence(bands, "bands")
-    for line in lines:
-        require_instance(line, VibrationBand, "each of bands")
+    lines = _bands_per_mode(bands, plant.hardware.modes)
     gains = tuple(number(g, "scenarios", above=0) for g in sequence(scenarios, "scenarios"))
     if not gains:
         raise ProblemError("scenarios must name at least one sensor gain; got none.")
@@ -97,17 +97,34 @@ def robust(
     if (low, high) != (1, 1):
         fixed.append(SensorGainRange(low=low, high=high))
     deviations = noise_per_mode(plant.hardware, plant.R)
-    by_mode: dict[tuple[str, int], Specification] = {}
+    by_mode: dict[object, Specification] = {}
     specifications = []
-    for noise_nm, model in zip(deviations.tolist(), plant.turbulence, strict=True):
+    for noise_nm, model, own in zip(deviations.tolist(), plant.turbulence, lines, strict=True):
         spectrum = model if turbulence is None else turbulence
         # equal modes share one specification, and are solved once
-        key = f"{noise_nm:.9g}", id(spectrum)
+        key = f"{noise_nm:.9g}", id(spectrum), own
         if key not in by_mode:
             air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
-            terms = tuple(replace(term, sensor_gain=g) for g in gains for term in (air, *lines))
+            terms: tuple[Leaf, ...] = (air, *own)
+            terms = tuple(replace(term, sensor_gain=g) for g in gains for term in terms)
             by_mode[key] = Specification(objective=Total(terms=terms), demands=(*fixed, *further))
         specifications.append(by_mode[key])
     path = plant.hardware
     design = shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)
     return replace(design, method="robust")
+
+
+def _bands_per_mode(
+    bands: Sequence[VibrationBand] | Sequence[Sequence[VibrationBand]], modes: int
+) -> list[tuple[VibrationBand, ...]]:
+    """Return the bands of each mode: those of all modes, or one sequence per mode."""
+    given: tuple[Any, ...] = sequence(bands, "bands")
+    nested = bool(given) and all(isinstance(own, list | tuple) for own in given)
+    if nested and len(given) != modes:
+        raise ProblemError(
+            f"bands must be one sequence, or one per mode ({modes}); got {len(given)} of them."
+        )
+    out = [tuple(own) for own in given] if nested else [given] * modes
+    for line in (line for own in out for line in own):
+        require_instance(line, VibrationBand, "each of bands")
+    return out

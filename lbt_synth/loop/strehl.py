@@ -77,6 +77,11 @@ class Imaging:
         check_fields(self)
 
     @property
+    def label(self) -> str:
+        """What tables call its Strehl ratio, with the wavelength."""
+        return f"Strehl ratio at {self.wavelength_um:g} um"
+
+    @property
     def cycles_per_nm(self) -> float:
         """Highest spatial frequency D/lambda, in cycles per nm of tilt wavefront.
 

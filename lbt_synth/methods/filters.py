@@ -24,6 +24,7 @@ Horizon = Annotated[
         json_schema_extra={"instead": "Set loop.delay_frames in the configuration instead."},
     ),
 ]
+LIMIT_IN_MODEL = "least residual of any linear controller in it"  # heading, below the residual
 BOUNDS = frozenset({"gamma", "gamma_ratio", "rms"})  # at most one is given
 
 
@@ -52,8 +53,9 @@ class FilterFacts:
 
     rms: float = column("estimation error, rms", unit="nm")
     gamma: float = column("estimation error, H-infinity norm", unit="nm")
-    limit_nm: float | None = column("least residual of any linear controller", unit="nm")
-    above_limit_percent: float | None = column("estimation error above it", unit="%", format=".5f")
+    residual_nm: float | None = column("residual in its model, rms", unit="nm")
+    limit_nm: float | None = column(LIMIT_IN_MODEL, unit="nm")
+    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
     rms_requested: float | None = column("rms asked for", unit="nm")
     gamma_requested: float | None = column("bound asked for", unit="nm")
     gamma_least: float | None = column(
@@ -65,13 +67,12 @@ class FilterFacts:
 
 
 def limit_facts(design: EstimatorDesign) -> dict[str, Any]:
-    """Return the limit of a design's own model, and how far the design is above it."""
+    """Return residual and limit of a design's own model, and how far the design is above it."""
     from lbt_synth.design.model_limits import model_limit
 
-    if design.hardware is None:
-        return {"limit_nm": None, "above_limit_percent": None}
-    limit_nm, above = model_limit(design)
-    return {"limit_nm": limit_nm, "above_limit_percent": above}
+    names = ("residual_nm", "limit_nm", "above_limit_percent")
+    found = (None, None, None) if design.hardware is None else model_limit(design)
+    return dict(zip(names, found, strict=True))
 
 
 def _describe_filter(design: FilterDesign) -> Description:

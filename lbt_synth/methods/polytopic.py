@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from lbt_synth.methods.filters import Horizon, limit_facts
+from lbt_synth.methods.filters import LIMIT_IN_MODEL, Horizon, limit_facts
 from lbt_synth.methods.method import Description, DesignInputs, Method, Section
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, number
@@ -39,8 +39,9 @@ class PolytopicFacts:
 
     rms: float = column("estimation error at the centre, rms", unit="nm")
     gamma: float = column("estimation error at the centre, H-infinity norm", unit="nm")
-    limit_nm: float | None = column("least residual of any linear controller", unit="nm")
-    above_limit_percent: float | None = column("estimation error above it", unit="%", format=".5f")
+    residual_nm: float | None = column("residual in its model, rms", unit="nm")
+    limit_nm: float | None = column(LIMIT_IN_MODEL, unit="nm")
+    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
     half_width_hz: float = column("half width of the interval of frequencies", unit="Hz")
     low_hz: float = column("interval of frequencies, from", unit="Hz")
     high_hz: float = column("interval of frequencies, to", unit="Hz")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -27,10 +27,12 @@ if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.shaping.specification import Demand
-    from lbt_synth.models import Spectrum, TipTiltPlant
+    from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 
 T = TypeVar("T")
+Axis: TypeAlias = Literal["tip", "tilt", "both"]
 _KEY = "design.robust"
+_AXES: dict[Axis, int] = {"tip": 0, "tilt": 1}
 _MOST_BANDS = 6  # around lines of a plant
 _BAND = 0.02  # half width of such a band, over its frequency
 _PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes minutes
@@ -43,6 +45,8 @@ class BandSection(Section):
     high_hz: Positive
     rms_nm: Positive | None = None
     rms_mas: Positive | None = None
+    axis: Axis = "both"
+    damping: Annotated[float, Field(ge=0, lt=1)] | None = None
 
     @model_validator(mode="after")
     def _require_one_size(self) -> BandSection:
@@ -165,14 +169,33 @@ def _choose_spectrum(inputs: DesignInputs, section: RobustSection) -> Spectrum |
 
 
 def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[Any]:
+    """Return the bands, one list per mode."""
     from lbt_synth.design.shaping import VibrationBand
 
-    out = []
+    modes = inputs.hardware.modes
+    out: list[list[Any]] = [[] for _ in range(modes)]
     for i, band in enumerate(section.bands):
         rms_nm = inputs.size_nm(band, f"{_KEY}.bands[{i}]")
-        entry = {"low_hz": band.low_hz, "high_hz": band.high_hz, "rms_nm": rms_nm}
-        out.append(_build_entry(inputs, f"bands[{i}]", VibrationBand, entry))
+        axis = _AXES.get(band.axis)
+        if axis is not None and modes != 2:
+            key = f"{_KEY}.bands[{i}].axis"
+            raise ConfigError(f"{key}: this loop has {modes} axes: leave axis out.", path=key)
+        for mode in range(modes) if axis is None else (axis,):
+            damping = _model_damping(inputs, band, mode) if band.damping is None else band.damping
+            entry = {"low_hz": band.low_hz, "high_hz": band.high_hz, "rms_nm": rms_nm}
+            entry["damping"] = damping
+            out[mode].append(_build_entry(inputs, f"bands[{i}]", VibrationBand, entry))
     return out
+
+
+def _model_damping(inputs: DesignInputs, band: BandSection, mode: int) -> float:
+    """Return the largest damping of the model's vibrations of a mode in a band, 0 without one."""
+    found = (
+        line.damping
+        for line in inputs.plant.vibrations
+        if band.low_hz <= line.frequency_hz <= band.high_hz and line.direction[mode]
+    )
+    return max(found, default=0.0)
 
 
 def _build_entry(
@@ -240,25 +263,32 @@ def _plant_section(plant: TipTiltPlant) -> RobustSection:
     """Return bands around the strongest lines of a plant, those that overlap as one."""
     lines = sorted(plant.vibrations, key=lambda line: -line.rms_nm)
     nyquist_hz = plant.hardware.frame_rate_hz / 2
-    bands: list[tuple[float, float, float]] = []
+    bands: list[BandSection] = []
     for line in sorted(lines[:_MOST_BANDS], key=lambda line: line.frequency_hz):
         half = max(_BAND * line.frequency_hz, line.damping * line.frequency_hz)
         low, high = max(line.frequency_hz - half, 0.0), min(line.frequency_hz + half, nyquist_hz)
-        power = line.rms_nm**2
-        if bands and low <= bands[-1][1]:
-            first, last, before = bands.pop()
-            low, high, power = min(first, low), max(last, high), power + before
-        bands.append((low, high, power))
+        axis, rms_nm, damping = _axis(line), line.rms_nm, line.damping
+        last = bands[-1] if bands else None
+        if last is not None and low <= last.high_hz:
+            bands.pop()
+            low, high = min(last.low_hz, low), max(last.high_hz, high)
+            axis = axis if axis == last.axis else "both"
+            rms_nm = float(np.hypot(last.rms_nm or 0.0, rms_nm))
+            damping = max(last.damping or 0.0, damping)
+        bands.append(
+            BandSection(low_hz=low, high_hz=high, rms_nm=rms_nm, axis=axis, damping=damping)
+        )
     if not bands:
         raise ProblemError("a robust controller is for vibrations; the plant has none.")
-    return RobustSection(
-        bands=[
-            BandSection(low_hz=low, high_hz=high, rms_nm=float(np.sqrt(power)))
-            for low, high, power in bands
-        ],
-        functions=_PLANT_FUNCTIONS,
-        states=None,
-    )
+    return RobustSection(bands=bands, functions=_PLANT_FUNCTIONS, states=None)
+
+
+def _axis(line: Vibration) -> Axis:
+    """Return the axis that a line of two axes shakes."""
+    if len(line.direction) != 2:
+        return "both"
+    shaken = [name for name, mode in _AXES.items() if line.direction[mode]]
+    return shaken[0] if len(shaken) == 1 else "both"
 
 
 def _pack(design: ShapedDesign) -> DesignRecord:

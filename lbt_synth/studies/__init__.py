@@ -14,3 +14,4 @@ from lbt_synth.studies.limits import limits as limits  # noqa: E402
 from lbt_synth.studies.mirror import mirror as mirror  # noqa: E402
 from lbt_synth.studies.robustness import robustness as robustness  # noqa: E402
 from lbt_synth.studies.tradeoff import tradeoff as tradeoff  # noqa: E402
+from lbt_synth.studies.unexpected_power import unexpected_power as unexpected_power  # noqa: E402

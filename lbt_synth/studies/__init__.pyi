@@ -32,3 +32,7 @@ from .study.study import Study as Study
 from .study.summary import summary_tables as summary_tables
 from .tradeoff import TradeoffPoint as TradeoffPoint
 from .tradeoff import tradeoff as tradeoff
+from .truth_comparison import TruthComparison as TruthComparison
+from .truth_comparison import compare_in_truth as compare_in_truth
+from .unexpected_power import UnexpectedPower as UnexpectedPower
+from .unexpected_power import unexpected_power as unexpected_power

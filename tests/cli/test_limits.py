@@ -92,7 +92,7 @@ def test_show_and_simulate_print_the_limit(tmp_path, capsys, config):
     data = json.loads(run(capsys, *simulate, "--json")[1])
     assert data["limit_nm"] == pytest.approx(10.8414, abs=1e-4)
     assert data["above_limit_percent"] == pytest.approx(231.589, abs=1e-2)
-    assert "least residual of any linear controller" in run(capsys, *simulate)[1]
+    assert "least residual in the truth, any controller" in run(capsys, *simulate)[1]
 
 
 def test_show_without_a_limit(tmp_path, capsys):

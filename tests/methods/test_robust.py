@@ -1,5 +1,7 @@
 """The robust section of a configuration."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.configs import AR, OTHER, minimal_config, write_config
@@ -7,7 +9,7 @@ from support.robust_config import SMALL, robust_writer
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.methods.registry import plant_methods
+from lbt_synth.methods.registry import plant_methods, reference_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 
 
@@ -107,3 +109,86 @@ def test_the_strongest_lines_of_a_plant_have_bands():
 def test_a_plant_without_lines_has_no_robust_design():
     with pytest.raises(ProblemError, match="the plant has none"):
         design_request("robust", {}).build(PlantInputs(plant=a_plant_with_lines()))
+
+
+def test_bands_have_an_axis_and_the_damping_of_the_model(small, tmp_path):
+    section = """
+  robust:
+    bands:
+      - {low_hz: 16.0, high_hz: 20.0, rms_nm: 100, axis: tip}
+      - {low_hz: 30.0, high_hz: 33.0, rms_nm: 50, axis: tilt, damping: 0.03}
+      - {low_hz: 60.0, high_hz: 70.0, rms_nm: 20}
+    functions: 8
+    states: null
+"""
+    model = (
+        "    kind: ar2",
+        (
+            "    kind: ar2\n  vibrations:\n"
+            "    - {axis: both, frequency_hz: 18.0, damping: 0.01, rms_nm: 100}\n"
+            "    - {axis: tip, frequency_hz: 31.0, damping: 0.02, rms_nm: 100}"
+        ),
+    )
+    design = lbt.load_config(small(section, model=model)).design("robust")
+    bands = [
+        [(term.low_hz, term.damping) for term in spec.objective.terms[1:]]
+        for spec in design.specifications
+    ]
+    assert bands == [[(16.0, 0.01), (60.0, 0.0)], [(30.0, 0.03), (60.0, 0.0)]]
+
+
+def test_a_band_of_one_axis_is_refused_where_there_is_one(tmp_path):
+    band = {"low_hz": 16.0, "high_hz": 20.0, "rms_nm": 9.0, "axis": "tip"}
+    content = minimal_config(loop={"axes": 1}, design={"robust": {"bands": [band]}})
+    content["model"].pop("vibrations")
+    with pytest.raises(ProblemError, match=r"design\.robust\.bands\[0\]\.axis: this loop has 1"):
+        lbt.load_config(write_config(tmp_path, content)).design("robust")
+
+
+def worst_in_bands(config, design):
+    """The worst variance with the resonances of the truth anywhere in their bands [nm^2]."""
+    loop = lbt.close_loop(config.hardware, design.controller)
+    still = replace(config.truth, vibrations=())
+    total = lbt.residual_budget(loop, still).rms_nm ** 2
+    for line, band in zip(
+        config.truth.vibrations, config.method_section("robust").bands, strict=True
+    ):
+        alone = lbt.Truth(turbulence=None)
+        total += max(
+            lbt.residual_budget(
+                loop, replace(alone, vibrations=(replace(line, frequency_hz=float(f)),))
+            ).rms_nm
+            ** 2
+            for f in np.linspace(band.low_hz, band.high_hz, 9)
+        )
+    return total
+
+
+def test_robust_stays_beside_the_filters_within_its_bands(tmp_path):
+    """A loop of 8 m with two resonances, of which the bands do not say the damping."""
+    lines = [
+        {"axis": axis, "frequency_hz": f, "damping": 0.01, "rms_nm": rms}
+        for axis, f, rms in (("tip", 18.0, 116.0), ("tilt", 48.0, 78.0))
+    ]
+    content = minimal_config(
+        sensor={"noise_nm": 20.0},
+        loop={"frame_rate_hz": 1000.0, "delay_frames": 2.0},
+        model={"vibrations": lines},
+        truth={"turbulence": "model", "vibrations": [{"kind": "resonance", **x} for x in lines]},
+        design={
+            "robust": {
+                "bands": [
+                    {"low_hz": 16.0, "high_hz": 20.0, "rms_nm": 116.0, "axis": "tip"},
+                    {"low_hz": 45.0, "high_hz": 51.0, "rms_nm": 78.0, "axis": "tilt"},
+                ],
+                "functions": 30,
+                "states": None,
+            }
+        },
+    )
+    config = lbt.load_config(write_config(tmp_path, content))
+    worst = [worst_in_bands(config, config.design("robust"))]
+    for method in reference_methods():
+        design = config.design(method.name, **method.reference_options)
+        worst.append(worst_in_bands(config, design))
+    assert worst[0] < 1.01 * min(worst[1:])

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
 from lbt_synth.design.shaping.frequencies import Band, CheckedFields, Grid
@@ -13,7 +14,15 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function
 from lbt_synth.loop import residual_budget
 from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth
-from lbt_synth.validation import FloatArray, NotNegative, Positive, number, sequence, set_fields
+from lbt_synth.validation import (
+    FloatArray,
+    NotNegative,
+    Positive,
+    number,
+    real_array,
+    sequence,
+    set_fields,
+)
 
 _RECORDED = Atmosphere | ARModel | TabulatedSpectrum | None  # what a gain file can hold
 
@@ -61,20 +70,72 @@ class ResidualVariance(CheckedFields):
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the variance over a grid as a function of the coefficients [nm^2]."""
         f, w = grid.nodes_hz, grid.weights_hz
-        density = np.zeros(f.size) if self.turbulence is None else self.turbulence.psd(f)
-        size = np.sqrt(w * density)
+        left = _left_of(self.turbulence, self.sensor_gain, channel, grid)
         noise = self.noise_nm * np.sqrt(w / channel.nyquist_hz)
-        noise_rows = noise[:, None] * channel.noise_rows(f)
-        rows = np.stack([-size[:, None] * channel.complementary_rows(f), noise_rows], axis=1)
-        centres = np.stack([size, np.zeros(f.size)], axis=1).astype(np.complex128)
-        steering = channel.steering_rows(f, self.sensor_gain)
-        return Fractions(frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=False)
+        noise_rows = noise[:, None, None] * channel.noise_rows(f)[:, None]
+        return replace(
+            left,
+            rows=np.concatenate([left.rows, noise_rows], axis=1),
+            centres=np.pad(left.centres, ((0, 0), (0, 1))),
+        )
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the variance in the real loop, exactly."""
-        gain = self.sensor_gain
-        truth = Truth(turbulence=self.turbulence, noise_nm=self.noise_nm, sensor_gain=gain)
-        return residual_budget(loop.at(gain), truth).rms_nm ** 2
+        return _measured_left(self.turbulence, self.noise_nm, self.sensor_gain, loop)
+
+
+def _left_of(
+    spectrum: Spectrum | None, sensor_gain: float, channel: Channel, grid: Grid
+) -> Fractions:
+    """Return the variance that the loop leaves of a spectrum, as a function of coefficients."""
+    f = grid.nodes_hz
+    density = np.zeros(f.size) if spectrum is None else spectrum.psd(f)
+    size = np.sqrt(grid.weights_hz * density)[:, None]
+    return Fractions(
+        frequency_hz=f,
+        rows=(-size * channel.complementary_rows(f))[:, None],
+        centres=size.astype(np.complex128),
+        steering=channel.steering_rows(f, sensor_gain),
+        worst=False,
+    )
+
+
+def _measured_left(
+    spectrum: Spectrum | None, noise_nm: float, sensor_gain: float, loop: SingleModeLoop
+) -> float:
+    """Return the variance that the real loop leaves of a spectrum and noise, exactly [nm^2]."""
+    truth = Truth(turbulence=spectrum, noise_nm=noise_nm, sensor_gain=sensor_gain)
+    return residual_budget(loop.at(sensor_gain), truth).rms_nm ** 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Skirts:
+    """Spectrum outside a band of a resonance that may be anywhere in it: at most this.
+
+    Below the band it is that of the resonance at the lower end, above it at the upper end; white
+    noise drives the resonance.
+    """
+
+    low_hz: float
+    high_hz: float
+    rms_nm: float
+    damping: float
+
+    @property
+    def breakpoints_hz(self) -> FloatArray:
+        """Ends of the band, and frequencies from which the skirts fall [Hz]."""
+        steps = self.damping * np.array([0.0, 1.0, 3.0, 9.0, 27.0])
+        return np.concatenate([self.low_hz * (1 - steps), self.high_hz * (1 + steps)])
+
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
+        """Return the spectrum at frequencies [Hz], zero inside the band [nm^2/Hz]."""
+        f = real_array(frequency_hz, "frequency_hz")
+        centre = np.where(f < self.low_hz, self.low_hz, self.high_hz)
+        width = 2 * self.damping * centre
+        shape = (centre**2 - f**2) ** 2 + (width * f) ** 2
+        outside = (f < self.low_hz) | (f > self.high_hz)
+        height = 2 * self.rms_nm**2 * width * centre**2 / np.pi
+        return np.asarray(np.where(outside, height / shape, 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,9 +147,13 @@ class VibrationBand(Band):
     low_hz, high_hz : float
         Ends of the band [Hz].
     rms_nm : float
-        Standard deviation of the vibration, a sinusoid [nm rms wavefront].
+        Standard deviation of the vibration [nm rms wavefront].
     sensor_gain : float, optional
         Sensor gain at which the loop runs, relative to the one it is designed for.
+    damping : float, optional
+        Its damping ratio, below 1; 0 for a sinusoid. The skirts of a resonance outside the band
+        are added to the worst inside it, which bounds the residual of a resonance anywhere in
+        the band.
 
     Raises
     ------
@@ -105,18 +170,37 @@ class VibrationBand(Band):
     _label: ClassVar = "vibration in {0.band_text} at sensor gain {0.sensor_gain:g}"
     rms_nm: Positive
     sensor_gain: Positive = 1.0
+    damping: Annotated[float, ("at_least", 0), ("below", 1)] = 0.0
 
-    def function(self, channel: Channel, grid: Grid) -> Fractions:
+    @property
+    def skirts(self) -> Skirts | None:
+        """What a resonance leaves outside the band; None for a sinusoid."""
+        if not self.damping:
+            return None
+        return Skirts(
+            low_hz=self.low_hz, high_hz=self.high_hz, rms_nm=self.rms_nm, damping=self.damping
+        )
+
+    def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""
         f = grid.within(self.low_hz, self.high_hz)
         rows = -self.rms_nm * channel.complementary_rows(f)[:, None, :]
         centres = np.full((f.size, 1), self.rms_nm, dtype=np.complex128)
         steering = channel.steering_rows(f, self.sensor_gain)
-        return Fractions(frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=True)
+        inside = Fractions(
+            frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=True
+        )
+        if self.skirts is None:
+            return inside
+        outside = _left_of(self.skirts, self.sensor_gain, channel, grid)
+        return CombinedFunction(parts=(inside, outside), weights=(1.0, 1.0), worst=False)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
-        """Return the worst variance in the real loop, by level sets."""
-        return (self.rms_nm * self.peak(loop.at(self.sensor_gain).rejection())) ** 2
+        """Return the worst variance in the real loop, by level sets, and that of the skirts."""
+        inside = (self.rms_nm * self.peak(loop.at(self.sensor_gain).rejection())) ** 2
+        if self.skirts is None:
+            return inside
+        return inside + _measured_left(self.skirts, 0.0, self.sensor_gain, loop)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -239,8 +323,9 @@ def frequency_costs(term: Term, frequency_hz: FloatArray) -> FloatArray:
         if isinstance(leaf, VibrationBand):
             inside = (frequency_hz >= leaf.low_hz) & (frequency_hz <= leaf.high_hz)
             cost += np.where(inside, 3 * leaf.rms_nm**2 / (leaf.high_hz - leaf.low_hz), 0.0)
-        elif leaf.turbulence is not None:
-            cost += leaf.turbulence.psd(frequency_hz)
+        spectrum = leaf.skirts if isinstance(leaf, VibrationBand) else leaf.turbulence
+        if spectrum is not None:
+            cost += spectrum.psd(frequency_hz)
     return cost
 
 

@@ -96,6 +96,7 @@ class Specification:
         """Spectra of the objective and of the demands."""
         kinds = ResidualVariance | CommandRms
         found = [part.turbulence for part in self._parts if isinstance(part, kinds)]
+        found += [part.skirts for part in self._parts if isinstance(part, VibrationBand)]
         return tuple(spectrum for spectrum in found if spectrum is not None)
 
     def require_fitting(self, hardware: LoopHardware) -> None:

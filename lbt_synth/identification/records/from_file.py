@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 from zipfile import ZipFile
@@ -253,7 +254,7 @@ def record_from_telemetry(
         obstruction=obstruction,
         source=(telemetry.name or "telemetry") if source is None else source,
     )
-    return cast(LoopRecord, record)
+    return replace(cast(LoopRecord, record), imaging_wavelength_um=telemetry.imaging_wavelength_um)
 
 
 def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[str]) -> list[Column]:

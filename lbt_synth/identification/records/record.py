@@ -61,6 +61,8 @@ class LoopRecord:
         What was found.
     diameter_m, obstruction : float, optional
         Telescope diameter [m], and its central obstruction as a fraction of it.
+    imaging_wavelength_um : float, optional
+        Wavelength of the image [um], for Strehl ratios.
     source : str, optional
         Where it is from.
     measured, commanded : (frames,) bool array_like, optional
@@ -99,6 +101,7 @@ class LoopRecord:
     health: RecordHealth
     diameter_m: Positive | None = None
     obstruction: Obstruction | None = None
+    imaging_wavelength_um: Positive | None = None
     source: str = ""
     measured: BoolArray | None = None
     commanded: BoolArray | None = None

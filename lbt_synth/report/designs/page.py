@@ -17,7 +17,7 @@ from lbt_synth.report.designs.charts import (
     transfer_charts,
 )
 from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.designs.tables import certificate_table, summary_table
+from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table
 from lbt_synth.report.designs.verdict import verdict
 from lbt_synth.report.number_text import listing_text, number_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
@@ -132,6 +132,13 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
         *blocks,
         Paragraph(text=verdict(report)),
         summary_table(report),
+        truth_table(report),
+        *(
+            Notice(text=f"{one.name}: {text}.")
+            for one in report.stable
+            for text in report.truth.warnings[one.name]
+        ),
+        *(Notice(text=note) for note in report.truth.notes),
         Paragraph(text=_situation_text(report)),
         *(
             Notice(text=f"{one.name} was {note}")

@@ -20,7 +20,7 @@ from lbt_synth.report import provenance
 from lbt_synth.report.designs.assessment import DesignAssessment, assess_design, require_compatible
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
 from lbt_synth.report.figures.loop import frequency_grid
-from lbt_synth.studies import LimitRow, LimitStudy
+from lbt_synth.studies import LimitRow, LimitStudy, TruthComparison
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")
@@ -43,6 +43,8 @@ class DesignReport:
         Of the designs whose loop is stable.
     limits : LimitStudy
         Residuals over the frequency error, and what no linear controller goes below.
+    truth : TruthComparison
+        The designs beside reference designs, and what they were not made for.
     frequency_hz : (f,) ndarray
         Frequencies of the transfer functions [Hz].
     errors_hz : (e,) ndarray
@@ -60,6 +62,7 @@ class DesignReport:
     assessments: tuple[DesignAssessment, ...]
     simulations: Mapping[str, DesignSimulation]
     limits: LimitStudy
+    truth: TruthComparison
     frequency_hz: FloatArray
     errors_hz: FloatArray
     files: tuple[provenance.SourceFile, ...]
@@ -156,6 +159,8 @@ def design_report(
         count(1)
     limits = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
     count(1)
+    compared = studies.compare_in_truth(designs, config)
+    count(1)
     stable = [one for one in assessments if one.stable]
     settle = [settling_frames(one.spectral_radius) for one in stable]
     simulations = {}
@@ -169,6 +174,7 @@ def design_report(
         assessments=tuple(assessments),
         simulations=simulations,
         limits=limits,
+        truth=compared,
         frequency_hz=grid,
         errors_hz=errors,
         files=tuple(files),
@@ -179,7 +185,7 @@ def design_report(
 
 def count_steps(designs: int) -> int:
     """Return the number of steps that a report of so many designs takes at most."""
-    return 2 * designs + 1
+    return 2 * designs + 2
 
 
 def frequency_errors(config: Config) -> FloatArray:

@@ -20,7 +20,7 @@ from lbt_synth.report.number_text import (
     number_text,
     signed_text,
 )
-from lbt_synth.storage.rows import Column, columns
+from lbt_synth.storage.rows import Column, columns, row_table
 from lbt_synth.storage.tables import Cell, Table
 
 # titles of what is an interval, not a column of the row
@@ -70,10 +70,18 @@ def summary_table(report: DesignReport) -> Table:
             cells = (_text(each, row) if own is None else own(report, one) for one, row in found)
             lines.append((title, *cells))
     return Table(
-        caption=f"Summary at a real sensor gain of {number_text(report.real_gain)}",
+        caption=f"Summary at a real sensor gain of {number_text(report.real_gain)}; "
+        f"{report.config.imaging.label}",
         headings=("quantity", *report.names),
         rows=tuple(lines),
     )
+
+
+def truth_table(report: DesignReport) -> Table:
+    """Return the designs and reference designs in the truth of the configuration."""
+    caption = f"In the truth of {report.config.source.name}; {report.config.imaging.label}"
+    without = ("worst_nm", "above_band_limit_percent", "method", "stable")
+    return row_table(caption, report.truth.rows, without=without)
 
 
 def _title(each: Column) -> str:

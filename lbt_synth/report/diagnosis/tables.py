@@ -64,7 +64,10 @@ def residual_tables(found: Diagnosis) -> list[Table]:
             caption += f" (best design: {found.best})"
         tables.append(row_table(caption, found.costs))
     if found.residuals:
-        caption = "Residual on the second half of the record, by models of the first"
+        caption = (
+            "Residual on the second half of the record, by models of the first; "
+            f"{found.imaging.label}"
+        )
         tables.append(row_table(caption, found.residuals))
     if found.given is not None:
         tables.append(fact_table("The gain file on this record", found.given))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from support.shaping import (
     AIR,
@@ -23,6 +24,7 @@ TERMS = [
     lbt.design.shaping.ResidualVariance(turbulence=None, noise_nm=15.5),
     lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797),
     lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797, sensor_gain=0.6),
+    lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797, damping=0.02),
     lbt.design.shaping.Total(
         terms=(BASIC, lbt.design.shaping.VibrationBand(low_hz=5, high_hz=9, rms_nm=30)),
         weights=(1, 2),
@@ -42,6 +44,30 @@ def test_a_term_over_the_grid_is_the_residual_of_the_real_loop(term, delay):
     found = term.function(mode, spec(objective=term).grid(mode, fineness=2)).value(c)
     exact = term.measured_nm2(mode_loop(mode.hardware, mode.basis.parameter(c)))
     assert found == pytest.approx(exact, rel=2e-3)
+
+
+@pytest.mark.parametrize("frequency_hz", [16.5, 18.0, 20.0, 23.5])
+def test_a_band_with_damping_bounds_a_resonance_anywhere_in_it(frequency_hz):
+    mode, damping = channel(delay=2.0), 0.02
+    band = lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797, damping=damping)
+    loop = mode_loop(mode.hardware, mode.basis.parameter(random_coefficients(12) * 0.5))
+    line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=797, direction=(1,))
+    truth = lbt.Truth(turbulence=None, vibrations=(line,))
+    left_nm2 = lbt.residual_budget(loop.at(1.0), truth).rms_nm ** 2
+    assert left_nm2 < band.measured_nm2(loop) < 3 * left_nm2
+    assert replace(band, damping=0.0).skirts is None
+
+
+def test_skirts_are_those_of_the_resonance_at_the_nearer_end():
+    band = lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797, damping=0.02)
+    low, high = (
+        lbt.Vibration(frequency_hz=f, damping=0.02, rms_nm=797, direction=(1,)).ar_model(8000)
+        for f in (16.5, 23.5)
+    )
+    f = np.array([2.0, 12.0, 16.0, 24.0, 30.0, 100.0])
+    expected = np.where(f < 20, low.psd(f), high.psd(f))
+    np.testing.assert_allclose(band.skirts.psd(f), expected, rtol=2e-2)
+    assert not band.skirts.psd([16.5, 20.0, 23.5]).any()
 
 
 def test_a_narrow_line_of_a_tabulated_spectrum_is_not_missed():

@@ -144,14 +144,17 @@ def test_kalman_filters_of_fractional_delays_stay_above(delay):
     truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
     limit = lbt.loop.least_residual(plant.hardware, truth).rms_nm
     assert limit < budget(design, truth).rms_nm < 1.08 * limit
-    found, above = model_limit(design)
+    residual, found, above = model_limit(design)
     assert found == pytest.approx(limit)
-    assert np.isnan(above)  # its estimation error is not its residual
+    assert residual == pytest.approx(budget(design, truth).rms_nm)  # not its estimation error
+    assert residual < 0.99 * design.rms
+    assert above == pytest.approx(100 * (residual / limit - 1))
 
 
 def test_kalman_of_the_example(config):
     design = lbt.kalman(config.plant)
-    limit_nm, above = model_limit(design)
+    residual_nm, limit_nm, above = model_limit(design)
+    assert residual_nm == design.rms
     assert limit_nm == pytest.approx(192.619, abs=1e-3)
     assert abs(above) < 1e-8
     as_truth = lbt.Truth(

@@ -1,0 +1,35 @@
+"""What a design leaves in the truth of a configuration, beside reference designs and the limit."""
+
+from __future__ import annotations
+
+from lbt_synth.cli.output import Report
+from lbt_synth.config import Config
+from lbt_synth.design import Design
+from lbt_synth.studies import compare_in_truth
+
+_WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
+_NAME = "this design"
+
+
+def add_truth(report: Report, design: Design, config: Config) -> None:
+    """Add what a design leaves in the truth, beside reference designs and the limit."""
+    if config.truth.drifts:
+        report.notes.append(
+            "note: a vibration of the truth drifts, so that its residual has no exact value; "
+            "lbt-synth simulate runs it."
+        )
+        return
+    found = compare_in_truth({_NAME: design}, config)
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    report.add_rows("truth", caption, found.rows, without=_WITHOUT)
+    report.data |= {
+        "truth_limit_nm": None if found.limit is None else found.limit.rms_nm,
+        "wavelength_um": config.imaging.wavelength_um,
+        "truth_warnings": found.warnings[_NAME],
+    }
+    if found.limit is not None:
+        report.notes.append(
+            f"least residual of any linear controller in the truth: {found.limit.rms_nm:.6g} nm rms"
+        )
+    report.notes += [f"warning: {text}." for text in found.warnings[_NAME]]
+    report.notes += [f"note: {text}" for text in found.notes]

@@ -1,0 +1,124 @@
+"""What designs leave in the truth of a configuration, beside reference designs and the limit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from lbt_synth.config import Config
+from lbt_synth.design import Design, ShapedDesign
+from lbt_synth.design.violated_demands import violated_demands
+from lbt_synth.errors import LbtSynthError
+from lbt_synth.loop import ResidualLimit, close_loop
+from lbt_synth.methods.registry import reference_methods
+from lbt_synth.studies.limits import LimitRow, limits
+from lbt_synth.studies.unexpected_power import unexpected_power
+
+_SAME = 1e-6  # relative difference of residuals of one design
+_CLEAR = 0.01  # of the residual's variance by which a reference has to be better
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TruthComparison:
+    """Designs in the truth of a configuration.
+
+    Attributes
+    ----------
+    rows : tuple of LimitRow
+        The designs, then the reference designs that are none of them.
+    limit : ResidualLimit or None
+        The least residual of any linear controller; None where the modes do not decouple.
+    warnings : mapping of str to tuple of str
+        What is wrong with a design in this truth: an unstable loop, power that it was not made
+        for, and demands that cost residual.
+    notes : tuple of str
+        Why reference designs are missing.
+    """
+
+    rows: tuple[LimitRow, ...]
+    limit: ResidualLimit | None
+    warnings: Mapping[str, tuple[str, ...]]
+    notes: tuple[str, ...]
+
+
+def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComparison:
+    """Compare designs in the truth of a configuration with its reference designs.
+
+    The reference designs are made for the configuration: the best integrator, the Kalman filter
+    and the H-infinity filter.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        Designs by name.
+    config : Config
+        The configuration; its truth must be stationary.
+
+    Returns
+    -------
+    TruthComparison
+        Exact residuals, the limit, and warnings.
+
+    Raises
+    ------
+    ProblemError
+        If a design or a vibration does not fit the loop, or a vibration drifts.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> slow = config.design("integrator", gain=0.2)
+    >>> found = lbt.studies.compare_in_truth({"slow": slow}, config)
+    >>> [row.design for row in found.rows], round(found.limit.rms_nm, 2)
+    (['slow', 'integrator', 'kalman', 'hinf'], 10.84)
+    """
+    references: dict[str, Design] = {}
+    notes = []
+    for method in reference_methods():
+        name = f"{method.name} (reference)" if method.name in designs else method.name
+        try:
+            references[name] = config.design(method.name, **method.reference_options)
+        except LbtSynthError as error:
+            notes.append(f"{method.name} is left out: {error}")
+    study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
+    ours, theirs = study.rows[: len(designs)], study.rows[len(designs) :]
+    others = [row for row in theirs if not any(_is_same(row, own) for own in ours)]
+    better = {row.design: (references[row.design], row.residual_nm) for row in others}
+    return TruthComparison(
+        rows=(*ours, *others),
+        limit=study.limit,
+        warnings={
+            row.design: tuple(_warnings(designs[row.design], row, config, better)) for row in ours
+        },
+        notes=tuple(notes),
+    )
+
+
+def _is_same(row: LimitRow, other: LimitRow) -> bool:
+    return abs(row.residual_nm - other.residual_nm) <= _SAME * other.residual_nm
+
+
+def _warnings(
+    design: Design, row: LimitRow, config: Config, others: Mapping[str, tuple[Design, float]]
+) -> Iterator[str]:
+    """Yield what is wrong with a design in the truth."""
+    if not row.stable:
+        yield "the loop is unstable in the truth"
+        return
+    loop = close_loop(config.hardware, design.controller, sensor_gain=config.truth.sensor_gain)
+    found = unexpected_power(design, loop, config.truth)
+    yield from map(str, found)
+    if not isinstance(design, ShapedDesign):
+        return
+    for name, (other, residual_nm) in others.items():
+        if not residual_nm**2 < (1 - _CLEAR) * row.residual_nm**2:
+            continue
+        violated = violated_demands(design, other.controller)
+        if violated:
+            yield f"{name} leaves less in the truth; it violates: {'; '.join(violated)}"
+        elif not found:
+            yield (
+                f"{name} leaves less in the truth, where each vibration is at one frequency; "
+                "this design is for all frequencies of its bands"
+            )
