@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import lbt_synth as lbt
+from lbt_synth.identification.tracking.evidence import prediction_errors
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.simulation.run import step_loop
 from lbt_synth.models.plant.tip_tilt import with_vibrations
@@ -228,6 +229,7 @@ def windows() -> None:
                         window_s=window_s,
                         update_s=update_s,
                         extrapolate=trend,
+                        guarded=False,
                     ),
                     case.truth(case.line),
                     hardware=case.plant.hardware,
@@ -254,6 +256,14 @@ def frame_times() -> None:
         for _ in range(20_000):
             running.step(y)
         print(f"a frame, {name}: {1e6 * (time.perf_counter() - started) / 20_000:.1f} us")
+    design, series = case.design(20.0), np.zeros((round(2 * WINDOW_S * RATE_HZ), 1))
+    started = time.perf_counter()
+    for _ in range(100):
+        prediction_errors(design, series, series)
+    print(
+        f"what a filter would have left of {2 * WINDOW_S:g} s: "
+        f"{10 * (time.perf_counter() - started):.1f} ms"
+    )
 
 
 class Exchanged:

@@ -48,6 +48,7 @@ from .records.record import LoopRecord as LoopRecord
 from .records.record import require_length as require_length
 from .records.spectrum import SpectrumRecord as SpectrumRecord
 from .stretches import split_halves as split_halves
+from .tracking.evidence import Evidence as Evidence
 from .tracking.identifiers import LineFollower as LineFollower
 from .tracking.identifiers import LoopIdentifier as LoopIdentifier
 from .tracking.switching import SwitchedController as SwitchedController

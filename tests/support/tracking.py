@@ -25,9 +25,13 @@ def axis(*frequencies_hz, noise_nm=15.5, **changes):
     )
 
 
-def disturbed(plant, *, frames, hz=20, seed=0):
+def disturbed(plant, *, frames, hz=20, seed=0, damping=None):
     """Total phase and noise, (1, frames, n) each."""
-    shake = lbt.models.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=(1,))
+    shake = (
+        lbt.models.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=(1,))
+        if damping is None
+        else line(hz, damping)
+    )
     truth = lbt.Truth(turbulence=AIR, vibrations=(shake,), noise_nm=15.5)
     rng = np.random.default_rng(seed)
     size = {"frames": frames, "cases": 1, "rng": rng}

@@ -32,8 +32,7 @@ _RESOLUTION = 2.0  # bins from the top of a line to the first zero of a Hann win
 class LoopIdentifier:
     """Identify turbulence, lines and noise of each axis in a window (:func:`identify_axis`).
 
-    Each window starts from the model of the last one. A window that does not show the sensor gain
-    takes that of the plant.
+    Each starts from the last model; one that does not show the sensor gain takes the plant's.
 
     Parameters
     ----------
@@ -42,8 +41,8 @@ class LoopIdentifier:
     find_gain : bool, optional
         Whether the sensor gain is found; otherwise it is the plant's.
     most_lines : int, optional
-        Most resonances per axis. A line that drifts within the window looks like several, which
-        take long and change nothing.
+        Most resonances per axis; by default one more than the plant has. A line that drifts looks
+        like several, which take long and change nothing.
 
     Raises
     ------
@@ -69,7 +68,9 @@ class LoopIdentifier:
     True
     """
 
-    def __init__(self, plant: TipTiltPlant, *, find_gain: bool = True, most_lines: int = 2) -> None:
+    def __init__(
+        self, plant: TipTiltPlant, *, find_gain: bool = True, most_lines: int | None = None
+    ) -> None:
         require_instance(plant, TipTiltPlant)
         sensor = plant.hardware.sensor
         gains = np.diag(sensor)
@@ -79,7 +80,11 @@ class LoopIdentifier:
                 f"{sensor.tolist()}. Recombine the measurements into axes before the controller."
             )
         self._plant, self._gains, self._find_gain = plant, gains.tolist(), bool(find_gain)
-        self._most_lines = integer(most_lines, "most_lines", at_least=0)
+        along = zip(*(line.direction for line in plant.vibrations), strict=True)
+        own = max((int(np.count_nonzero(axis)) for axis in along), default=0)
+        self._most_lines = integer(
+            own + 1 if most_lines is None else most_lines, "most_lines", at_least=0
+        )
         self.reset()
 
     def reset(self) -> None:

@@ -74,7 +74,7 @@ class SwitchedController:
     """
 
     def __init__(self, design: FilterDesign, *, memory_s: float = 8.0) -> None:
-        self._first, self._hardware = design, _plant(design).hardware
+        self._first, self._hardware = design, plant_of_filter(design).hardware
         frames = number(memory_s, "memory_s", above=0) * self._hardware.frame_rate_hz
         self._memory = int(number(frames, "memory_s in frames", at_least=1, at_most=1e7))
         self._mirror = self._hardware.mirror_system.whole
@@ -178,7 +178,7 @@ class SwitchedController:
         ProblemError
             If the design is of another kind, or for another loop.
         """
-        require_same_loop(_plant(design), self._hardware)
+        require_same_loop(plant_of_filter(design), self._hardware)
         old = self._filter
         self._take(design)
         if all(np.array_equal(a, b) for a, b in zip(old, self._filter, strict=True)):
@@ -246,12 +246,13 @@ class SwitchedController:
 
     def _take(self, design: FilterDesign) -> None:
         """Set the filter: its matrices F, K, C, the sensor matrix, and from state to command."""
-        self._design, self._plant = design, _plant(design)
+        self._design, self._plant = design, plant_of_filter(design)
         plant, hw, K = self._plant, self._plant.hardware, design.gain_predictor
         self._filter = plant.A - K @ plant.C, K, plant.C, hw.sensor, hw.projector @ plant.L
 
 
-def _plant(design: object) -> TipTiltPlant:
+def plant_of_filter(design: object) -> TipTiltPlant:
+    """Return the plant of a filter; refuse a design that is none, or of another problem."""
     if not isinstance(design, FilterDesign) or not isinstance(design.problem, TipTiltPlant):
         kind = getattr(design, "method", type(design).__name__)
         raise ProblemError(

@@ -13,17 +13,28 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design import FilterDesign, kalman
 from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.identification.records.faults import fill, find_outliers, runs
+from lbt_synth.identification.tracking.evidence import (
+    LONGEST_S,
+    Evidence,
+    find_better,
+    prediction_errors,
+)
+from lbt_synth.identification.tracking.glitches import bridge_frames, find_glitches, stand_alone
 from lbt_synth.identification.tracking.identifiers import LoopIdentifier
-from lbt_synth.identification.tracking.switching import SwitchedController, require_same_loop
+from lbt_synth.identification.tracking.switching import (
+    SwitchedController,
+    plant_of_filter,
+    require_same_loop,
+)
 from lbt_synth.identification.tracking.trend import LineTrack, match_tracks
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
-from lbt_synth.validation import BoolArray, FloatArray, number, require_instance
+from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_LEFT_OUT = 0.01  # of the frames of a window; with more there is no fit
 _LEAST_FRAMES = 16  # in a window
+_JUDGE_S = 0.25  # time between two judgements, or less before an update
 _NARROW = 0.1  # damping ratio; wider resonances belong to the background and have no trend
 
 
@@ -103,6 +114,10 @@ class TrackingController(SwitchedController):
     frequency of its middle, but the filter needs that of the middle of the time to the next
     update: the trend of the last fits is extrapolated as far as it is significant.
 
+    It is guarded: the first filter runs until the newest ones have left clearly less, on frames
+    after their windows, and it returns when they leave clearly more (:func:`find_better`). While
+    they are better, each new one runs at once.
+
     No update can stop the loop: if a window has too few good measurements, the fit fails, the
     design does not pass its certificate, or its loop would be unstable at the sensor gain that the
     running filter assumes, the running filter stays, and :attr:`history` says why.
@@ -127,6 +142,8 @@ class TrackingController(SwitchedController):
         5 updates.
     design : callable, optional
         From plant to :class:`FilterDesign`; :func:`kalman` by default.
+    guarded : bool, optional
+        Whether a filter must show that it is better before it runs; otherwise each one runs.
 
     Raises
     ------
@@ -149,8 +166,8 @@ class TrackingController(SwitchedController):
     ... )
     >>> truth = lbt.Truth(turbulence=slow, vibrations=(shake,), noise_nm=15.5)
     >>> run = lbt.simulate(tracker, truth, hardware=plant.hardware, frames=6400)
-    >>> [update.switched for update in tracker.history[:3]]
-    [True, True, True]
+    >>> [evidence.rival for _, evidence in tracker.exchanges]  # the new filters took over
+    [1]
     >>> bool(abs(tracker.history[-1].frequencies_hz[0] - 22) < 0.2)
     True
     """
@@ -165,6 +182,7 @@ class TrackingController(SwitchedController):
         extrapolate: bool = True,
         trend_s: float | None = None,
         design: Callable[[TipTiltPlant], FilterDesign] = kalman,
+        guarded: bool = True,
     ) -> None:
         require_instance(plant, TipTiltPlant)
         if identifier is None:
@@ -179,8 +197,11 @@ class TrackingController(SwitchedController):
         self._window_frames = round(self._window_s * rate)
         self._update_frames = round(self._update_s * rate)
         self._rate, self._extrapolate = rate, bool(extrapolate)
+        self._judge_frames = max(1, round(_JUDGE_S * rate))
         self._identifier, self._design_filter = identifier, design
-        super().__init__(design(plant), memory_s=self._window_frames / rate)
+        self._guarded = bool(guarded)
+        super().__init__(design(plant), memory_s=2 * self._window_frames / rate)
+        self._to_phase = np.linalg.pinv(self.hardware.sensor).T
 
     @property
     def history(self) -> tuple[TrackingUpdate, ...]:
@@ -192,9 +213,18 @@ class TrackingController(SwitchedController):
         """Updates since the reset at which the running filter was kept."""
         return sum(not update.switched for update in self._history)
 
+    @property
+    def exchanges(self) -> tuple[tuple[float, Evidence], ...]:
+        """When the newest filters (rival 1) took over or the first (0) did [s], and why."""
+        return tuple(self._exchanges)
+
     def reset(self) -> None:
         """Return to the first filter, and forget everything."""
         super().reset()
+        self._newest: FilterDesign | None = None
+        self._follows = not self._guarded  # whether the newest filters run
+        self._judged, self._losses = 0, np.zeros((2, 0))
+        self._exchanges: list[tuple[float, Evidence]] = []
         self._history: list[TrackingUpdate] = []
         self._tracks: list[LineTrack] = []
         reset = getattr(self._identifier, "reset", None)
@@ -205,9 +235,32 @@ class TrackingController(SwitchedController):
         """Return the command as :meth:`SwitchedController.step` does, and update if it is time."""
         command = super().step(y)
         since_full = self.frames - self._window_frames
-        if since_full >= 0 and since_full % self._update_frames == 0:
+        is_due = since_full >= 0 and since_full % self._update_frames == 0
+        if self._guarded and (is_due or since_full % self._judge_frames == 0):
+            self._judge()
+        if is_due:
             self._update(self.frames / self._rate)
         return command
+
+    def _judge(self) -> None:
+        """Compare first and newest filter on the frames since the last time, and run the better.
+
+        What the newest filters leave is one series: it judges the tracking, not a single filter.
+        """
+        if self._newest is None:
+            return
+        rivals, since = (self._first, self._newest), self.frames - self._judged
+        errors = np.array([prediction_errors(each, *self.window())[-since:] for each in rivals])
+        losses = np.sum((errors @ self._to_phase) ** 2, axis=2)
+        longest = round(LONGEST_S * self._rate)
+        self._losses = np.concatenate([self._losses, losses], axis=1)[:, -longest:]
+        self._judged = self.frames
+        found = find_better(self._losses, int(self._follows), self._rate)
+        if found is not None and self._is_stable(rivals[found.rival]):
+            self.switch(rivals[found.rival])
+            self._follows = bool(found.rival)
+            self._losses = self._losses[:, :0]  # frames before a change are no evidence after it
+            self._exchanges.append((self.frames / self._rate, found))
 
     def _update(self, time_s: float) -> None:
         """Identify the last window, switch to the filter designed for it, and record the update."""
@@ -221,9 +274,9 @@ class TrackingController(SwitchedController):
             plant = self._extrapolate_lines(found, time_s)
             with _keep_filter_if_fails("design"):
                 designed = self._design_filter(plant)
-            self._require_stable(designed)
+            self._take_newest(designed)
             clock.append(time.perf_counter())
-            self.switch(designed)
+            self._run_newest()
         except _KeepFilterError as kept:
             reason = str(kept)
         except LbtSynthError as error:
@@ -246,16 +299,30 @@ class TrackingController(SwitchedController):
         )
         self._history.append(update)
 
-    def _require_stable(self, designed: FilterDesign) -> None:
-        """Refuse a filter whose loop would be unstable at the sensor gain of the running one.
+    def _is_stable(self, designed: FilterDesign) -> bool:
+        """Return whether a filter's loop is stable at the sensor gain of the running one.
 
         A short window may be explained by a wrong gain. The real one is between updates where it
         was, so that it can still be followed in steps.
         """
-        if not close_loop(self._plant.hardware, designed.controller).is_stable:
+        return close_loop(self._plant.hardware, designed.controller).is_stable
+
+    def _take_newest(self, designed: FilterDesign) -> None:
+        """Let a filter be the newest one."""
+        require_same_loop(plant_of_filter(designed), self.hardware)
+        if not self._is_stable(designed):
             raise _KeepFilterError(
                 "the new filter's loop is unstable at the sensor gain that the running one assumes"
             )
+        if self._newest is None:
+            self._judged = self.frames
+        self._newest = designed
+
+    def _run_newest(self) -> None:
+        """Switch to the newest filter if these run."""
+        if self._newest is None or not self._follows:
+            raise _KeepFilterError("the newest filters have not left clearly less than the first")
+        self.switch(self._newest)
 
     def _identify_window(self) -> TipTiltPlant:
         """Return the plant of the last window."""
@@ -318,42 +385,3 @@ def _move_line(line: Vibration, frequency_hz: float, frame_rate_hz: float) -> Vi
     """Return a narrow vibration at a frequency that it can have; else the vibration unchanged."""
     possible = line.damping * line.frequency_hz < frequency_hz < frame_rate_hz / 2
     return line.at_frequency(frequency_hz) if possible and line.damping <= _NARROW else line
-
-
-_APART = 10  # frames between two glitches; nearer ones are echoes in a loop of another gain
-
-
-def find_glitches(open_loop: FloatArray) -> BoolArray:
-    """Return the frames with an outlier in any column of a pseudo-open-loop series.
-
-    That series (frames, q) does not show what a glitch does to the commands, but the glitch itself
-    bends it as nothing around does (see ``records.faults.find_outliers``).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.identification.tracking.tracker import find_glitches
-    >>> series = np.random.default_rng(0).standard_normal((1000, 1))
-    >>> series[300] = 100
-    >>> np.flatnonzero(find_glitches(series)).tolist()
-    [300]
-    """
-    every = np.ones(len(open_loop), dtype=np.bool_)
-    found = [find_outliers(column, every) for column in open_loop.T]
-    return np.asarray(np.any(found, axis=0))
-
-
-def stand_alone(flags: BoolArray, delay_frames: float) -> bool:
-    """Whether glitches are short and far from each other.
-
-    A glitch ends before its own command comes back. Otherwise the sensor gain differs from the
-    model's, the series also shows the response to the glitch, and must not be left out in part.
-    """
-    each = runs(flags)
-    lengths, gaps = each[:, 1] - each[:, 0], each[1:, 0] - each[:-1, 1]
-    return bool(np.all(lengths <= max(1, int(delay_frames))) and np.all(gaps >= _APART))
-
-
-def bridge_frames(series: FloatArray, flags: BoolArray) -> FloatArray:
-    """Return a series (frames, q) with the frames that are flagged interpolated linearly."""
-    return np.column_stack([fill(column, ~flags) for column in series.T])

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification import (
     ForwardSplit,
+    LoopIdentifier,
+    RecordedDesign,
     TrackingController,
     design_from_record,
     least_squares_predictor,
@@ -137,8 +139,12 @@ def _residual_of_auto(split: ForwardSplit) -> FloatArray:
 
     It chooses its method, and refuses what it would not write.
     """
-    made = design_from_record(split.past, **split.options)
-    return split.replay(made.design.controller)
+    return split.replay(_design_automatically(split).design.controller)
+
+
+@lru_cache(maxsize=1)  # of the two entries that need it
+def _design_automatically(split: ForwardSplit) -> RecordedDesign:
+    return design_from_record(split.past, **split.options)
 
 
 def _residual_of_pyrtc(split: ForwardSplit, *, kind: str) -> FloatArray:
@@ -154,11 +160,20 @@ def _residual_of_pyrtc(split: ForwardSplit, *, kind: str) -> FloatArray:
 
 
 def _residual_of_tracking(split: ForwardSplit) -> FloatArray:
-    """Return what a controller leaves that goes on identifying; it starts a window before."""
+    """Return what a controller leaves that goes on identifying; it starts two windows before.
+
+    It begins with the automatic design; where there is none, with the model's filter. The sensor
+    gain does not move in a league, so it is not looked for.
+    """
     rate = split.hardware.frame_rate_hz
     past_s = sum(stop - start for start, stop in split.training) / rate
     window_s = min(_WINDOW_S, past_s / 2)
-    controller = TrackingController(split.model.plant(), window_s=window_s)
+    try:
+        plant = _design_automatically(split).model.plant()
+    except LbtSynthError:
+        plant = split.model.plant()
+    identifier = LoopIdentifier(plant, find_gain=False)
+    controller = TrackingController(plant, identifier, window_s=window_s)
     gains, taps = np.array(split.model.sensor_gains), split.hardware.mirror_taps
 
     def residual(series: FloatArray) -> FloatArray:

@@ -40,6 +40,18 @@ def test_the_whole_model_is_found_in_a_window():
             along = [w for w in found.vibrations if w.direction == v.direction]
             assert min(abs(w.frequency_hz - v.frequency_hz) for w in along) < 0.5
     assert lbt.kalman(found).certificate.passed
+    # one more than the plant's on the axis that has most, or as many as are asked for
+    three = lbt.simulate(
+        lbt.integrator(path, gain=0.5).controller,
+        replace(truth, vibrations=(*true, *(replace(true[0], frequency_hz=hz) for hz in (12, 60)))),
+        hardware=path,
+        frames=8000,
+        seed=3,
+    )
+    y3, u3 = three.measurements[0, 2:], three.commands[0, :-2]
+    for most, expected in ((None, 2), (1, 1), (3, 3)):
+        made = lbt.identification.LoopIdentifier(believed, most_lines=most)(y3, u3)
+        assert sum(v.direction == (1, 0) for v in made.vibrations) == expected
     given = lbt.identification.LoopIdentifier(believed, find_gain=False, most_lines=1)(y, u)
     assert np.array_equal(given.hardware.sensor, believed.hardware.sensor)
 

@@ -13,7 +13,7 @@ import lbt_synth as lbt
 def test_the_figure_has_the_frequencies_and_the_residuals():
     plant = axis(18)
     tracker = lbt.identification.TrackingController(
-        plant, Oracle(plant, DRIFT.frequency_hz_at, 1.0, 1.0), window_s=1, update_s=1
+        plant, Oracle(plant, DRIFT.frequency_hz_at, 1.0, 1.0), window_s=1, update_s=1, guarded=False
     )
     runs = {"tracking": simulated(tracker, frames=2400)}
     figure = lbt.report.figures.tracking_figure(

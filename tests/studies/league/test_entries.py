@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from support.league import short_record, short_split
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.methods import method_named, register, unregister
 from lbt_synth.studies.league import entries
 from lbt_synth.studies.league.entries import all_entries, choose_entries
@@ -81,13 +82,35 @@ def test_entries_are_chosen_by_name():
         choose_entries(["magic"])
 
 
-def test_the_tracking_controller_is_a_loop_frame_by_frame(split):
-    plant = split.model.plant()
-    start, past = split.test[0][0], 4000  # two windows
-    tracker = lbt.identification.TrackingController(plant, window_s=4.0)
+def test_the_tracking_controller_is_a_loop_frame_by_frame(split, monkeypatch):
+    """From two windows before the test on, it begins with the automatic design's plant."""
+    model = replace(split.model, axes=(replace(split.model.axes[0], noise_nm=7.0),))
+    made = SimpleNamespace(model=model)
+    monkeypatch.setattr(entries, "design_from_record", lambda *_given, **_options: made)
+    start, past = split.test[0][0], 4000
+    identifier = lbt.identification.LoopIdentifier(model.plant(), find_gain=False)
+    tracker = lbt.identification.TrackingController(model.plant(), identifier, window_s=4.0)
     left, commands = [], [np.zeros(1), np.zeros(1)]
     for open_loop in split.open_loop[start - past : split.test[0][1]]:
         left.append(open_loop - commands[-2])
         commands.append(tracker.step(np.array(split.model.sensor_gains) * left[-1]))
     expected = np.array(left)[past:]
-    assert all_entries()["tracking"].residual(split) == pytest.approx(expected, abs=1e-9)
+    found = all_entries()["tracking"].residual(replace(split))
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_without_an_automatic_design_tracking_begins_with_the_model(split, monkeypatch):
+    begun = []
+
+    def refuse(*_given, **_options):
+        raise CertificateError("not at all gains")
+
+    def begin(plant, *_given, **_options):
+        begun.append(plant)
+        raise ProblemError("seen enough")
+
+    monkeypatch.setattr(entries, "design_from_record", refuse)
+    monkeypatch.setattr(entries, "TrackingController", begin)
+    with pytest.raises(ProblemError, match="seen enough"):
+        all_entries()["tracking"].residual(replace(split))
+    assert np.array_equal(begun[0].A, split.model.plant().A)
