@@ -31,6 +31,7 @@ GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 _SPLIT = 9.0  # the same of the second of two lines that lie in each other's skirts
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
+_LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
 _POWERS = (0.0, float(np.log(4)), float(-np.log(4)))
 
@@ -132,12 +133,13 @@ class Search:
 def fit(search: Search, start: SpectrumModel) -> FittedModel | None:
     """Fit all parameters; None if no fit settles.
 
-    Components that leave the band below the Nyquist frequency are dropped.
+    Components that leave the band, from the first bin to the Nyquist frequency, are dropped.
     """
     found = minimise(search.merge(start), start, search.priors(start))
     if found is None:
         return None
-    inside = found.spectrum.keep(lambda c: c.log_frequency < _HIGHEST)
+    lowest = search.log_angle(_LOWEST * search.data.step_hz)
+    inside = found.spectrum.keep(lambda c: lowest < c.log_frequency < _HIGHEST)
     if len(inside.components) < len(start.components):
         return fit(search, inside)
     return replace(found, contrast=contrast(search.data, found.spectrum))
@@ -152,10 +154,10 @@ def refit(search: Search, start: SpectrumModel) -> FittedModel | None:
     return fit(search, start)
 
 
-def likeliest(fits: Iterable[FittedModel | None]) -> FittedModel | None:
-    """Return the likeliest of several fits; None if none of them settled."""
+def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel | None:
+    """Return the fit of the least cost; None if none of them settled."""
     settled = (model for model in fits if model is not None)
-    return min(settled, key=lambda model: model.contrast, default=None)
+    return min(settled, key=lambda model: cost(search, model), default=None)
 
 
 def drop_roll_off(search: Search, model: FittedModel) -> FittedModel:

@@ -32,7 +32,7 @@ from lbt_synth.identification.fit.whittle import (
 from lbt_synth.validation import FloatArray
 
 _WIDEST = 0.3  # band, of its frequency
-_STARTING_GAINS = (0.35, 0.6, 1.0)
+_STARTING_GAINS = (0.6, 0.35, 1.0)
 _STARTING_TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz], damping ratio
 _OVERDAMPED = 2.0  # damping ratio of a turbulence that is a drift already
 _LARGEST_DAMPING = 0.9  # of the turbulence beside a drift, when a fit begins
@@ -85,8 +85,7 @@ def find_components(
     """Find the model: add components, move them, prune them."""
     model = None if start is None else fitting.refit(search, start)
     if model is None:
-        gains = _STARTING_GAINS if search.finds_gain else (search.gain or 1.0,)
-        model = fitting.likeliest(_begin(search, gain) for gain in gains)
+        model = _begin(search)
     if model is None:
         raise NumericalError(
             "the likelihood of the spectrum is not finite. Check the units of the series."
@@ -130,14 +129,32 @@ def _trials(search: Search, spectrum: SpectrumModel) -> Iterator[tuple[SpectrumM
         yield from ((trial, 0.0) for trial in _add_first_order(search, spectrum))
 
 
-def _begin(search: Search, gain: float) -> FittedModel | None:
-    """Fit the background and the first lines at a sensor gain."""
-    ground = _fit_background(search, gain)
-    if ground is None:
-        return None
-    found = _find_excesses(search, ground.spectrum)
-    clear = [c for c in found if c.gain > max(2 * search.price, 0.02 * found[0].gain)]
-    return fitting.fit(search, _add_candidates(search, ground.spectrum, clear))
+def _begin(search: Search) -> FittedModel | None:
+    """Fit the background and the clear lines from several sensor gains; return the likeliest.
+
+    The first gain is held until the lines are there: a gain that is free while lines are missing
+    runs away to what explains these. The others begin with those lines.
+    """
+    gains = _STARTING_GAINS if search.finds_gain else (search.gain or 1.0,)
+    known = replace(search, gain=gains[0])
+    model = _fit_background(search, gains[0])
+    for _ in range(_FEW_ROUNDS):
+        found = [] if model is None else _find_excesses(known, model.spectrum)
+        clear = [c for c in found if c.gain > max(2 * search.price, 0.02 * found[0].gain)]
+        if model is None or not clear:
+            break
+        model = fitting.fit(known, _add_candidates(known, model.spectrum, clear))
+    if model is None or not search.finds_gain:
+        return model
+    _, *lines = model.spectrum.components
+    fits = [fitting.fit(search, model.spectrum)]
+    for gain in gains[1:]:
+        ground = _fit_background(search, gain)
+        if ground is not None:
+            more = 2 * float(np.log(gain / gains[0]))
+            moved = [line.shift(0.0, 0.0, more) for line in lines]
+            fits.append(fitting.fit(search, ground.spectrum.add(*moved)))
+    return fitting.likeliest(search, fits)
 
 
 def _fit_background(search: Search, gain: float) -> FittedModel | None:
@@ -156,7 +173,8 @@ def _fit_background(search: Search, gain: float) -> FittedModel | None:
         ground.add(known.component("turbulence", hz, ratio, slow))
         for hz, ratio in _STARTING_TURBULENCE
     ]
-    return fitting.likeliest(minimise(smooth, start, known.priors(start)) for start in starts)
+    fits = [minimise(smooth, start, known.priors(start)) for start in starts]
+    return fitting.likeliest(known, fits)
 
 
 def _add_candidates(

@@ -168,6 +168,7 @@ class SpectrumModel:
 
 _DIFFERENCE = 1e-4  # of a logarithm
 _FARTHEST = 60.0  # of a logarithm: exp stays finite
+_LEAST_INFORMATION = 1e-6  # of a parameter: a step is finite where the data say nothing
 _OPTIONS: dict[str, Any] = {
     "maxiter": 40,
     "gtol": 1e-3,
@@ -311,7 +312,7 @@ def scoring_minimum(
         return (
             value + 0.5 * float(np.sum(precision * away**2)),
             gradient + precision * away,
-            information + np.diag(precision),
+            information + np.diag(precision + _LEAST_INFORMATION),
         )
 
     try:
