@@ -1,6 +1,8 @@
 """Identification of random closed loops: lines found, filters designed, gains, times.
 
     python benchmarks/identification.py [--records 200] [--jobs 2] [--seconds 60]
+    python benchmarks/identification.py --errors    only how honest the standard errors are
+    python benchmarks/identification.py --drifts    sinusoids and narrow resonances that drift
     python benchmarks/identification.py --times
 
 One axis at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain 0.4 to
@@ -18,10 +20,14 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from unittest import mock
 
 import numpy as np
+from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit import both_axes
+from lbt_synth.identification.fit.line_drift import describe_drifts, measure_drift
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -137,31 +143,77 @@ def background(it: Case, line: lbt.Vibration) -> float:
     return found + sum(float(other.ar_model(RATE).psd(f)[0]) for other in others)
 
 
-def judged(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[tuple[float, ...]]]:
-    """Match the lines that were found with those there are, the strongest first."""
-    spare = list(axis.lines)
-    out: dict[str, list[tuple[float, ...]]] = {"found": [], "missed": [], "false": []}
+def paired(
+    it: Case, axis: lbt.identification.IdentifiedAxis
+) -> tuple[list[tuple[lbt.Vibration, lbt.identification.IdentifiedLine | None, float]], list]:
+    """Pair the lines there are with those found, and how far away; then those that are spare."""
+    spare, out = list(axis.lines), []
     for line in sorted(it.truth.vibrations, key=lambda v: -v.rms_nm):
-        own = float(line.ar_model(RATE).psd(np.array([line.frequency_hz]))[0])
-        clear = own > background(it, line)  # with it, twice the background
         near = min(spare, key=lambda x: abs(x.frequency_hz - line.frequency_hz), default=None)
         away = np.inf if near is None else abs(near.frequency_hz - line.frequency_hz)
-        # the least standard error of any estimate from so many seconds
-        bound = np.sqrt(line.frequency_hz * line.damping / (2 * np.pi * it.record.duration_s))
-        if near is not None and away < max(NEAR_HZ, 5 * bound):
+        if away < max(NEAR_HZ, 5 * bound(it, line)):
             spare.remove(near)
-        if clear:
+            out.append((line, near, float(away)))
+        else:
+            out.append((line, None, float(away)))
+    return out, spare
+
+
+def bound(it: Case, line: lbt.Vibration) -> float:
+    """Least standard error of any estimate of a frequency from so many seconds [Hz]."""
+    return float(np.sqrt(line.frequency_hz * line.damping / (2 * np.pi * it.record.duration_s)))
+
+
+def judged(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[tuple[float, ...]]]:
+    """Return which lines were found, the strongest first, which missed, and which are false."""
+    out: dict[str, list[tuple[float, ...]]] = {"found": [], "missed": [], "false": []}
+    pairs, spare = paired(it, axis)
+    for line, _, away in pairs:
+        own = float(line.ar_model(RATE).psd(np.array([line.frequency_hz]))[0])
+        if own > background(it, line):  # with it, twice the background
             facts = (
                 line.frequency_hz,
                 line.damping,
                 line.rms_nm,
                 own / background(it, line),
-                float(away),
-                float(bound),
+                away,
+                bound(it, line),
             )
             out["found" if away < NEAR_HZ else "missed"].append(facts)
     out["false"] = [(x.frequency_hz, x.damping, x.rms_nm, x.evidence) for x in spare]
     return out
+
+
+def deviations(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[float]]:
+    """Return how far estimates are from the truth, in their standard errors."""
+    truth, gain_error = it.truth, axis.sensor_gain_error
+    found = [(line, near) for line, near, _ in paired(it, axis)[0] if near is not None]
+    return {
+        "sensor gain": []
+        if gain_error is None
+        else [(axis.sensor_gain - truth.sensor_gain) / gain_error],
+        "noise": [(axis.noise_nm - truth.noise_nm) / max(axis.noise_error_nm, 1e-300)],
+        "line, frequency": [
+            (x.frequency_hz - line.frequency_hz) / x.frequency_error_hz for line, x in found
+        ],
+        "line, rms": [(x.rms_nm - line.rms_nm) / x.rms_error_nm for line, x in found],
+        "line, damping": [(x.damping - line.damping) / x.damping_error for line, x in found],
+    }
+
+
+def coverage(results: list[dict]) -> None:
+    """Print how often estimates lie within 1 and 1.96 of their standard errors of the truth."""
+    print("estimates within 1 and 1.96 standard errors of the truth (68 and 95 %)")
+    for name in results[0]["errors"]:
+        away = np.abs([value for r in results for value in r["errors"][name]])
+        inside = [100 * np.mean(away < reach) for reach in (1, 1.96)]
+        print(f"  {name:16s} {away.size:4d} {inside[0]:6.1f} % {inside[1]:6.1f} %")
+
+
+def only_errors(seed: int, frames: int) -> dict:
+    """Return the deviations of one record."""
+    it = case(seed, frames)
+    return {"errors": deviations(it, lbt.identify(it.record).axes[0])}
 
 
 def studied(seed: int, frames: int) -> dict:
@@ -204,6 +256,7 @@ def studied(seed: int, frames: int) -> dict:
         "seed": seed,
         "frozen": it.frozen,
         **judged(it, axis),
+        "errors": deviations(it, axis),
         "ratio": left(it, filter_.controller) / best,
         "limit": left(it, filter_.controller) / limit,
         "half_ratio": left(it, half_filter) / left(it, predictor.controller),
@@ -240,6 +293,7 @@ def table(results: list[dict]) -> None:
                 *facts
             )
         )
+    coverage(results)
     groups = {"all": results}
     groups["second-order turbulence"] = [r for r in results if not r["frozen"]]
     groups["frozen flow"] = [r for r in results if r["frozen"]]
@@ -274,6 +328,71 @@ def table(results: list[dict]) -> None:
         f"processor time, one axis: identify median {np.median(times[:, 0]):.2f} s, largest "
         f"{np.max(times[:, 0]):.2f} s; design {np.median(times[:, 1]):.3f} s"
     )
+
+
+def wandering_line(drift_hz: float, half_width: float, seed: int) -> np.ndarray:
+    """Return 30 s of a line of 50 nm rms from 30 Hz upwards, of a half width in bins, at 1 kHz."""
+    rng = np.random.default_rng([seed, 5])
+    t = np.arange(30 * int(RATE)) / RATE
+    size = np.full(t.size, np.exp(2j * np.pi * rng.uniform()))
+    if half_width:
+        decay = np.exp(-2 * np.pi * half_width / t.size)
+        drive = rng.standard_normal(2 * t.size).view(complex) * np.sqrt((1 - decay**2) / 2)
+        start = rng.standard_normal(2).view(complex) / np.sqrt(2)
+        size = lfilter([1], [1, -decay], drive, zi=decay * start)[0]
+    turns = 30 * t + drift_hz / 30 * t**2 / 2
+    return 50 * np.sqrt(2) * (size * np.exp(2j * np.pi * turns)).real
+
+
+def drifts() -> None:
+    """Print how often a drift is seen, and what is identified in loops with a drifting sinusoid."""
+    print("seen as a drift of 0, 0.3 and 1 Hz in 30 s [%], by half width [bins]")
+    for half_width in (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0):
+        seen = []
+        for drift_hz, count in ((0.0, 300), (0.3, 60), (1.0, 60)):
+            found = [
+                measure_drift(
+                    wandering_line(drift_hz, half_width, seed)
+                    + 5 * np.random.default_rng(seed).standard_normal(30_000),
+                    RATE,
+                    (27.0, 33.0 + drift_hz),
+                )
+                for seed in range(count)
+            ]
+            seen.append(100 * np.mean([drift is not None and drift.is_clear for drift in found]))
+        print(f"  {half_width:4.1f}  " + "  ".join(f"{value:6.1f}" for value in seen))
+    print("a loop with a sinusoid of 50 nm that drifts from 30 Hz")
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2, modes=1)
+    slow = lbt.models.ARModel(coefficients=[1.99, -0.9902], driving_rms_nm=0.3, frame_rate_hz=RATE)
+    for drift_hz in (0.05, 0.1, 0.3, 1.0, 3.0):
+        line = lbt.models.DriftingVibration(
+            start_hz=30, end_hz=30 + drift_hz, duration_s=30, rms_nm=50, direction=(1.0,)
+        )
+        truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0, sensor_gain=0.8)
+        run = lbt.simulate(
+            lbt.integrator(path, gain=0.3).controller, truth, hardware=path, frames=30_000
+        )
+        record = lbt.identification.loop_record(
+            run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+        )
+        for name, describe in (("fit", lambda model, *_: model), ("drift", describe_drifts)):
+            with mock.patch.object(both_axes, "describe_drifts", describe):
+                model = lbt.identify(record)
+            left_nm2 = lbt.identification.replayed_residual(
+                record.pseudo_open_loop(0.8),
+                lbt.kalman(model.plant()).controller,
+                path,
+                noise_nm=5.0,
+                sensor_gain=0.8,
+                stretches=record.stretches(),
+                test=record.stretches(),
+            ).total_nm2
+            lines = ", ".join(
+                f"{x.rms_nm:.1f} +- {x.rms_error_nm:.1f} nm at {x.frequency_hz:.4f} +- "
+                f"{x.frequency_error_hz:.4f} Hz"
+                for x in model.axes[0].lines
+            )
+            print(f"  {drift_hz:4.2f} Hz, {name:5s} filter leaves {left_nm2**0.5:.2f} nm: {lines}")
 
 
 def times() -> None:
@@ -318,15 +437,18 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--drifts", action="store_true", help="only sinusoids that drift")
     parser.add_argument("--times", action="store_true", help="only the time of two axes")
+    parser.add_argument("--errors", action="store_true", help="only the standard errors")
     asked = parser.parse_args()
-    if asked.times:
-        times()
+    if asked.times or asked.drifts:
+        times() if asked.times else drifts()
         return
-    one = partial(studied, frames=int(asked.seconds * RATE))
+    study, show = (only_errors, coverage) if asked.errors else (studied, table)
+    one = partial(study, frames=int(asked.seconds * RATE))
     with ProcessPoolExecutor(asked.jobs) as pool:
         seeds = range(asked.first, asked.first + asked.records)
-        table(list(pool.map(one, seeds)))
+        show(list(pool.map(one, seeds)))
 
 
 if __name__ == "__main__":

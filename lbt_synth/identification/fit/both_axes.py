@@ -19,6 +19,7 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedLine,
     IdentifiedModel,
 )
+from lbt_synth.identification.fit.line_drift import describe_drifts
 from lbt_synth.identification.fit.record_doubts import (
     cut_at_jumps,
     find_correction_jumps,
@@ -34,6 +35,7 @@ _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _APART = 3.0  # standard errors between gains that differ
+_NOT_WHITE = 1e-3  # probability of white innovations below which a note says so
 _BOTH = 2  # axes that may share resonances
 
 
@@ -144,14 +146,14 @@ def identify(
     if len(axes) > 1 and found_gain and gains == [None] * len(axes):
         axes, note = _pool_gains(axes, found_gain, partial(fit, cut))
         notes.append(note)
-    notes += _find_doubts(axes, found_gain, most_lines)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == _BOTH:
         axes, shared, more = couple_axes(record, axes, cut, lowest_line_hz)
         notes += more
+    notes += _find_doubts(axes, found_gain, most_lines)
     if progress is not None and next(fits) <= total:
         progress(total, total)
-    return IdentifiedModel(
+    model = IdentifiedModel(
         axes=tuple(axes),
         shared=shared,
         frame_rate_hz=record.frame_rate_hz,
@@ -159,6 +161,7 @@ def identify(
         mirror=record.mirror,
         notes=tuple(notes),
     )
+    return describe_drifts(model, record.pseudo_open_loop(model.sensor_gains), cut)
 
 
 def _fit_axes(
@@ -239,8 +242,11 @@ def _pool_gains(
     if np.any(np.abs(log - mean) * gains > _APART * errors):
         values = ", ".join(f"{g:.3f} +- {e:.3f}" for g, e in zip(gains, errors, strict=True))
         return axes, f"warning: the axes have different sensor gains, {values}"
-    gain = float(np.exp(mean))
-    pooled = fit([gain] * len(axes), axes, gain / float(np.sqrt(np.sum(weight))))
+    gain, error = float(np.exp(mean)), 1 / float(np.sqrt(np.sum(weight)))
+    if any(axes[i].turbulence_fit.corner_hz is not None for i in found_gain):
+        # what a model of finite order leaves of turbulence shifts the gains of all axes alike
+        error = float(np.min(errors / gains))
+    pooled = fit([gain] * len(axes), axes, gain * error)
     notes = ["that of the other axis"] * len(axes)
     for i in found_gain:
         alone = len(found_gain) < len(axes)
@@ -252,7 +258,7 @@ def _pool_gains(
 def _find_doubts(
     axes: Sequence[IdentifiedAxis], found_gain: Sequence[int], most_lines: int
 ) -> Iterator[str]:
-    """Yield notes on odd gains, hidden noise, and the limit of lines."""
+    """Yield notes on odd gains, hidden noise, the limit of lines, and what no model explains."""
     for i in found_gain:
         if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN:
             yield (
@@ -267,6 +273,15 @@ def _find_doubts(
             yield (
                 f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and "
                 "the rest of the model suffers"
+            )
+    for i, axis in enumerate(axes):
+        test = axis.whiteness
+        if test.p_value < _NOT_WHITE or test.correlation_p_value < _NOT_WHITE:
+            yield (
+                f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}, "
+                f"{test.correlation_p_value:.2g}): the model leaves something out, such as noise "
+                "that is not white. The standard errors do not cover that, and the sensor gain may "
+                "be wrong by many of them"
             )
 
 
