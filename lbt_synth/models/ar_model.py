@@ -48,10 +48,13 @@ class ARModel:
             )
         check_fields(self, coefficients=frozen_copy(a))
         radius = float(np.max(np.abs(np.linalg.eigvals(self.companion))))
-        if not radius < 1:
+        with np.errstate(all="ignore"):
+            ratio = variance_ratios(self.coefficients)
+        if not (radius < 1 and 0 < ratio < np.inf):
             raise ProblemError(
                 "an AR model must be stationary, all poles inside the unit circle; got a pole of "
-                f"modulus {radius:.9g}. Check the signs: x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)."
+                f"modulus {radius:.9g} and no finite variance. "
+                "Check the signs: x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)."
             )
 
     @property

@@ -31,3 +31,9 @@ def test_the_papers_literal_sign_is_refused():
     a1, a2 = 1.972279, 0.996863  # erratum 1: + A2
     with pytest.raises(lbt.errors.ProblemError, match="Check the signs"):
         lbt.models.ARModel(coefficients=[a1, a2], driving_rms_nm=1, frame_rate_hz=800)
+
+
+def test_a_process_without_a_finite_variance_is_refused():
+    # rounding leaves its poles inside the unit circle
+    with pytest.raises(lbt.errors.ProblemError, match="no finite variance"):
+        lbt.models.ARModel(coefficients=[1.9, -1.0], driving_rms_nm=1, frame_rate_hz=500)

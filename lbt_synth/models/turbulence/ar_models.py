@@ -14,11 +14,15 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lbt_synth.errors import NumericalError
+from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.resonance_spectrum import coefficients, log_density
-from lbt_synth.models.turbulence.atmosphere import Atmosphere
+from lbt_synth.models.turbulence.atmosphere import LOWEST, Atmosphere
 from lbt_synth.models.turbulence.frozen_flows import FrozenFlows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
+
+_PANELS = 100  # of the contrast
+_FREQUENCIES, _DAMPINGS = (0.25, 0.5, 1.0), (0.01, 0.05, 0.2, 0.6)  # starts; the first in V / D
 
 
 def le_roux_pole(
@@ -119,8 +123,9 @@ def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, 
 def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: float) -> ARModel:
     """AR2 model fitted to the von Karman frozen-flow spectrum.
 
-    Minimises the Whittle contrast ``int log(M + N) + (S + N) / (M + N) df`` over
-    the model spectrum M; S is the turbulence and N the white measurement noise.
+    Its rms is that of the turbulence. Its frequency and damping minimise the Whittle contrast
+    ``int log(M + N) + (S + N) / (M + N) df`` over the model spectrum M; S is the turbulence and N
+    the white measurement noise.
 
     Parameters
     ----------
@@ -135,7 +140,7 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     Returns
     -------
     ARModel
-        Process of order 2.
+        Process of order 2 with ``rms_nm`` equal to ``atmosphere.tilt_rms_nm``.
 
     Raises
     ------
@@ -156,29 +161,25 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     noise = number(noise_nm, "noise_nm", above=0)
-    edges = np.geomspace(1e-4 * atmosphere.wind_speed_m_s / atmosphere.diameter_m, rate / 2, 300)
-    frequency = np.sqrt(edges[1:] * edges[:-1])
-    weight = np.diff(edges) / (rate / 2)
-    white = 2 * noise**2 / rate
-    target = atmosphere.psd(frequency) + white
+    crossing_hz, rms = atmosphere.wind_speed_m_s / atmosphere.diameter_m, atmosphere.tilt_rms_nm
+    frequency, weight = gauss_panels(np.geomspace(LOWEST * crossing_hz, rate / 2, _PANELS), 4)
+    weight, target = weight / (rate / 2), 1 + atmosphere.psd(frequency) * rate / (2 * noise**2)
     s = 4 * np.sin(np.pi * frequency / rate) ** 2
 
-    def unpack(p: np.ndarray) -> tuple[float, float]:
-        """Turn log frequency and log damping / (1 - damping) into angle per frame and damping."""
-        return 2 * np.pi * float(np.exp(p[0])) / rate, float(1 / (1 + np.exp(-p[1])))
+    def contrast(p: FloatArray) -> float:
+        """Take the mean of log(model / numerator), which has no narrow peaks, for log(model)."""
+        angle, damping = _unpack(p, rate)
+        shape, _, _ = log_density(angle, damping, s)
+        numerator = coefficients(angle, damping)[2]
+        model = 1 + (rms / noise) ** 2 * np.exp(shape)
+        return float(np.log(numerator) + weight @ (np.log(model) - shape + target / model))
 
-    def contrast(p: np.ndarray) -> float:
-        density, _, _ = log_density(*unpack(p), s)
-        model = 2 / rate * np.exp(2 * p[2] + density) + white
-        return float(np.sum(weight * (np.log(model) + target / model)))
-
-    corner = 0.5 * atmosphere.wind_speed_m_s / atmosphere.diameter_m
-    start = np.array([np.log(corner), np.log(0.25), np.log(atmosphere.tilt_rms_nm)])
+    starts = [_pack(f * crossing_hz, z) for f in _FREQUENCIES for z in _DAMPINGS]
     fit = minimize(
         contrast,
-        start,
+        min(starts, key=contrast),
         method="Nelder-Mead",
-        options={"xatol": 1e-9, "fatol": 1e-14, "maxiter": 4000, "maxfev": 4000},
+        options={"xatol": 1e-8, "fatol": 1e-13},
     )
     if not fit.success:
         raise NumericalError(
@@ -186,8 +187,17 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
             "Try the AR1 model, or check that the noise is not above the turbulence.",
             status=str(fit.message),
         )
-    a1, a2, drive = coefficients(*unpack(fit.x))
-    rms = float(np.exp(fit.x[2]))
+    a1, a2, drive = coefficients(*_unpack(fit.x, rate))
     return ARModel(
         coefficients=frozen_copy([a1, a2]), driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
     )
+
+
+def _pack(frequency_hz: float, damping: float) -> FloatArray:
+    """Return log frequency and log damping / (1 - damping)."""
+    return np.log([frequency_hz, damping / (1 - damping)])
+
+
+def _unpack(p: FloatArray, rate: float) -> tuple[float, float]:
+    """Return the angle per frame and the damping of packed parameters."""
+    return 2 * np.pi * float(np.exp(p[0])) / rate, float(1 / (1 + np.exp(-p[1])))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import lbt_synth as lbt
@@ -25,6 +26,30 @@ def test_ar2_fit_of_the_lbt(air):
 def test_ar2_fit_returns_the_model_that_made_the_spectrum(monkeypatch, air):
     made = lbt.models.ARModel(coefficients=[1.99, -0.992], driving_rms_nm=0.8, frame_rate_hz=800)
     monkeypatch.setattr(type(air), "psd", lambda _self, f: made.psd(f))
+    monkeypatch.setattr(type(air), "tilt_rms_nm", made.rms_nm)
     found = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=1.0)
     assert found.coefficients == pytest.approx(made.coefficients, abs=1e-5)
     assert found.driving_rms_nm == pytest.approx(0.8, rel=1e-3)
+
+
+@pytest.mark.parametrize(("outer_scale_m", "wind_m_s"), [(30, 16.5), (40, 16.0)])
+def test_ar2_fit_is_not_a_line_between_two_nodes(outer_scale_m, wind_m_s):
+    air = lbt.Atmosphere(
+        seeing_arcsec=0.8, outer_scale_m=outer_scale_m, wind_speed_m_s=wind_m_s, diameter_m=8.22
+    )
+    model = lbt.models.ar2_turbulence(air, frame_rate_hz=500, noise_nm=1.0)
+    assert model.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-6)
+    frequency = (np.arange(20_000) + 0.5) / 80
+    white = 2 / 500
+    target = air.psd(frequency) + white
+
+    def contrast(made: lbt.ARModel) -> float:
+        spectrum = made.psd(frequency) + white
+        return float(np.mean(np.log(spectrum) + target / spectrum))
+
+    others = [
+        lbt.Vibration(frequency_hz=f, damping=damping, rms_nm=air.tilt_rms_nm).ar_model(500)
+        for f in np.geomspace(0.5, 3, 9)
+        for damping in (0.02, 0.04, 0.06, 0.1, 0.4)
+    ]
+    assert contrast(model) < min(map(contrast, others))
