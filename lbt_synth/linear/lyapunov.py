@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 
@@ -10,6 +12,11 @@ from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 _SOLVED = 1e-14  # relative residual of an equation solved to rounding
+# A step of refinement that moves X by more than this part of it is repeated with the residual in
+# extended precision: next to the unit circle, rounding of the residual moves X by a million times
+# itself and more.
+_SETTLED = 1e-11
+_REFINEMENTS = 6
 
 
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
@@ -61,14 +68,29 @@ def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
     >>> round(float(X[0, 0, 0]), 12), bool(residuals[0] < 1e-14)
     (100.0, True)
     """
-    X = smith_sum(A, Q)
     with np.errstate(all="ignore"):  # the caller judges the residuals
-        for _ in range(2):
-            X = symmetrise(X + smith_sum(A, symmetrise(A @ X @ transpose(A) - X + Q)))
+        X = smith_sum(A, Q)
+        X, step = _refine(A, Q, X, np.float64)
+        poor = np.flatnonzero(step > _SETTLED)
+        step[poor] = np.inf
+        for _ in range(_REFINEMENTS if poor.size else 0):
+            last = step[poor]
+            X[poor], step[poor] = _refine(A[poor], Q[poor], X[poor], np.longdouble)
+            poor = poor[(step[poor] > _SETTLED) & (step[poor] < last / 2)]
         AXA = A @ X @ transpose(A)
         size = frobenius_norms(X) + frobenius_norms(AXA) + frobenius_norms(Q)
         residuals = frobenius_norms(AXA - X + Q) / np.where(size > 0, size, 1.0)
     return X, residuals
+
+
+def _refine(
+    A: FloatArray, Q: FloatArray, X: FloatArray, precision: type[np.floating[Any]]
+) -> tuple[FloatArray, FloatArray]:
+    """Correct X by its residual, summed in some precision; return the relative steps as well."""
+    left, middle = A.astype(precision), X.astype(precision)
+    residual = (left @ middle @ transpose(left) - middle + Q).astype(np.float64)
+    step = smith_sum(A, symmetrise(residual))
+    return symmetrise(X + step), frobenius_norms(step) / np.maximum(frobenius_norms(X), 1e-300)
 
 
 def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:

@@ -87,5 +87,5 @@ def test_claims_need_a_proof_and_must_fit_the_filter(axis_plant):
         lbt.linear.Witness(states=np.zeros((2, 3)), disturbances=np.zeros((2, 2)))
     with pytest.raises(lbt.errors.NonFiniteError):
         lbt.linear.Witness(states=[[np.nan]], disturbances=[[1.0]])
-    with pytest.raises(lbt.errors.ProblemError, match="level must be above 0"):
+    with pytest.raises(lbt.errors.ProblemError, match="level must be at least 0"):
         lbt.design.certify_infeasible(axis_plant, -5.0, design.witness)

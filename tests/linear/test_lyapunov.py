@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
+import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
+import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariances
 
 
@@ -20,3 +24,16 @@ def test_stacked_lyapunov_is_scipys():
         assert np.allclose(x, solve_discrete_lyapunov(a, q), rtol=1e-7)
     unstable, _ = stationary_covariances(1.01 * np.eye(2)[None], np.eye(2)[None])
     assert not np.isfinite(unstable).any()
+
+
+@pytest.mark.parametrize(("damping", "limit"), [(1e-3, 1e-7), (1e-5, 1e-4)])
+def test_a_slow_line_has_its_closed_form_variance(damping, limit):
+    """Rounding of the residual in double precision moves it by 2e-6 and 4e-3."""
+    line = lbt.Vibration(frequency_hz=0.5, damping=damping, rms_nm=1.0).ar_model(4000)
+    drive = np.zeros((1, 2, 2))
+    drive[0, 0, 0] = line.driving_rms_nm**2
+    X, residuals = stationary_covariances(line.companion[None], drive)
+    a1, a2 = map(Fraction, line.coefficients.tolist())  # their rounding moves it by 6e-3
+    exact = Fraction(float(drive[0, 0, 0])) * (1 - a2) / ((1 + a2) * ((1 - a2) ** 2 - a1**2))
+    assert X[0, 0, 0] == pytest.approx(float(exact), rel=limit)
+    assert residuals[0] < 1e-14

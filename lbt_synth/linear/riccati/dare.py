@@ -26,11 +26,10 @@ from lbt_synth.validation import (
 RESIDUAL_LIMIT = 1e-12  # a solution beyond one of these limits is refused
 ERROR_LIMIT = 1e-3
 _SATISFIED = 1e-8  # if the estimated error of X is larger, the next route is tried
-_DOUBTFUL = 1e-6  # if a pole is this close to the unit circle, existence is checked
-# Rounding may have moved a pole this close to the unit circle off the circle itself; the pole
-# counts as stable only if the error of X is at most this part of its distance to the circle.
+# Rounding may have moved a pole this close to the unit circle off the circle itself. The solution
+# exists if Newton's method, started at X, converges in spite of rounding (Kantorovich: below 1/4).
 _NEAR = 1e-2
-_CLEAR = 1e-5
+_CONTRACTION = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,10 +174,12 @@ def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     radius = np.abs(best.poles).max(axis=-1)
 
     solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
-    solved &= (1 - radius > _NEAR) | (best.errors <= _CLEAR * (1 - radius))
-    for i in np.flatnonzero(~solved | (radius > 1 - _DOUBTFUL)):
+    near = np.flatnonzero(solved & (1 - radius <= _NEAR))
+    doubtful = balanced.take(near).contractions(best.X[near], best.gains[near])
+    solved[near] = doubtful <= _CONTRACTION
+    for i in np.flatnonzero(~solved):
         try:
-            require_stabilising(balanced, int(i), _prefix(int(i), lead), zeros=not solved[i])
+            require_stabilising(balanced, int(i), _prefix(int(i), lead))
         except ProblemError:
             raise
         except ValueError:  # numbers out of range (LinAlgError): refused without a reason
@@ -278,7 +279,7 @@ def _refuse(
         f"{_prefix(index, lead)}the Riccati equation was not solved: "
         f"{', '.join(attempt.route for attempt in attempts)} gave {found}; expected a stable "
         f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
-        f"{ERROR_LIMIT:g} (of a pole near the unit circle, below {_CLEAR:g} of its distance). "
+        f"{ERROR_LIMIT:g}, and a pole further from the unit circle than rounding can move it. "
         "There may be no stabilising solution; look for modes near the unit circle that are barely "
         "driven or seen.",
         status="residual",

@@ -128,6 +128,33 @@ class Equations:
         scale = size + frobenius_norms(AXA.astype(np.float64)) + frobenius_norms(self.Q)
         return gains, residual, frobenius_norms(residual) / np.maximum(scale, 1e-300)
 
+    def contractions(self, X: FloatArray, gains: FloatArray) -> FloatArray:
+        """Second Newton step over the first, for the residual that rounding of the data leaves.
+
+        Where it is small, Newton's method converges from X, so a stabilising solution exists. A
+        pole that rounding alone has moved off the unit circle gives one or more, as its distance is
+        the square root of what moved it.
+        """
+        sizes = (
+            self._magnitudes(X, np.eye(X.shape[-1]))
+            + self._magnitudes(X, self.A)
+            + self._magnitudes(self.Q, np.eye(X.shape[-1]))
+            + self._magnitudes(self.weights(X), gains)
+        )
+        rounding = X.shape[-1] * np.finfo(float).eps * sizes[..., None] * np.eye(X.shape[-1])
+        closed = self.A - self.B @ gains
+        first = smith_sum(transpose(closed), rounding)
+        moved = transpose(self.B) @ first @ closed
+        change = symmetrise(transpose(moved) @ solve_stack(self.weights(X), moved))
+        second = smith_sum(transpose(closed), change)
+        return np.asarray(frobenius_norms(second) / np.maximum(frobenius_norms(first), 1e-300))
+
+    @staticmethod
+    def _magnitudes(weight: FloatArray, M: FloatArray) -> FloatArray:
+        """Bound of the diagonal of ``M' weight M``, without cancellation."""
+        root = np.sqrt(np.abs(np.diagonal(weight, axis1=-2, axis2=-1)))
+        return np.asarray((np.abs(transpose(M)) @ root[..., None])[..., 0] ** 2)
+
     def refine(self, X: FloatArray, steps: IntArray) -> Solutions:
         """Take Newton steps while they lower the residual.
 

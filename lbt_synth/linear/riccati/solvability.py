@@ -13,6 +13,7 @@ from lbt_synth.validation import FloatArray
 _RANK = 1e-10
 _CIRCLE = 1e-3  # a multiple root on the circle is computed up to this far from it
 _SINGULAR = 1e-11  # a ratio of singular values of a pencil that counts as zero
+_ROUNDING = 1e-14  # a change of the data by this part is one of rounding
 _LARGE = 1e6  # above this norm the ratio of singular values says little
 _ELSEWHERE = 0.37 + 0.61j  # an arbitrary point
 # An eigenvalue of a defective matrix is computed up to this far from the circle. It is tested on
@@ -50,9 +51,7 @@ def unstable_hidden_mode(
     return None
 
 
-def require_stabilising(
-    equations: Equations, index: int, name: str = "", *, zeros: bool = True
-) -> None:
+def require_stabilising(equations: Equations, index: int, name: str = "") -> None:
     """Raise if an equation has no stabilising solution for a reason that can be named."""
     A, B, Q, R, S = (getattr(equations, key)[index] for key in "ABQRS")
     hidden = unstable_hidden_mode(A.T, B.T, drive=_root(Q))
@@ -80,11 +79,11 @@ def require_stabilising(
                 "has no weight, so there is no stabilising solution. Add a small weight on it.",
                 eigenvalue=hidden,
             )
-    zero = _unit_circle_zero(A, B, Q, R, S, name) if zeros else None
+    zero = _unit_circle_zero(A, B, Q, R, S, name)
     if zero is not None:
         raise DetectabilityError(
-            f"{name}the equation has a zero on the unit circle, at {zero:.6g}: there its weights "
-            "leave an oscillation free of cost, so there is no stabilising solution. "
+            f"{name}to rounding, the equation has a zero on the unit circle, at {zero:.6g}: there "
+            "its weights leave an oscillation free of cost, so there is no stabilising solution. "
             "Add a small weight.",
             eigenvalue=zero,
         )
@@ -119,6 +118,6 @@ def _unit_circle_zero(
         if abs(abs(value) - 1) > _CIRCLE:
             continue
         on_circle = value / abs(value)
-        if np.linalg.svd(M - on_circle * N, compute_uv=False)[-1] < _SINGULAR * size:
+        if np.linalg.svd(M - on_circle * N, compute_uv=False)[-1] < _ROUNDING * size:
             return complex(on_circle)
     return None

@@ -175,3 +175,42 @@ def test_the_bracket_does_not_depend_on_the_units_of_states(seed):
     one, other = (lbt.hinf(p, route="riccati") for p in (problem, scaled))
     assert other.gamma_least == pytest.approx(one.gamma_least, rel=1e-8)
     assert other.gamma_infeasible == pytest.approx(one.gamma_infeasible, rel=1e-8)
+
+
+def slow_line(rate_hz, frequency_hz, damping, rms_nm, noise_nm):
+    """One axis with AR1 turbulence and a line."""
+    air = lbt.models.ARModel(coefficients=[0.9986], driving_rms_nm=22.7, frame_rate_hz=rate_hz)
+    line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=rms_nm, direction=(1,))
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=rate_hz, turbulence=air, vibrations=[line], noise_nm=noise_nm, modes=1
+    )
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (2000, 1.076, 1.1e-3, 34.5, 175),
+        (4000, 0.5, 1e-5, 1.0, 1000),
+        (4000, 1.0, 1e-5, 300.0, 1.0),
+        (100, 0.5, 1e-5, 1.0, 1000),
+    ],
+)
+def test_a_slow_line_of_little_damping_is_no_line_without_any(numbers):
+    """Its pole is at 1e-8 to 1e-4 inside the circle, further than rounding can move it."""
+    plant = slow_line(*numbers)
+    found = lbt.linear.kalman_riccati(plant)
+    peer = scipy.linalg.solve_discrete_are(plant.A.T, plant.C.T, plant.Q, plant.R, s=plant.S)
+    assert found.P == pytest.approx(peer, rel=1e-5)
+    certificate = lbt.design.certify_filter(plant, found.gain_predictor, least_variance=True)
+    assert certificate.passed
+
+
+def test_an_oscillation_without_damping_or_drive_is_still_refused():
+    turn = 2 * np.cos(2 * np.pi * 1.076 / 2000)
+    A = np.array([[0.9986, 0, 0], [0, turn, 1], [0, -1, 0]])
+    B = np.array([[22.7, 0], [0, 0], [0, 0]])
+    undriven = lbt.EstimationProblem(A=A, B=B, C=[[1, 1, 0]], D=[[0, 175.0]], L=[[1, 1, 0]])
+    with pytest.raises(lbt.errors.DetectabilityError, match="must be driven by noise"):
+        lbt.kalman(undriven)
+    with pytest.raises(lbt.errors.DetectabilityError, match="Q must see every mode"):
+        lbt.solve_dare(A.T, undriven.C.T, undriven.Q, undriven.R)
