@@ -9,17 +9,25 @@ from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
+from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
+from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.models import LoopHardware
+from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
 _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
 _WIDEST = 1e4
+_DIVISION, _DIVISIONS = 64, 3  # of the delays in which the delay margin is sought
 
 
 @table_row
 class LoopMargins:
-    """Margins of a stable loop; each measurement is broken in turn, the others closed."""
+    """Margins of a stable loop.
+
+    For the phase each measurement is broken in turn, the others closed; gain and delay change in
+    all of them at once.
+    """
 
     modulus: float = column(
         "modulus margin",
@@ -36,9 +44,9 @@ class LoopMargins:
         unit="deg",
         help="Least phase lag that destabilises; inf without a crossover",
     )
-    delay_s: float = column(unit="s", help="Least further delay that destabilises")
+    delay_s: float = column(unit="s", help="Least further delay of the loop that destabilises")
     delay_frames: float = column(
-        "delay margin", unit="frames", help="The same; inf without a crossover"
+        "delay margin", unit="frames", help="The same; inf if the longest delay is stable"
     )
     crossover_hz: float = column(
         "highest crossover",
@@ -78,20 +86,19 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     """
     loop.require_stable()
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
-    phases, delays, crossovers = [np.inf], [np.inf], [0.0]
+    phases, crossovers = [np.inf], [0.0]
     for index in range(loop.hardware.n_measurements):
         for frequency, lag in _crossings(loop, index):
             phases.append(np.degrees(lag))
-            delays.append(lag / (2 * np.pi * frequency))
             crossovers.append(frequency)
-    delay = float(min(delays))
+    delay = _delay_margin_frames(loop)
     return LoopMargins(
         modulus=1 / float(hinf_norm(loop.output_sensitivity())),
         gain_low=low / loop.sensor_gain,
         gain_high=high / loop.sensor_gain,
         phase_deg=float(min(phases)),
-        delay_s=delay,
-        delay_frames=delay * loop.hardware.frame_rate_hz,
+        delay_s=delay / loop.hardware.frame_rate_hz,
+        delay_frames=delay,
         crossover_hz=float(max(crossovers)),
     )
 
@@ -156,6 +163,31 @@ def stable_sensor_gains(
             inner, outer = (middle, outer) if is_stable(middle) else (inner, middle)
         ends.append(float(inner))
     return ends[0], ends[1]
+
+
+def _delay_margin_frames(loop: ClosedLoop) -> float:
+    """Least further delay at which the loop, as it is simulated, is unstable [frames].
+
+    A part of a frame is no phase lag: an exposure then sees two commands. So poles decide.
+    """
+    hardware, matrices = loop.hardware, textbook_matrices([loop.controller])
+
+    def first_unstable(low: float, high: float) -> tuple[float, float] | None:
+        """Return the step of an equal division in which the loop becomes unstable, or None."""
+        further = np.linspace(low, high, _DIVISION + 1)
+        gains = np.full(_DIVISION, loop.sensor_gain)
+        delays = hardware.delay_frames + further[1:]
+        unstable = np.flatnonzero(~ClosedLoops.of(matrices, hardware, gains, delays).stable)
+        return None if unstable.size == 0 else tuple(further[unstable[0] : unstable[0] + 2])
+
+    low, high, longest = 0.0, 1.0, LONGEST_DELAY - hardware.delay_frames
+    while (step := first_unstable(low, min(high, longest))) is None:
+        if high >= longest:
+            return np.inf
+        low, high = high, 2 * high
+    for _ in range(_DIVISIONS):
+        step = first_unstable(*step) or step
+    return float(step[0])
 
 
 def _crossings(loop: ClosedLoop, index: int) -> list[tuple[float, float]]:

@@ -12,6 +12,8 @@ from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_syste
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, matrix
 
+LONGEST_DELAY = 100  # of a loop [frames]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopHardware:
@@ -70,7 +72,7 @@ class LoopHardware:
     delay_frames: Annotated[
         float,
         ("at_least", 1),
-        ("at_most", 100),
+        ("at_most", LONGEST_DELAY),
         ("hint", "One frame is the exposure itself: no loop is faster."),
     ] = 2.0
     sensor_matrix: FloatArray | None = None

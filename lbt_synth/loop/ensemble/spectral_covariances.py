@@ -17,12 +17,16 @@ from lbt_synth.loop.ensemble.closed_loops import LoopGroup
 from lbt_synth.loop.ensemble.loop_ensemble import Turbulence
 from lbt_synth.models import ARModel, Atmosphere, FrozenFlows, SumSpectrum, TabulatedSpectrum
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.models.turbulence.atmosphere import LOWEST
+from lbt_synth.models.turbulence.atmosphere import LOWEST, TAIL
 from lbt_synth.validation import ComplexArray, FloatArray
 
 ORDER = 10  # nodes per panel
-_RIPPLES = np.concatenate([np.arange(1, 3, 0.5), np.arange(3, 26, 1.25), np.geomspace(26, 60, 8)])
-_ALIKE, _STEP = 3.5, 0.08  # winds of a larger ratio share panels that widen with frequency
+# The tilt filter ripples with the inverse of the time that the wind takes over the pupil. Panels
+# end at knots of the spectrum's spline, where it has them; for the fast winds they widen in steps.
+_RIPPLES = np.concatenate(
+    [np.arange(1, 3, 0.5), np.arange(3, 12, 1.25), TAIL[:56:4], TAIL[56:168:8], TAIL[168::16]]
+)
+_STEP = 0.08
 _FLAT = 0.02  # a spectrum is flat below this fraction of the frequency V / L0
 _SETTLED, _HALVINGS = 1e-8, 20  # of the panels of a spectrum of unknown shape
 _COVERED = 1e-6  # fraction of Nyquist above which there are geometric panels in any case
@@ -125,12 +129,8 @@ def _breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
     air = spectrum if isinstance(spectrum, Atmosphere) else spectrum.atmosphere
     wind = np.unique(spectrum.wind_speed_m_s) / air.diameter_m
     slow, fast = float(wind[0]), float(wind[-1])
-    # the tilt filter ripples with the inverse of the time that the wind takes over the pupil
-    if fast > _ALIKE * slow:
-        ripples = np.geomspace(slow, fast * _RIPPLES[-1], int(np.log(60 * fast / slow) / _STEP) + 2)
-    else:
-        reach = np.geomspace(slow * _RIPPLES[-1], fast * _RIPPLES[-1], 8)
-        ripples = np.concatenate([slow * _RIPPLES, reach])
+    reach = np.geomspace(slow, fast, int(np.log(fast / slow) / _STEP) + 2)
+    ripples = np.concatenate([slow * _RIPPLES, TAIL[-1] * reach])
     # below them it is flat, up to where the outer scale bends it
     outer = spectrum.outer_scale_m
     bend = LOWEST if outer is None else max(LOWEST, _FLAT * air.diameter_m / float(np.max(outer)))

@@ -22,6 +22,7 @@ from lbt_synth.validation import FloatArray, Obstruction, Positive, check_fields
 
 ARCSEC_RAD = np.pi / 180 / 3600
 LOWEST = 1e-4  # spectra are constant below this frequency, in units of V / D
+TAIL = np.linspace(12, 120, 400)  # last knots of spectra, in these units
 _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
 
 
@@ -188,7 +189,7 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
         [
             np.geomspace(LOWEST, 0.3, 120, endpoint=False),
             np.linspace(0.3, 12, 480, endpoint=False),
-            np.linspace(12, 120, 400),
+            TAIL,
         ]
     )
     fy, wy = _spatial_panels()

@@ -338,3 +338,26 @@ def test_controllers_that_do_not_fit(kalman):
     slow = lbt.LoopHardware(frame_rate_hz=500)
     with pytest.raises(lbt.errors.ProblemError, match="must run at the loop's 500 Hz"):
         lbt.loop.ensemble_residuals(kalman.controller, slow, ensemble)
+
+
+def test_ripples_far_above_the_wind():
+    """All that this loop leaves of the turbulence is there."""
+    air = lbt.Atmosphere(
+        seeing_arcsec=1.0, outer_scale_m=10.6, wind_speed_m_s=14.3, diameter_m=17.84
+    )
+    line = lbt.Vibration(frequency_hz=20.83, damping=1.9e-5, rms_nm=3, direction=(1,))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=606,
+        delay_frames=1,
+        turbulence=lbt.models.ar2_turbulence(air, frame_rate_hz=606, noise_nm=0.5),
+        vibrations=[line],
+        noise_nm=0.5,
+        modes=1,
+    )
+    controller = lbt.kalman(plant).controller
+    found = lbt.loop.ensemble_residuals(
+        controller, plant.hardware, lbt.loop.LoopEnsemble(turbulence=air)
+    )
+    loop = lbt.close_loop(plant.hardware, controller)
+    single = lbt.residual_budget(loop, lbt.Truth(turbulence=air))
+    assert found.turbulence_nm[0] == pytest.approx(single.turbulence_nm, rel=3e-6)
