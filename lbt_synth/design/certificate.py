@@ -236,7 +236,7 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     problem : EstimationProblem
         The problem.
     level : float
-        Level that is claimed infeasible.
+        Level that is claimed infeasible; 0 claims nothing.
     witness : Witness
         Disturbances that no measurement shows.
 
@@ -249,7 +249,7 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     Raises
     ------
     ProblemError
-        If the witness is not a :class:`Witness`, or the level not a positive number.
+        If the witness is not a :class:`Witness`, or the level negative.
     DimensionError
         If the witness does not fit the problem.
 
@@ -276,7 +276,7 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
             f"a witness must have {problem.n_states} rows of states, {problem.B.shape[1]} rows of "
             f"disturbances and as many columns in both; got {x.shape} and {w.shape}."
         )
-    claimed = number(level, "level", above=0)
+    claimed = number(level, "level", at_least=0)
     proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
     above = claimed / max(proved, _TINY) - 1
     how = "disturbances that no measurement shows"

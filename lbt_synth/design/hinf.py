@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
-from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
+from lbt_synth.errors import CertificateError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_level
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
@@ -62,7 +62,7 @@ def hinf(
     route : {"lmi", "riccati"}, optional
         Linear matrix inequality, or the gamma-Riccati equation. For a given
         bound both give the central filter. By default the inequality up to 20 states, and
-        the equation beyond: the inequality takes minutes there.
+        the equation beyond, where the inequality takes minutes, or where the inequality fails.
 
     Returns
     -------
@@ -94,9 +94,8 @@ def hinf(
     True
     """
     require_problem(problem)
-    if route is None:
-        route = "lmi" if problem.A.shape[0] <= _LARGEST_LMI else "riccati"
-    choice(route, "route", ("lmi", "riccati"))
+    if route is not None:
+        choice(route, "route", ("lmi", "riccati"))
     if gamma is not None and gamma_ratio is not None:
         raise ProblemError(
             "give gamma or gamma_ratio, not both; "
@@ -114,6 +113,22 @@ def hinf(
         )
     problem = problem.ahead(horizon)
     start = kalman_riccati(problem)
+    if route is None and len(problem.A) <= _LARGEST_LMI:
+        try:
+            return _design(problem, start, "lmi", gamma, gamma_ratio)
+        except (NumericalError, CertificateError):  # noise far below the signal
+            pass
+    return _design(problem, start, route or "riccati", gamma, gamma_ratio)
+
+
+def _design(
+    problem: EstimationProblem,
+    start: FilterRiccati,
+    route: str,
+    gamma: float | None,
+    gamma_ratio: float | None,
+) -> FilterDesign:
+    """Find the least gamma by one route, and the filter of the level asked for."""
     synthesis = _LmiRoute(problem, start) if route == "lmi" else _RiccatiRoute(problem, start)
     gains, witness = synthesis.least_gamma()
     least, infeasible = _verified_bracket(problem, start, gains, witness)

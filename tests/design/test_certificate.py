@@ -50,3 +50,10 @@ def test_a_variance_that_rounding_has_spoilt_is_not_certified():
         check = next(c for c in design.certificate.checks if "adjoint" in c.name)
         assert check.value < 1e-6
     assert 0 < spoilt
+
+
+def test_a_level_of_zero_claims_nothing():
+    problem = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    nothing = lbt.linear.Witness(states=np.zeros((1, 1)), disturbances=np.zeros((2, 1)))
+    assert lbt.design.certify_infeasible(problem, 0.0, nothing).passed
+    assert not lbt.design.certify_infeasible(problem, 1e-3, nothing).passed

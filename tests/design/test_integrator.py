@@ -104,3 +104,24 @@ def test_truths_of_other_loops_are_refused():
             lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=SLOW, **wrong)
     with pytest.raises(lbt.errors.ProblemError, match="the truth must disturb the loop"):
         lbt.design.optimal_integrator(both, lbt.Truth(turbulence=[None, None], noise_nm=[0, 0]))
+
+
+def test_the_least_of_two_minima():
+    """A line above the bandwidth: hardly any loop, or a fast one that takes turbulence with it."""
+    path = lbt.LoopHardware(frame_rate_hz=500, delay_frames=3, modes=1)
+    line = lbt.models.SinusoidalVibration(frequency_hz=28.5, rms_nm=38.76, direction=(1,))
+    truth = lbt.Truth(
+        turbulence=lbt.models.ARModel(
+            coefficients=[0.9926], driving_rms_nm=2.27, frame_rate_hz=500
+        ),
+        noise_nm=6.94,
+        vibrations=(line,),
+    )
+
+    def residual(gain: float) -> float:
+        controller = lbt.integrator(path, gain=gain).controller
+        return lbt.residual_budget(lbt.close_loop(path, controller), truth).rms_nm
+
+    found = residual(lbt.design.optimal_integrator(path, truth).gain)
+    assert residual(0.0117) < min(residual(0.005), residual(0.03))  # the other minimum
+    assert found <= min(map(residual, np.linspace(0.005, 0.615, 123)))

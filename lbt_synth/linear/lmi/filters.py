@@ -21,7 +21,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import null_space
 
-from lbt_synth.errors import InfeasibleError
+from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
@@ -61,7 +61,12 @@ class BalancedProblem:
         witness: Witness | None = None,
     ) -> LmiSolution:
         """Bring a covariance, and the gains of an information matrix, to the original states."""
-        predictor, filtering = filter_gains(self.problem, information)
+        try:
+            predictor, filtering = filter_gains(self.problem, information)
+        except np.linalg.LinAlgError as error:
+            raise NumericalError(
+                f"the inequality's storage matrix has no gain: {error}. {_ADVICE}", status=run[0]
+            ) from error
         back = self.basis @ predictor @ self.measurement_scale
         return LmiSolution(
             gamma=gamma,
