@@ -18,6 +18,9 @@ _MANY_SAMPLES = 4096
 _GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # samples, and groups if there are fewer
 _MOST_GROUPS = 32
 _MIDDLE = 0.05, 0.95
+_FEWEST_OF_LINE = 3  # samples on either side of an edge
+_CLEAR = 20.0  # F-value of an edge, beyond what chance gives some thousand intervals
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +78,9 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
     subtracted (T. L. Kelley, Proc. Natl. Acad. Sci. 21, 554 (1935), doi:10.1073/pnas.21.9.554,
     for means). ``s^2`` is the scatter about the fit for independent samples. Samples of a
     Sobol sequence or a Latin hypercube scatter less about the mean of an interval: there
-    the jumps between neighbouring lines, of variance ``8 s^2 B / n``, tell how much.
+    the jumps between neighbouring lines, of variance ``8 s^2 B / n``, tell how much. Where two
+    lines fit an interval clearly better than one (by an F-test), it is parted in two: a loop that
+    becomes unstable beyond some value of x leaves an edge.
 
     Examples
     --------
@@ -99,8 +104,11 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
     else:
         groups = round(n ** (1 / 3))
         starts = group_starts(n, groups if n >= _MANY_SAMPLES else min(groups, _MOST_INTERVALS))
-        coefficients = 2 * len(starts)
+        edges = _edges(spread, starts)
+        starts = np.sort(np.concatenate([starts, edges]))
+        coefficients = 2 * len(starts) + len(edges)
         fit, jumps = _lines(spread, starts)
+        jumps = jumps[~np.isin(starts[1:], edges)]
     rest = spread - fit
     squares = rest * rest
     unexplained = float(np.sum(squares)) / total
@@ -126,6 +134,33 @@ def _means(values: FloatArray, starts: IntArray) -> FloatArray:
     counts = np.diff(np.append(starts, len(values)))
     means: FloatArray = np.repeat(np.add.reduceat(values, starts) / counts, counts)
     return means
+
+
+def _edges(values: FloatArray, starts: IntArray) -> IntArray:
+    """Return where to part the groups that two lines fit clearly better than one."""
+    edges = []
+    for start, group in zip(starts, np.split(values, starts[1:]), strict=True):
+        m = len(group)
+        least = max(_FEWEST_OF_LINE, m // 32)
+        before, after = _line_squares(group), _line_squares(group[::-1])[::-1]
+        # squares about two lines that meet before sample k, for k = least ... m - least
+        both = before[least - 1 : m - least] + after[least : m - least + 1]
+        if both.size == 0:
+            continue
+        best = int(np.argmin(both))
+        gained = float(before[-1] - both[best])
+        if gained * (m - 4) > 2 * _CLEAR * both[best] and gained > _ROUNDING * float(group @ group):
+            edges.append(int(start) + least + best)
+    return np.array(edges, dtype=np.int64)
+
+
+def _line_squares(values: FloatArray) -> FloatArray:
+    """Return the sum of squares about a line through the first k values, for each k."""
+    k = np.arange(1, len(values) + 1)
+    total = np.cumsum(values)
+    slope = np.cumsum((k - 1) * values) - (k - 1) / 2 * total
+    spread = np.maximum(k * (k * k - 1) / 12, 0.5)  # the slope of one value is 0
+    return np.maximum(np.cumsum(values * values) - total**2 / k - slope**2 / spread, 0.0)
 
 
 def _lines(values: FloatArray, starts: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -188,3 +188,16 @@ def test_rank_correlation_is_scipys(ties):
     columns = make_columns({"p": p}, {"a": strehl})
     found = lbt.studies.study_statistics(columns, ["p"], ["a"]).sensitivities[0].parameters[0]
     assert found.spearman == pytest.approx(stats.spearmanr(p, strehl).statistic, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["independent", "latin", "sobol"])
+@pytest.mark.parametrize("n", [512, 4096])
+def test_an_edge_within_an_interval_is_not_missed(kind, n):
+    """A loop that is unstable beyond 0.9 has a Strehl ratio of 0 there."""
+    u = draw_points(kind, n, 2, seed=2)
+    x, y = u.T
+    found = index(x, np.where(x > 0.9, 0.0, 0.8 - 0.2 * y))
+    between, within = 0.09 * 0.7**2, 0.9 * 0.2**2 / 12
+    assert abs(found.value - between / (between + within)) < 3 * found.error
+    assert found.error < 0.02
+    assert index(x, (x < 0.37) * 1.0).value == pytest.approx(1, abs=4e-3)
