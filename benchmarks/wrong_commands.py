@@ -1,18 +1,21 @@
 """Records whose commands are wrong: which faults are named, and which good records pass.
 
-    python benchmarks/wrong_commands.py [--records 200] [--seconds 30] [--jobs 2] [--good]
+    python benchmarks/wrong_commands.py [--records 200] [--seconds 30] [--jobs 2] [--good] [--auto]
 
 Loops of two axes at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain
 0.4 to 1, noise 2 to 30 nm a frame (evenly in its logarithm), turbulence as in identification.py,
 and 0 to 5 resonances of 5 to 100 nm rms in any direction, 5 to 150 Hz, damping 0.002 to 0.01. Each
 record is given with each fault. ``--good`` draws loops of other kinds instead, without a fault:
 wide resonances, the lines of ERIS, delays of 1.5 to 3 frames, AR1 turbulence, leaky and double
-integrators, Kalman filters, unequal and low gains, coarse steps, at 500 to 2000 Hz.
+integrators, Kalman filters, unequal and low gains, coarse steps, at 500 to 2000 Hz. ``--auto``
+designs from each record that passes, and runs the design in the true loop: is it stable, and how
+much more variance does it leave than the best linear controller?
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -150,8 +153,28 @@ def spoil(loop: Loop, fault: str) -> tuple[np.ndarray, np.ndarray]:
     return y, wrong[fault] if fault in wrong else run(loop, night=1)[1]
 
 
-def judge(seed: int, frames: int) -> list[tuple[str, bool, bool, float, str]]:
-    """Return fault, whether it was named, whether the record passed, seconds, and the words."""
+def try_design(loop: Loop, record: lbt.identification.LoopRecord) -> tuple[str, float]:
+    """Return what became of a design in the true loop, and its variance over the least one."""
+    try:
+        design = lbt.design_from_record(record).design
+    except lbt.errors.RecordError as error:
+        return f"named: {error.options}", np.nan
+    except lbt.errors.LbtSynthError as error:
+        return f"refused: {error}", np.nan
+    closed = lbt.close_loop(loop.path, design.controller, sensor_gain=loop.truth.sensor_gain)
+    if not closed.is_stable:
+        return "UNSTABLE", np.inf
+    try:
+        least_nm = lbt.loop.least_residual(loop.path, loop.truth).rms_nm
+    except lbt.errors.CoupledModesError:  # lines at any angle: no limit is known
+        least_nm = np.nan
+    return "stable", (lbt.residual_budget(closed, loop.truth).rms_nm / least_nm) ** 2
+
+
+def judge(
+    seed: int, frames: int, design: bool
+) -> list[tuple[str, bool, bool, float, str, str, float]]:
+    """Return fault, whether named, whether passed, seconds, words, and what the design does."""
     loop, out = draw_loop(seed, frames), []
     for fault, options in FAULTS.items():
         y, u = spoil(loop, fault)
@@ -165,7 +188,15 @@ def judge(seed: int, frames: int) -> list[tuple[str, bool, bool, float, str]]:
         if fault == "other night":
             right = not verdict.accepted and "nothing to do" in verdict.explanation
         words = "" if right else f"{seed}: {verdict.explanation} {verdict.options}"
-        out.append((fault, right, verdict.accepted, seconds, words))
+        made = try_design(loop, record) if design and verdict.accepted else ("", np.nan)
+        if made[0].startswith("named:"):  # by the gains of the fit
+            right = bool(options) and made[0].startswith(f"named: {options}")
+            words = "" if right else f"{seed}: {made[0]}"
+            accepted, seconds = False, time.perf_counter() - start
+        else:
+            accepted = verdict.accepted
+        out.append((fault, right, accepted, seconds, words, *made))
+        print(seed, *out[-1], sep="; ", file=sys.stderr, flush=True)
     return out
 
 
@@ -251,6 +282,19 @@ def judge_good(seed: int, seconds: float) -> list[tuple[str, bool, bool, float, 
     return out
 
 
+def show_designs(designs: list[tuple[str, float]]) -> None:
+    """Print what the designs of the accepted records do in the true loop."""
+    stable = [ratio for what, ratio in designs if what == "stable"]
+    unstable = sum(what == "UNSTABLE" for what, _ in designs)
+    refused = len(designs) - len(stable) - unstable
+    print(f"    designs: {len(stable)} stable, {unstable} unstable, {refused} refused", end="")
+    if stable:
+        parts = np.nanquantile(stable, [0.5, 0.9, 1])
+        print("; variance over the least: median, 90 %, largest", *(f"{x:.3f}" for x in parts))
+    else:
+        print()
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser()
@@ -259,9 +303,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--good", action="store_true")
+    parser.add_argument("--auto", action="store_true")
     given = parser.parse_args()
     seeds = range(given.first, given.first + given.records)
-    one = partial(judge, frames=int(given.seconds * RATE))
+    one = partial(judge, frames=int(given.seconds * RATE), design=given.auto)
     if given.good:
         one = partial(judge_good, seconds=given.seconds)
     with ProcessPoolExecutor(given.jobs) as pool:
@@ -272,6 +317,8 @@ def main() -> None:
         slowest = max(row[3] for row in own)
         print(f"{fault:12s} right {100 * named:5.1f} %  passed {100 * passed:5.1f} %  ", end="")
         print(f"slowest {slowest:.1f} s")
+        if given.auto:
+            show_designs([row[5:] for row in own if len(row) > 5 and row[5]])
         for row in own:
             if row[4]:
                 print("    ", row[4])

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import CertificateError
-from lbt_synth.identification.commands.gain_interval import allowed_gains, unstable_gains
+from lbt_synth.identification.commands.fitted_gains import judge_fitted_gains
+from lbt_synth.identification.commands.gain_interval import allowed_gains
 from lbt_synth.identification.commands.verdict import explain_commands
+from lbt_synth.identification.design_for_gains import design_for_gains, is_stable_at_gains
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.likeliest_gain import agrees, identify_likeliest
+from lbt_synth.identification.likeliest_gain import identify_likeliest
 from lbt_synth.identification.method_choice import MethodChoice, choose_method
 from lbt_synth.identification.prediction.comparison import (
     PredictionRow,
@@ -27,13 +28,12 @@ from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.loop import Imaging, close_loop
-from lbt_synth.methods.registry import method_named, record_methods
+from lbt_synth.methods.registry import gain_robust_method, method_named, record_methods
 from lbt_synth.methods.request import PlantInputs, design_request
-from lbt_synth.validation import FloatArray, choice, number, require_instance
+from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
 _APART = 3.0  # standard errors between gains that disagree
-_CAREFUL = 1.4  # by which a design's gain is below the largest that a record allows
 LEAST_SECONDS = 8.0  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 
@@ -171,6 +171,8 @@ def design_from_record(
     design = partial(_design, gamma_ratio=gamma_ratio)
     fit, test = split_halves(record.stretches(), record.frames)
     half = fit_model(stretches=fit)
+    if allowed is not None:
+        assumptions += _judge_gains(half, accept_record)
     found = None
     if method is None:
         found = choose_method(
@@ -178,7 +180,7 @@ def design_from_record(
             half,
             identify_past=fit_model,
             design=design,
-            is_safe=lambda made: allowed is None or _is_stable_at_gains(made, allowed, half),
+            is_safe=lambda made: allowed is None or is_stable_at_gains(made, allowed, half),
         )
         method = found.method
     step(1)
@@ -196,7 +198,9 @@ def design_from_record(
         taps=taps,
     )
     step(1)
-    model, made, held = _design_for_gains(fit_model, partial(design, method), half, allowed)
+    model, made, held = design_for_gains(
+        fit_model, partial(design, method), _design_robustly, half, allowed
+    )
     step(1)
     row = held_out[name]
     assert row.model_axis_nm is not None
@@ -213,26 +217,6 @@ def design_from_record(
     )
 
 
-def _design_for_gains(
-    fit_model: Callable[..., IdentifiedModel],
-    design: Callable[[IdentifiedModel], Design],
-    half: IdentifiedModel,
-    allowed: FloatArray | None,
-) -> tuple[IdentifiedModel, Design, tuple[str, ...]]:
-    """Return model and design, stable at all possible gains, and what is assumed of them."""
-    model = fit_model(start=half)
-    made = design(model)
-    if allowed is None:
-        return model, made, ()
-    intervals = _possible_gains(allowed, model, half)
-    for gain in _careful_gains(intervals):
-        if unstable_gains(made, intervals) is None:
-            break
-        model = fit_model(start=model, sensor_gain=gain)
-        made = design(model)
-    return model, made, (_require_stable(made, intervals),)
-
-
 def _design(
     method: str,
     model: IdentifiedModel,
@@ -244,9 +228,10 @@ def _design(
     return design_request(method, options).build(inputs)
 
 
-def _is_stable_at_gains(design: Design, allowed: FloatArray, model: IdentifiedModel) -> bool:
-    """Return whether a design is stable at all sensor gains that record and model allow."""
-    return unstable_gains(design, _possible_gains(allowed, model)) is None
+def _design_robustly(model: IdentifiedModel, gains: tuple[float, float]) -> Design:
+    """Design for an interval of gains, relative to the model's, by a method that can."""
+    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
+    return design_request(gain_robust_method(), {}).build(inputs)
 
 
 def _note_short(seconds: float, model: IdentifiedModel, row: PredictionRow) -> Iterator[str]:
@@ -281,6 +266,16 @@ def _judge_commands(
     return list(verdict.notes), [*verdict.overruled, *given]
 
 
+def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
+    """Return what is assumed of fitted gains; refuse those of commands in another unit."""
+    errors = [axis.sensor_gain_error for axis in model.axes]
+    known = np.array([np.inf if error is None else error for error in errors])
+    verdict = judge_fitted_gains(np.array(model.sensor_gains), known)
+    if not accept:
+        verdict.require_accepted()
+    return verdict.overruled
+
+
 def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[str]:
     """Warn of sensor gains that disagree."""
     for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
@@ -292,43 +287,3 @@ def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[st
                 f"warning: axis {i} has a sensor gain of {first.sensor_gain:.3f} in the first half "
                 f"of the record, and of {whole.sensor_gain:.3f} in all of it"
             )
-
-
-def _possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
-    """Return the interval of gains of each axis that the record and its models allow.
-
-    Where the fit finds the gains, near those that the record allows, its errors decide.
-    """
-    found = []
-    for each in models:
-        errors = [_APART * (axis.sensor_gain_error or 0.0) for axis in each.axes]
-        gains = np.array(each.sensor_gains)
-        found += [gains - np.minimum(errors, gains / 2), gains + errors]
-    known = all(axis.sensor_gain_error is not None for each in models for axis in each.axes)
-    if not (known and all(agrees(each, allowed) for each in models)):
-        found += list(allowed.T)
-    return np.column_stack([np.min(found, axis=0), np.max(found, axis=0)])
-
-
-def _careful_gains(intervals: FloatArray) -> list[float]:
-    """Return gains for designs that may be stable within intervals, the slowest first."""
-    low, high = float(np.min(intervals)), float(np.max(intervals))
-    return [high / _CAREFUL, float(np.sqrt(low * high)) * _CAREFUL, float(np.sqrt(low * high))]
-
-
-def _require_stable(design: Design, intervals: FloatArray) -> str:
-    """Return what is assumed of the sensor gains; refuse a design that they make unstable."""
-    bad = unstable_gains(design, intervals)
-    each = [f"{low:.3g} to {high:.3g}" for low, high in intervals]
-    words = " and ".join(dict.fromkeys(each))
-    if bad is not None:
-        gain = ", ".join(f"{value:.3g}" for value in bad)
-        raise CertificateError(
-            f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
-            f"{words}. Record with a higher loop gain, look for jumps in the record, or give the "
-            "sensor gain."
-        )
-    return (
-        f"the sensor gain lies within {words}, as the record and its model allow; the loop is "
-        "stable at all of these"
-    )

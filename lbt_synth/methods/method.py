@@ -162,7 +162,8 @@ class Method:
     section : type or None
         Section ``design.<name>`` of a configuration, a :class:`Section`.
     plant_section : callable or None
-        From a plant alone to a section with defaults; None if it takes a configuration.
+        From a plant alone, and the interval of relative sensor gains at which its design has to
+        be stable, or None, to a section with defaults; None if it takes a configuration.
     exclusive : frozenset of str
         Options of which at most one is given.
     configurable : frozenset of str
@@ -195,7 +196,7 @@ class Method:
     describe: Callable[[Any], Description]
     design_names: tuple[str, ...] = ()
     section: type[Section] | None = None
-    plant_section: Callable[[TipTiltPlant], Section] | None = None
+    plant_section: Callable[[TipTiltPlant, tuple[float, float] | None], Section] | None = None
     exclusive: frozenset[str] = frozenset()
     configurable: frozenset[str] = frozenset()
     estimator: bool = True

@@ -166,6 +166,11 @@ def plant_methods() -> list[str]:
     return sorted(able.union(record_methods()))
 
 
+def gain_robust_method() -> str:
+    """Return the name of the method that designs for a plant and an interval of sensor gains."""
+    return next(n for n, m in all_methods().items() if m.plant_section is not None)
+
+
 def default_method() -> str:
     """Return the name of the method that is designed unless another is named."""
     return reference_methods(estimators_only=True)[0].name

@@ -155,6 +155,7 @@ class PlantInputs:
     design_defaults: Mapping[str, Any] = field(default_factory=dict)
     atmosphere: None = None
     sensor_gain: float = 1.0
+    sensor_gains: tuple[float, float] | None = None  # to be stable at, relative to the plant's
 
     @property
     def hardware(self) -> LoopHardware:
@@ -169,7 +170,7 @@ class PlantInputs:
     def method_section(self, name: str) -> Any:
         """Return the section that a method makes of a plant, None if it makes none."""
         make = method_named(name).plant_section
-        return None if make is None else make(self.plant)
+        return None if make is None else make(self.plant, self.sensor_gains)
 
     def size_nm(self, entry: Any, key: str) -> float:
         """Return the size of an entry, which must give it in nm."""

@@ -259,7 +259,9 @@ def _list_command_bounds(
     return [bound_commands(at_most_nm=bound, rate=rate) for bound, rate in bounds]
 
 
-def _plant_section(plant: TipTiltPlant) -> RobustSection:
+def _plant_section(
+    plant: TipTiltPlant, sensor_gains: tuple[float, float] | None = None
+) -> RobustSection:
     """Return bands around the strongest lines of a plant, those that overlap as one."""
     lines = sorted(plant.vibrations, key=lambda line: -line.rms_nm)
     nyquist_hz = plant.hardware.frame_rate_hz / 2
@@ -280,7 +282,8 @@ def _plant_section(plant: TipTiltPlant) -> RobustSection:
         )
     if not bands:
         raise ProblemError("a robust controller is for vibrations; the plant has none.")
-    return RobustSection(bands=bands, functions=_PLANT_FUNCTIONS, states=None)
+    gains = None if sensor_gains is None else [min(sensor_gains[0], 1.0), max(sensor_gains[1], 1.0)]
+    return RobustSection(bands=bands, sensor_gain=gains, functions=_PLANT_FUNCTIONS, states=None)
 
 
 def _axis(line: Vibration) -> Axis:

@@ -9,6 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, RecordError
 from lbt_synth.identification.commands.axis_matrix import classify_matrix
+from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factor
 from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
 from lbt_synth.identification.commands.explanations import (
     invert_axes,
@@ -34,15 +35,12 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each, require_instance
 
 AS_GIVEN = "as given"
-PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 _CLEAR = 20.0  # nats that decide
 _CLEAR_FINER = 8.0  # the same by the criterion of the fit, beyond its price of resonances
 _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
-_FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
-_USUAL_GAIN = 0.7
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _INSIDE = 8  # gains that are tried of the plausible ones
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
@@ -351,12 +349,8 @@ def _find_scale(
     near = coarse.compare([found.guess] * _INSIDE, np.tile(inside, (len(bounded), 1)))
     if np.sum(np.min(near.axis_contrast, axis=1)) - found.own_contrast < found.clear:
         return 1.0
+    factor, usual = likely_factor(found.gain, plausible)
     gain = float(np.exp(np.mean(np.log(found.gain))))
-    usual = float(np.clip(_USUAL_GAIN, low, high))
-    fits = [f for f in _FACTORS if low <= gain / f <= high]
-    factor = float(f"{gain / usual:.2g}")
-    if fits:
-        factor = float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
     tried = inside[:, None] * np.ones(len(bounded))
     record = coarse.record
     if law is not None and _is_sure(law):

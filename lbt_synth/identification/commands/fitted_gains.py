@@ -1,0 +1,29 @@
+"""The sensor gains of a fit, which may show commands in another unit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factor
+from lbt_synth.identification.commands.explanations import wrong_scale
+from lbt_synth.identification.commands.repair import CommandRepair
+from lbt_synth.identification.commands.verdict import AS_GIVEN, CommandVerdict
+from lbt_synth.validation import FloatArray, frozen_copy
+
+_FIT_ERRORS = 4.0  # of a fitted gain from a plausible one that refute the unit
+
+
+def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
+    """Judge the commands by the sensor gains (axes,) of a fit, with their standard errors.
+
+    The fit shows gains beyond the plausible ones where the coarse model leaves them open.
+    """
+    accepted = not np.all(gains - _FIT_ERRORS * errors > PLAUSIBLE_GAINS[1])
+    factor = 1.0 if accepted else likely_factor(gains, PLAUSIBLE_GAINS)[0]
+    return CommandVerdict(
+        explanation=AS_GIVEN if accepted else wrong_scale(1 / factor, gains),
+        accepted=accepted,
+        repair=None if accepted else CommandRepair(scale=factor),
+        gain=frozen_copy(gains / factor),
+        law=None,
+    )
