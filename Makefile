@@ -8,7 +8,7 @@ OUT    ?= out
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-all e2e browser study bench docs lint clean
+.PHONY: demo test test-all lowest e2e browser study bench docs lint clean
 
 $(VENV)/.ready: pyproject.toml
 ifdef UV
@@ -60,6 +60,12 @@ test: lint               ## the whole default check
 
 test-all:                ## the check on each supported Python that is found
 	PYTHON=$(PYTHON) .ci/each-python $(MAKE) test
+
+lowest:                  ## the default tests with the lowest versions of all dependencies; needs uv
+	$(UV) venv --quiet --allow-existing --python $(PYTHON) $(VENV)-lowest
+	$(UV) pip install --quiet --python $(VENV)-lowest/bin/python --resolution lowest-direct -e .
+	$(UV) pip install --quiet --python $(VENV)-lowest/bin/python -e . --group test
+	$(VENV)-lowest/bin/python -m pytest -n 2 -m "not study and not e2e and not browser" tests
 
 e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT, Dask, Parquet, pyRTC; a test that is skipped, or none at all, fails
 	$(BIN)/pytest -n 2 -m e2e --no-skips tests

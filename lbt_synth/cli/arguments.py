@@ -210,8 +210,11 @@ def _add_acceptance(parser: ArgumentParser) -> None:
 def _add_engine(parser: ArgumentParser) -> None:
     engine = parser.add_mutually_exclusive_group()
     add_option(engine, "--jobs", int, "processes", 1)
-    text = "Dask scheduler that runs it instead, as tcp://host:8786"
+    text = "Dask scheduler that runs it instead, as tcp://host:8786; it can run code here: trust it"
     add_option(engine, "--dask", str, text, metavar="ADDRESS")
+    text = "files of the authority, certificate and key for a scheduler at tls://host:8786"
+    metavar = ("CA", "CERT", "KEY")
+    add_option(parser, "--dask-tls", str, text, nargs=3, metavar=metavar)
 
 
 def diagnose(parser: ArgumentParser) -> None:

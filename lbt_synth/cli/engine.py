@@ -21,5 +21,7 @@ def choose_engine(
 ) -> AbstractContextManager[tuple[Executor | None, int | None]]:
     """Provide the executor of ``--dask`` and its workers, or None for both with ``--jobs``."""
     if arguments.dask is None:
+        if arguments.dask_tls is not None:
+            raise ProblemError("--dask-tls goes with --dask.")
         return nullcontext((None, None))
-    return connect_cluster(arguments.dask)
+    return connect_cluster(arguments.dask, tls=arguments.dask_tls)

@@ -129,7 +129,7 @@ class LoopSection(Section):
 
     axes: Annotated[int, Field(ge=1, le=2)] | None = None
     frame_rate_hz: Positive
-    delay_frames: Annotated[float, Field(ge=1)] = 2.0
+    delay_frames: Annotated[float, Field(ge=1, le=20)] = 2.0
 
 
 class _LineSection(Section):

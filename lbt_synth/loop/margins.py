@@ -18,6 +18,7 @@ from lbt_synth.validation import number
 
 _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
 _WIDEST = 1e4
+_AT_ONCE = 32  # gains, whose loops are in memory together
 _DIVISION, _DIVISIONS = 64, 3  # of the delays in which the delay margin is sought
 
 
@@ -153,11 +154,13 @@ def stable_sensor_gains(
     for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
         count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
         gains = np.asarray(centre * ratio ** np.arange(count + 1), dtype=np.float64)
-        outside = np.nonzero(radii(gains) >= 1)[0]
-        if outside.size == 0:
+        parts = (range(i, min(i + _AT_ONCE, count + 1)) for i in range(0, count + 1, _AT_ONCE))
+        outside = (part[i] for part in parts for i in np.flatnonzero(radii(gains[part]) >= 1))
+        first = next(outside, None)
+        if first is None:
             ends.append(open_end)
             continue
-        inner, outer = gains[outside[0] - 1], gains[outside[0]]
+        inner, outer = gains[first - 1], gains[first]
         for _ in range(60):
             middle = (inner + outer) / 2
             inner, outer = (middle, outer) if is_stable(middle) else (inner, middle)

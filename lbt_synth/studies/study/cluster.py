@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from typing import Any
@@ -15,20 +16,30 @@ _TIMEOUT_S = 10
 
 
 @contextmanager
-def connect_cluster(address: str) -> Iterator[tuple[Executor, int]]:
-    """Provide the executor of a Dask scheduler with this package, and how many threads it has."""
+def connect_cluster(
+    address: str, *, tls: Sequence[str] | None = None
+) -> Iterator[tuple[Executor, int]]:
+    """Provide the executor of a Dask scheduler with this package, and how many threads it has.
+
+    A scheduler can run code on its clients: name only one that you trust. ``tls`` names the
+    files of the authority, of the certificate and of the key of an encrypted connection.
+    """
     try:
         from distributed import Client
-        from distributed.comm import get_address_host_port
+        from distributed.security import Security
     except ImportError as error:
         raise MissingExtraError(
             '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
         ) from error
+    names = ("tls_ca_file", "tls_client_cert", "tls_client_key")
     try:
-        # a client made with an invalid address complains again when it is collected
-        get_address_host_port(address if "://" in address else f"tcp://{address}", strict=True)
-        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
+        files = dict(zip(names, tls, strict=True)) if tls else {}
+        security = Security(**files, require_encryption=True if tls else None)
+        # a client hangs where nothing answers, and complains again when it is collected
+        with _silence_logging():
+            asyncio.run(asyncio.wait_for(_greet(address, security), 3 * _TIMEOUT_S))
+        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False, security=security)
+    except Exception as error:  # foreign answers raise whatever they like
         text = " ".join(str(error).split()) or "no answer"
         raise ProblemError(
             f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
@@ -43,6 +54,22 @@ def connect_cluster(address: str) -> Iterator[tuple[Executor, int]]:
             ) from error
         _require_versions(address, client)
         yield client.get_executor(pure=False), sum(client.ncores().values())
+
+
+async def _greet(address: str, security: Any) -> None:
+    """Ask who answers at an address; OSError if it is no scheduler."""
+    from distributed.comm import connect, get_address_host_port
+    from distributed.core import send_recv
+
+    full = address if "://" in address else f"tcp://{address}"
+    get_address_host_port(full, strict=True)
+    comm = await connect(full, timeout=_TIMEOUT_S, **security.get_connection_args("client"))
+    try:
+        found = await asyncio.wait_for(send_recv(comm, op="identity"), _TIMEOUT_S)
+    finally:
+        comm.abort()
+    if not isinstance(found, dict) or found.get("type") != "Scheduler":
+        raise OSError("what answers is no scheduler")
 
 
 @contextmanager

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
+import socket
+import threading
 import time
 
 import numpy as np
@@ -89,3 +92,37 @@ def test_dask_logs_no_tracebacks(capsys, cluster):
         assert not logger.isEnabledFor(logging.ERROR)
     assert logger.isEnabledFor(logging.ERROR)
     assert "a traceback" not in capsys.readouterr().err
+
+
+ANSWERS = {
+    "silent": b"",
+    "a web server": b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n",
+    "a shell": b"SSH-2.0-OpenSSH_9.2p1\r\n",
+    "endless": b"\xff" * 64,
+}
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("who", ANSWERS)
+def test_what_is_no_scheduler_is_refused_in_time(monkeypatch, who):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 1)
+    kept = []
+
+    def answer():
+        with contextlib.suppress(OSError):
+            while True:
+                kept.append(listener.accept()[0])
+                kept[-1].sendall(ANSWERS[who])
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=answer, daemon=True).start()
+        port = listener.getsockname()[1]
+        with (
+            pytest.raises(lbt.errors.ProblemError, match="no Dask scheduler answers at"),
+            connect_cluster(f"tcp://127.0.0.1:{port}"),
+        ):
+            pass
+        listener.shutdown(socket.SHUT_RDWR)
+    for each in kept:
+        each.close()
