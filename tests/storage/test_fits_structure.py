@@ -97,5 +97,5 @@ def test_a_record_with_a_checksum_and_one_flipped_bit_is_refused(tmp_path):
 def test_foreign_bytes_are_no_fits():
     for content in (b"", b"SIMPLE", b"SIMPLE  = " + bytes(2870), b"END".ljust(80) * 36):
         if content:
-            with pytest.raises(ValueError, match="of its HDU 0 is wrong"):
+            with pytest.raises(ValueError, match=r"of its HDU 0 is wrong|truncated"):
                 check_fits(content)
