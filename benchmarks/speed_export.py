@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import statistics
 import subprocess
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from harness import Row
 from scipy.linalg import cython_blas
 
 import lbt_synth as lbt
+from lbt_synth.validation import set_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 FRAMES, REPEATS = 20_000, 15
@@ -95,7 +96,7 @@ def frame(design: lbt.Design, *, single: bool) -> Row:
     textbook = k.to_statespace()  # one product gives the next state and the command
     whole = np.block([[textbook.A, textbook.B], [textbook.C, textbook.D]])
     state, y, u, x, out, matrix = map(
-        array, (np.zeros(n), np.zeros(q), np.zeros(m), np.zeros(n + q), np.zeros(n + m), whole)
+        array, (np.zeros(n + m), np.zeros(q), np.zeros(m), np.zeros(n + q), np.zeros(n + m), whole)
     )
     gemv = blas("sgemv" if single else "dgemv")
     mine, theirs = [], []
@@ -116,7 +117,9 @@ def turned(design: lbt.Design) -> lbt.Design:
     own = design.controller
     T, _ = np.linalg.qr(np.random.default_rng(0).standard_normal(own.A.shape))
     other = lbt.Controller(A=T @ own.A @ T.T, B=T @ own.B, C=own.C @ T.T, D=own.D, dt_s=own.dt_s)
-    return replace(design, controller=other)
+    turned_design = copy.copy(design)
+    set_fields(turned_design, controller=other)
+    return turned_design
 
 
 def compiled_frames() -> dict[str, Row]:

@@ -259,6 +259,13 @@ def choice(value: Any, name: str, options: Sequence[str]) -> str:
     return cast(str, value)
 
 
+def text(value: Any, name: str) -> str:
+    """Return a text; refuse anything else."""
+    if not isinstance(value, str):
+        raise ProblemError(f"{name} must be a text; got {value!r}.")
+    return value
+
+
 def sequence(value: Any, name: str) -> tuple[Any, ...]:
     """Return a list or tuple as a tuple; refuse anything else."""
     if not isinstance(value, list | tuple):

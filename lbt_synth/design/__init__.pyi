@@ -6,6 +6,7 @@ from .certificate import certify_filter as certify_filter
 from .certificate import certify_infeasible as certify_infeasible
 from .certificate import certify_loop as certify_loop
 from .hinf import hinf as hinf
+from .integrator import IntegratorDesign as IntegratorDesign
 from .integrator import integrator as integrator
 from .integrator import integrator_gain_limit as integrator_gain_limit
 from .integrator import model_integrator as model_integrator
@@ -22,6 +23,5 @@ from .polytopic import polytopic as polytopic
 from .result import Design as Design
 from .result import EstimatorDesign as EstimatorDesign
 from .result import FilterDesign as FilterDesign
-from .result import IntegratorDesign as IntegratorDesign
 from .result import SolverReport as SolverReport
 from .robust import robust as robust

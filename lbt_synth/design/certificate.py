@@ -27,6 +27,7 @@ from lbt_synth.validation import FloatArray, frozen_copy, number, set_fields
 
 GAIN_TOLERANCE = 1e-6
 NORM_TOLERANCE = 1e-6
+ORIGIN_TOLERANCE = 1e-5
 RESIDUAL_TOLERANCE = 1e-8
 INFEASIBLE_TOLERANCE = 1e-9
 VARIANCE_TOLERANCE = 1e-6
@@ -320,16 +321,3 @@ def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
 
 def _stability_check(name: str, radius: float) -> Check:
     return Check(name, radius, 1 - STABILITY_MARGIN, "eigenvalues")
-
-
-def controller_difference(one: Controller, other: Controller) -> float:
-    """Largest relative difference of two controllers' matrices; infinite where sizes differ."""
-    worst = 0.0
-    for name in "ABCD":
-        a, b = getattr(one, name), getattr(other, name)
-        if a.shape != b.shape:
-            return float("inf")
-        size = float(np.max(np.abs(b), initial=0.0))
-        difference = float(np.max(np.abs(a - b), initial=0.0))
-        worst = max(worst, difference / size if size > 0 else difference)
-    return worst

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.design.result import UNCERTIFIED, IntegratorDesign, SolverReport, with_certificate
+from lbt_synth.design.certificate import Certificate, certify_loop
+from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
@@ -19,12 +21,52 @@ from lbt_synth.loop import (
     stable_sensor_gains,
 )
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
-from lbt_synth.validation import frozen_copy, number, require_instance
+from lbt_synth.validation import (
+    ComplexArray,
+    frozen_copy,
+    number,
+    require_instance,
+    set_fields,
+)
 
 TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as fractions of the limit
 # A line far above the bandwidth leaves one minimum with its amplification and one without: the
 # trials are as close as these where the loop is fast.
 _TRIALS = np.concatenate([np.geomspace(TRIED_GAINS[0], 0.1, 12), np.linspace(0.1, 0.999, 46)[1:]])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IntegratorDesign(Design):
+    """The classical controller ``u(k) = u(k-1) + gain R y(k)``.
+
+    Attributes
+    ----------
+    loop_hardware : LoopHardware
+        The loop.
+    gain : float
+        Integrator gain, per unit of sensor gain.
+    """
+
+    controller: Controller = field(init=False)
+    loop_hardware: LoopHardware
+    gain: float
+
+    def __post_init__(self) -> None:
+        set_fields(self, controller=_integrator_controller(self.loop_hardware, self.gain))
+
+    @property
+    def hardware(self) -> LoopHardware | None:
+        """Loop that the design is for."""
+        return self.loop_hardware
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles of the closed loop."""
+        return close_loop(self.loop_hardware, self.controller).system.poles
+
+    def recertify(self) -> Certificate:
+        """Compute the certificate again from the matrices."""
+        return replace(UNCERTIFIED, checks=(certify_loop(self.loop_hardware, self.controller),))
 
 
 def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
@@ -69,7 +111,6 @@ def _design_with_gain(
     """Make the design of a gain and certify it."""
     design = IntegratorDesign(
         method="integrator",
-        controller=_integrator_controller(hardware, gain),
         certificate=UNCERTIFIED,
         solver=SolverReport(route=route, status=status, iterations=0),
         loop_hardware=hardware,

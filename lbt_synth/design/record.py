@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.design.certificate import Certificate, Check
-from lbt_synth.design.result import Design, SolverReport
+from lbt_synth.design.certificate import Certificate
+from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.models import (
     ARModel,
@@ -19,11 +19,14 @@ from lbt_synth.models import (
     TipTiltPlant,
     Vibration,
 )
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.models.plant.parts import PlantParts, held_frames
+from lbt_synth.models.plant.tip_tilt import assemble
+from lbt_synth.validation import FloatArray, integer, sequence, text
 
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
+_SAME = 1e-9
 _CHECK = ("name", "value", "limit", "computed_by")
 _PROBLEMS: dict[str, type[EstimationProblem]] = {
     "problem": EstimationProblem,
@@ -51,14 +54,20 @@ class DesignRecord:
         return Controller(**arrays, **given, dt_s=self.meta["dt_s"])
 
     def common(self) -> dict[str, Any]:
-        """Return what every design has, as arguments of its class."""
+        """Return what every design has, as arguments of its class; it is not certified yet."""
+        solver, assumptions = self.meta["solver"], self.meta.get("assumptions", [])
         return {
             "method": self.meta["method"],
-            "controller": self.controller(),
-            "certificate": _unpack_certificate(self.meta["certificate"]),
-            "solver": SolverReport(**self.meta["solver"]),
-            "assumptions": tuple(map(str, self.meta.get("assumptions", ()))),
-            "configuration": str(self.meta.get("configuration", "")),
+            "certificate": UNCERTIFIED,
+            "solver": SolverReport(
+                route=text(solver["route"], "route"),
+                status=text(solver["status"], "status"),
+                iterations=integer(solver["iterations"], "iterations", at_least=0),
+            ),
+            "assumptions": tuple(
+                text(a, "assumptions") for a in sequence(assumptions, "assumptions")
+            ),
+            "configuration": text(self.meta.get("configuration", ""), "configuration"),
         }
 
     def hardware(self) -> LoopHardware:
@@ -73,24 +82,37 @@ class DesignRecord:
         )
 
     def problem(self) -> EstimationProblem:
-        """Return the estimation problem."""
+        """Return the estimation problem; that of a plant is assembled from its parts."""
+        kind = _PROBLEMS[self.meta["problem"]]
+        if kind is TipTiltPlant:
+            return self._assembled_plant()
         fields: dict[str, Any] = {name: self.arrays[f"PLANT_{name}"] for name in "ABCDL"}
         fields["dt_s"] = self.meta["dt_s"]
-        kind = _PROBLEMS[self.meta["problem"]]
-        if kind is not EstimationProblem:
-            fields["hardware"] = self.hardware()
         if kind is FullStatePlant:
             fields |= {"B_known": self.arrays["KNOWN_B"], "D_known": self.arrays["KNOWN_D"]}
-        if kind is TipTiltPlant:
-            fields["turbulence"] = tuple(
-                ARModel(**model, frame_rate_hz=self.meta["frame_rate_hz"])
-                for model in self.meta["turbulence"]
-            )
-            fields["vibrations"] = tuple(
-                Vibration(**{**line, "direction": tuple(line["direction"])})
-                for line in self.meta["vibrations"]
-            )
+            plant = FullStatePlant(**fields, hardware=self.hardware())
+            _require_own_loop(plant)
+            return plant
         return kind(**fields)
+
+    def _assembled_plant(self) -> EstimationProblem:
+        """Return the plant of loop, turbulence, vibrations and noise, with a filter's memory."""
+        hardware, meta = self.hardware(), self.meta
+        parts = PlantParts(
+            hardware=hardware,
+            turbulence=tuple(
+                ARModel(**model, frame_rate_hz=hardware.frame_rate_hz)
+                for model in meta["turbulence"]
+            ),
+            vibrations=tuple(
+                Vibration(**{**line, "direction": tuple(line["direction"])})
+                for line in meta["vibrations"]
+            ),
+            noise_factor=self.arrays["PLANT_D"][:, -hardware.n_measurements :],
+        )
+        memory = self.arrays["PLANT_L"][:, parts.size :]
+        plant = assemble(parts)
+        return plant.with_memory(memory) if memory.size else plant
 
     def plant(self, reason: str) -> TipTiltPlant:
         """Return the problem if it is a tip/tilt plant; TypeError with the reason if not."""
@@ -118,6 +140,8 @@ def record_common(design: Design) -> DesignRecord:
     if hardware is not None:
         arrays |= {"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}
         meta |= {"frame_rate_hz": hardware.frame_rate_hz, "delay_frames": hardware.delay_frames}
+        taps = hardware.mirror_taps
+        meta["mean_delay_frames"] = 1 + float(np.arange(taps.size) @ taps)
         if hardware.mirror is not None:
             meta["mirror"] = asdict(hardware.mirror)
         meta["units"] = {
@@ -153,17 +177,30 @@ def _pack_certificate(certificate: Certificate) -> Meta:
     }
 
 
-def _unpack_certificate(meta: Meta) -> Certificate:
-    return Certificate(
-        checks=tuple(_unpack_check(check) for check in meta["checks"]),
-        gamma=np.nan if meta["gamma"] is None else float(meta["gamma"]),
-        rms_per_output=frozen_copy(np.array(meta["rms_per_output"], dtype=np.float64)),
-    )
+def _require_own_loop(plant: FullStatePlant) -> None:
+    """Refuse a plant whose commands or sensor are not those of its loop.
 
-
-def _unpack_check(meta: Meta) -> Check:
-    """Return a check; files of version 0.1 call ``computed_by`` ``method``."""
-    values = dict(meta)
-    if "method" in values:
-        values["computed_by"] = values.pop("method")
-    return Check(**values)
+    The response of y to a command is that of the hardware; and as y sees the phase ``h + 1``
+    frames after ``L x`` reaches it, ``S L A^i B = (1-f) C A^(i+h) B + f C A^(i+h-1) B``, with f the
+    weight of the frame before.
+    """
+    hardware, n = plant.hardware, plant.n_states
+    mirror, response = hardware.mirror_system.whole, -hardware.sensor @ hardware.influence
+    held = held_frames(hardware)
+    late = held + 1 - hardware.delay_frames
+    known, entry, state = plant.B_known, plant.B, mirror.B
+    seen, estimated = [], []
+    pairs = [(plant.D_known, mirror.D * response)]
+    for _ in range(n + held):
+        pairs.append((plant.C @ known, mirror.C @ state * response))
+        seen.append(plant.C @ entry)
+        estimated.append(hardware.sensor @ plant.L @ entry)
+        known, entry, state = plant.A @ known, plant.A @ entry, mirror.A @ state
+    before = [np.zeros_like(seen[0]), *seen]
+    pairs += [(seen[i], before[0]) for i in range(held)]
+    pairs += [
+        ((1 - late) * seen[i + held] + late * before[i + held], estimated[i]) for i in range(n)
+    ]
+    found, expected = (np.concatenate([np.ravel(pair[i]) for pair in pairs]) for i in (0, 1))
+    if not np.allclose(found, expected, rtol=_SAME, atol=_SAME * np.max(np.abs(expected))):
+        raise ValueError("the plant does not respond to its loop's commands and phase")

@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
 from lbt_synth.design.certificate import (
+    GAIN_TOLERANCE,
     INFEASIBLE_TOLERANCE,
     LEVEL_SETS,
     NORM_TOLERANCE,
+    ORIGIN_TOLERANCE,
     Certificate,
     Check,
     certify_filter,
     certify_infeasible,
     certify_loop,
 )
+from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
-from lbt_synth.loop import close_loop
+from lbt_synth.linear.estimation_problem import decorrelate
+from lbt_synth.linear.riccati.filtering import (
+    FilterRiccati,
+    GammaEquation,
+    gamma_riccati,
+    kalman_riccati,
+)
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +62,8 @@ class Design:
     method : str
         Name that the method of synthesis gives its designs.
     controller : Controller
-        From y(k) to u(k), the known input included (new-state form).
+        From y(k) to u(k), the known input included (new-state form). The designs of this package
+        make it of their loop and gains; it cannot be given to them.
     certificate : Certificate
         Checks that were passed.
     solver : SolverReport
@@ -175,6 +186,7 @@ class FilterDesign(EstimatorDesign):
         The proof of that level: disturbances that no measurement shows.
     """
 
+    controller: Controller = field(init=False)
     gain_predictor: FloatArray
     gain_filter: FloatArray
     gamma_requested: float | None = None
@@ -182,6 +194,9 @@ class FilterDesign(EstimatorDesign):
     gamma_infeasible: float | None = None
     witness: Witness | None = None
     rms_requested: float | None = None
+
+    def __post_init__(self) -> None:
+        set_fields(self, controller=self.problem.controller(self.gain_predictor))
 
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
         """System from w to the estimation error.
@@ -222,11 +237,28 @@ class FilterDesign(EstimatorDesign):
             gamma=self.gamma_requested,
             least_variance=not self.is_bounded,
         )
-        checks = list(certificate.checks)
+        checks = [*certificate.checks, *self._claim_checks(certificate)]
+        if self.hardware is not None:
+            checks.append(certify_loop(self.hardware, self.controller))
+        return replace(certificate, checks=tuple(checks))
+
+    def _claim_checks(self, certificate: Certificate) -> list[Check]:
+        """Check the gains against each other, and what is said of bounds."""
+        problem, start = self.problem, kalman_riccati(self.problem)
+        checks = [self._gain_check(), self._origin_check(certificate, start)]
         if self.rms_requested is not None:
             limit = self.rms_requested * (1 + NORM_TOLERANCE)
             name = "standard deviation of the estimation error"
             checks.append(Check(name, certificate.rms, limit, "Lyapunov equation"))
+        if self.gamma_least is not None:
+            equation = GammaEquation(problem, start)
+            meets = [
+                equation.trial(self.gamma_least * (1 + side * NORM_TOLERANCE)).P is not None
+                for side in (-1, 1)
+            ]
+            name, how = "least norm of any filter, error", "gamma-Riccati equation on both sides"
+            off = 0.0 if meets == [False, True] else np.inf
+            checks.append(Check(name, off, NORM_TOLERANCE, how))
         if self.gamma_infeasible is not None:
             name = "infeasible level over the norm achieved, less 1"
             value = self.gamma_infeasible / certificate.gamma - 1
@@ -236,40 +268,45 @@ class FilterDesign(EstimatorDesign):
                 states=np.zeros((problem.n_states, 1)),
                 disturbances=np.zeros((problem.B.shape[1], 1)),
             )
-            checks.append(certify_infeasible(problem, self.gamma_infeasible, proof))
-        if self.hardware is not None:
-            checks.append(certify_loop(self.hardware, self.controller))
-        return replace(certificate, checks=tuple(checks))
+            proved = certify_infeasible(problem, self.gamma_infeasible, proof)
+            below = -proved.value / (1 + proved.value)
+            name = "level proved over the infeasible level, less 1"
+            checks += [proved, Check(name, below, NORM_TOLERANCE, proved.computed_by)]
+        return checks
+
+    def _gain_check(self) -> Check:
+        """Check that the two gains are of one filter, in the states that go on."""
+        A, _, injection = decorrelate(self.problem)
+        goes_on = np.any(A != 0, axis=1)  # not so the newest innovation of a mixed filter
+        apart = (A @ self.gain_filter + injection - self.gain_predictor)[goes_on]
+        size = max(float(np.max(np.abs(self.gain_predictor), initial=0.0)), 1e-300)
+        value = float(np.max(np.abs(apart), initial=0.0)) / size
+        how = "A times the filter gain, relative"
+        return Check("predictor gain against the filter gain", value, GAIN_TOLERANCE, how)
+
+    def _origin_check(self, certificate: Certificate, start: FilterRiccati) -> Check:
+        """Check that the gains are Kalman's or the central filter's, or that the bound is met."""
+        origins, short = [start], np.inf  # of the bound, relative
+        if self.rms_requested is not None:
+            short = 1 - certificate.rms / self.rms_requested
+        if self.gamma_requested is not None:
+            short = min(short, 1 - certificate.gamma / self.gamma_requested)
+            with suppress(NumericalError):
+                central = gamma_riccati(self.problem, self.gamma_requested, start=start)
+                origins += [] if central is None else [central]
+        own = np.vstack([self.gain_predictor, self.gain_filter])
+        others = [np.vstack([origin.gain_predictor, origin.gain_filter]) for origin in origins]
+        n = self.problem.n_states
+        near = [other for other in others if _apart(own[:n], other[:n]) < ORIGIN_TOLERANCE]
+        # of a Riccati filter both gains are known; a mixed filter only meets its bound
+        value = min(_apart(own, other) for other in near) if near else short
+        name = "distance from its Riccati filter, or its bound"
+        return Check(name, value, ORIGIN_TOLERANCE, "relative")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IntegratorDesign(Design):
-    """The classical controller ``u(k) = u(k-1) + gain R y(k)``.
-
-    Attributes
-    ----------
-    loop_hardware : LoopHardware
-        The loop.
-    gain : float
-        Integrator gain, per unit of sensor gain.
-    """
-
-    loop_hardware: LoopHardware
-    gain: float
-
-    @property
-    def hardware(self) -> LoopHardware | None:
-        """Loop that the design is for."""
-        return self.loop_hardware
-
-    @property
-    def poles(self) -> ComplexArray:
-        """Poles of the closed loop."""
-        return close_loop(self.loop_hardware, self.controller).system.poles
-
-    def recertify(self) -> Certificate:
-        """Compute the certificate again from the matrices."""
-        return replace(UNCERTIFIED, checks=(certify_loop(self.loop_hardware, self.controller),))
+def _apart(own: FloatArray, other: FloatArray) -> float:
+    """Relative distance of two gains."""
+    return float(np.linalg.norm(own - other)) / max(float(np.linalg.norm(other)), 1e-300)
 
 
 UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))
@@ -293,7 +330,6 @@ def filter_design(
     """Make a design and certify it; raise CertificateError if it fails."""
     design = FilterDesign(
         method=method,
-        controller=problem.controller(gain_predictor),
         certificate=UNCERTIFIED,
         solver=solver,
         problem=problem,

@@ -9,9 +9,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.errors import FileError
+from lbt_synth.errors import FileError, LbtSynthError
 from lbt_synth.storage.array_file import digest, error_reason
 from lbt_synth.validation import FloatArray
+
+
+def unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object; refuse a name that stands twice, as readers differ in which they take.
+
+    For ``json.loads(text, object_pairs_hook=unique_names)``.
+    """
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a name stands twice in one object of its JSON")
+    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +45,7 @@ class FileKind:
         """Return the arrays and the metadata, of a layout that is known and with their digest."""
         try:
             arrays, text = read(content)
-            meta = json.loads(text)
+            meta = json.loads(text, object_pairs_hook=unique_names)
             found = digest(arrays, meta) if isinstance(meta, dict) else ""
         except Exception as error:  # foreign bytes: the decoders raise whatever they like
             why = f"{source} is no {self.name}, or it is damaged: {error_reason(error)}."
@@ -62,7 +73,16 @@ class FileKind:
             yield
         except FileError:
             raise
-        except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
+        except (
+            LbtSynthError,
+            ValueError,
+            LookupError,
+            TypeError,
+            AttributeError,
+            ArithmeticError,
+            RecursionError,
+            MemoryError,
+        ) as error:
             raise self.error(
                 f"{source} is inconsistent: {error_reason(error)}.{self.advice}", path=source
             ) from error

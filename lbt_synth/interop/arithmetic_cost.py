@@ -24,7 +24,7 @@ class FrameCost:
     >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
     >>> cost = lbt.interop.frame_cost(slow)
     >>> cost.multiplications, cost.dense_multiplications, cost.state_bytes_single
-    (2, 16, 8)
+    (2, 16, 16)
     """
 
     form: str = column(
@@ -40,7 +40,7 @@ class FrameCost:
     additions: int = column("additions per frame", help="Of the exported source")
     dense_additions: int = column("  with whole matrices", help="The same of A, B, C, D")
     coefficients: int = column(help="Numbers that the exported source stores")
-    states: int = column(help="Numbers that it keeps from one frame to the next")
+    states: int = column(help="Numbers that it keeps between frames: states and last commands")
     coefficient_bytes_double: int = column("coefficients, double", unit="bytes", init=False)
     coefficient_bytes_single: int = column("coefficients, single", unit="bytes", init=False)
     dense_coefficients: int = column(
@@ -101,7 +101,7 @@ def frame_cost(design: Design | Controller) -> FrameCost:
         multiplications=factors if written else whole.size,
         additions=int(np.sum(np.maximum(terms - 1, 0))) if written else whole.size,
         coefficients=factors if written else whole.size,
-        states=controller.n_states,
+        states=controller.n_states + len(controller.C),
         dense_multiplications=whole.size,
         dense_additions=rows * (columns - 1),
         dense_coefficients=whole.size,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import matrix_balance, schur
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.batched import solve_stack
 from lbt_synth.validation import (
     ComplexArray,
@@ -323,12 +323,18 @@ class RunningController:
         self.state = np.zeros(self.controller.n_states)
 
     def step(self, y: ArrayLike) -> FloatArray:
-        """Take the measurements y(k), (q,), and return the command u(k), (m,)."""
+        """Take the measurements y(k), (q,), and return the command u(k), (m,).
+
+        A measurement that is not finite raises a NonFiniteError and leaves the state as it is:
+        hold the last command.
+        """
         k = self.controller
         measured = np.asarray(y, dtype=np.float64)
         if measured.shape != (k.B.shape[1],):
             raise DimensionError(
                 f"y must have shape ({k.B.shape[1]},) to match B {k.B.shape}; got {measured.shape}."
             )
+        if not np.isfinite(measured).all():
+            raise NonFiniteError(f"y must be finite; got {measured}. Hold the last command.")
         self.state = k.A @ self.state + k.B @ measured
         return k.C @ self.state + k.D @ measured

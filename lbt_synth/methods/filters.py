@@ -9,12 +9,13 @@ from pydantic import Field
 
 from lbt_synth.methods.method import Description, Method, Section
 from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.validation import number
 
 if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.result import EstimatorDesign, FilterDesign
 
-_CLAIMS, _LATER_CLAIMS = ("gamma_requested", "gamma_least"), ("gamma_infeasible", "rms_requested")
+_CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
 
 Horizon = Annotated[
     int,
@@ -90,7 +91,7 @@ def _pack_filter(design: FilterDesign) -> DesignRecord:
     arrays = {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
     if design.witness is not None:
         arrays |= {"WITNESS_X": design.witness.states, "WITNESS_W": design.witness.disturbances}
-    meta = {name: getattr(design, name) for name in _CLAIMS + _LATER_CLAIMS}
+    meta = {name: getattr(design, name) for name in _CLAIMS}
     return DesignRecord(arrays, meta) | record_problem(design.problem)
 
 
@@ -101,9 +102,8 @@ def _unpack_filter(record: DesignRecord) -> FilterDesign:
 
     problem, arrays = record.problem(), record.arrays
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
-    claims: dict[str, Any] = {name: record.meta[name] for name in _CLAIMS}
-    # files of 0.1 have no infeasible level, witness or rms
-    claims |= {name: record.meta.get(name) for name in _LATER_CLAIMS}
+    said = {name: record.meta.get(name) for name in _CLAIMS}  # files of 0.1 have fewer
+    claims: dict[str, Any] = {k: number(v, k, above=0) for k, v in said.items() if v is not None}
     for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
         if arrays[name].shape != rows_cols:
             raise ValueError(f"{name} must be {rows_cols} to match the plant")

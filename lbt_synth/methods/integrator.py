@@ -8,10 +8,11 @@ from pydantic import Field
 
 from lbt_synth.methods.method import Description, DesignInputs, Method, Section
 from lbt_synth.storage.rows import column, table_row
+from lbt_synth.validation import number
 
 if TYPE_CHECKING:
+    from lbt_synth.design.integrator import IntegratorDesign
     from lbt_synth.design.record import DesignRecord
-    from lbt_synth.design.result import IntegratorDesign
 
 
 class IntegratorOptions(Section):
@@ -44,9 +45,9 @@ def _pack(design: IntegratorDesign) -> DesignRecord:
 
 
 def _unpack(record: DesignRecord) -> IntegratorDesign:
-    from lbt_synth.design.result import IntegratorDesign
+    from lbt_synth.design.integrator import IntegratorDesign
 
-    gain = record.meta["integrator_gain"]
+    gain = number(record.meta["integrator_gain"], "integrator_gain", above=0)
     return IntegratorDesign(**record.common(), loop_hardware=record.hardware(), gain=gain)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from zipfile import ZipFile
 
@@ -81,10 +81,20 @@ def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
     check_fits(content)
     try:
         with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False) as units:
-            data = {unit.name: np.array(unit.data) for unit in units[1:]}
+            pairs = [(unit.name, np.array(unit.data)) for unit in units[1:]]
     except Exception as error:  # astropy raises many kinds on damaged files
         raise ValueError("its FITS structure is broken") from error
-    return _split_text(data)
+    if len(dict(pairs)) != len(pairs):  # readers differ in which of two they take
+        raise ValueError("two of its HDUs have one name")
+    return _split_text(dict(pairs))
+
+
+def read_cards(content: bytes, names: Iterable[str]) -> dict[str, Any]:
+    """Read cards of the primary header of a FITS file, those that are there."""
+    from astropy.io import fits
+
+    header = fits.Header.fromfile(io.BytesIO(content))
+    return {name: header[name] for name in names if name in header}
 
 
 def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> bytes:
@@ -121,9 +131,12 @@ def read_numpy(content: bytes) -> dict[str, npt.NDArray[Any]]:
 
 
 def _require_small(archive: ZipFile) -> None:
-    """Refuse an archive that unpacks to more than is read."""
-    if sum(member.file_size for member in archive.infolist()) > LARGEST_BYTES:
+    """Refuse an archive that unpacks to more than is read, or names two members alike."""
+    members = archive.infolist()
+    if sum(member.file_size for member in members) > LARGEST_BYTES:
         raise ValueError(f"it unpacks to more than {LARGEST_BYTES >> 20} MB")
+    if len({member.filename for member in members}) != len(members):
+        raise ValueError("two of its arrays have one name")
 
 
 def _with_text(arrays: Mapping[str, Any], text: str) -> dict[str, Any]:

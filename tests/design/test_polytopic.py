@@ -196,7 +196,6 @@ def test_claims_that_do_not_hold(made):
         ({"worst_frequency_hz": 20.3}, "worst error stated, against that at its frequency"),
         ({"half_width_hz": 1.1}, "bound over the interval"),
         ({"half_width_hz": 0.9}, "distance of that frequency"),
-        ({"controller": made["h2", 1.0].controller}, "controller, against"),
         ({"predictor": made["h2", 1.0].predictor}, "bound over the interval"),
     ):
         names = [

@@ -15,14 +15,14 @@ def test_costs_by_hand():
     )
     cost = lbt.interop.frame_cost(controller)
     # x0 + .5 x1 + 2 y; -x1; n0 + n1; 3 y
-    assert (cost.multiplications, cost.additions, cost.coefficients, cost.states) == (3, 3, 3, 2)
+    assert (cost.multiplications, cost.additions, cost.coefficients, cost.states) == (3, 3, 3, 4)
     assert (cost.dense_multiplications, cost.dense_additions, cost.dense_coefficients) == (
         12,
         8,
         12,
     )
     assert (cost.coefficient_bytes_double, cost.coefficient_bytes_single) == (24, 12)
-    assert (cost.state_bytes_double, cost.state_bytes_single) == (16, 8)
+    assert (cost.state_bytes_double, cost.state_bytes_single) == (32, 16)
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])

@@ -47,15 +47,16 @@ class Compiled:
             key: int(text.split(f"{self.name.upper()}_{key} ")[1].split()[0])
             for key in ("STATES", "MEASUREMENTS", "COMMANDS")
         }
-        self.state = np.full(sizes["STATES"], 7.0, dtype=self.real)  # what was in the memory before
+        size = sizes["STATES"] + sizes["COMMANDS"]
+        self.state = np.full(size, 7.0, dtype=self.real)  # what was in the memory before
         self.inputs = sizes["MEASUREMENTS"]
         self.u = np.zeros(sizes["COMMANDS"], dtype=self.real)
         self.reset()
 
     def _call(self, function, *arrays):
         call = getattr(self.library, f"{self.name}_{function}")
-        call.restype = None
-        call(*(ctypes.c_void_p(a.ctypes.data) for a in arrays))
+        call.restype = ctypes.c_int if function == "step" else None
+        return call(*(ctypes.c_void_p(a.ctypes.data) for a in arrays))
 
     def reset(self):
         self._call("reset", self.state)
@@ -63,5 +64,5 @@ class Compiled:
     def step(self, y):
         measured = np.array(y, dtype=self.real)
         assert measured.shape == (self.inputs,)
-        self._call("step", self.state, measured, self.u)
+        self.held = self._call("step", self.state, measured, self.u)
         return self.u.astype(np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import copy
 from functools import cache
 
 import numpy as np
@@ -10,6 +10,7 @@ from astropy.io import fits
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
+from lbt_synth.validation import set_fields
 
 
 def relative(found, expected):
@@ -57,7 +58,14 @@ def turn_states(design):
     own = design.controller
     T, _ = np.linalg.qr(np.random.default_rng(8).standard_normal(own.A.shape))
     other = lbt.Controller(A=T @ own.A @ T.T, B=T @ own.B, C=own.C @ T.T, D=own.D, dt_s=own.dt_s)
-    return replace(design, controller=other)
+    return with_controller(design, other)
+
+
+def with_controller(design, controller):
+    """A design with a controller that is not its own, for what runs any controller."""
+    other = copy.copy(design)
+    set_fields(other, controller=controller)
+    return other
 
 
 def transfer_functions(path):

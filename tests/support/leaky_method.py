@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import Field
@@ -14,6 +14,7 @@ from lbt_synth.linear import Controller
 from lbt_synth.methods import Description, Method, RowTable, Section
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, table_row
+from lbt_synth.validation import set_fields
 
 
 class LeakyOptions(Section):
@@ -27,9 +28,23 @@ class LeakyOptions(Section):
 class LeakyDesign(Design):
     """An integrator that forgets."""
 
+    controller: Controller = field(init=False)
     loop_hardware: LoopHardware
     gain: float
     leak_per_s: float
+
+    def __post_init__(self):
+        hardware = self.loop_hardware
+        back = np.linalg.pinv(hardware.sensor @ hardware.influence)
+        each = np.eye(hardware.modes)
+        controller = Controller(
+            A=np.exp(-self.leak_per_s * hardware.dt_s) * each,
+            B=self.gain * back,
+            C=each,
+            D=np.zeros((hardware.modes, back.shape[1])),
+            dt_s=hardware.dt_s,
+        )
+        set_fields(self, controller=controller)
 
     @property
     def hardware(self):
@@ -59,21 +74,11 @@ class LeakRow:
 
 def build(inputs, options):
     """Design it."""
-    hardware = inputs.hardware
-    back = np.linalg.pinv(hardware.sensor @ hardware.influence)
-    each = np.eye(hardware.modes)
     design = LeakyDesign(
         method="leaky",
-        controller=Controller(
-            A=np.exp(-options.leak_per_s * hardware.dt_s) * each,
-            B=options.gain * back,
-            C=each,
-            D=np.zeros((hardware.modes, back.shape[1])),
-            dt_s=hardware.dt_s,
-        ),
         certificate=UNCERTIFIED,
         solver=SolverReport(route="closed form", status="given", iterations=0),
-        loop_hardware=hardware,
+        loop_hardware=inputs.hardware,
         gain=options.gain,
         leak_per_s=options.leak_per_s,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,21 @@ import numpy as np
 import lbt_synth
 from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.design.record import DesignRecord, Meta, record_common
-from lbt_synth.errors import GainFileError, OutputError, SchemaVersionError
-from lbt_synth.files.file_checks import FileKind
+from lbt_synth.errors import CertificateError, GainFileError, OutputError, SchemaVersionError
+from lbt_synth.files.file_checks import FileKind, unique_names
+from lbt_synth.files.gain_file.agreement import require_agreement, require_certificate, require_same
 from lbt_synth.methods.registry import method_of_design
-from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes, read_fits, read_npz
+from lbt_synth.storage.array_file import (
+    digest,
+    fits_bytes,
+    npz_bytes,
+    read_cards,
+    read_fits,
+    read_npz,
+)
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.validation import FloatArray, float_array, frozen_copy, real_array, text
 
 SCHEMA = "lbt_synth gain file"
 SCHEMA_VERSION = 1
@@ -33,16 +42,12 @@ CONVENTION = (
 FITS_LAYOUT_VERSION = 1  # of SPECULA's state-space filter file
 
 
-def write_fits(arrays: Mapping[str, FloatArray], text: str, design: Design, meta: Meta) -> bytes:
-    """Write the arrays and the metadata's text under a header for people.
-
-    The HDUs A, B, C, D come first, as SPECULA's ``SsrFilterData`` loads them; the other arrays
-    follow, and META, the text that :func:`load_gain` reads back.
-    """
+def write_cards(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
+    """Return the header of a FITS file, for people and programs that read nothing else."""
     cards: dict[str, tuple[Any, str]] = {
         "VERSION": (FITS_LAYOUT_VERSION, "layout of the HDUs A, B, C, D"),
-        "NFILTER": (arrays["B"].shape[1], "inputs of the controller"),
-        "NSTATES": (arrays["A"].shape[0], "states of the controller"),
+        "NFILTER": (design.controller.B.shape[1], "inputs of the controller"),
+        "NSTATES": (design.controller.n_states, "states of the controller"),
         "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
         "LBTSCHEM": (SCHEMA_VERSION, "version of the lbt_synth layout"),
         "METHOD": (design.method, "synthesis"),
@@ -55,21 +60,21 @@ def write_fits(arrays: Mapping[str, FloatArray], text: str, design: Design, meta
         cards["RMS"] = (design.rms, "estimation error, standard deviation")
         cards["GAMMA"] = (design.gamma, "estimation error, H-infinity norm")
     cards["SHA256"] = (meta["digest"], "")
-    return fits_bytes(cards, arrays, text)
+    return cards
 
 
-def write_json(arrays: Mapping[str, FloatArray], text: str) -> bytes:
+def write_json(arrays: Mapping[str, FloatArray], words: str) -> bytes:
     """Write one JSON object; numbers keep all their digits."""
-    document = {"meta": json.loads(text), "arrays": {k: v.tolist() for k, v in arrays.items()}}
+    document = {"meta": json.loads(words), "arrays": {k: v.tolist() for k, v in arrays.items()}}
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
 
 def read_json(content: bytes) -> tuple[dict[str, FloatArray], str]:
     """Read the arrays and the text of :func:`write_json`; other bytes raise some exception."""
-    document = json.loads(content.decode())
+    document = json.loads(content.decode(), object_pairs_hook=unique_names)
     if not isinstance(document, dict):
         raise ValueError("the JSON is not an object")  # noqa: TRY004 - one kind of refusal
-    arrays = {k: np.array(v, dtype=np.float64) for k, v in document["arrays"].items()}
+    arrays = {k: float_array(v, k) for k, v in document["arrays"].items()}
     return arrays, json.dumps(document["meta"])
 
 
@@ -124,23 +129,38 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     target = require_gain_name(path)
     if not isinstance(design, Design):
         raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
+    record = _record_design(design, lbt_synth.__version__)
+    try:  # what could not be read back is not written
+        require_agreement(record, _record_design(_rebuild(record), lbt_synth.__version__))
+    except ValueError as error:
+        raise OutputError(f"the design contradicts itself: {error}", path=target) from error
+    arrays, meta = record.arrays, record.meta
+    meta["digest"] = digest(arrays, meta)
+    words, ending = json.dumps(meta, allow_nan=False), target.suffix.lower()
+    if ending == ".fits":
+        # A, B, C and D come first, as SPECULA's SsrFilterData loads them
+        content = fits_bytes(write_cards(design, meta), arrays, words)
+    else:
+        content = npz_bytes(arrays, words) if ending == ".npz" else write_json(arrays, words)
+    return write_atomically(target, content)
+
+
+def _record_design(design: Design, version: str) -> DesignRecord:
+    """Record a design, as a version of the package writes it."""
     header = DesignRecord(
         meta={
             "schema": SCHEMA,
             "schema_version": SCHEMA_VERSION,
-            "library_version": lbt_synth.__version__,
+            "library_version": version,
             "convention": CONVENTION,
         }
     )
-    record = header | record_common(design) | method_of_design(design.method).pack(design)
-    arrays, meta = record.arrays, record.meta
-    meta["digest"] = digest(arrays, meta)
-    text, ending = json.dumps(meta, allow_nan=False), target.suffix.lower()
-    if ending == ".fits":
-        content = write_fits(arrays, text, design, meta)
-    else:
-        content = npz_bytes(arrays, text) if ending == ".npz" else write_json(arrays, text)
-    return write_atomically(target, content)
+    return header | record_common(design) | method_of_design(design.method).pack(design)
+
+
+def _rebuild(record: DesignRecord) -> Design:
+    """Rebuild the design of a record from its plant, loop and gains, without a certificate."""
+    return method_of_design(text(record.meta["method"], "method")).unpack(record)
 
 
 def load_gain(path: str | os.PathLike[str]) -> Design:
@@ -154,13 +174,13 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
     Returns
     -------
     Design
-        The design, with the certificate that it was saved with; ``design.recertify()`` computes
-        it again.
+        The design, made again from its plant, loop and gains, and certified again.
 
     Raises
     ------
     GainFileError
-        If the file is missing, damaged or no gain file.
+        If the file is missing, damaged or no gain file, if it contradicts its own design, or if
+        the design fails its certificate.
     SchemaVersionError
         If its layout is of another version.
 
@@ -177,14 +197,37 @@ def load_gain(path: str | os.PathLike[str]) -> Design:
 
 def load_with_digest(path: str | os.PathLike[str]) -> tuple[Design, str]:
     """Read a gain file as :func:`load_gain` does, and return its digest beside the design."""
+    design, found = read_design(path)
+    try:
+        design.certificate.require()
+    except CertificateError as error:
+        raise GainFileError(
+            f"{path} is not verified: {'; '.join(error.failed)}. Try lbt-synth verify, or write it "
+            "again with lbt-synth design.",
+            path=Path(path),
+        ) from error
+    return design, found
+
+
+def read_design(path: str | os.PathLike[str]) -> tuple[Design, str]:
+    """Return the design of a gain file with its certificate computed again, and the digest.
+
+    The certificate may have failed; :func:`load_gain` refuses that.
+    """
     source = require_ending(path, "a gain file", _READERS, GainFileError)
-    content = read_bytes(source, GainFileError)
-    arrays, meta = _KIND.decode(content, _READERS[source.suffix.lower()], source)
-    for name, array in arrays.items():
-        if not np.all(np.isfinite(array)):
-            raise GainFileError(
-                f"{source} is damaged: {name} holds values that are not finite.", path=source
-            )
-    record = DesignRecord({name: frozen_copy(array) for name, array in arrays.items()}, meta)
-    with _KIND.rebuilding(source):
-        return method_of_design(meta["method"]).unpack(record), str(meta["digest"])
+    content, ending = read_bytes(source, GainFileError), source.suffix.lower()
+    arrays, meta = _KIND.decode(content, _READERS[ending], source)
+    found = DesignRecord({name: frozen_copy(array) for name, array in arrays.items()}, meta)
+    with _KIND.rebuilding(source), np.errstate(all="ignore"):
+        for name, array in arrays.items():
+            real_array(array, name)
+        design, version = _rebuild(found), text(meta["library_version"], "library_version")
+        require_agreement(found, _record_design(design, version))
+        design = replace(design, certificate=design.recertify())
+        if design.certificate.passed:
+            own = record_common(design).meta["certificate"]
+            require_certificate(meta["certificate"], own)
+            if ending == ".fits":
+                cards = {key: value for key, (value, _) in write_cards(design, meta).items()}
+                require_same(read_cards(content, cards), cards, "header")
+    return design, str(meta["digest"])

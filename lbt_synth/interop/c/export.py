@@ -46,8 +46,9 @@ def export_c(
     The source needs no library, allocates nothing, and has no state of its own: it is passed
     in. ``<name>_reset(&state)`` sets the state to zero; ``<name>_step(&state, y, u)`` computes
     ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``, in the same number of operations
-    each frame. Coefficients are exact (hexadecimal). Units are those of the design: nm rms of
-    wavefront for a loop whose sensor and influence matrices are the identity.
+    each frame, and returns 0. If a measurement is not finite it returns 1: u is the last command
+    again, and the state stays. Coefficients are exact (hexadecimal). Units are those of the
+    design: nm rms of wavefront for a loop whose sensor and influence matrices are the identity.
 
     Parameters
     ----------
@@ -188,6 +189,7 @@ def render_code(
         "q": controller.B.shape[1],
         "m": len(controller.C),
         "type": "float" if single else "double",
+        "largest": "FLT_MAX" if single else "DBL_MAX",
         "controller": controller,
         "provenance": provenance,
         "cost": frame_cost(controller),

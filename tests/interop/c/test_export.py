@@ -115,15 +115,50 @@ def test_two_loops_at_once_do_not_meet(tmp_path, designs, name):
             assert np.allclose(instance.step(y), own.step(y), rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_reset_forgets_even_what_is_not_a_number(tmp_path, designs, name):
+def test_a_measurement_that_is_not_finite_holds_command_and_state(
+    tmp_path, designs, name, precision
+):
+    source = lbt.interop.export_c(tmp_path / "ctl.c", designs[name], precision=precision).files[0]
+    theirs, undisturbed = (Compiled(source, single=precision == "single") for _ in range(2))
+    before = np.zeros(2)
+    for k, y in enumerate(np.random.default_rng(4).standard_normal((20, 2))):
+        for bad in (np.nan, np.inf, -np.inf):
+            state = theirs.state.copy()
+            theirs.u[:] = 99.0
+            assert np.array_equal(theirs.step([bad, 1.0] if k % 2 else [1.0, bad]), before)
+            assert theirs.held == 1
+            assert np.array_equal(theirs.state, state)
+        before = undisturbed.step(y)
+        assert np.array_equal(theirs.step(y), before)
+        assert theirs.held == undisturbed.held == 0
+
+
+def test_a_command_is_held_where_it_shares_its_array_with_the_measurements(tmp_path, designs):
+    theirs = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs["kalman"]).files[0])
+    last = theirs.step([1.0, -2.0])
+    both = np.array([3.0, np.nan])
+    assert theirs._call("step", theirs.state, both, both) == 1
+    assert np.array_equal(both, last)
+
+
+@pytest.mark.parametrize("name", ["kalman", "turned"])
+def test_reset_forgets(tmp_path, designs, name):
     theirs = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs[name]).files[0])
     series = np.random.default_rng(4).standard_normal((20, 2))
     first = [theirs.step(y) for y in series]
-    assert not np.all(np.isfinite(theirs.step([np.nan, 1.0])))
-    assert not np.all(np.isfinite(theirs.step([1.0, 1.0])))  # the state keeps it
     theirs.reset()
+    assert np.array_equal(theirs.step([np.nan, 1.0]), [0.0, 0.0])
     assert np.array_equal([theirs.step(y) for y in series], first)
+
+
+def test_flags_that_hide_such_measurements_are_refused(tmp_path, designs):
+    source = lbt.interop.export_c(tmp_path / "ctl.c", designs["integrator"]).files[0]
+    command = [compiler(), "-std=c99", "-ffast-math", "-c", source, "-o", tmp_path / "ctl.o"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "compile without -ffast-math" in done.stderr
 
 
 def test_measurements_and_commands_in_one_array(tmp_path, designs):
