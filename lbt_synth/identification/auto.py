@@ -151,17 +151,7 @@ def design_from_record(
     >>> bool(table[made.name].replayed_nm < 0.5 * table["what ran"].replayed_nm)
     True
     """
-    require_instance(record, LoopRecord)
-    if method is not None:
-        choice(method, "method", record_methods())
-    number(
-        gamma_ratio,
-        "gamma_ratio",
-        at_least=1,
-        hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
-    )
-    _ = record.hardware  # refuses a record without a delay
-    usable = require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
+    usable = _require_able(record, method, gamma_ratio)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
@@ -226,6 +216,21 @@ def _design(
 ) -> Design:
     inputs = PlantInputs(plant=model.plant(), design_defaults={"gamma_ratio": gamma_ratio})
     return design_request(method, options).build(inputs)
+
+
+def _require_able(record: LoopRecord, method: str | None, gamma_ratio: float) -> float:
+    """Return the usable seconds of a record; refuse it, a method or a ratio that cannot be."""
+    require_instance(record, LoopRecord)
+    if method is not None:
+        choice(method, "method", record_methods())
+    number(
+        gamma_ratio,
+        "gamma_ratio",
+        at_least=1,
+        hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
+    )
+    _ = record.hardware  # refuses a record without a delay
+    return require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
 
 
 def _design_robustly(model: IdentifiedModel, gains: tuple[float, float]) -> Design:

@@ -59,15 +59,13 @@ class LoopRecord:
         False where a frame is missing or spoilt: the values there are finite fillers.
     health : RecordHealth
         What was found.
-    diameter_m, obstruction : float, optional
-        Telescope diameter [m], and its central obstruction as a fraction of it.
-    imaging_wavelength_um : float, optional
-        Wavelength of the image [um], for Strehl ratios.
+    diameter_m, obstruction, imaging_wavelength_um : float, optional
+        Telescope diameter [m], its central obstruction as a fraction of it, and the wavelength of
+        the image [um].
     source : str, optional
         Where it is from.
     measured, commanded : (frames,) bool array_like, optional
-        Frames whose measurement, and whose command, is good; ``usable`` follows from both and
-        the delay. By default that of ``usable``, and all.
+        Frames whose measurement, and whose command, is good: with the delay they make ``usable``.
 
     Raises
     ------
@@ -267,9 +265,8 @@ class LoopRecord:
     ) -> LoopRecord:
         """Return the record with short holes interpolated.
 
-        The pseudo-open-loop measurement is interpolated through the two frames on either side
-        (a cubic; a straight line where there are not two). Shorter holes come first, until the
-        fraction is used up.
+        The pseudo-open-loop measurement is interpolated through the two frames on either side (a
+        cubic, or a straight line where there are fewer), the shortest holes first.
 
         Parameters
         ----------

@@ -41,8 +41,7 @@ class LoopIdentifier:
     find_gain : bool, optional
         Whether the sensor gain is found; otherwise it is the plant's.
     most_lines : int, optional
-        Most resonances per axis; by default one more than the plant has. A line that drifts looks
-        like several, which take long and change nothing.
+        Most resonances per axis; by default one more than the plant has.
 
     Raises
     ------
@@ -51,7 +50,6 @@ class LoopIdentifier:
 
     Examples
     --------
-    >>> import numpy as np
     >>> import lbt_synth as lbt
     >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10, frame_rate_hz=500)
     >>> line = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=100, direction=(1,))
@@ -64,7 +62,7 @@ class LoopIdentifier:
     ...     plant, lbt.identification.LoopIdentifier(plant), window_s=4
     ... )
     >>> run = lbt.simulate(tracker, truth, hardware=plant.hardware, frames=2000)
-    >>> bool(min(abs(np.array(tracker.history[-1].frequencies_hz) - 43)) < 0.5)
+    >>> any(abs(hz - 43) < 0.5 for hz in tracker.history[-1].frequencies_hz)
     True
     """
 
@@ -392,8 +390,7 @@ def _fit_line(start: _Line, rest: FloatArray) -> _Line | None:
         return move(p).contrast(rest) if inside else np.inf
 
     f = float(np.clip(start.peak_hz, low, max(low, high)))
-    steps = [[0, 0], [0.25 * start.bin_hz, 0], [0, 0.3]]
-    simplex = np.array([f, start.log_rms]) + np.array(steps)
+    simplex = np.add([f, start.log_rms], [[0, 0], [0.25 * start.bin_hz, 0], [0, 0.3]])
     fit = minimize(
         contrast,
         simplex[0],
