@@ -109,7 +109,8 @@ def test_a_study_comes_out_the_same(old_study, tmp_path, capsys):
     for row, again in zip(old, new, strict=True):
         assert row.keys() == again.keys()
         for key, text in row.items():
-            assert float(again[key]) == pytest.approx(float(text), rel=1e-9, nan_ok=True), key
+            # the quadrature of the turbulence is finer than it was then
+            assert float(again[key]) == pytest.approx(float(text), rel=1e-7, nan_ok=True), key
 
 
 def test_a_row_of_a_study_is_computed_again(old_study, capsys):

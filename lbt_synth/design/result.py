@@ -33,6 +33,8 @@ from lbt_synth.linear.riccati.filtering import (
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
+ORIGIN = "distance from its Riccati filter"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolverReport:
@@ -245,7 +247,7 @@ class FilterDesign(EstimatorDesign):
     def _claim_checks(self, certificate: Certificate) -> list[Check]:
         """Check the gains against each other, and what is said of bounds."""
         problem, start = self.problem, kalman_riccati(self.problem)
-        checks = [self._gain_check(), self._origin_check(certificate, start)]
+        checks = [self._gain_check(), *self._origin_checks(start)]
         if self.rms_requested is not None:
             limit = self.rms_requested * (1 + NORM_TOLERANCE)
             name = "standard deviation of the estimation error"
@@ -284,24 +286,24 @@ class FilterDesign(EstimatorDesign):
         how = "A times the filter gain, relative"
         return Check("predictor gain against the filter gain", value, GAIN_TOLERANCE, how)
 
-    def _origin_check(self, certificate: Certificate, start: FilterRiccati) -> Check:
-        """Check that the gains are Kalman's or the central filter's, or that the bound is met."""
-        origins, short = [start], np.inf  # of the bound, relative
-        if self.rms_requested is not None:
-            short = 1 - certificate.rms / self.rms_requested
+    def _origin_checks(self, start: FilterRiccati) -> list[Check]:
+        """Check both gains of Kalman's filter and of the central filter of a bound.
+
+        A filter of a bound that is neither has its bound and norms as its proof.
+        """
+        origins = [start]
         if self.gamma_requested is not None:
-            short = min(short, 1 - certificate.gamma / self.gamma_requested)
             with suppress(NumericalError):
                 central = gamma_riccati(self.problem, self.gamma_requested, start=start)
                 origins += [] if central is None else [central]
         own = np.vstack([self.gain_predictor, self.gain_filter])
-        others = [np.vstack([origin.gain_predictor, origin.gain_filter]) for origin in origins]
-        n = self.problem.n_states
-        near = [other for other in others if _apart(own[:n], other[:n]) < ORIGIN_TOLERANCE]
-        # of a Riccati filter both gains are known; a mixed filter only meets its bound
-        value = min(_apart(own, other) for other in near) if near else short
-        name = "distance from its Riccati filter, or its bound"
-        return Check(name, value, ORIGIN_TOLERANCE, "relative")
+        value = min(
+            _apart(own, np.vstack([origin.gain_predictor, origin.gain_filter]))
+            for origin in origins
+        )
+        if self.is_bounded and value > ORIGIN_TOLERANCE:
+            return []
+        return [Check(ORIGIN, value, ORIGIN_TOLERANCE, "relative")]
 
 
 def _apart(own: FloatArray, other: FloatArray) -> float:

@@ -78,7 +78,7 @@ def test_command_with_gain_files(tmp_path, capsys, files, kalman, settings):
         figure,
     )
     assert (status, error) == (0, "")
-    assert "kalman: Strehl ratio over frequency errors of -2 to +2 Hz" in text
+    assert "kalman: Strehl ratio at 2.2 um, over frequency errors of -2 to +2 Hz" in text
     assert "hinf: stable sensor gains: 0.5484 to" in text
     assert "with a delay error of +0.1 frames" in text
     assert figure.read_bytes().startswith(b"\x89PNG")

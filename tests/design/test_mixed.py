@@ -175,7 +175,8 @@ def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
     monkeypatch.setattr(cvxpy.Problem, "solve", panic)
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     with pytest.raises(lbt.errors.NumericalError, match="numbers out of its range"):
-        lbt.hinf(walk)
+        lbt.hinf(walk, route="lmi")
+    assert lbt.hinf(walk).solver.route == "riccati"  # which takes over where the LMI fails
 
 
 def test_close_to_the_least_norm_of_two_axes():

@@ -28,7 +28,11 @@ def test_a_wrong_solver_answer_does_not_leave_the_library(monkeypatch, axis_plan
     monkeypatch.setattr(module, "kalman_riccati", lambda _: wrong)
     with pytest.raises(lbt.errors.CertificateError, match="least-variance gain") as caught:
         lbt.kalman(axis_plant)
-    assert caught.value.failed == ("distance from the least-variance gain",)
+    assert caught.value.failed == (
+        "distance from the least-variance gain",
+        "predictor gain against the filter gain",
+        "distance from its Riccati filter",
+    )
 
 
 def test_an_unstable_optimal_filter_does_not_leave_the_library(monkeypatch, axis_plant):

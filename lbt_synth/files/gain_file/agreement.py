@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design.record import DesignRecord
+from lbt_synth.design.result import ORIGIN
 from lbt_synth.validation import FloatArray, number
 
 _ARRAYS = 1e-9  # relative, of an entry; and a thousandth of that, of the largest
@@ -20,7 +21,7 @@ _NUMBERS = 1e-6  # relative
 _LATER = frozenset({"mean_delay_frames", "gamma_infeasible", "rms_requested"})  # than 0.1
 _LATER_CHECKS = {  # than 0.2
     "predictor gain against the filter gain",
-    "distance from its Riccati filter, or its bound",
+    ORIGIN,
     "least norm of any filter, error",
     "level proved over the infeasible level, less 1",
     "objective claimed over the one found, less 1",

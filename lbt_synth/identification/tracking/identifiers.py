@@ -390,7 +390,7 @@ def _fit_line(start: _Line, rest: FloatArray) -> _Line | None:
         return move(p).contrast(rest) if inside else np.inf
 
     f = float(np.clip(start.peak_hz, low, max(low, high)))
-    simplex = np.add([f, start.log_rms], [[0, 0], [0.25 * start.bin_hz, 0], [0, 0.3]])
+    simplex = np.add([f, start.log_rms], np.array([[0, 0], [0.25 * start.bin_hz, 0], [0, 0.3]]))
     fit = minimize(
         contrast,
         simplex[0],
