@@ -12,6 +12,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -170,7 +171,8 @@ def formats(folder: Path) -> list[Format]:
         seeds = _contents(folder, ending, lbt.save_gain, *designs)
         add(f"gain file {ending}", ending, seeds, lbt.load_gain, covered=True)
     nights = [full(random=0), full(random=1, frames=8)]
-    for ending, share in ((".fits", 10), (".npz", 10), (".aot.fits", 2)):
+    standard = ((".aot.fits", 2),) if find_spec("aotpy") else ()  # an extra that writes it
+    for ending, share in ((".fits", 10), (".npz", 10), *standard):
         seeds = _contents(folder, ending, lbt.files.save_telemetry, *nights)
         add(
             f"telemetry {ending}",
