@@ -9,6 +9,7 @@ from lbt_synth.cli.loop_inputs import load_designs, loop_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
+from lbt_synth.cli.truth_table import say_limit
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.methods.registry import reference_methods
@@ -67,7 +68,7 @@ def _limit_notes(study: studies.LimitStudy) -> list[str]:
             "vibrations along principal axes of the sensor's noise."
         ]
     notes = [
-        f"least residual of any linear controller in the truth: {study.limit.rms_nm:.6g} nm rms"
+        say_limit(study.limit)
         + (" (sinusoids of known frequency cost nothing)" if study.band is not None else "")
     ]
     if study.band is not None and study.band_hz is not None:

@@ -40,7 +40,6 @@ from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 
-WAVELENGTH_UM = 2.2  # of Strehl ratios, where nothing says it
 _FACTS = (  # that a file may not hold
     *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
     *("axes", "averages", "commands"),
@@ -96,7 +95,7 @@ def imaging_wavelength_um(arguments: Namespace, record: LoopRecord | SpectrumRec
     for value in (arguments.wavelength_um, known):
         if value is not None:
             return float(value)
-    return WAVELENGTH_UM
+    return Imaging().wavelength_um
 
 
 def _parse_columns(given: Sequence[str] | None) -> dict[str, list[str | int]] | None:

@@ -5,10 +5,16 @@ from __future__ import annotations
 from lbt_synth.cli.output import Report
 from lbt_synth.config import Config
 from lbt_synth.design import Design
+from lbt_synth.loop import ResidualLimit
 from lbt_synth.studies import compare_in_truth
 
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
 _NAME = "this design"
+
+
+def say_limit(limit: ResidualLimit) -> str:
+    """Return the sentence on the limit of a truth."""
+    return f"least residual of any linear controller in the truth: {limit.rms_nm:.6g} nm rms"
 
 
 def add_truth(report: Report, design: Design, config: Config) -> None:
@@ -28,8 +34,6 @@ def add_truth(report: Report, design: Design, config: Config) -> None:
         "truth_warnings": found.warnings[_NAME],
     }
     if found.limit is not None:
-        report.notes.append(
-            f"least residual of any linear controller in the truth: {found.limit.rms_nm:.6g} nm rms"
-        )
+        report.notes.append(say_limit(found.limit))
     report.notes += [f"warning: {text}." for text in found.warnings[_NAME]]
     report.notes += [f"note: {text}" for text in found.notes]

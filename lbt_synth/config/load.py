@@ -180,8 +180,7 @@ def config_from_text(text: str, source: Path) -> Config:
     try:
         settings = FileSection.model_validate_json(text)
     except ValidationError as error:
-        message, key = describe_error(error, FileSection)
-        raise ConfigError(f"the configuration in {source}: {message}", path=key) from error
+        raise _config_error(error, FileSection, f"the configuration in {source}") from error
     return build_config(settings, source)
 
 
@@ -190,8 +189,13 @@ def validate_sections(schema: type[Checked], raw: Mapping[str, Any], source: Pat
     try:
         return schema.model_validate(raw)
     except ValidationError as error:
-        message, key = describe_error(error, schema)
-        raise ConfigError(f"{source}: {message}", path=key) from error
+        raise _config_error(error, schema, str(source)) from error
+
+
+def _config_error(error: ValidationError, schema: type[BaseModel], where: str) -> ConfigError:
+    """Return the first mistake of a configuration as an error that names its key."""
+    message, key = describe_error(error, schema)
+    return ConfigError(f"{where}: {message}", path=key)
 
 
 def read_mapping(source: Path) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from lbt_synth.validation import FloatArray
 
 _APART = 3.0  # standard errors of a gain that are allowed
 _CAREFUL = 1.4  # by which a design's gain is below the largest that a record allows
-_HALF = np.array([0.5, 0.5])  # of these gains are left of commands recorded at half their size
+_HALF = 0.5  # of the gains are left of commands recorded at half their size
 
 
 def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
@@ -52,14 +52,17 @@ def design_for_gains(
     if allowed is None:
         return model, made, ()
     intervals = possible_gains(allowed, model, half)
-    first = model, made
+    bad = unstable_gains(made, intervals)
+    first = model, bad
     for gain in _careful_gains(intervals):
-        if unstable_gains(made, intervals) is None:
+        if bad is None:
             break
         model = fit_model(start=model, sensor_gain=gain)
         made = design(model)
-    if unstable_gains(made, intervals) is not None:
-        model, made = _robust(*first, intervals, design_robustly)
+        bad = unstable_gains(made, intervals)
+    if bad is not None:
+        model, bad = first
+        made = _robust(model, bad, intervals, design_robustly)
     assumed = (
         f"the sensor gain lies within {_words(intervals)}, as the record and its model allow; the "
         "loop is stable at all of these"
@@ -80,19 +83,18 @@ def _careful_gains(intervals: FloatArray) -> list[float]:
 
 def _robust(
     model: IdentifiedModel,
-    made: Design,
+    bad: FloatArray | None,
     intervals: FloatArray,
     design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
-) -> tuple[IdentifiedModel, Design]:
-    """Return a design by robust synthesis, or refuse the one that was made."""
+) -> Design:
+    """Return a design by robust synthesis, or refuse with the gains that are bad for another."""
     factors = intervals / np.array(model.sensor_gains)[:, None]
     try:
         found = design_robustly(model, (float(np.min(factors)), float(np.max(factors))))
         if unstable_gains(found, intervals) is None:
-            return model, found
+            return found
     except SynthesisError:
         pass  # the refusal says what the record lacks
-    bad = unstable_gains(made, intervals)
     assert bad is not None
     gain = ", ".join(f"{value:.3g}" for value in bad)
     raise CertificateError(
