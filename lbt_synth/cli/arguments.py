@@ -274,7 +274,8 @@ def _add_repairs(parser: ArgumentParser) -> None:
     add_option(needs, "--command-rotation-deg", float, text, 0.0)
     text = "matrix from them to the axes of the measurements, row after row"
     add_option(needs, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
-    add_option(needs, "--command-scale", float, "factor", 1.0)
+    text = "factor; 1 says that they were recorded at the size that was applied"
+    add_option(needs, "--command-scale", float, text)
 
 
 def _add_prior_knowledge(parser: ArgumentParser) -> None:

@@ -41,6 +41,7 @@ def run(arguments: Namespace) -> Report:
             gamma_ratio=arguments.gamma_ratio,
             imaging=imaging,
             accept_record=arguments.accept_record,
+            command_scale_known=command_repairs.is_scale_known(arguments),
             progress=count,
             **loop_records.identification_options(arguments, record),
         )

@@ -24,8 +24,13 @@ def given_repair(arguments: Namespace) -> CommandRepair:
         sign=tuple(arguments.command_sign or ()),
         rotation_deg=arguments.command_rotation_deg,
         matrix=tuple(arguments.command_matrix or ()),
-        scale=arguments.command_scale,
+        scale=1.0 if arguments.command_scale is None else arguments.command_scale,
     )
+
+
+def is_scale_known(arguments: Namespace) -> bool:
+    """Return whether the command line says at which size commands were recorded."""
+    return arguments.command_scale is not None or arguments.command_matrix is not None
 
 
 @contextmanager

@@ -81,6 +81,7 @@ def design_from_record(
     imaging: Imaging | None = None,
     taps: int = 32,
     accept_record: bool = False,
+    command_scale_known: bool = False,
     progress: Callable[[int], None] | None = None,
     **options: Any,
 ) -> RecordedDesign:
@@ -112,6 +113,9 @@ def design_from_record(
         Coefficients of the predictor by least squares.
     accept_record : bool, optional
         Go on although something else explains the record better; the design says so.
+    command_scale_known : bool, optional
+        The commands were recorded at the size that was applied. No record can tell this from
+        half that size, so by default a design is also stable at half the sensor gain.
     progress : callable, optional
         Called with 1 after each of 3 steps.
     **options
@@ -188,21 +192,33 @@ def design_from_record(
         taps=taps,
     )
     step(1)
-    model, made, held = design_for_gains(
-        fit_model, partial(design, method), _design_robustly, half, allowed
+    safe = design_for_gains(
+        fit_model,
+        partial(design, method),
+        _design_robustly,
+        half,
+        allowed,
+        command_scale_known=command_scale_known,
     )
     step(1)
     row = held_out[name]
     assert row.model_axis_nm is not None
+    model, made = safe.model, safe.design
     loop = close_loop(model.hardware, made.controller)
     drifts = note_drift(record, loop, row.model_axis_nm)
     return RecordedDesign(
         model=model,
-        design=replace(made, assumptions=(*assumptions, *held)),
+        design=replace(made, assumptions=(*assumptions, *safe.assumptions)),
         half_model=half,
         held_out=held_out,
         name=name,
-        notes=(*notes, *_compare_gains(model, half), *drifts, *_note_short(usable, model, row)),
+        notes=(
+            *notes,
+            *safe.notes,
+            *_compare_gains(model, half),
+            *drifts,
+            *_note_short(usable, model, row),
+        ),
         choice=found,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,11 +12,23 @@ from lbt_synth.errors import CertificateError, SynthesisError
 from lbt_synth.identification.commands.gain_interval import unstable_gains
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.likeliest_gain import agrees
+from lbt_synth.loop import close_loop, residual_budget
 from lbt_synth.validation import FloatArray
 
 _APART = 3.0  # standard errors of a gain that are allowed
-_CAREFUL = 1.4  # by which a design's gain is below the largest that a record allows
+_CAREFUL = (0.9, 0.8)  # of the fitted gain: slower designs at little cost
+_WIDE = 1.4  # by which the gain of a design is below the largest of a wide interval
 _HALF = 0.5  # of the gains are left of commands recorded at half their size
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SafeDesign:
+    """A design that is stable at all possible gains, its model, and what is to be said of it."""
+
+    model: IdentifiedModel
+    design: Design
+    assumptions: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
@@ -45,47 +58,74 @@ def design_for_gains(
     design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
     half: IdentifiedModel,
     allowed: FloatArray | None,
-) -> tuple[IdentifiedModel, Design, tuple[str, ...]]:
-    """Return model and design, stable at all possible gains, and what is assumed of them."""
+    *,
+    command_scale_known: bool,
+) -> SafeDesign:
+    """Return a design that is stable at all possible gains.
+
+    Commands that were recorded at half their size look like twice the sensor gain, and no record
+    can tell; so half of the gains are possible, unless the scale of the commands is known.
+    """
     model = fit_model(start=half)
     made = design(model)
     if allowed is None:
-        return model, made, ()
+        return SafeDesign(model=model, design=made)
     intervals = possible_gains(allowed, model, half)
-    bad = unstable_gains(made, intervals)
-    first = model, bad
-    for gain in _careful_gains(intervals):
-        if bad is None:
-            break
-        model = fit_model(start=model, sensor_gain=gain)
-        made = design(model)
-        bad = unstable_gains(made, intervals)
-    if bad is not None:
-        model, bad = first
-        made = _robust(model, bad, intervals, design_robustly)
     assumed = (
         f"the sensor gain lies within {_words(intervals)}, as the record and its model allow; the "
         "loop is stable at all of these"
     )
-    if unstable_gains(made, intervals * _HALF) is not None:
-        assumed += (
-            ". The commands are those that were applied: if they were recorded at half their size, "
-            "the loop would be unstable"
-        )
-    return model, made, (assumed,)
+    if command_scale_known:
+        assumed += ". The commands were recorded at the size that was applied, as was stated"
+    else:
+        intervals = intervals * [_HALF, 1.0]
+        assumed += " and at half of them, should the commands be recorded at half their size"
+    bad = unstable_gains(made, intervals)
+    if bad is None:
+        return SafeDesign(model=model, design=made, assumptions=(assumed,))
+    used, careful = _design_carefully(fit_model, design, model, intervals)
+    if careful is None:
+        careful = _robust(model, bad, intervals, design_robustly, command_scale_known)
+    note = (
+        f"to be stable at sensor gains of {_words(intervals)}, the design leaves "
+        f"{_residual_nm(careful, model):.3g} nm in the model; without that it would leave "
+        f"{_residual_nm(made, model):.3g} nm"
+    )
+    if not command_scale_known and unstable_gains(made, intervals / [_HALF, 1.0]) is None:
+        note += " (--command-scale 1: the commands were recorded at the size that was applied)"
+    return SafeDesign(model=used, design=careful, assumptions=(assumed,), notes=(note,))
 
 
-def _careful_gains(intervals: FloatArray) -> list[float]:
-    """Return gains for designs that may be stable within intervals, the slowest first."""
+def _design_carefully(
+    fit_model: Callable[..., IdentifiedModel],
+    design: Callable[[IdentifiedModel], Design],
+    model: IdentifiedModel,
+    intervals: FloatArray,
+) -> tuple[IdentifiedModel, Design | None]:
+    """Return the first design for other gains that is stable within intervals, and its model."""
     low, high = float(np.min(intervals)), float(np.max(intervals))
-    return [high / _CAREFUL, float(np.sqrt(low * high)) * _CAREFUL, float(np.sqrt(low * high))]
+    own = float(np.mean(model.sensor_gains))
+    middle = float(np.sqrt(low * high))
+    for gain in (*(own * part for part in _CAREFUL), high / _WIDE, middle):
+        fitted = fit_model(start=model, sensor_gain=gain)
+        made = design(fitted)
+        if unstable_gains(made, intervals) is None:
+            return fitted, made
+    return model, None
+
+
+def _residual_nm(design: Design, model: IdentifiedModel) -> float:
+    """Return what a design leaves in a model; infinite where its loop is unstable."""
+    loop = close_loop(model.hardware, design.controller)
+    return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else np.inf
 
 
 def _robust(
     model: IdentifiedModel,
-    bad: FloatArray | None,
+    bad: FloatArray,
     intervals: FloatArray,
     design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
+    command_scale_known: bool,
 ) -> Design:
     """Return a design by robust synthesis, or refuse with the gains that are bad for another."""
     factors = intervals / np.array(model.sensor_gains)[:, None]
@@ -95,12 +135,12 @@ def _robust(
             return found
     except SynthesisError:
         pass  # the refusal says what the record lacks
-    assert bad is not None
     gain = ", ".join(f"{value:.3g}" for value in bad)
+    advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
     raise CertificateError(
         f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
-        f"{_words(intervals)}. Record with a higher loop gain, look for jumps in the record, or "
-        "give the sensor gain."
+        f"{_words(intervals)}. Record with a higher loop gain, look for jumps in the record, "
+        f"give the sensor gain{advice}."
     )
 
 

@@ -47,21 +47,50 @@ def fail(model, gains):
 
 def test_gains_that_the_fit_shows_keep_the_design(fit_model, half):
     gain, error = half.axes[0].sensor_gain, half.axes[0].sensor_gain_error
-    model, made, assumed = design_for_gains(fit_model, kalman, fail, half, np.array([[0.6, 1.2]]))
-    assert made.method == "kalman"
-    assert model.axes[0].sensor_gain == pytest.approx(gain, abs=error)
-    (text,) = assumed
+    allowed = np.array([[0.6, 1.2]])
+    safe = design_for_gains(fit_model, kalman, fail, half, allowed, command_scale_known=True)
+    assert safe.design.method == "kalman"
+    assert safe.model.axes[0].sensor_gain == pytest.approx(gain, abs=error)
+    (text,) = safe.assumptions
     assert "the loop is stable at all of these" in text
-    halved = unstable_gains(made, 0.5 * possible_gains(np.array([[0.6, 1.2]]), model, half))
-    assert ("recorded at half their size" in text) == (halved is not None)
-    assert design_for_gains(fit_model, kalman, fail, half, None)[2] == ()
+    assert "at the size that was applied, as was stated" in text
+    assert safe.notes == ()
+    free = design_for_gains(fit_model, kalman, fail, half, None, command_scale_known=False)
+    assert free.assumptions == ()
+
+
+def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
+    line = ((60.0, 0.004, 100.0),)
+    record = spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9)
+    fit_model = partial(lbt.identification.identify, record)
+    first = fit_model()
+    made = partial(design_for_gains, fit_model, hinf, half=first, allowed=np.array([[0.8, 1.0]]))
+    best = made(design_robustly=fail, command_scale_known=True)
+    halves = possible_gains(np.array([[0.8, 1.0]]), first) * [0.5, 1.0]
+    assert best.design.method == "hinf"
+    assert best.notes == ()
+    assert unstable_gains(best.design, halves) is not None
+    safe = made(design_robustly=robust, command_scale_known=False)
+    assert unstable_gains(safe.design, halves) is None
+    assert "at half of them" in safe.assumptions[0]
+    (note,) = safe.notes
+    assert "--command-scale 1" in note
+    with pytest.raises(lbt.errors.CertificateError, match="or say --command-scale 1"):
+        design_for_gains(
+            lambda **_: first,
+            lambda _: best.design,
+            fail,
+            first,
+            np.array([[0.8, 1.0]]),
+            command_scale_known=False,
+        )
 
 
 def test_gains_that_are_too_far_apart_take_robust_synthesis_or_no_design(fit_model, half):
     wide = np.array([[0.02, 0.4]])  # the fit is outside: both count
     with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):
-        design_for_gains(fit_model, hinf, fail, half, wide)
-    _, made, assumed = design_for_gains(fit_model, hinf, robust, half, wide)
-    assert made.method == gain_robust_method()
-    assert unstable_gains(made, possible_gains(wide, half)) is None
-    assert "lies within 0.02 to 0.9" in assumed[0]
+        design_for_gains(fit_model, hinf, fail, half, wide, command_scale_known=True)
+    safe = design_for_gains(fit_model, hinf, robust, half, wide, command_scale_known=True)
+    assert safe.design.method == gain_robust_method()
+    assert unstable_gains(safe.design, possible_gains(wide, half)) is None
+    assert "lies within 0.02 to 0.9" in safe.assumptions[0]
