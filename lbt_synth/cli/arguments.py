@@ -59,6 +59,24 @@ def add_outputs(parser: ArgumentParser) -> None:
     parser.add_argument("-o", "--output", action="append", default=[], help=text)
 
 
+def init(parser: ArgumentParser) -> None:
+    """Write a commented configuration to begin with."""
+    from lbt_synth.config.templates import telescope_names
+
+    text = "published numbers and their sources (default generic: assumed ones)"
+    add_option(parser, "--telescope", telescope_names(), text)
+    text = "telemetry, for what it knows: timing, telescope, noise, turbulence and lines"
+    add_option(parser, "--from", str, text, dest="source", metavar="RECORD")
+    add_switch(parser, "--examples", "write the examples of the documentation instead (folder)")
+    add_switch(parser, "--force", "replace files that are there")
+    add_output(parser, "file to write (default: telescope or record, .yaml)", required=False)
+
+
+def schema(parser: ArgumentParser) -> None:
+    """Print the JSON schema of a configuration, for editors."""
+    add_output(parser, "file to write (.json)", required=False)
+
+
 def design(parser: ArgumentParser) -> None:
     """Design a controller and write its gain file."""
     from lbt_synth.cli.method_options import add_method_options

@@ -78,7 +78,7 @@ def _require_local_loop(config: Config) -> PositionLoop:
     if shell is None:
         raise ConfigError(
             f"{config.source}: the key {key} is missing: without it the mirror settles at once. "
-            "Try examples/lbt_slow_mirror.yaml.",
+            "lbt_slow_mirror.yaml of lbt-synth init --examples has it.",
             path=key,
         )
     return shell

@@ -14,6 +14,7 @@ from lbt_synth.cli.streams import printable
 COMMANDS = {
     add_arguments.__name__.replace("_", "-"): add_arguments
     for add_arguments in (
+        *(arguments.init, arguments.schema),
         *(arguments.design, arguments.show, arguments.verify, arguments.export, arguments.sigma),
         *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
         *(arguments.diagnose, arguments.league),

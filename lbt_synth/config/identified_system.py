@@ -9,7 +9,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from lbt_synth.config.schema import FileSection, describe_error
+from lbt_synth.config.schema import FileSection
+from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedModel

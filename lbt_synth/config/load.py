@@ -23,7 +23,8 @@ from lbt_synth.config.plant_and_truth import (
     require_atmosphere,
     vibration_rms_nm,
 )
-from lbt_synth.config.schema import FileSection, describe_error
+from lbt_synth.config.schema import FileSection
+from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.interop import EndToEndSetup

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import (
-    BaseModel,
     Discriminator,
     Field,
     Tag,
-    ValidationError,
     create_model,
     model_validator,
 )
@@ -50,36 +47,48 @@ class Section(MethodSection):
 class TelescopeSection(Section):
     """The pupil."""
 
-    diameter_m: Positive
-    obstruction: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    diameter_m: Positive = Field(description="diameter of the pupil [m]")
+    obstruction: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="central obstruction over the diameter",
+    )
 
 
 class AtmosphereSection(Section):
     """The turbulence; ``outer_scale_m: null`` is Kolmogorov."""
 
-    seeing_arcsec: Positive
-    outer_scale_m: Positive | None
-    wind_speed_m_s: Positive
-    seeing_wavelength_um: Positive = 0.5
+    seeing_arcsec: Positive = Field(description="seeing [arcsec]")
+    outer_scale_m: Positive | None = Field(description="outer scale [m], null for Kolmogorov")
+    wind_speed_m_s: Positive = Field(description="wind speed [m/s]")
+    seeing_wavelength_um: Positive = Field(default=0.5, description="wavelength of the seeing [um]")
 
 
 class PyramidSection(Section):
     """Pyramid sensor, from which the noise is computed."""
 
-    wavelength_um: Positive
-    modulation_lambda_over_d: Positive
-    subapertures_across: Count
-    photons: Positive
-    read_noise_electrons: NonNegative
+    wavelength_um: Positive = Field(description="sensing wavelength [um]")
+    modulation_lambda_over_d: Positive = Field(description="modulation radius [lambda/D]")
+    subapertures_across: Count = Field(description="subapertures over the diameter")
+    photons: Positive = Field(description="photons per subaperture and frame")
+    read_noise_electrons: NonNegative = Field(description="read noise per pixel [electrons]")
 
 
 class SensorSection(Section):
     """Measurement noise: given, or from a pyramid."""
 
-    noise_nm: PositiveOrEach | None = None
-    noise_mas: Positive | None = None
-    pyramid: PyramidSection | None = None
-    matrix: list[list[float]] | None = None
+    noise_nm: PositiveOrEach | None = Field(
+        default=None,
+        description="noise per frame [nm rms], or one per measurement",
+    )
+    noise_mas: Positive | None = Field(default=None, description="noise per frame [mas]")
+    pyramid: PyramidSection | None = Field(
+        default=None, description="a pyramid, whose noise is computed"
+    )
+    matrix: list[list[float]] | None = Field(
+        default=None, description="rows: measurements by modes (default: identity)"
+    )
 
     @model_validator(mode="after")
     def _require_one_noise(self) -> SensorSection:
@@ -92,16 +101,24 @@ class SensorSection(Section):
 class LocalLoopSection(Section):
     """The mirror's local position loop: its gains, or the frequency and damping they make."""
 
-    natural_frequency_hz: Positive
-    damping: NonNegative
-    bandwidth_hz: Positive | None = None
-    bandwidth_damping: Positive | None = None
-    proportional_per_s2: NonNegative | None = None
-    derivative_per_s: NonNegative | None = None
-    feed_forward: NonNegative = 1.0
-    sampling_hz: Positive = 72_000.0
-    delay_samples: Annotated[int, Field(ge=0)] = 1
-    ramp_samples: Count = 1
+    natural_frequency_hz: Positive = Field(description="frequency of the mode itself [Hz]")
+    damping: NonNegative = Field(description="damping ratio of that mode")
+    bandwidth_hz: Positive | None = Field(default=None, description="frequency with the loop [Hz]")
+    bandwidth_damping: Positive | None = Field(
+        default=None, description="damping with the loop, 0.7"
+    )
+    proportional_per_s2: NonNegative | None = Field(
+        default=None, description="position gain [1/s^2]"
+    )
+    derivative_per_s: NonNegative | None = Field(default=None, description="velocity gain [1/s]")
+    feed_forward: NonNegative = Field(default=1.0, description="feed-forward over holding force")
+    sampling_hz: Positive = Field(
+        default=72_000.0, description="rate, whole multiple of the frame rate [Hz]"
+    )
+    delay_samples: int = Field(
+        default=1, ge=0, description="computing delay of the local loop [samples]"
+    )
+    ramp_samples: Count = Field(default=1, description="samples over which a command is ramped")
 
     @model_validator(mode="after")
     def _require_one_kind_of_gains(self) -> LocalLoopSection:
@@ -119,26 +136,32 @@ class LocalLoopSection(Section):
 class MirrorSection(Section):
     """Deformable mirror; ``modes`` counts the controlled ones, for modal designs and end to end."""
 
-    modes: Count | None = None
-    influence_matrix: list[list[float]] | None = None
-    local_loop: LocalLoopSection | None = None
+    modes: Count | None = Field(default=None, description="number of controlled modes")
+    influence_matrix: list[list[float]] | None = Field(
+        default=None, description="rows: modes by commands (default: identity)"
+    )
+    local_loop: LocalLoopSection | None = Field(
+        default=None, description="position loop (default: it settles at once)"
+    )
 
 
 class LoopSection(Section):
     """Timing, and how many axes there are."""
 
-    axes: Annotated[int, Field(ge=1, le=2)] | None = None
-    frame_rate_hz: Positive
-    delay_frames: Annotated[float, Field(ge=1, le=20)] = 2.0
+    axes: int | None = Field(default=None, ge=1, le=2, description="number of axes (default 2)")
+    frame_rate_hz: Positive = Field(description="frame rate [Hz]")
+    delay_frames: float = Field(default=2.0, ge=1, le=20, description="total delay [frames]")
 
 
 class _LineSection(Section):
     # which of axis and direction_deg is needed depends on the number of axes
-    axis: Literal["tip", "tilt", "both"] | None = None
-    direction_deg: float | None = None
-    frequency_hz: Positive
-    rms_nm: Positive | None = None
-    rms_mas: Positive | None = None
+    axis: Literal["tip", "tilt", "both"] | None = Field(
+        default=None, description="tip, tilt or both"
+    )
+    direction_deg: float | None = Field(default=None, description="angle from tip to tilt [deg]")
+    frequency_hz: Positive = Field(description="frequency [Hz], below half the frame rate")
+    rms_nm: Positive | None = Field(default=None, description="standard deviation [nm rms]")
+    rms_mas: Positive | None = Field(default=None, description="standard deviation [mas]")
 
     @model_validator(mode="after")
     def _require_one_size_and_direction(self) -> _LineSection:
@@ -152,9 +175,11 @@ class _LineSection(Section):
 class VibrationSection(_LineSection):
     """A vibration of the model; ``spread_hz`` makes several ``lines`` of it."""
 
-    damping: Damping
-    spread_hz: Positive | None = None
-    lines: Annotated[int, Field(ge=1, le=64)] | None = None
+    damping: Damping = Field(description="damping ratio")
+    spread_hz: Positive | None = Field(default=None, description="half width of its interval [Hz]")
+    lines: int | None = Field(
+        default=None, ge=1, le=64, description="how many lines cover it (default 5)"
+    )
 
     @model_validator(mode="after")
     def _require_spread_of_lines(self) -> VibrationSection:
@@ -166,10 +191,16 @@ class VibrationSection(_LineSection):
 class TrueVibrationSection(_LineSection):
     """A vibration of the truth: a sinusoid, a resonance with its damping, or one that drifts."""
 
-    kind: Literal["sinusoid", "resonance", "drift"]
-    damping: Damping | None = None
-    end_hz: Positive | None = None
-    duration_s: Positive | None = None
+    kind: Literal["sinusoid", "resonance", "drift"] = Field(
+        description="sinusoid, resonance or drift"
+    )
+    damping: Damping | None = Field(
+        default=None, description="damping ratio of a resonance or a drift"
+    )
+    end_hz: Positive | None = Field(
+        default=None, description="frequency at the end of a drift [Hz]"
+    )
+    duration_s: Positive | None = Field(default=None, description="duration of a drift [s]")
 
     @model_validator(mode="after")
     def _require_what_the_kind_needs(self) -> TrueVibrationSection:
@@ -186,21 +217,21 @@ class TrueVibrationSection(_LineSection):
 class Ar1Section(Section):
     """AR1 turbulence, from the atmosphere."""
 
-    kind: Literal["ar1"]
+    kind: Literal["ar1"] = Field(description="first order, from the atmosphere")
 
 
 class Ar2Section(Section):
     """AR2 turbulence, fitted to the atmosphere's spectrum above the noise."""
 
-    kind: Literal["ar2"]
+    kind: Literal["ar2"] = Field(description="second order, from the atmosphere")
 
 
 class ArSection(Section):
     """Auto-regressive turbulence by its coefficients."""
 
-    kind: Literal["ar"]
-    coefficients: Annotated[list[float], Field(min_length=1)]
-    driving_rms_nm: Positive
+    kind: Literal["ar"] = Field(description="any order, by its coefficients")
+    coefficients: list[float] = Field(min_length=1, description="of past values, newest first")
+    driving_rms_nm: Positive = Field(description="rms of the driving noise [nm]")
 
 
 TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discriminator="kind")]
@@ -213,27 +244,36 @@ class ModelSection(Section):
         Annotated[TurbulenceSection, Tag(ONE)]
         | Annotated[list[TurbulenceSection], Field(min_length=1), Tag(EACH)],
         Discriminator(_tag_one_or_each),
-    ]
-    vibrations: Annotated[list[VibrationSection], Field(min_length=1)] | None = None
-    sensor_gain: PositiveOrEach = 1.0
+    ] = Field(description="model of the turbulence, or one per axis")
+    vibrations: list[VibrationSection] | None = Field(
+        default=None, min_length=1, description="the vibrations, if there are any"
+    )
+    sensor_gain: PositiveOrEach = Field(
+        default=1.0, description="sensor gain that the design assumes, or one per measurement"
+    )
 
 
 class TruthSection(Section):
     """What the real loop meets; ``vibrations: model`` takes those of the model."""
 
-    turbulence: Literal["frozen_flow", "model", "none"] | None = None
+    turbulence: Literal["frozen_flow", "model", "none"] | None = Field(
+        default=None,
+        description="spectrum of the turbulence",
+    )
     vibrations: Annotated[
         Annotated[Literal["model"], Tag(ONE)] | Annotated[list[TrueVibrationSection], Tag(EACH)],
         Discriminator(_tag_one_or_each),
-    ] = []
-    sensor_gain: PositiveOrEach = 1.0
+    ] = Field(default=[], description="the vibrations, or model: those of the model")
+    sensor_gain: PositiveOrEach = Field(
+        default=1.0, description="real sensor gain, or one per measurement"
+    )
 
 
 class ImagingSection(Section):
     """The camera."""
 
-    wavelength_um: Positive = 2.2
-    other_modes_strehl: Fraction = 1.0
+    wavelength_um: Positive = Field(default=2.2, description="wavelength of the Strehl ratio [um]")
+    other_modes_strehl: Fraction = Field(default=1.0, description="Strehl ratio of all other modes")
 
 
 def _design_section() -> type[Section]:
@@ -244,7 +284,7 @@ def _design_section() -> type[Section]:
             option = method.options.model_fields[name]
             fields[name] = (option.annotation, option)
         if method.section is not None:
-            fields[method.name] = (method.section | None, None)
+            fields[method.name] = (method.section | None, Field(None, description=method.title))
     return create_model("DesignSection", __base__=Section, **fields)
 
 
@@ -257,51 +297,78 @@ else:
 class SimulationSection(Section):
     """Time-domain runs."""
 
-    frames: Annotated[int, Field(ge=2)] = 8000
-    cases: Count = 4
-    seed: Annotated[int, Field(ge=0)] = 0
-    settle_frames: Annotated[int, Field(ge=0)] = 2000
+    frames: int = Field(default=8000, ge=2, description="frames recorded")
+    cases: Count = Field(default=4, description="independent runs")
+    seed: int = Field(default=0, ge=0, description="seed of the random series")
+    settle_frames: int = Field(default=2000, ge=0, description="frames before those recorded")
 
 
 class RobustnessSection(Section):
     """The studies over a frequency error, a sensor gain and a delay error."""
 
-    errors_hz: Annotated[list[float], Field(min_length=1)] = [x / 2 for x in range(-7, 8)]
-    hold: Literal["driving", "rms"] = "driving"
-    sensor_gains: Annotated[list[Positive], Field(min_length=1)] = [x / 40 for x in range(10, 53)]
-    delay_errors_frames: Annotated[list[float], Field(min_length=1)] = [0.0]
+    errors_hz: list[float] = Field(
+        default=[x / 2 for x in range(-7, 8)],
+        min_length=1,
+        description="frequency in the model less the true one [Hz]",
+    )
+    hold: Literal["driving", "rms"] = Field(
+        default="driving",
+        description="what a shifted vibration keeps: its driving or its own rms",
+    )
+    sensor_gains: list[Positive] = Field(
+        default=[x / 40 for x in range(10, 53)],
+        min_length=1,
+        description="real sensor gains of maps",
+    )
+    delay_errors_frames: list[float] = Field(
+        default=[0.0], min_length=1, description="real delay less the design's [frames]"
+    )
 
 
 class EndToEndSection(Section):
     """The end-to-end simulation; the other sections describe its system."""
 
-    pixels: Annotated[int, Field(ge=8)] = 60
-    frames: Annotated[int, Field(ge=2)] = 1600
-    settle_frames: Annotated[int, Field(ge=200)] = 400
-    gain: NonNegative = 0.5
-    leak: Annotated[float, Field(ge=0, le=1)] = 0.97
-    leak_from_mode: Annotated[int, Field(ge=2)] = 50
-    actuators_across: Annotated[int, Field(ge=3)] = 31
-    wind_direction_deg: float = 0.0
-    calibration_nm: Positive = 20.0
+    pixels: int = Field(default=60, ge=8, description="pixels across the pupil")
+    frames: int = Field(default=1600, ge=2, description="frames of the exposure")
+    settle_frames: int = Field(default=400, ge=200, description="frames before it")
+    gain: NonNegative = Field(
+        default=0.5, description="integrator gain of every mode without a filter"
+    )
+    leak: float = Field(default=0.97, ge=0, le=1, description="leak of the integrators")
+    leak_from_mode: int = Field(default=50, ge=2, description="first mode with a leak")
+    actuators_across: int = Field(default=31, ge=3, description="actuators across the mirror")
+    wind_direction_deg: float = Field(
+        default=0.0, description="direction of the wind [deg]; 0 is along tip"
+    )
+    calibration_nm: Positive = Field(default=20.0, description="amplitude of the calibration [nm]")
 
 
 class FileSection(Section):
     """A whole configuration file; an identified system knows no telescope and no atmosphere."""
 
-    version: Annotated[int, Field(ge=1, le=1)]
-    telescope: TelescopeSection | None = None
-    atmosphere: AtmosphereSection | None = None
-    sensor: SensorSection
-    mirror: MirrorSection = MirrorSection()
-    loop: LoopSection
-    model: ModelSection
-    truth: TruthSection = TruthSection()
-    imaging: ImagingSection = ImagingSection()
-    design: DesignSection = DesignSection()
-    simulation: SimulationSection = SimulationSection()
-    robustness: RobustnessSection = RobustnessSection()
-    end_to_end: EndToEndSection = EndToEndSection()
+    version: int = Field(ge=1, le=1, description="version of the layout: 1")
+    telescope: TelescopeSection | None = Field(default=None, description="the pupil")
+    atmosphere: AtmosphereSection | None = Field(default=None, description="the turbulence")
+    sensor: SensorSection = Field(description="noise of the measurements")
+    mirror: MirrorSection = Field(default=MirrorSection(), description="the deformable mirror")
+    loop: LoopSection = Field(description="timing, and the number of axes")
+    model: ModelSection = Field(description="what the design assumes")
+    truth: TruthSection = Field(default=TruthSection(), description="what the loop meets")
+    imaging: ImagingSection = Field(
+        default=ImagingSection(), description="the camera of the Strehl ratio"
+    )
+    design: DesignSection = Field(
+        default=DesignSection(), description="defaults of the methods of synthesis"
+    )
+    simulation: SimulationSection = Field(
+        default=SimulationSection(), description="time-domain runs"
+    )
+    robustness: RobustnessSection = Field(
+        default=RobustnessSection(), description="errors that studies try"
+    )
+    end_to_end: EndToEndSection = Field(
+        default=EndToEndSection(), description="the end-to-end simulation"
+    )
 
     @property
     def usual_turbulence(self) -> str:
@@ -312,67 +379,3 @@ class FileSection(Section):
     def true_turbulence(self) -> str:
         """Turbulence that the real loop meets: frozen_flow, model or none."""
         return self.truth.turbulence or self.usual_turbulence
-
-
-def describe_error(
-    error: ValidationError, schema: type[BaseModel] = FileSection
-) -> tuple[str, str]:
-    """Return one sentence on the first mistake, and the path of its key."""
-    details = error.errors()
-    # an unknown key says more than the missing one that it was meant to be
-    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
-    location = tuple(p for p in first["loc"] if p not in ("ar1", "ar2", "ar", ONE, EACH))
-    key = _key_path(location)
-    more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
-    if first["type"] == "extra_forbidden":
-        known = _list_keys(schema, location[:-1])
-        close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
-        hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
-        return f"unknown key {key}; {hint}{more}", key
-    if first["type"] == "missing":
-        return f"the key {key} is missing.{more}", key
-    if first["type"] == "value_error":
-        return f"{key}: {first['ctx']['error']}.{more}", key
-    if first["type"] == "too_short" and key.endswith("vibrations"):
-        return f"{key} is empty; leave the key out for a model without vibrations.{more}", key
-    if first["type"] == "union_tag_invalid":
-        expected, got = first["ctx"]["expected_tags"], first["ctx"]["tag"]
-        return f"{key}.kind must be one of {expected}; got {got!r}.{more}", key
-    if first["type"] == "model_type":
-        return f"{key} must be a mapping of keys; got {first['input']!r}.{more}", key
-    text = first["msg"][0].lower() + first["msg"][1:]
-    return f"{key}: {text}; got {first['input']!r}.{more}", key
-
-
-def _key_path(location: tuple[int | str, ...]) -> str:
-    out = ""
-    for part in location:
-        out += f"[{part}]" if isinstance(part, int) else f".{part}" if out else str(part)
-    return out
-
-
-def _list_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that the schema knows at a location."""
-    here: list[type[BaseModel]] = [model]
-    chosen_name = False  # the next part is a name that the file chooses, a key of a mapping
-    for part in location:
-        if isinstance(part, int) or chosen_name:
-            chosen_name = False
-            continue
-        fields = [
-            field
-            for section in here
-            for name, field in section.model_fields.items()
-            if part == (field.alias or name)
-        ]
-        chosen_name = any(get_origin(field.annotation) is dict for field in fields)
-        here = [found for field in fields for found in _find_models(field.annotation)]
-    return sorted(
-        {field.alias or name for section in here for name, field in section.model_fields.items()}
-    )
-
-
-def _find_models(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [m for arg in getattr(annotation, "__args__", ()) for m in _find_models(arg)]

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from lbt_synth.errors import ConfigError, ProblemError, name_key
 from lbt_synth.methods.method import (
-    Count,
     Description,
     DesignInputs,
     Method,
-    NonNegative,
-    Positive,
     RowTable,
     Section,
+)
+from lbt_synth.methods.robust_section import (
+    Axis,
+    BandSection,
+    RobustSection,
 )
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import number
@@ -30,67 +31,12 @@ if TYPE_CHECKING:
     from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 
 T = TypeVar("T")
-Axis: TypeAlias = Literal["tip", "tilt", "both"]
 _KEY = "design.robust"
 _AXES: dict[Axis, int] = {"tip": 0, "tilt": 1}
 _MOST_BANDS = 6  # around lines of a plant
 _BAND = 0.02  # half width of such a band, over its frequency
 _PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes minutes
 _GAIN_BAND, _GAIN_MARGIN, _GAIN_FUNCTIONS = 0.003, 0.25, 60  # if only the gain is uncertain
-
-
-class BandSection(Section):
-    """A band in which a vibration may be anywhere."""
-
-    low_hz: NonNegative
-    high_hz: Positive
-    rms_nm: Positive | None = None
-    rms_mas: Positive | None = None
-    axis: Axis = "both"
-    damping: Annotated[float, Field(ge=0, lt=1)] | None = None
-
-    @model_validator(mode="after")
-    def _require_one_size(self) -> BandSection:
-        if (self.rms_nm is None) == (self.rms_mas is None):
-            raise ValueError("expected exactly one of rms_nm, rms_mas")
-        return self
-
-
-class AttenuationSection(Section):
-    """One step of a mask on the rejection."""
-
-    low_hz: NonNegative
-    high_hz: Positive
-    at_most: Positive
-    sensor_gain: Positive | None = None
-
-
-class MirrorUncertaintySection(Section):
-    """Relative uncertainty of the mirror in a band."""
-
-    relative: Positive
-    low_hz: NonNegative
-    high_hz: Positive
-
-
-class RobustSection(Section):
-    """The robust design: bands of vibrations, sensor gains, demands."""
-
-    bands: Annotated[list[BandSection], Field(min_length=1)]
-    turbulence: Literal["frozen_flow", "model"] | None = None
-    sensor_gain: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = None
-    scenarios: Annotated[list[Positive], Field(min_length=1)] | None = None
-    modulus_margin: Annotated[float, Field(gt=0, lt=1)] = 0.45
-    noise_peak: Positive | None = None
-    delay_error_frames: Annotated[float, Field(gt=0, le=1)] | None = None
-    command_stroke_nm: Positive | None = None
-    command_step_nm: Positive | None = None
-    attenuation: list[AttenuationSection] = []
-    mirror_uncertainty: list[MirrorUncertaintySection] = []
-    functions: Count = 60
-    pole: Annotated[float, Field(ge=0, lt=1)] = 0.7
-    states: Annotated[int, Field(ge=2)] | None = 20
-    loss: NonNegative = 0.1
 
 
 @table_row
@@ -129,8 +75,8 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
     section: RobustSection | None = inputs.method_section(METHOD.name)
     if section is None:
         raise ConfigError(
-            f"the key {_KEY} is missing: the robust design needs its bands at least. Try "
-            "examples/lbt_robust.yaml.",
+            f"the key {_KEY} is missing: the robust design needs its bands at least. "
+            "lbt_robust.yaml of lbt-synth init --examples has it.",
             path=_KEY,
         )
     assumed = inputs.sensor_gain

@@ -1,0 +1,78 @@
+"""The command init: a configuration to begin with."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from support.commands import run
+from support.night import LINE_HZ
+from support.recorded_loops import RATE
+
+import lbt_synth as lbt
+from lbt_synth.config.templates import example_files, telescope_names
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("telescope", telescope_names())
+def test_a_telescope_is_written_with_its_schema(here, capsys, telescope):
+    status, out, error = run(capsys, "init", "--telescope", telescope)
+    assert (status, error) == (0, "")
+    assert f"next: put in your own numbers, then lbt-synth design {telescope}.yaml" in out
+    text = (here / f"{telescope}.yaml").read_text()
+    assert text.startswith("# yaml-language-server: $schema=lbt-synth.schema.json\n")
+    assert json.loads((here / "lbt-synth.schema.json").read_text()) == lbt.config.config_schema()
+    lbt.load_config(f"{telescope}.yaml")
+
+
+def test_nothing_is_replaced_without_force(here, capsys):
+    assert run(capsys, "init")[0] == 0
+    assert run(capsys, "init")[0] == 0  # the same again replaces nothing
+    (here / "generic.yaml").write_text("mine")
+    status, _, error = run(capsys, "init")
+    assert status == 2
+    assert "generic.yaml would be replaced. Give another name by -o, or --force." in error
+    assert (here / "generic.yaml").read_text() == "mine"
+    status, out, _ = run(capsys, "init", "--force", "--json")
+    assert json.loads(out) == {"files": ["generic.yaml", "lbt-synth.schema.json"]}
+    lbt.load_config("generic.yaml")
+
+
+def test_the_examples_are_written_under_their_names(here, capsys):
+    assert run(capsys, "init", "--examples")[0] == 0
+    assert {file.name for file in (here / "examples").iterdir()} == set(example_files())
+    lbt.studies.load_study("examples/study.yaml")
+
+
+def test_a_record_gives_what_it_knows(here, capsys, recorded_night):
+    status, out, _ = run(
+        capsys, "init", "--from", recorded_night, "--telescope", "gemini", "-o", "n.yaml"
+    )
+    assert status == 0
+    assert "n_kalman.fits" in out
+    config = lbt.load_config("n.yaml")
+    assert config.hardware.frame_rate_hz == RATE
+    assert config.plant.vibrations[0].frequency_hz == pytest.approx(LINE_HZ, abs=0.2)
+    text = (here / "n.yaml").read_text()
+    assert f"frame_rate_hz: {RATE:.1f}" in text
+    assert "# from night.fits\n" in text
+    tail = text.split("# Not in night.fits; this is of the template gemini:\n")[1]
+    assert "# atmosphere:\n#   seeing_arcsec: 0.83" in tail
+    assert "# [2] Gemini Observatory" in tail
+    assert "[4]" not in tail  # nothing that follows cites it
+    sections = tail.partition("\n# [1] Gemini")[0].replace("\n# ", "\n").removeprefix("# ")
+    (here / "more.yaml").write_text(text + sections + "\n")
+    assert lbt.load_config("more.yaml").atmosphere is not None
+
+
+def test_records_that_know_too_little_are_refused(here, capsys):
+    (here / "a.csv").write_text("tip_mas,tilt_mas\n" + "1,2\n2,1\n" * 200)
+    status, _, error = run(capsys, "init", "--from", "a.csv")
+    assert status == 2
+    assert "Try lbt-synth identify, which takes what is missing." in error
+    assert sorted(file.name for file in here.iterdir()) == ["a.csv"]
