@@ -14,3 +14,4 @@ from .riccati.filtering import kalman_riccati as kalman_riccati
 from .state_space import Controller as Controller
 from .state_space import RunningController as RunningController
 from .state_space import StateSpace as StateSpace
+from .structured_norm import structured_norm as structured_norm

@@ -109,19 +109,22 @@ def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
 
 def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
     """Largest singular value of a balanced system between two angles, by level sets."""
-
-    def pencil(level: float) -> FloatArray:
-        # one scaling of states serves both x and p; levels are scaled to one
-        B, C, D = G.B / np.sqrt(level), G.C / np.sqrt(level), G.D / level
-        return _pencil_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
-
-    peak, angle = _climb(G, low, high, lambda angles: _largest(G, angles), pencil)
+    peak, angle = _climb(
+        G, low, high, lambda angles: _largest(G, angles), lambda level: level_angles(G, level)
+    )
     return HinfNorm(
         value=peak,
         lower=peak,
         upper=peak * (1 + 2 * _TOLERANCE),
         peak_frequency_hz=angle / (2 * np.pi * G.dt_s),
     )
+
+
+def level_angles(G: StateSpace, level: float) -> FloatArray:
+    """Angles of a balanced system at which a singular value may be at a level."""
+    # one scaling of states serves both x and p; levels are scaled to one
+    B, C, D = G.B / np.sqrt(level), G.C / np.sqrt(level), G.D / level
+    return _pencil_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
 
 
 def largest_real_part(system: StateSpace) -> float:
@@ -167,12 +170,12 @@ def _climb(
     ``level_angles`` returns the angles between which values may lie above a level.
     """
     seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
-    peak, angle = largest(_fold(seeds, low, high))
+    peak, angle = largest(fold_angles(seeds, low, high))
     if peak == 0:
         return peak, angle
     for _ in range(100):
         level = peak * (1 + _TOLERANCE)
-        angles = _fold(level_angles(level), low, high)
+        angles = fold_angles(level_angles(level), low, high)
         new_peak, new_angle = largest(np.concatenate([angles, (angles[1:] + angles[:-1]) / 2]))
         if new_peak > peak:
             peak, angle = new_peak, new_angle
@@ -238,7 +241,7 @@ def spectral_norms(matrices: ComplexArray) -> FloatArray:
     return np.asarray(scale * np.sqrt(np.maximum(largest, 0.0)), dtype=np.float64)
 
 
-def _fold(angles: FloatArray, low: float, high: float) -> FloatArray:
+def fold_angles(angles: FloatArray, low: float, high: float) -> FloatArray:
     """Fold angles into [low, high] within [0, pi]; return them sorted, with both ends."""
     inside = np.abs(np.mod(angles + np.pi, 2 * np.pi) - np.pi)
     return np.unique(np.concatenate([np.clip(inside, low, high), [low, high]]))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import brentq
 
-from lbt_synth.linear import Controller, hinf_norm
+from lbt_synth.linear import Controller, hinf_norm, structured_norm
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
@@ -27,7 +29,8 @@ class LoopMargins:
     """Margins of a stable loop.
 
     For the phase each measurement is broken in turn, the others closed; gain and delay change in
-    all of them at once.
+    all of them at once. The disk margin is of all measurements at once, each with a gain and a
+    phase of its own.
     """
 
     modulus: float = column(
@@ -53,6 +56,19 @@ class LoopMargins:
         "highest crossover",
         unit="Hz",
         help="Highest frequency at which a loop's gain crosses one; 0 without any",
+    )
+    disk: float = column(
+        "disk margin, axis by axis",
+        help="Size of the symmetric disks of gains and phases that keep the loop stable",
+    )
+    disk_gain_low: float = column(
+        "stable gain of each axis, from", help="Least factors, each axis with its own"
+    )
+    disk_gain_high: float = column(
+        "stable gain of each axis, to", help="Largest factors, each axis with its own"
+    )
+    disk_phase_deg: float = column(
+        "stable phase of each axis, up to", unit="deg", help="Each axis with its own"
     )
 
 
@@ -93,6 +109,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
             phases.append(np.degrees(lag))
             crossovers.append(frequency)
     delay = _delay_margin_frames(loop)
+    disk = _disk_margin(loop)
     return LoopMargins(
         modulus=1 / float(hinf_norm(loop.output_sensitivity())),
         gain_low=low / loop.sensor_gain,
@@ -101,6 +118,10 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
         delay_s=delay / loop.hardware.frame_rate_hz,
         delay_frames=delay,
         crossover_hz=float(max(crossovers)),
+        disk=disk,
+        disk_gain_low=max(2 - disk, 0.0) / (2 + disk),
+        disk_gain_high=(2 + disk) / (2 - disk) if disk < 2 else np.inf,
+        disk_phase_deg=float(np.degrees(2 * np.arctan(disk / 2))),
     )
 
 
@@ -166,6 +187,16 @@ def stable_sensor_gains(
             inner, outer = (middle, outer) if is_stable(middle) else (inner, middle)
         ends.append(float(inner))
     return ends[0], ends[1]
+
+
+def _disk_margin(loop: ClosedLoop) -> float:
+    """Return the symmetric disk margin of all measurements at once.
+
+    Eq. 32 of P. Seiler, A. Packard, P. Gahinet, IEEE Control Syst. 40(5), 78 (2020),
+    doi:10.1109/MCS.2020.3005277: one over the structured norm of ``(S - T) / 2``.
+    """
+    S = loop.output_sensitivity()
+    return 1 / structured_norm(replace(S, D=S.D - np.eye(len(S.D)) / 2)).upper
 
 
 def _delay_margin_frames(loop: ClosedLoop) -> float:

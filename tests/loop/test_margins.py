@@ -75,6 +75,66 @@ def test_the_delay_margin_is_that_of_the_simulated_loop():
     assert radius(margins.delay_frames) < 1 < radius(1.001 * margins.delay_frames)
 
 
+def test_the_disk_margin_of_one_axis_is_the_norm_of_a_difference():
+    """(S - T) / 2 of an integrator on the unit circle, by the closed form of its loop."""
+    g = 0.5
+    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+    law = lbt.Controller(A=1.0, B=g, C=1.0, D=0.0, dt_s=1e-3)
+    margins = lbt.loop_margins(lbt.close_loop(path, law))
+    z = np.exp(1j * np.linspace(1e-6, np.pi, 200_001))
+    broken = g * z**-2 / (1 - 1 / z)
+    assert margins.disk == pytest.approx(1 / np.max(abs((1 - broken) / (1 + broken) / 2)), rel=1e-6)
+    assert margins.disk_gain_low == pytest.approx(1 / margins.disk_gain_high)
+    assert margins.disk_gain_high < margins.gain_high
+    assert margins.disk_phase_deg < margins.phase_deg
+
+
+@pytest.fixture(scope="module")
+def coupled():
+    """Two lines along directions that are not at right angles, and a mirror that is askew."""
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=500,
+        turbulence=lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=500),
+        vibrations=[
+            lbt.Vibration(frequency_hz=30, damping=0.01, rms_nm=200, direction=(0.8, 0.6)),
+            lbt.Vibration(frequency_hz=47, damping=0.01, rms_nm=100, direction=(-0.28, 0.96)),
+        ],
+        noise_nm=5.0,
+        influence_matrix=np.array([[1.0, 0.6], [0.0, 0.8]]),
+    )
+    return plant.hardware, lbt.kalman(plant).controller
+
+
+def test_gains_of_each_axis_within_the_disk_keep_a_coupled_loop_stable(coupled):
+    path, law = coupled
+    margins = lbt.loop_margins(lbt.close_loop(path, law))
+    assert margins.disk_gain_low > margins.gain_low  # a common gain is easier to bear
+    corners = [margins.disk_gain_low, margins.disk_gain_high]
+    for gains in ((a, b) for a in corners for b in corners):
+        moved = replace(path, sensor_matrix=np.diag(gains) @ path.sensor)
+        assert lbt.close_loop(moved, law).is_stable
+    wide = replace(path, sensor_matrix=np.diag([0.6 * corners[0], 1.6 * corners[1]]) @ path.sensor)
+    assert not lbt.close_loop(wide, law).is_stable
+
+
+def test_phases_of_each_axis_within_the_disk_do_not_change_the_encirclements(coupled):
+    path, law = coupled
+    loop = lbt.close_loop(path, law)
+    half = np.deg2rad(lbt.loop_margins(loop).disk_phase_deg)
+    frequency_hz = np.linspace(1e-3, 250, 40_000)
+    up = np.linalg.inv(loop.output_sensitivity().frequency_response(frequency_hz)) - np.eye(2)
+    around = np.concatenate([up[::-1].conj(), up])
+
+    def encirclements(phases):
+        turned = np.exp(1j * np.array(phases))[:, None] * around
+        angle = np.unwrap(np.angle(np.linalg.det(np.eye(2) + turned)))
+        return round((angle[-1] - angle[0]) / (2 * np.pi))
+
+    nominal = encirclements((0, 0))
+    assert {encirclements((a, b)) for a in (half, -half) for b in (half, -half)} == {nominal}
+    assert encirclements((-2.5 * half, -2.5 * half)) != nominal
+
+
 def test_an_unstable_nominal_has_no_interval():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     wild = lbt.Controller(A=1.0, B=3.0, C=1.0, D=0.0, dt_s=1 / 800)
