@@ -138,7 +138,7 @@ def _scales(matrix: ComplexArray) -> FloatArray:
     scales = np.ones(len(matrix))
     for _ in range(_SWEEPS):
         for i in range(len(matrix)):
-            row = np.linalg.norm(scales[i] * size[i] / scales)
-            column = np.linalg.norm(scales * size[:, i] / scales[i])
+            row = float(np.linalg.norm(scales[i] * size[i] / scales))
+            column = float(np.linalg.norm(scales * size[:, i] / scales[i]))
             scales[i] *= np.sqrt(max(column, tiny) / max(row, tiny))
     return np.asarray(np.clip(scales / scales.max(), 1 / _MOST_RATIO, 1.0))
