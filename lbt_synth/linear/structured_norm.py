@@ -122,7 +122,8 @@ def _scaled_size(system: StateSpace, angle: float) -> tuple[float, float]:
 
 
 def _response(system: StateSpace, angle: float) -> ComplexArray:
-    return pointwise_response(system, np.exp(1j * np.array([angle])))[0]
+    response = pointwise_response(system, np.exp(1j * np.array([angle])))
+    return np.asarray(response[0])
 
 
 def _scales(matrix: ComplexArray) -> FloatArray:
