@@ -7,7 +7,7 @@ message are on the exception, so that a script need not parse text.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,15 @@ def shorten_middle(message: str) -> str:
         return message
     start, end = message[: _LONGEST_MESSAGE // 2], message[-_LONGEST_MESSAGE // 4 :]
     return f"{start} [... {len(message) - len(start) - len(end)} characters ...] {end}"
+
+
+def suggest_word(word: str, known: Iterable[str]) -> str:
+    """Return which of the known words was meant, or all of them."""
+    import difflib  # not needed for what goes well
+
+    words = list(known)
+    close = difflib.get_close_matches(word, words, n=1)
+    return f"did you mean {close[0]}?" if close else f"known are {', '.join(words)}."
 
 
 class LbtSynthError(Exception):

@@ -387,3 +387,13 @@ def study(parser: ArgumentParser) -> None:
 def paper(parser: ArgumentParser) -> None:
     """Compute the tables and figures of Agapito et al. 2008, ours beside theirs."""
     add_output(parser, "directory to write into")
+
+
+def help(parser: ArgumentParser) -> None:  # noqa: A001
+    """Show what a command does, and its arguments."""
+    parser.add_argument("topic", nargs="?", metavar="command", help="default: all of them")
+
+
+def completion(parser: ArgumentParser) -> None:
+    """Print the script with which a shell completes commands, options and files."""
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"))

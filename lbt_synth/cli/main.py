@@ -18,7 +18,11 @@ from lbt_synth.cli.streams import discard, print_error, reopen_closed
 from lbt_synth.errors import LbtSynthError, SynthesisError
 
 DONE, FAILED, WRONG = 0, 1, 2
-INTERRUPTED, BROKEN_PIPE = 130, 141  # as shells count signals
+INTERRUPTED, BROKEN_PIPE, TERMINATED = 130, 141, 143  # as shells count signals
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came: what catches an interruption says what is kept."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
         if signal.getsignal(signal.SIGINT) is _stop_loading:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGTERM, _terminate)
         report = command.run(arguments)
     except LbtSynthError as error:
         message = _name_options(str(error), vars(arguments))
@@ -45,6 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         print_error("error: not enough memory; ask for less.")
         return WRONG
+    except Terminated:
+        print_error("terminated")
+        return TERMINATED
     except KeyboardInterrupt:
         print_error("interrupted")
         return INTERRUPTED
@@ -72,6 +80,10 @@ def _stop_loading(*_: object) -> None:
     """End at once: nothing is written yet, and compiled modules take no interruption."""
     os.write(2, b"lbt-synth: interrupted\n")
     os._exit(INTERRUPTED)
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
 
 
 def entry_point() -> None:

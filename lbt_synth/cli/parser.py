@@ -8,6 +8,7 @@ from typing import NoReturn
 import lbt_synth
 from lbt_synth.cli import arguments
 from lbt_synth.cli.streams import printable
+from lbt_synth.errors import ProblemError, suggest_word
 
 # In the order of the help, each with the function that adds its arguments, whose docstring is its
 # help. A command runs in the module of its name, with underscores for dashes.
@@ -21,16 +22,33 @@ COMMANDS = {
         *(arguments.robustness, arguments.tradeoff, arguments.limits, arguments.report),
         *(arguments.end_to_end, arguments.end_to_end_table),
         *(arguments.mirror, arguments.modal, arguments.study, arguments.paper),
+        *(arguments.help, arguments.completion),
     )
 }
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors show what was typed without the control characters in it."""
+    """A parser whose errors are one line: what is wrong, what was meant, and where help is."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and what is wrong with the words, and exit with status 2."""
-        super().error(printable(message))
+        """Print what is wrong with the words, without control characters; exit with status 2."""
+        strange = message.removeprefix("unrecognized arguments: ")
+        if strange != message and (known := _option_strings(self)):
+            message += f"; {suggest_word(strange.split()[0].partition('=')[0], known)}"
+        self.exit(2, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
+
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        if action.choices is not None and value not in action.choices:
+            hint = suggest_word(str(value), map(str, action.choices))
+            raise argparse.ArgumentError(action, f"invalid choice {value!r}; {hint}")
+
+
+def _option_strings(parser: argparse.ArgumentParser) -> list[str]:
+    """Return the options of a parser and of the commands whose arguments it has."""
+    own = [word for word in parser._option_string_actions if word.startswith("--")]
+    commands = parser._subparsers._group_actions[0].choices if parser._subparsers else None
+    inner = commands.values() if isinstance(commands, dict) else ()
+    return list(dict.fromkeys([*own, *(word for each in inner for word in _option_strings(each))]))
 
 
 def build_parser(*named: str) -> argparse.ArgumentParser:
@@ -53,6 +71,12 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
     return parser
 
 
-def whole_parser() -> argparse.ArgumentParser:
-    """Build the parser with the arguments of every command, from which shells complete words."""
-    return build_parser(*COMMANDS)
+def command_help(name: str = "") -> str:
+    """Return the help of a command, or of all where none is named."""
+    parser = build_parser(name)
+    if not name:
+        return parser.format_help()
+    if name not in COMMANDS:
+        raise ProblemError(f"there is no command {name!r}; {suggest_word(name, COMMANDS)}")
+    commands = parser._subparsers._group_actions[0]  # type: ignore[union-attr]
+    return str(commands.choices[name].format_help())  # type: ignore[index]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from lbt_synth.config.schema import EACH, ONE, FileSection
+from lbt_synth.errors import suggest_word
 
 
 def describe_error(
@@ -22,9 +22,7 @@ def describe_error(
     more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = _list_keys(schema, location[:-1])
-        close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.6)
-        hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}."
-        return f"unknown key {key}; {hint}{more}", key
+        return f"unknown key {key}; {suggest_word(str(location[-1]), known)}{more}", key
     if first["type"] == "missing":
         return f"the key {key} is missing.{more}", key
     if first["type"] == "value_error":

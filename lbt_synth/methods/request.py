@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import ProblemError, suggest_word
 from lbt_synth.methods.method import DesignInputs, Method, Section
 from lbt_synth.methods.registry import all_methods, method_named
 
@@ -116,10 +115,8 @@ def _describe_stranger(option: str, method: Method, called: str, words: Wording)
         extra = _extra(method_named(owners[0]), option).get("instead", "")
         others = words.method.format(" or ".join(owners))
         return f"{place} goes with {others}; got {called}. {extra}".rstrip()
-    known = sorted(method.options.model_fields)
-    close = difflib.get_close_matches(option, known, n=1)
-    hint = f"did you mean {words.name(close[0])}?" if close else f"known are {', '.join(known)}."
-    return f"{place} is no option of {called}; {hint}"
+    known = map(words.name, sorted(method.options.model_fields))
+    return f"{place} is no option of {called}; {suggest_word(words.name(option), known)}"
 
 
 def _extra(method: Method, option: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.cli.parser import COMMANDS, build_parser, whole_parser
+from lbt_synth.cli.parser import COMMANDS, build_parser
 from lbt_synth.config.schema import FileSection
 
 CONFIG = str(LBT_YAML)
@@ -93,6 +93,13 @@ def test_bad_input(tmp_path, capsys, monkeypatch, gains, arguments, expected, te
     assert sorted(os.listdir(tmp_path)) == before  # nothing half-written
 
 
+def test_the_package_runs_as_a_module():
+    done = subprocess.run(
+        [sys.executable, "-m", "lbt_synth", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"lbt-synth {lbt.__version__}\n"
+
+
 def test_one_line_an_error(capsys):
     _, _, error = run(capsys, "show", "none.fits")
     assert error.startswith("lbt-synth: error: ")
@@ -116,7 +123,7 @@ def test_every_command_has_a_module_of_its_name(command):
 
 def test_shells_complete_every_option():
     names = {}
-    for parser in (build_parser("tradeoff"), whole_parser()):
+    for parser in (build_parser("tradeoff"), build_parser(*COMMANDS)):
         (commands,) = parser._subparsers._group_actions
         assert list(commands.choices) == list(COMMANDS)
         for command, own in commands.choices.items():

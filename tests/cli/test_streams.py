@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -9,11 +10,12 @@ import sys
 
 import pytest
 from support.commands import run
-from support.plants import LBT_YAML
+from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
-from lbt_synth.cli.main import _stop_loading
+from lbt_synth.cli.main import _stop_loading, entry_point
 from lbt_synth.cli.output import Report
+from lbt_synth.cli.parser import COMMANDS
 from lbt_synth.cli.streams import discard, printable
 
 COMMAND = f"{sys.executable} -c 'from lbt_synth.cli.main import entry_point; entry_point()'"
@@ -110,3 +112,102 @@ def test_the_command_itself_may_be_interrupted(monkeypatch, capsys):
     finally:
         signal.signal(signal.SIGINT, before)
     assert (status, error) == (130, "lbt-synth: interrupted\n")
+
+
+def test_a_termination_says_what_is_kept(monkeypatch, capsys, tmp_path):
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, _stop_loading)
+    monkeypatch.setattr(
+        "lbt_synth.studies.run_study", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM)
+    )
+    study = ROOT / "examples" / "study.yaml"
+    try:
+        status, out, error = run(capsys, "study", study, "-o", tmp_path / "s")
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert (status, out) == (143, "")
+    assert error.splitlines() == [
+        f"lbt-synth: what is finished is kept in {tmp_path / 's'}; start it again to continue",
+        "lbt-synth: terminated",
+    ]
+
+
+def run_in(monkeypatch, encoding, *words):
+    """Status and what both streams got, of a process whose streams have an encoding."""
+    streams = [io.BytesIO(), io.BytesIO()]
+    wrapped = [io.TextIOWrapper(one, encoding=encoding, newline="\n") for one in streams]
+    monkeypatch.setattr(sys, "stdout", wrapped[0])
+    monkeypatch.setattr(sys, "stderr", wrapped[1])
+    monkeypatch.setattr(sys, "argv", ["lbt-synth", *map(str, words)])
+    monkeypatch.setenv("COLUMNS", "40")
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        entry_point()
+    except SystemExit as stop:
+        status = stop.code
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for one in wrapped:
+        one.flush()
+    return status, *(stream.getvalue().decode(encoding) for stream in streams)
+
+
+SAID = {  # what each command does with files that are there, its status, and a part of what it says
+    "init": (("-o", "OUT.yaml"), 0, "written: OUT.yaml"),
+    "schema": ((), 0, '"frame_rate_hz"'),
+    "design": (("CONFIG", "--method", "kalman", "-o", "OUT.fits"), 0, "written: OUT.fits"),
+    "show": (("GAIN",), 0, "| quantity"),
+    "verify": (("GAIN",), 0, "spectral radius"),
+    "export": (("GAIN", "--format", "c", "-o", "OUT.c"), 0, "written: OUT.c"),
+    "sigma": (("GAIN", "-o", "OUT.png"), 0, "written: OUT.png"),
+    "simulate": (("CONFIG", "GAIN", "--frames", "200", "--cases", "1"), 0, "Strehl"),
+    "telemetry": (("NIGHT",), 0, "frame rate"),
+    "identify": (("NIGHT", "-o", "\u00b1.txt"), 2, "got '+-.txt'"),
+    "auto": (("\u2212.fits", "-o", "OUT.fits"), 2, "cannot read -.fits"),
+    "diagnose": (("\u2264.fits",), 2, "cannot read <=.fits"),
+    "league": (("NIGHT", "-o", "OUT", "--entries", "\u00b5"), 2, "got 'u'"),
+    "robustness": (("CONFIG", "GAIN", "--errors-hz", "0", "1", "2"), 0, "Strehl"),
+    "tradeoff": (("CONFIG", "--points", "2", "--taps", "2"), 0, "norm"),
+    "limits": (("CONFIG", "\u00e9.fits"), 2, "\\xe9.fits"),
+    "report": (("CONFIG", "GAIN", "-o", "\u00d7.txt"), 2, "got 'x.txt'"),
+    "end-to-end": (("CONFIG", "GAIN", "-o", "GAIN"), 2, "error"),
+    "end-to-end-table": (("CONFIG", "GAIN", "-o", "GAIN"), 2, "error"),
+    "mirror": (("CONFIG",), 2, "mirror.local_loop"),
+    "modal": (("CONFIG", "--modes", "5"), 0, "Kalman"),
+    "study": (("none.yaml", "-o", "OUT"), 2, "none.yaml"),
+    "paper": (("-o", "GAIN"), 2, "GAIN"),
+    "help": (("show",), 0, "usage: lbt-synth show"),
+    "completion": (("csh",), 2, "invalid choice"),
+}
+
+
+def test_every_command_is_said_in_any_encoding():
+    assert list(SAID) == list(COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_command_ends_on_a_character(tmp_path, monkeypatch, gains, recorded_night, command):
+    words, expected, text = SAID[command]
+    monkeypatch.chdir(tmp_path)
+    places = {
+        "CONFIG": LBT_YAML,
+        "GAIN": gains["kalman"],
+        "NIGHT": recorded_night,
+    }
+    words = [places.get(word, word) for word in words]
+    status, out, error = run_in(monkeypatch, "ascii", command, *words)
+    assert status == expected, error
+    assert "Traceback" not in error
+    assert text.replace("GAIN", str(gains["kalman"])) in " ".join((out + error).split())
+    assert (error == "") == (status == 0)
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "latin-1"])
+def test_characters_that_an_encoding_lacks_become_plain(monkeypatch, encoding):
+    status, _, error = run_in(monkeypatch, encoding, "show", "\u22123\u221e\u4e2d.fits")
+    assert (status, error) == (
+        2,
+        "lbt-synth: error: cannot read -3inf\\u4e2d.fits: No such file or directory.\n",
+    )

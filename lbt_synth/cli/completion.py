@@ -1,0 +1,35 @@
+"""The command completion: a script with which a shell completes commands, options and files."""
+
+from __future__ import annotations
+
+from argparse import Action, ArgumentParser, Namespace
+from collections.abc import Iterator
+
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.parser import COMMANDS, build_parser
+from lbt_synth.errors import MissingExtraError
+
+
+def run(arguments: Namespace) -> Report:
+    """Print the script of a shell, made from the arguments of all commands."""
+    try:
+        import shtab
+    except ImportError as error:
+        raise MissingExtraError(
+            "the script of a shell needs shtab: pip install shtab.", extra="shtab"
+        ) from error
+    parser = build_parser(*COMMANDS)
+    for action in _takes_files(parser):
+        action.complete = shtab.FILE  # type: ignore[attr-defined]
+    text = shtab.complete(parser, shell=arguments.shell)
+    return Report(data={"shell": arguments.shell, "script": text}, opening=text.splitlines())
+
+
+def _takes_files(parser: ArgumentParser) -> Iterator[Action]:
+    """Yield the arguments of all commands that may be the name of a file."""
+    for action in parser._actions:
+        if isinstance(action.choices, dict):
+            for command in action.choices.values():
+                yield from _takes_files(command)
+        elif action.choices is None and action.nargs != 0 and action.type in (None, str):
+            yield action
