@@ -327,7 +327,7 @@ def robustness(parser: ArgumentParser) -> None:
     fixed = parser.add_argument_group("with gain files")
     ends = ("LOW", "HIGH", "COUNT")
     for name, text in (
-        ("--errors-hz", "frequency in the design less the true one [Hz]"),
+        ("--errors-hz", "true frequency less that of the design, of the line that moves most [Hz]"),
         ("--sensor-gains", "real sensor gain"),
     ):
         text += ": COUNT values (default: the configuration's)"

@@ -29,7 +29,7 @@ def run(arguments: Namespace) -> Report:
             config.hardware,
             config.truth,
             config.imaging,
-            errors_hz=config.settings.robustness.errors_hz,
+            errors_hz=config.errors_hz,
         )
     no_band = () if study.band is not None else ("above_band_limit_percent",)
     report = Report()

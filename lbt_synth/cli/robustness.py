@@ -53,7 +53,7 @@ def _refuse_unused_options(arguments: Namespace) -> None:
 def _redesign(config: Config, arguments: Namespace) -> Report:
     settings = config.settings
     ratio = arguments.gamma_ratio
-    errors = settings.robustness.errors_hz
+    errors = config.errors_hz
     rows = list(
         track_progress(
             studies.robustness(
@@ -79,7 +79,7 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
 def _map_designs(config: Config, arguments: Namespace) -> Report:
     """Map the Strehl ratio of gain files over frequency error, sensor gain and delay error."""
     settings = config.settings.robustness
-    errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(settings.errors_hz))
+    errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(config.errors_hz))
     gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
     delays = arguments.delay_errors or settings.delay_errors_frames
     for gain in gains:

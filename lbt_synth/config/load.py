@@ -31,12 +31,15 @@ from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
+from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray
 
 Checked = TypeVar("Checked", bound=BaseModel)
 _LARGEST_BYTES = 2**17  # of a file; ruamel.yaml may read no more than 30 kB per second
+_MOST_ERROR_HZ, _USUAL_ERROR = 3.5, 0.175  # of frequencies, unless the file says
+_ERROR_STEPS = [step / 7 for step in range(-7, 8)]
 _MOST_NODES, _DEEPEST, _MOST_DIGITS = 2**16, 40, 40
 
 
@@ -83,6 +86,21 @@ class Config:
     def design_defaults(self) -> dict[str, Any]:
         """Options of methods of synthesis that the file gives, or their defaults."""
         return dict(self.settings.design)
+
+    @property
+    def errors_hz(self) -> list[float]:
+        """Frequency errors of studies: those of the file, or of what it says of its vibrations."""
+        given = self.settings.robustness.errors_hz
+        if given is not None:
+            return given
+        lines = [line.frequency_hz for line in stationary_vibrations(self.truth.vibrations)]
+        if not lines:
+            return [0.0]
+        stated = self.truth.frequency_errors_hz
+        room = self.hardware.frame_rate_hz / 2 - max(lines)
+        most = min(_MOST_ERROR_HZ, _USUAL_ERROR * max(lines), room / 2)
+        most = most if stated is None else max(stated)
+        return [most * step for step in _ERROR_STEPS] if most else [0.0]
 
     def method_section(self, name: str) -> Any:
         """Return the section ``design.<name>`` of a method, None if there is none."""

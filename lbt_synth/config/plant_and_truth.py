@@ -298,12 +298,30 @@ def build_truth(
         "model": one if same else plant.turbulence,
         "none": None,
     }
+    vibrations = _build_true_vibrations(settings, plant)
     return Truth(
         turbulence=spectra[kind],
-        vibrations=_build_true_vibrations(settings, plant),
+        vibrations=vibrations,
         noise_nm=noise_nm,
         sensor_gain=relative_gain(settings, reference_gain(settings)),
+        frequency_errors_hz=_frequency_errors(settings, vibrations),
     )
+
+
+def _frequency_errors(
+    settings: FileSection, vibrations: tuple[TrueVibration, ...]
+) -> tuple[float, ...] | None:
+    """Return the error that is stated of each vibration [Hz], 0 beside others; None if none is."""
+    sections = getattr(settings, true_vibrations_owner(settings)).vibrations or []
+    if all(section.largest_error_hz is None for section in sections):
+        return None
+    places = np.array([section.frequency_hz for section in sections])
+    starts = [
+        line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
+        for line in vibrations
+    ]
+    nearest = [sections[int(np.argmin(np.abs(places - start)))] for start in starts]
+    return tuple(section.largest_error_hz or 0.0 for section in nearest)
 
 
 def _build_true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVibration, ...]:

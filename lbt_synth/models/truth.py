@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
-from lbt_synth.models.vibration.in_a_loop import TrueVibration
-from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, one_or_each
+from lbt_synth.models.vibration.in_a_loop import TrueVibration, stationary_vibrations
+from lbt_synth.validation import (
+    FloatArray,
+    Positive,
+    check_fields,
+    frozen_copy,
+    number,
+    one_or_each,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,6 +39,10 @@ class Truth:
         Real sensor (optical) gain relative to the sensor matrix:
         ``y = sensor_gain D phi_res + noise``. Put gains that differ between the axes
         into the sensor matrix of the loop.
+    frequency_errors_hz : sequence of float, optional
+        How far the frequency of each vibration may be from the assumed one [Hz]; 0 where it is
+        known. Studies of frequency errors move the vibrations in proportion to these; by default
+        in proportion to their frequencies.
 
     Raises
     ------
@@ -61,6 +72,7 @@ class Truth:
     vibrations: tuple[TrueVibration, ...] = ()
     noise_nm: float | FloatArray = 0.0
     sensor_gain: Positive = 1.0
+    frequency_errors_hz: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         given = self.turbulence
@@ -82,7 +94,49 @@ class Truth:
             turbulence=parts if isinstance(given, Sequence) else given,
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
+            frequency_errors_hz=self._checked_errors(),
         )
+
+    def _checked_errors(self) -> tuple[float, ...] | None:
+        """Return the frequency errors, of which each vibration must have one."""
+        if self.frequency_errors_hz is None:
+            return None
+        errors = [number(e, "frequency_errors_hz", at_least=0) for e in self.frequency_errors_hz]
+        if len(errors) != len(self.vibrations):
+            raise DimensionError(
+                f"frequency_errors_hz must be one per vibration ({len(self.vibrations)}); got "
+                f"{len(errors)}."
+            )
+        return tuple(errors)
+
+    def frequency_shift_hz(self, frequency_hz: float, error_hz: float) -> float:
+        """Return how far a line moves with an error of the vibration that moves most [Hz].
+
+        The line takes the share of the vibration that is nearest to it in frequency. Without
+        vibrations it moves by the whole error.
+        """
+        lines = stationary_vibrations(self.vibrations)
+        if not lines:
+            return error_hz
+        places = np.array([line.frequency_hz for line in lines])
+        given = self.frequency_errors_hz
+        sizes = places if given is None else np.array(given)
+        share = sizes / max(float(np.max(sizes)), np.finfo(float).tiny)
+        return error_hz * float(share[np.argmin(np.abs(np.log(places / frequency_hz)))])
+
+    def with_frequency_error(self, error_hz: float) -> Truth:
+        """Return a truth whose vibrations have moved, the one that moves most by an error [Hz]."""
+        moved = []
+        for line in stationary_vibrations(self.vibrations):
+            frequency_hz = line.frequency_hz + self.frequency_shift_hz(line.frequency_hz, error_hz)
+            if not frequency_hz > 0:
+                raise ProblemError(
+                    f"errors_hz must leave each vibration above 0 Hz; got an error of "
+                    f"{error_hz:.6g} Hz, which moves the one at {line.frequency_hz:.6g} Hz to "
+                    f"{frequency_hz:.6g} Hz. Try a smaller one, or a smaller error of this line."
+                )
+            moved.append(replace(line, frequency_hz=frequency_hz))
+        return replace(self, vibrations=tuple(moved))
 
     @property
     def drifts(self) -> bool:

@@ -78,7 +78,8 @@ class LimitStudy:
     band_hz : tuple of float or None
         That range [Hz].
     shift_hz : (s,) ndarray
-        True frequency less that of the truth [Hz]; empty without vibrations.
+        True frequency less that of the truth [Hz], of the vibration that moves most; empty
+        without vibrations.
     residual_nm : (designs, s) ndarray
         Residual of each design at each shift [nm rms]; nan if unstable.
     frequency_hz : float or None
@@ -115,8 +116,9 @@ def limits(
     imaging : Imaging
         The camera.
     errors_hz : sequence of float, optional
-        Errors of the model's frequency [Hz]: model less truth. The true vibrations move over
-        the whole range between the extremes.
+        True frequency less that of the model [Hz], of the vibration that moves most; the others
+        move in proportion (``truth.frequency_errors_hz``), over the whole range between the
+        extremes.
 
     Returns
     -------
@@ -192,10 +194,10 @@ def limits(
 
 
 def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
-    """Return true frequencies less those of the truth; the model's error is their opposite."""
+    """Return the shifts over the range of errors, the errors and 0 among them."""
     if not truth.vibrations:
         return np.zeros(0)
-    moved = -np.array(errors_hz)
+    moved = np.array(errors_hz)
     grid = np.linspace(moved.min(), moved.max(), _GRID)
     inside = [0.0] if moved.min() <= 0 <= moved.max() else []
     return np.asarray(np.unique(np.concatenate([grid, moved, inside]) + 0.0))
@@ -220,10 +222,6 @@ def _evaluate_loop(
     still = replace(truth, turbulence=None, noise_nm=0.0)
     variance = np.empty(shifts.size)
     for i, shift in enumerate(shifts):
-        moved = tuple(
-            replace(line, frequency_hz=line.frequency_hz + float(shift))
-            for line in stationary_vibrations(truth.vibrations)
-        )
-        own = residual_budget(loop, replace(still, vibrations=moved))
+        own = residual_budget(loop, still.with_frequency_error(float(shift)))
         variance[i] = rest + np.trace(own.vibration_nm2)
     return budget.rms_nm, strehl(budget, imaging), np.sqrt(variance)

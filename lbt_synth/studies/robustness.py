@@ -41,7 +41,7 @@ class RobustnessRow:
     """One design at one frequency error; what an unstable loop does not have is nan."""
 
     error_hz: float = column(
-        "error", unit="Hz", format="+.2f", help="Frequency in the model less the true one"
+        "error", unit="Hz", format="+.2f", help="True frequency less that of the model"
     )
     method: str = column("method", help="Method of synthesis")
     strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
@@ -77,7 +77,8 @@ def robustness(
     imaging : Imaging
         The camera.
     errors_hz : sequence of float
-        Errors of the model's frequency [Hz].
+        True frequency less that of the model [Hz], of the vibration that moves most; the others
+        move in proportion (``truth.frequency_errors_hz``).
     methods : sequence of str, optional
         Methods of synthesis that design for a plant; by default the Kalman and the H-infinity
         filter.
@@ -120,7 +121,9 @@ def robustness(
         choice(name, "method", record_methods())
     bound = {"gamma_ratio": gamma_ratio} if gamma is None else {"gamma": gamma}
     for error in errors_hz:
-        moved = retuned_plant(plant, number(error, "errors_hz"), hold=hold)
+        number(error, "errors_hz")
+        shifts = [-truth.frequency_shift_hz(line.frequency_hz, error) for line in plant.vibrations]
+        moved = retuned_plant(plant, shifts, hold=hold)
         for name in names:
             yield _row(reference_design(name, moved, bound), truth, imaging, float(error))
 
@@ -157,7 +160,7 @@ class RobustnessMap:
     Attributes
     ----------
     errors_hz : (e,) ndarray
-        Frequency that the design assumes less the true one [Hz].
+        True frequency less that of the design [Hz], of the vibration that moves most.
     sensor_gains : (g,) ndarray
         Real sensor gain relative to the design's sensor matrix.
     delay_errors_frames : (d,) ndarray
@@ -200,8 +203,8 @@ def robustness_map(
     imaging : Imaging
         The camera.
     errors_hz : (e,) array_like
-        Frequency that the design assumes less the true one [Hz]: every vibration of the truth
-        moves by minus the error and keeps its rms.
+        True frequency less that of the design [Hz], of the vibration that moves most. The others
+        move in proportion (``truth.frequency_errors_hz``), and all keep their rms.
     sensor_gains : (g,) array_like
         Real sensor gains relative to the design's sensor matrix.
     delay_errors_frames : (d,) array_like, optional
@@ -320,17 +323,24 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
 def _shift_vibrations(
     truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
 ) -> list[EnsembleVibration]:
-    """Return the true vibrations, each at its frequency less every error."""
+    """Return the true vibrations, each at its frequency under every error."""
     if not truth.vibrations and np.any(errors_hz != 0):
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
     nyquist = hardware.frame_rate_hz / 2
+    places = [
+        [line.frequency_hz for line in stationary_vibrations(each.vibrations)]
+        for each in (truth.with_frequency_error(float(error)) for error in errors_hz)
+    ]
     moved = []
-    for vibration in stationary_vibrations(truth.vibrations):
+    for vibration, frequencies in zip(
+        stationary_vibrations(truth.vibrations),
+        np.reshape(places, (errors_hz.size, -1)).T,
+        strict=True,
+    ):
         checked_direction(vibration, hardware)
-        frequencies = vibration.frequency_hz - errors_hz
-        wrong = ~((frequencies > 0) & (frequencies < nyquist))
+        wrong = ~(frequencies < nyquist)
         if np.any(wrong):
             raise ProblemError(
                 f"errors_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "

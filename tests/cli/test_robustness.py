@@ -182,7 +182,7 @@ BAD = [
     ((CONFIG, "KALMAN", "--errors-hz", "-1", "1", "1e9"), "COUNT of 2 to 2001"),
     ((CONFIG, "KALMAN", "--errors-hz", "-1", "nan", "3"), "--errors-hz must be finite"),
     ((CONFIG, "KALMAN", "--errors-hz", "-1", "1"), "expected 3 arguments"),
-    ((CONFIG, "KALMAN", "--errors-hz", "-1", "30", "3"), "errors_hz must leave each vibration"),
+    ((CONFIG, "KALMAN", "--errors-hz", "-30", "1", "3"), "errors_hz must leave each vibration"),
     ((CONFIG, "KALMAN", "--sensor-gains", "0", "1", "3"), "--sensor-gains must be above 0"),
     ((CONFIG, "KALMAN", "--delay-errors", "-2"), "delay_errors_frames must be at least -1"),
     ((CONFIG, "KALMAN", "--delay-errors", "0", "0"), "each value once"),

@@ -202,3 +202,42 @@ def test_gains_of_a_configuration(tmp_path):
     )
     mirror = lbt.load_config(path).hardware.mirror
     assert (mirror.proportional_per_s2, mirror.derivative_per_s) == (4.0e5, 800.0)
+
+
+LINES = [
+    {"kind": "sinusoid", "frequency_hz": 0.3, "rms_nm": 400, "axis": "both"},
+    {"kind": "sinusoid", "frequency_hz": 40.0, "rms_nm": 50, "axis": "tip"},
+]
+
+
+@pytest.mark.parametrize(
+    ("stated", "errors", "widest"),
+    [
+        (({}, {}), None, 3.5),
+        (({"frequency_error_hz": 0}, {"frequency_error_percent": 5}), (0, 0, 2), 2.0),
+        (({}, {"frequency_error_hz": 1.0}), (0, 0, 1), 1.0),
+        (({"frequency_error_hz": 0}, {"frequency_error_hz": 0}), (0, 0, 0), 0.0),
+    ],
+)
+def test_frequency_errors_of_each_line(tmp_path, stated, errors, widest):
+    lines = [line | more for line, more in zip(LINES, stated, strict=True)]
+    config = lbt.load_config(write_config(tmp_path, minimal_config(truth={"vibrations": lines})))
+    assert config.truth.frequency_errors_hz == errors  # the first line is one on each axis
+    assert max(config.errors_hz) == pytest.approx(widest)
+    assert min(config.errors_hz) == pytest.approx(-widest)
+
+
+def test_a_slow_line_alone_has_small_errors(tmp_path):
+    config = lbt.load_config(
+        write_config(tmp_path, minimal_config(truth={"vibrations": LINES[:1]}))
+    )
+    assert config.truth.frequency_errors_hz is None
+    assert max(config.errors_hz) == pytest.approx(0.175 * 0.3)
+    bare = lbt.load_config(write_config(tmp_path, minimal_config()))
+    assert bare.errors_hz == [0.0]
+
+
+def test_a_line_has_one_frequency_error(tmp_path):
+    line = LINES[0] | {"frequency_error_hz": 1, "frequency_error_percent": 5}
+    with pytest.raises(lbt.errors.ConfigError, match="one of frequency_error_hz, frequency_error"):
+        lbt.load_config(write_config(tmp_path, minimal_config(truth={"vibrations": [line]})))

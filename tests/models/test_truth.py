@@ -8,6 +8,8 @@ from support.uneven_axes import SLOW
 
 import lbt_synth as lbt
 
+LINE = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100)
+
 
 @pytest.mark.parametrize(
     "make",
@@ -52,8 +54,37 @@ def test_a_truth_needs_a_spectrum():
         ({"turbulence": None, "noise_nm": []}, lbt.errors.DimensionError, r"got shape \(0,\)"),
         ({"turbulence": None, "noise_nm": [1.0, -1.0]}, lbt.errors.ProblemError, "noise_nm"),
         ({"turbulence": None, "noise_nm": [1.0, np.nan]}, lbt.errors.ProblemError, "noise_nm"),
+        (
+            {"turbulence": None, "frequency_errors_hz": [1.0]},
+            lbt.errors.DimensionError,
+            r"one per vibration \(0\); got 1",
+        ),
+        (
+            {"turbulence": None, "vibrations": (LINE,), "frequency_errors_hz": [-1.0]},
+            lbt.errors.ProblemError,
+            "frequency_errors_hz must be at least 0",
+        ),
     ],
 )
 def test_wrong_truths_are_refused(arguments, error, text):
     with pytest.raises(error, match=text):
         lbt.Truth(**arguments)
+
+
+def test_a_frequency_error_moves_each_vibration_by_its_share():
+    lines = [lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=9) for f in (0.3, 20.0, 40.0)]
+    truth = lbt.Truth(turbulence=None, vibrations=tuple(lines))
+
+    def moved(given, error_hz):
+        return [line.frequency_hz for line in given.with_frequency_error(error_hz).vibrations]
+
+    assert moved(truth, 4.0) == pytest.approx([0.33, 22.0, 44.0])
+    stated = lbt.Truth(
+        turbulence=None, vibrations=tuple(lines), frequency_errors_hz=(0.0, 2.0, 1.0)
+    )
+    assert moved(stated, -2.0) == pytest.approx([0.3, 18.0, 39.0])
+    known = lbt.Truth(turbulence=None, vibrations=tuple(lines), frequency_errors_hz=(0, 0, 0))
+    assert moved(known, 5.0) == [0.3, 20.0, 40.0]
+    with pytest.raises(lbt.errors.ProblemError, match="moves the one at 20 Hz to -5 Hz"):
+        stated.with_frequency_error(-25.0)
+    assert lbt.Truth(turbulence=None).frequency_shift_hz(30.0, 2.0) == 2.0

@@ -54,8 +54,10 @@ def test_bad_studies(config):
     designs = {"kalman": lbt.kalman(config.plant)}
     with pytest.raises(lbt.errors.ProblemError, match="at least one error"):
         lbt.studies.limits(designs, *good, errors_hz=[])
-    with pytest.raises(lbt.errors.ProblemError, match="must be above 0"):
-        lbt.studies.limits(designs, *good, errors_hz=[25.0])
+    with pytest.raises(
+        lbt.errors.ProblemError, match="each vibration above 0 Hz; got an error of -25"
+    ):
+        lbt.studies.limits(designs, *good, errors_hz=[-25.0])
     still = lbt.studies.limits(designs, *good)
     assert still.band is None
     with pytest.raises(lbt.errors.ProblemError, match="a vibration that moves"):

@@ -29,7 +29,7 @@ def test_robustness_rows(config):
         parts = row.vibration_nm**2 + row.turbulence_nm**2 + row.noise_nm**2
         assert row.residual_nm**2 == pytest.approx(parts)
     # the same as designing and evaluating by hand
-    moved = lbt.kalman(lbt.models.retuned_plant(config.plant, 3, hold="driving"))
+    moved = lbt.kalman(lbt.models.retuned_plant(config.plant, -3, hold="driving"))
     budget = lbt.residual_budget(lbt.close_loop(moved.hardware, moved.controller), config.truth)
     assert kalman[3].residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
 
@@ -57,7 +57,7 @@ def test_the_study_refuses_what_it_cannot_do(config):
             )
         )
     with pytest.raises(lbt.errors.ProblemError, match="above 0"):
-        list(lbt.studies.robustness(config.plant, config.truth, config.imaging, errors_hz=[-25]))
+        list(lbt.studies.robustness(config.plant, config.truth, config.imaging, errors_hz=[25]))
 
 
 def test_what_needs_a_stationary_truth_refuses_it(config):
@@ -244,18 +244,62 @@ def test_turning_the_vibration_changes_nothing(kalman, air):
     assert mapped((1.0, 0.0)) == pytest.approx(mapped(DIAGONAL), rel=1e-6)
 
 
-def test_the_sign_of_the_error_is_that_of_the_robustness_study(kalman, settings):
-    """The design believes more than is true: the true line lies below."""
+def test_the_sign_of_the_error_is_true_less_assumed(kalman, settings):
+    """A design that believes more than is true meets a line that lies below."""
     moved = replace(
         settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
     )
     below = lbt.studies.robustness_map(
         kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1]
     )
-    above = lbt.studies.robustness_map(
-        kalman, settings.truth, settings.imaging, errors_hz=[1.5], sensor_gains=[1]
+    error = lbt.studies.robustness_map(
+        kalman, settings.truth, settings.imaging, errors_hz=[-1.5], sensor_gains=[1]
     )
-    assert below.strehl == pytest.approx(above.strehl, rel=1e-12)
+    assert below.strehl == pytest.approx(error.strehl, rel=1e-12)
+
+
+def test_each_line_moves_by_its_share(kalman, settings):
+    """Wind shake at 0.3 Hz stays where the line at 20 Hz moves by 3.5 Hz, or as is stated."""
+    lines = (sinusoid(0.3, 400.0), sinusoid(20.0, 300.0))
+
+    def residual(truth, error):
+        found = lbt.studies.robustness_map(
+            kalman, truth, settings.imaging, errors_hz=[error], sensor_gains=[1]
+        )
+        return float(found.residual_nm[0, 0, 0])
+
+    def at(*frequencies):
+        moved = [replace(line, frequency_hz=f) for line, f in zip(lines, frequencies, strict=True)]
+        return residual(replace(settings.truth, vibrations=tuple(moved)), 0.0)
+
+    truth = replace(settings.truth, vibrations=lines)
+    assert residual(truth, 3.5) == pytest.approx(at(0.3 * 23.5 / 20, 23.5), rel=1e-12)
+    assert residual(truth, -3.5) == pytest.approx(at(0.3 * 16.5 / 20, 16.5), rel=1e-12)
+    stated = replace(truth, frequency_errors_hz=(0.1, 2.0))
+    assert residual(stated, -2.0) == pytest.approx(at(0.2, 18.0), rel=1e-12)
+    fixed = replace(truth, frequency_errors_hz=(0.0, 2.0))
+    assert residual(fixed, -3.5) == pytest.approx(at(0.3, 16.5), rel=1e-12)
+
+
+def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
+    model = [lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50.0) for f in (0.31, 21.0)]
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        turbulence=settings.plant.turbulence[0],
+        vibrations=model,
+        noise_nm=15.5,
+    )
+    truth = replace(
+        settings.truth,
+        vibrations=(sinusoid(0.3, 100.0), sinusoid(20.0, 100.0)),
+        frequency_errors_hz=(0.0, 3.5),
+    )
+    (row,) = lbt.studies.robustness(
+        plant, truth, settings.imaging, errors_hz=[2.0], methods=["kalman"]
+    )
+    moved = lbt.kalman(lbt.models.retuned_plant(plant, [0.0, -2.0], hold="driving"))
+    budget = lbt.residual_budget(lbt.close_loop(moved.hardware, moved.controller), truth)
+    assert row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
 
 
 def test_counts_points_as_they_are_done(kalman, settings):
@@ -277,8 +321,8 @@ WRONG = [
     ({"errors_hz": [[0.0]]}, "at least one number"),
     ({"errors_hz": [np.nan]}, "finite"),
     ({"errors_hz": [1, 1]}, "each value once"),
-    ({"errors_hz": [20]}, "moves the one at 20 Hz to 0 Hz"),
-    ({"errors_hz": [-380]}, "between 0 and 400 Hz"),
+    ({"errors_hz": [-20]}, "moves the one at 20 Hz to 0 Hz"),
+    ({"errors_hz": [380]}, "between 0 and 400 Hz"),
     ({"sensor_gains": [0.5, 0]}, "sensor_gains must be above 0"),
     ({"sensor_gains": "wide"}, "sensor_gains must be an array of numbers"),
     ({"delay_errors_frames": [-1.5]}, "delay_errors_frames must be at least -1"),

@@ -29,7 +29,7 @@ from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.full_state import FullStatePlant
 from lbt_synth.models.plant.parts import PlantParts, held_frames, noise_factor
 from lbt_synth.models.vibration.resonance import Vibration
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number, one_or_each
+from lbt_synth.validation import FloatArray, frozen_copy, integer, one_or_each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -294,15 +294,17 @@ def _companion(coefficients: FloatArray) -> FloatArray:
     return A
 
 
-def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") -> TipTiltPlant:
+def retuned_plant(
+    plant: TipTiltPlant, shift_hz: float | Sequence[float], *, hold: str = "rms"
+) -> TipTiltPlant:
     """Return a plant whose model has every vibration at another frequency.
 
     Parameters
     ----------
     plant : TipTiltPlant
         The plant.
-    shift_hz : float
-        Added to the frequency of each vibration [Hz].
+    shift_hz : float or sequence of float
+        Added to the frequency of each vibration [Hz]; one for all of them, or one for each.
     hold : {"rms", "driving"}, optional
         What stays: the rms of each vibration, or that of its driving noise.
 
@@ -327,13 +329,13 @@ def retuned_plant(plant: TipTiltPlant, shift_hz: float, *, hold: str = "rms") ->
     >>> lbt.models.retuned_plant(plant, -3.5).vibrations[0].frequency_hz
     16.5
     """
-    shift = number(shift_hz, "shift_hz")
+    shifts = np.broadcast_to(one_or_each(shift_hz, "shift_hz"), (len(plant.vibrations),))
     rate = plant.hardware.frame_rate_hz
     return with_vibrations(
         plant,
         [
-            line.retuned(line.frequency_hz + shift, frame_rate_hz=rate, hold=hold)
-            for line in plant.vibrations
+            line.retuned(line.frequency_hz + float(shift), frame_rate_hz=rate, hold=hold)
+            for line, shift in zip(plant.vibrations, shifts, strict=True)
         ],
     )
 

@@ -94,7 +94,7 @@ def _strehl_chart(report: DesignReport) -> Chart:
 
 def _residual_chart(report: DesignReport) -> Chart:
     study = report.limits
-    panel = limits_panel(study, FREQUENCY_ERROR, -study.shift_hz + 0.0, str)
+    panel = limits_panel(study, FREQUENCY_ERROR, study.shift_hz, str)
     limits = [f"{rule.name} {fixed_text(rule.at, 1)} nm" for rule in panel.select(Rule)]
     worst = [f"{row.design} {fixed_text(row.worst_nm, 1)} nm" for row in study.rows if row.stable]
     return chart(

@@ -48,7 +48,7 @@ class DesignReport:
     frequency_hz : (f,) ndarray
         Frequencies of the transfer functions [Hz].
     errors_hz : (e,) ndarray
-        Frequency errors, design less truth [Hz]; only 0 where the truth has no vibration.
+        Frequency errors, truth less design [Hz]; only 0 where the truth has no vibration.
     files : tuple of SourceFile
         Digests of the files that were read.
     versions : tuple of (str, str)
@@ -197,10 +197,10 @@ def frequency_errors(config: Config) -> FloatArray:
     lines = [line.frequency_hz for line in stationary_vibrations(config.truth.vibrations)]
     if not lines:
         return frozen_copy([0.0])
-    fine = refine_values([*config.settings.robustness.errors_hz, 0.0])
-    nyquist = config.hardware.frame_rate_hz / 2
-    kept = (min(lines) - fine > 0) & (max(lines) - fine < nyquist)
-    return frozen_copy(fine[kept])
+    nyquist_hz, shift = config.hardware.frame_rate_hz / 2, config.truth.frequency_shift_hz
+    fine = refine_values([*config.errors_hz, 0.0]).tolist()
+    kept = [e for e in fine if all(0 < f + shift(f, e) < nyquist_hz for f in lines)]
+    return frozen_copy(kept)
 
 
 def refine_values(values: Sequence[float]) -> FloatArray:

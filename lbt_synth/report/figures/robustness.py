@@ -14,7 +14,7 @@ from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figu
 from lbt_synth.report.charts.scales import STREHL_LEVELS, count_columns, strehl_scale
 from lbt_synth.studies import RobustnessMap, RobustnessRow
 
-FREQUENCY_ERROR = Axis(label="frequency error, design less truth", unit="Hz")
+FREQUENCY_ERROR = Axis(label="frequency error, truth less design", unit="Hz")
 
 
 def robustness_figure(

@@ -38,7 +38,7 @@ class PlannedRow:
     table: str  # "II" or "III"
     label: str
     method: str
-    error_hz: float | None  # of the model's frequency; None without vibration
+    error_hz: float | None  # true frequency less the model's; None without vibration
     paper: float  # the paper's Strehl ratio [%], or nan
     controller: Controller  # of tip and tilt
     truth: Truth
@@ -53,7 +53,7 @@ class EndToEndEntry:
     label: str = column("row", key="row", help="Its row")
     method: str = column("method", help="Its controller")
     error_hz: float | None = column(
-        unit="Hz", help="Frequency of the model less that of the vibration"
+        unit="Hz", help="Frequency of the vibration less that of the model"
     )
     strehls: tuple[float, ...] = field()
     strehl: float = column(
@@ -154,7 +154,7 @@ def _plan_line(
     plan = functools.partial(_plan_row, setup, line, seeds)
     true_hz = moved_hz = None
     if line.error_hz is not None:
-        true_hz, moved_hz = VIBRATION_HZ, VIBRATION_HZ - line.error_hz
+        true_hz, moved_hz = VIBRATION_HZ, VIBRATION_HZ + line.error_hz
     if line.table == "II":
         gain = CLASSICAL_GAIN_VIBRATION if line.vibration else CLASSICAL_GAIN
         classical = integrator(setup.system.hardware, gain=gain).controller

@@ -43,8 +43,8 @@ class PublishedRow(NamedTuple):
 
     @property
     def error_hz(self) -> float | None:
-        """Frequency of the model less that of the vibration [Hz]; None without one."""
-        return self.model_hz - VIBRATION_HZ if self.vibration else None
+        """Frequency of the vibration less that of the model [Hz]; None without one."""
+        return VIBRATION_HZ - self.model_hz if self.vibration else None
 
     @property
     def label(self) -> str:

@@ -62,7 +62,7 @@ def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
     assert [panel.get_title(loc="left") for panel in (left, right)] == ["Kalman", "H-infinity"]
     assert bar.get_xlabel() == "Strehl ratio [%]"
     assert left.get_ylabel() == "sensor gain [-]"
-    assert left.get_xlabel() == "frequency error, design less truth [Hz]"
+    assert left.get_xlabel() == "frequency error, truth less design [Hz]"
     assert "unstable loop" in [text.get_text() for text in figure.legends[0].get_texts()]
     unstable = [[c.get_hatch() for c in p.collections].count("////") for p in (left, right)]
     assert unstable == [1, 2]  # the Kalman filter at 3, the other at 0.3 as well
