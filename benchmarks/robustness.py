@@ -154,7 +154,7 @@ def draw(every: dict[str, lbt.Design], bands: dict[float, float]) -> None:
                 list(zip(every.items(), styles, colours, strict=True)), transient=True
             ):
                 found = lbt.studies.robustness_map(
-                    design, TRUTH, CAMERA, errors_hz=-shifts, sensor_gains=[gain]
+                    design, TRUTH, CAMERA, errors_hz=shifts, sensor_gains=[gain]
                 )
                 axis.plot(20 + shifts, 100 * found.strehl[0, 0], ls=style, color=colour, label=name)
             axis.axhline(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
+from lbt_synth.design.expected_disturbance import expected_disturbance
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop import (
     EnsembleVibration,
@@ -172,6 +173,9 @@ class RobustnessMap:
         Residual of the modes [nm rms]; nan where the loop is unstable.
     stable : (d, g) bool ndarray
         Whether the loop is stable, which a frequency error does not change.
+    band_hz : tuple of float or None
+        Errors at which the vibration that moves most is within a band of the design [Hz]; None
+        for a design without a band around it.
     """
 
     errors_hz: FloatArray
@@ -180,6 +184,7 @@ class RobustnessMap:
     strehl: FloatArray
     residual_nm: FloatArray
     stable: BoolArray
+    band_hz: tuple[float, float] | None = None
 
 
 def robustness_map(
@@ -290,7 +295,20 @@ def robustness_map(
         strehl=read_only(strehls),
         residual_nm=read_only(residuals),
         stable=read_only(stable[..., 0]),
+        band_hz=_errors_in_band(design, truth),
     )
+
+
+def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
+    """Return the errors at which the vibration that moves most is within a band of the design."""
+    lines = [line.frequency_hz for line in stationary_vibrations(truth.vibrations)]
+    expected = expected_disturbance(design)
+    if not lines or expected is None:
+        return None
+    most_hz = max(lines, key=lambda f: truth.frequency_shift_hz(f, 1.0))
+    bands = (band for mode in expected for band in mode.bands)
+    held = (band for band in bands if band.low_hz <= most_hz <= band.high_hz)
+    return next(((band.low_hz - most_hz, band.high_hz - most_hz) for band in held), None)
 
 
 def _checked_hardware(design: Design) -> LoopHardware:

@@ -12,6 +12,9 @@ from support.plants import LBT_YAML, lbt_axis_plant
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
+from lbt_synth.design.expected_disturbance import expected_disturbance
+from lbt_synth.methods.registry import gain_robust_method
+from lbt_synth.methods.request import PlantInputs, design_request
 
 
 def test_robustness_rows(config):
@@ -279,6 +282,23 @@ def test_each_line_moves_by_its_share(kalman, settings):
     assert residual(stated, -2.0) == pytest.approx(at(0.2, 18.0), rel=1e-12)
     fixed = replace(truth, frequency_errors_hz=(0.0, 2.0))
     assert residual(fixed, -3.5) == pytest.approx(at(0.3, 16.5), rel=1e-12)
+
+
+def test_a_map_knows_the_band_of_its_design(kalman, settings):
+    inputs = PlantInputs(plant=settings.plant)
+    robust = design_request(gain_robust_method(), {}).build(inputs)
+
+    def band(design, truth):
+        return lbt.studies.robustness_map(
+            design, truth, settings.imaging, errors_hz=[0], sensor_gains=[1]
+        ).band_hz
+
+    assert band(kalman, settings.truth) is None
+    low, high = band(robust, settings.truth)
+    (edges,) = {(part.low_hz, part.high_hz) for part in expected_disturbance(robust)[0].bands}
+    assert (20.0 + low, 20.0 + high) == pytest.approx(edges)
+    assert band(robust, replace(settings.truth, vibrations=(sinusoid(70.0),))) is None
+    assert band(robust, replace(settings.truth, vibrations=())) is None
 
 
 def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):

@@ -172,6 +172,11 @@ def map_panels(
             ]
             if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
                 marks.append(Rule(name="real sensor gain", at=real_gain, axis="y", dash=1))
+            marks += [
+                Rule(name="edge of the design's band", at=edge, dash=2)
+                for edge in found.band_hz or ()
+                if found.errors_hz.min() < edge < found.errors_hz.max()
+            ]
             y = Axis(label="sensor gain", unit="-")
             panels.append(Panel(title=f"{name}{late}", x=x, y=y, marks=tuple(marks), height_in=2.3))
     return tuple(panels)
