@@ -205,9 +205,13 @@ def coverage(results: list[dict]) -> None:
     """Print how often estimates lie within 1 and 1.96 of their standard errors of the truth."""
     print("estimates within 1 and 1.96 standard errors of the truth (68 and 95 %)")
     for name in results[0]["errors"]:
-        away = np.abs([value for r in results for value in r["errors"][name]])
-        inside = [100 * np.mean(away < reach) for reach in (1, 1.96)]
-        print(f"  {name:16s} {away.size:4d} {inside[0]:6.1f} % {inside[1]:6.1f} %")
+        away = np.array([value for r in results for value in r["errors"][name]])
+        if away.size:
+            inside = [100 * np.mean(np.abs(away) < reach) for reach in (1, 1.96)]
+            print(
+                f"  {name:26s} {away.size:4d} {inside[0]:6.1f} % {inside[1]:6.1f} %, mean "
+                f"{np.mean(away):5.2f}, deviation {np.std(away):.2f}"
+            )
 
 
 def only_errors(seed: int, frames: int) -> dict:

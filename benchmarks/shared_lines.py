@@ -1,6 +1,7 @@
 """Lines along diagonals, and what only looks like them: what is found, how well, what it is worth.
 
     python benchmarks/shared_lines.py [--records 100] [--jobs 2] [--seconds 60]
+    python benchmarks/shared_lines.py --errors    only how honest the standard errors are
 
 Two axes at 1 kHz with a delay of 2 frames, integrator, sensor gain, noise, turbulence and lines as
 in benchmarks/identification.py (odd records: frozen flow). Four sets:
@@ -23,6 +24,7 @@ from functools import partial
 from unittest import mock
 
 import numpy as np
+from identification import coverage
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit import both_axes
@@ -148,9 +150,8 @@ def judged(
     spare, out = list(model.shared), []
     real = [line for line in truth.vibrations if min(np.abs(line.direction)) > 0]
     for line in real:
-        angle = np.degrees(np.arctan2(line.direction[1], line.direction[0]))
-        bound = np.sqrt(line.frequency_hz * line.damping / (2 * np.pi * 60))
-        reach = line.frequency_hz if kind == "air" else max(0.1, 5 * bound)
+        angle = angle_deg(line)
+        reach = line.frequency_hz if kind == "air" else reach_hz(line)
         near = [x for x in spare if abs(x.frequency_hz - line.frequency_hz) < reach]
         fact = {"angle": angle, "clear": clear(truth, line), "found": bool(near)}
         if near:
@@ -170,8 +171,8 @@ def judged(
     return out, sum(not any(each) for each in near)
 
 
-def studied(kind: str, seed: int, frames: int) -> dict:
-    """Everything that is measured of one record."""
+def run_loop(kind: str, seed: int, frames: int) -> tuple[lbt.Truth, lbt.identification.LoopRecord]:
+    """Return a truth, and the record of a loop that it shook."""
     truth, gain = draw_truth(kind, seed)
     path = lbt.LoopHardware(frame_rate_hz=RATE)
     run = lbt.simulate(
@@ -185,6 +186,68 @@ def studied(kind: str, seed: int, frames: int) -> dict:
     record = lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
+    return truth, record
+
+
+def only_errors(kind: str, seed: int, frames: int) -> dict:
+    """Return how far the estimates of a record are from the truth, in their standard errors."""
+    truth, record = run_loop(kind, seed, frames)
+    model = lbt.identify(record)
+    noise = float(np.max(truth.noise_nm))
+    gains = {(axis.sensor_gain, axis.sensor_gain_error) for axis in model.axes}
+    errors = {
+        "sensor gain": [(g - truth.sensor_gain) / error for g, error in gains if error is not None],
+        "noise": [(axis.noise_nm - noise) / axis.noise_error_nm for axis in model.axes],
+    }
+    for name, diagonal in (("line of an axis", False), ("shared line", True)):
+        lines = [v for v in truth.vibrations if (min(np.abs(v.direction)) > 0) == diagonal]
+        pairs = pair_lines(lines, [part for part in model.parts if part.kind == "line"])
+        errors |= {
+            f"{name}, frequency": [
+                (x.frequency_hz - v.frequency_hz) / x.frequency_error_hz for v, x in pairs
+            ],
+            f"{name}, rms": [(x.rms_nm - v.rms_nm) / x.rms_error_nm for v, x in pairs],
+            f"{name}, damping": [(x.damping - v.damping) / x.damping_error for v, x in pairs],
+        }
+    errors["shared line, direction"] = [
+        (np.degrees(np.arctan(np.tan(np.radians(x.direction_deg - angle_deg(v))))))
+        / x.direction_error_deg
+        for v, x in pairs
+    ]
+    return {"errors": errors, "frozen": isinstance(truth.turbulence, lbt.Atmosphere)}
+
+
+def angle_deg(line: lbt.Vibration) -> float:
+    """Return the direction of a line [degrees]."""
+    return float(np.degrees(np.arctan2(line.direction[1], line.direction[0])))
+
+
+def pair_lines(lines: list[lbt.Vibration], found: list) -> list[tuple]:
+    """Return the lines, the strongest first, with the nearest found along as many axes."""
+    spare, out = list(found), []
+    for line in sorted(lines, key=lambda v: -v.rms_nm):
+        shared = min(np.abs(line.direction)) > 0
+        near = [
+            x
+            for x in spare
+            if (x.direction_error_deg is not None) == shared
+            and (shared or np.allclose(x.direction, line.direction))
+            and abs(x.frequency_hz - line.frequency_hz) < reach_hz(line)
+        ]
+        if near:
+            out.append((line, min(near, key=lambda x: abs(x.frequency_hz - line.frequency_hz))))
+            spare.remove(out[-1][1])
+    return out
+
+
+def reach_hz(line: lbt.Vibration) -> float:
+    """Return how far from a line its estimate from a minute may lie [Hz]."""
+    return max(0.1, 5 * float(np.sqrt(line.frequency_hz * line.damping / (2 * np.pi * 60))))
+
+
+def studied(kind: str, seed: int, frames: int) -> dict:
+    """Everything that is measured of one record."""
+    truth, record = run_loop(kind, seed, frames)
     couple, alone = both_axes.couple_axes, {}
 
     def watched(record, axes, *rest):
@@ -270,12 +333,20 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS)
+    parser.add_argument("--errors", action="store_true", help="only the standard errors")
     asked = parser.parse_args()
-    seeds = range(asked.first, asked.first + asked.records)
+    seeds, frames = range(asked.first, asked.first + asked.records), int(asked.seconds * RATE)
     with ProcessPoolExecutor(asked.jobs) as pool:
         for kind in asked.sets:
-            one = partial(studied, kind, frames=int(asked.seconds * RATE))
-            table(kind, list(pool.map(one, seeds)))
+            study = partial(only_errors if asked.errors else studied, kind, frames=frames)
+            results = list(pool.map(study, seeds))
+            if not asked.errors:
+                table(kind, results)
+                continue
+            for frozen in (False, True):
+                some = [r for r in results if r["frozen"] == frozen]
+                print(f"{kind}, {'frozen flow' if frozen else 'second order'}: {len(some)} records")
+                coverage(some)
 
 
 if __name__ == "__main__":

@@ -87,8 +87,12 @@ def log_density(
     )
 
 
-def log_roll_off(corner: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Logarithm of the power response of a first-order low pass, and its derivative, (f,)."""
+def log_roll_off(corner: float, order: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Logarithm of the power response of low passes, ``order`` of first order, and its derivative.
+
+    The derivative is by the logarithm of the corner; both are (f,) as s is.
+    """
     gap, pole = -np.expm1(-corner), np.exp(-corner)
     size = gap**2 + pole * s
-    return np.log(gap**2 / size), corner * pole * (2 / gap - (2 * gap - s) / size)
+    slope = corner * pole * (2 / gap - (2 * gap - s) / size)
+    return order * np.log(gap**2 / size), order * slope

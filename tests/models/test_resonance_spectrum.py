@@ -55,9 +55,10 @@ def test_density_has_unit_variance_and_passes_critical_damping_smoothly() -> Non
 def test_roll_off_has_unit_gain_at_zero_and_a_right_derivative() -> None:
     s = np.array([0.0, 1e-4, 0.5, 4.0])
     for corner in (1e-3, 0.2, 3.0):
-        value, slope = log_roll_off(corner, s)
+        value, slope = log_roll_off(corner, 5 / 6, s)
         assert value[0] == 0
         numeric = (
-            log_roll_off(corner * np.exp(1e-6), s)[0] - log_roll_off(corner * np.exp(-1e-6), s)[0]
+            log_roll_off(corner * np.exp(1e-6), 5 / 6, s)[0]
+            - log_roll_off(corner * np.exp(-1e-6), 5 / 6, s)[0]
         ) / 2e-6
         assert slope == pytest.approx(numeric, abs=1e-8)

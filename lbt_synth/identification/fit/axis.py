@@ -21,6 +21,7 @@ from lbt_synth.identification.fit.periodogram import (
 from lbt_synth.identification.fit.physical_parameters import (
     WIDE_DAMPING,
     describe_axis,
+    hold_gain,
     parameter_covariance,
     standard_errors,
 )
@@ -52,7 +53,7 @@ def identify_axis(
 
     The pseudo-open-loop measurement ``y(k) + g c(k)``, with c(k) the correction that y(k)
     contains and g the sensor gain, is g times the phase plus the noise. Its spectrum is the sum
-    of turbulence (a second-order process, with a first-order low pass if the data ask for it),
+    of turbulence (a second-order process, with the roll-off of tilt if the data ask for it),
     resonances and white noise. The Whittle likelihood chooses all parameters, the sensor gain
     among them, and a penalised criterion the number of resonances.
 
@@ -127,6 +128,8 @@ def identify_axis(
     model = search_model(search, None if start is None else start.fitted_model.spectrum)
     if sensor_gain is not None:
         relative = given_error / sensor_gain
+        if relative:
+            model = hold_gain(search, model, relative)
         note = "given" if data.closed else "given: the series is divided by it"
         return describe_axis(search, model, relative or None, note)
     if not data.closed:

@@ -243,9 +243,6 @@ def _pool_gains(
         values = ", ".join(f"{g:.3f} +- {e:.3f}" for g, e in zip(gains, errors, strict=True))
         return axes, f"warning: the axes have different sensor gains, {values}"
     gain, error = float(np.exp(mean)), 1 / float(np.sqrt(np.sum(weight)))
-    if any(axes[i].turbulence_fit.corner_hz is not None for i in found_gain):
-        # what a model of finite order leaves of turbulence shifts the gains of all axes alike
-        error = float(np.min(errors / gains))
     pooled = fit([gain] * len(axes), axes, gain * error)
     notes = ["that of the other axis"] * len(axes)
     for i in found_gain:

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
-from lbt_synth.identification.fit.joint_whittle import JointFit, JointPeriodogram, JointSearch
+from lbt_synth.identification.fit.joint_whittle import (
+    JointFit,
+    JointPeriodogram,
+    JointSearch,
+    joint_derivatives,
+)
 from lbt_synth.identification.fit.periodogram import cross_periodogram
-from lbt_synth.identification.fit.physical_parameters import describe_axis
+from lbt_synth.identification.fit.physical_parameters import (
+    describe_axis,
+    gain_error_covariance,
+)
 from lbt_synth.identification.fit.shared_lines import find_shared
-from lbt_synth.identification.fit.whittle import FittedModel, contrast, invert_information
+from lbt_synth.identification.fit.whittle import (
+    GAIN,
+    FittedModel,
+    contrast,
+    invert_information,
+)
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches
+from lbt_synth.validation import FloatArray
+
+_DIFFERENCE = 1e-4  # of a logarithm
 
 
 def couple_axes(
@@ -25,7 +42,8 @@ def couple_axes(
 
     Axes that share nothing are returned as they are.
     """
-    search = _joint_search(record, axes, stretches, lowest_line_hz)
+    search_at = partial(_joint_search, record, stretches=stretches, lowest_line_hz=lowest_line_hz)
+    search = search_at(axes)
     fit, ellipses = find_shared(search, [axis.fitted_model for axis in axes])
     notes = [
         f"the lines of both axes at {frequency:.4g} Hz move on an ellipse, with a phase between "
@@ -35,12 +53,13 @@ def couple_axes(
     fit = None if fit is None else search.fit(fit.joint, exact=True)
     if fit is None:
         return list(axes), (), notes
+    fit = _add_gain_errors(fit, axes, search_at)
     coupled = [_describe_axis(search, fit, i, axis) for i, axis in enumerate(axes)]
     parts, shared = [list(axis.parts) for axis in coupled], []
     for k, tie in enumerate(fit.joint.ties):
         places = [_rank(fit, axis, place) for axis, place in enumerate(tie.parts)]
         shares = [own[place] for own, place in zip(parts, places, strict=True)]
-        line = _describe_line(fit, k, shares, coupled)
+        line = _describe_line(fit, k, shares)
         for own, place, share in zip(parts, places, shares, strict=True):
             own[place] = replace(
                 share, direction=line.direction, direction_error_deg=line.direction_error_deg
@@ -70,6 +89,37 @@ def _joint_search(
     )
 
 
+def _add_gain_errors(
+    fit: JointFit,
+    axes: Sequence[IdentifiedAxis],
+    search_at: Callable[[Sequence[IdentifiedAxis]], JointSearch],
+) -> JointFit:
+    """Return a fit with what the errors of the gains add to its covariance.
+
+    ``search_at`` returns the periodograms at the gains of the axes.
+    """
+    starts, covariance = np.array(fit.joint.starts), fit.covariance
+
+    def gradient(step: FloatArray) -> FloatArray:
+        """Return the gradient of the contrast at gains that differ by logarithms (2,)."""
+        theta = fit.joint.pack()
+        theta[starts + GAIN] += step
+        joint = fit.joint.unpack(theta)
+        each = zip(axes, joint.axes, strict=True)
+        search = search_at([replace(axis, sensor_gain=model.gain) for axis, model in each])
+        return joint_derivatives(search.merge(joint), joint)[1]
+
+    one_gain = axes[0].sensor_gain == axes[1].sensor_gain
+    for members in [[0, 1]] if one_gain else [[0], [1]]:
+        step = np.zeros(2)
+        step[members] = _DIFFERENCE
+        slope = (gradient(step) - gradient(-step)) / (2 * _DIFFERENCE)
+        error = (axes[members[0]].sensor_gain_error or 0.0) / axes[members[0]].sensor_gain
+        places = (starts[members] + GAIN).tolist()
+        covariance = covariance + gain_error_covariance(fit.covariance, slope, places, error)
+    return replace(fit, covariance=covariance)
+
+
 def _describe_axis(
     search: JointSearch, fit: JointFit, i: int, alone: IdentifiedAxis
 ) -> IdentifiedAxis:
@@ -96,19 +146,16 @@ def _rank(fit: JointFit, axis: int, place: int) -> int:
     return order.index(place)
 
 
-def _describe_line(
-    fit: JointFit, k: int, shares: Sequence[IdentifiedLine], axes: Sequence[IdentifiedAxis]
-) -> IdentifiedLine:
+def _describe_line(fit: JointFit, k: int, shares: Sequence[IdentifiedLine]) -> IdentifiedLine:
     """Return the resonance of tie k, with its size along its direction, from its shares."""
     tie = fit.joint.ties[k]
     first, second = (share.rms_nm for share in shares)
     rms = float(np.hypot(first, second))
     along = np.array([first, second * np.sign(np.cos(tie.phase))]) / rms
     places = [fit.joint.place(axis, part) + 2 for axis, part in enumerate(tie.parts)]
-    logs = fit.covariance[np.ix_(places, places)] / 4  # of the logarithms of both rms
-    gains = [(axis.sensor_gain_error or 0.0) / axis.sensor_gain for axis in axes]
-    one_gain = axes[0].sensor_gain == axes[1].sensor_gain
-    logs = logs + (np.full((2, 2), gains[0] * gains[1]) if one_gain else np.diag(gains) ** 2)
+    slope = np.zeros((2, len(fit.covariance)))  # of the logarithms of both rms
+    slope[[0, 1], places], slope[[0, 1], fit.joint.starts] = 0.5, -1.0
+    logs = slope @ fit.covariance @ slope.T
     size, turn = along**2, along[0] * along[1] * np.array([-1.0, 1.0])
     error = None if tie.whole else float(np.degrees(np.sqrt(max(turn @ logs @ turn, 0.0))))
     return replace(

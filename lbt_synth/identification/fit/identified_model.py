@@ -100,7 +100,7 @@ class IdentifiedLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentifiedTurbulence:
-    """The slow part of a spectrum: a resonance with a low pass, or without.
+    """The slow part of a spectrum: a resonance with the roll-off of tilt, or without.
 
     Attributes
     ----------
@@ -109,9 +109,10 @@ class IdentifiedTurbulence:
     damping, damping_error : float
         Its damping ratio (1 and more: two real poles) and the standard error.
     corner_hz, corner_error_hz : float or None
-        Corner of a first-order low pass behind it, and its standard error [Hz]; None for none.
+        Corner beyond which its density falls by another f^(-5/3), as that of frozen flow does, and
+        its standard error [Hz]; None for none.
     rms_nm, rms_error_nm : float
-        Standard deviation and its standard error [nm].
+        Standard deviation of the process that is nearest, and its standard error [nm].
     """
 
     frequency_hz: float

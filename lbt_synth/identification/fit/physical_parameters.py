@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from lbt_synth.identification.fit.fitting import Search
@@ -15,9 +18,12 @@ from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import (
     GAIN,
     FittedModel,
+    Priors,
     SpectrumModel,
     densities,
+    derivatives,
     invert_information,
+    minimise,
 )
 from lbt_synth.models import ARModel
 from lbt_synth.models.resonance_spectrum import coefficients
@@ -28,6 +34,7 @@ WIDE_DAMPING = 0.1
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 _DIFFERENCE = 1e-4  # of a logarithm
 _LAGS = 100
+_TURBULENCE = slice(2, 6)  # places of roll-off and turbulence in a packed vector
 _LOWEST = 3  # bins in which the ends of the taper show
 
 
@@ -41,6 +48,27 @@ def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> Spectrum
     return spectrum.unpack(np.sqrt(np.maximum(np.diag(covariance), 0)))
 
 
+def gain_error_covariance(
+    held: FloatArray, slope: FloatArray, gains: Sequence[int], error: float
+) -> FloatArray:
+    """Return what a relative error of gains adds to the covariance of a fit at them, (p, p).
+
+    The gains are in these places. They move the gradient of the contrast by ``slope`` (p,), and so
+    the parameters, whose covariance is ``held`` (p, p) where the gains have no error.
+    """
+    moves = -held @ slope
+    moves[list(gains)] = 1
+    return np.asarray(error**2 * np.outer(moves, moves))
+
+
+def hold_gain(search: Search, model: FittedModel, error: float) -> FittedModel:
+    """Return a model fitted at a gain, with the relative error of that in its information."""
+    slope = derivatives(search.merge(model.spectrum), model.spectrum)[2][GAIN]
+    held = parameter_covariance(model)
+    whole = held + gain_error_covariance(held, slope, [GAIN], error)
+    return replace(model, information=invert_information(whole))
+
+
 def describe_axis(
     search: Search, model: FittedModel, gain_error: float | None, note: str
 ) -> IdentifiedAxis:
@@ -51,8 +79,6 @@ def describe_axis(
     data, spectrum, gain = search.data, model.spectrum, model.spectrum.gain
     rate = data.frame_rate_hz
     covariance = parameter_covariance(model)
-    if gain_error is not None and not search.finds_gain:
-        covariance[GAIN, GAIN] = gain_error**2
     errors = standard_errors(spectrum, covariance)
     density, _, _ = densities(data, spectrum)
     fitted = density.sum(axis=0)
@@ -64,11 +90,12 @@ def describe_axis(
     for line, own in zip(lines, density[2:], strict=True):
         if line.kind == "line":
             background -= own
+    process = _turbulence_process(nearest_process(search, spectrum), rate)
     innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
     noise = max(float(np.exp(spectrum.log_noise / 2)), _LEAST_NOISE * innovation)
     return IdentifiedAxis(
-        turbulence=_turbulence_process(spectrum, rate),
-        turbulence_fit=_describe_turbulence(spectrum, errors, covariance, rate),
+        turbulence=process,
+        turbulence_fit=_describe_turbulence(spectrum, errors, covariance, process),
         parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
@@ -127,6 +154,23 @@ def _describe_line(
     )
 
 
+def nearest_process(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
+    """Return a model whose turbulence is a process of finite order, the nearest by its likelihood.
+
+    No process falls as tilt does.
+    """
+    if not spectrum.rolls_off:
+        return spectrum
+    data = search.merge(spectrum)
+    fitted, zero = densities(data, spectrum)[0].sum(axis=0), np.zeros_like(data.measured)
+    data = replace(data, measured=fitted, crossed=zero, corrected=zero)
+    start = replace(spectrum, roll_off_order=1.0)
+    width = np.zeros(start.pack().size)
+    width[_TURBULENCE] = np.inf
+    found = minimise(data, start, Priors(centre=start.pack(), width=width))
+    return start if found is None else found.spectrum
+
+
 def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
     """Return the turbulence as a process of the phase."""
     slow = spectrum.components[0]
@@ -141,10 +185,10 @@ def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
 
 
 def _describe_turbulence(
-    spectrum: SpectrumModel, errors: SpectrumModel, covariance: FloatArray, rate: float
+    spectrum: SpectrumModel, errors: SpectrumModel, covariance: FloatArray, process: ARModel
 ) -> IdentifiedTurbulence:
     """Return the parameters of the turbulence; the error of its rms is by differences."""
-    theta = spectrum.pack()
+    theta, rate = spectrum.pack(), process.frame_rate_hz
 
     def rms(change: FloatArray) -> float:
         return _turbulence_process(spectrum.unpack(theta + change), rate).rms_nm
@@ -160,8 +204,8 @@ def _describe_turbulence(
         damping_error=turbulence.damping_ratio * turbulence.damping_slope * error.damping,
         corner_hz=corner,
         corner_error_hz=None if corner is None else corner * errors.log_corner,
-        rms_nm=rms(np.zeros(theta.size)),
-        rms_error_nm=rms(np.zeros(theta.size)) * float(np.sqrt(slope @ covariance @ slope)),
+        rms_nm=process.rms_nm,
+        rms_error_nm=process.rms_nm * float(np.sqrt(slope @ covariance @ slope)),
     )
 
 

@@ -39,6 +39,7 @@ from lbt_synth.validation import ComplexArray, FloatArray
 _APART = 4.0  # standard errors between frequencies that differ
 _UNFITTED = 10.0  # log-likelihood that a fit may add to a line that the axes share
 _COHERENT = 0.5  # squared coherence of lines that are worth a fit all the same
+_ON_AXIS = 14.0  # logarithm of the powers of a line on both axes
 _HARDLY = 2.0  # the same of a part that one axis alone does not show
 _MOST_SHARED, _MOST_DAMPING = 0.95, 0.9  # of turbulence of both axes, to begin with
 _LEAST_SHARE = 0.3  # of the turbulence in a density that says whether the axes share it
@@ -90,7 +91,7 @@ def _share_lines(
 def _keep_asked(search: JointSearch, joint: JointSpectrum) -> JointFit | None:
     """Fit a model, and untie what the likelihood does not ask for; None if nothing is left."""
     while joint.ties:
-        fit = search.fit(joint)
+        fit = _fit_directions(search, joint)
         if fit is None:
             return None
         spare = [_spare(search, fit, k) for k in range(len(joint.ties))]
@@ -99,6 +100,25 @@ def _keep_asked(search: JointSearch, joint: JointSpectrum) -> JointFit | None:
             return fit
         joint = fit.joint.untie(worst)
     return None
+
+
+def _fit_directions(search: JointSearch, joint: JointSpectrum) -> JointFit | None:
+    """Fit a model; None if no fit settles.
+
+    A fit does not take a line across an axis: one that ends there begins again beyond it.
+    """
+    fit = search.fit(joint)
+    if fit is None:
+        return None
+
+    def turn(tie: Tie) -> Tie:
+        one, other = (c.components[i] for c, i in zip(fit.joint.axes, tie.parts, strict=True))
+        on_axis = abs(one.log_power - other.log_power) > _ON_AXIS
+        return replace(tie, phase=tie.phase + np.pi) if on_axis else tie
+
+    ties = tuple(turn(tie) for tie in joint.ties)
+    beyond = None if ties == joint.ties else search.fit(replace(joint, ties=ties))
+    return fit if beyond is None or beyond.lost(fit.joint) < 0 else beyond
 
 
 def _spare(search: JointSearch, fit: JointFit, k: int) -> float:

@@ -29,6 +29,7 @@ from lbt_synth.validation import FloatArray, IntArray
 
 GAIN = 0  # place of the sensor gain in a packed vector
 NO_CORNER = 50.0  # angle per frame; a corner above it is none
+_TILT_ORDER = 5 / 6  # of its roll-off: tilt falls with f^(-17/3), a second-order process with f^-4
 _LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
 _JUST_ABOVE = 1e-3
 
@@ -101,6 +102,7 @@ class SpectrumModel:
     log_noise: float  # of its variance
     log_corner: float  # of the roll-off of the turbulence, an angle per frame
     components: tuple[Component, ...]
+    roll_off_order: float = _TILT_ORDER  # 1 for a process of finite order
 
     def pack(self) -> FloatArray:
         """Return all parameters as a vector (p,)."""
@@ -112,7 +114,7 @@ class SpectrumModel:
         gain, noise, corner, *rest = vector.tolist()
         rows = zip(self.components, rest[::3], rest[1::3], rest[2::3], strict=True)
         each = (Component(c.kind, f, damping, power, c.announced) for c, f, damping, power in rows)
-        return SpectrumModel(gain, noise, corner, tuple(each))
+        return SpectrumModel(gain, noise, corner, tuple(each), self.roll_off_order)
 
     @property
     def gain(self) -> float:
@@ -212,7 +214,7 @@ def densities(
     count = len(spectrum.components)
     density, slopes = np.empty((1 + count, s.size)), np.empty((count, 2, s.size))
     density[0] = white * np.exp(spectrum.log_noise)
-    fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), s)
+    fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
     for c, own, slope in zip(spectrum.components, density[1:], slopes, strict=True):
         value, slope[0], slope[1] = log_density(c.frequency, c.damping_ratio, s)
         if c.kind == "turbulence":

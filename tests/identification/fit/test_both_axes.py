@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -12,7 +11,6 @@ from support.recorded_loops import LINE, integrator_loop, spliced_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.fit.both_axes import _pool_gains
 
 RATE = 1000.0
 
@@ -92,23 +90,6 @@ def test_innovations_that_are_not_white_are_noted() -> None:
         notes = [note for note in model.notes if "are not white" in note]
         assert len(notes) == count
         assert all("standard errors do not cover" in note for note in notes)
-
-
-def test_the_mean_gain_of_turbulence_that_rolls_off_is_no_surer_than_the_best() -> None:
-    y, c = integrator_loop(frames=4096)
-    axis = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6)
-    given: list[float] = []
-
-    def fit(gains, starts, error):
-        given.append(error / gains[0])
-        return list(starts)
-
-    for corner_hz in (None, 20.0):
-        turbulence = replace(axis.turbulence_fit, corner_hz=corner_hz, corner_error_hz=1.0)
-        one = replace(axis, turbulence_fit=turbulence, sensor_gain=0.6, sensor_gain_error=0.006)
-        other = replace(one, sensor_gain_error=0.008)
-        _pool_gains([one, other], [0, 1], fit)
-    assert given == pytest.approx([0.008, 0.01], rel=1e-6)
 
 
 def test_a_wide_resonance_is_no_turbulence() -> None:

@@ -7,6 +7,7 @@ import pytest
 from support.recorded_loops import RATE, open_record, slow
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.coupled_axes import couple_axes
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 
 ANGLE = 30.0
@@ -77,3 +78,37 @@ def test_errors_of_direction_frequency_and_size():
         )
     size = np.sqrt(np.mean(np.square(deviations), axis=0))
     assert np.all((size > 0.5) & (size < 1.6))
+
+
+def test_errors_hold_what_the_error_of_a_gain_moves():
+    """A fit at another gain says by how much."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE)
+    truth = lbt.Truth(turbulence=slow(), vibrations=(DIAGONAL,), noise_nm=6.0, sensor_gain=0.6)
+    ran = lbt.integrator(path, gain=0.2).controller
+    run = lbt.simulate(ran, truth, hardware=path, frames=8000)
+    record = lbt.identification.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+    )
+
+    def couple(gain: float, error: float):
+        axes = [
+            lbt.identification.identify_axis(
+                y,
+                c,
+                frame_rate_hz=RATE,
+                sensor_gain=gain,
+                sensor_gain_error=error,
+                stretches=record.stretches(),
+            )
+            for y, c in zip(record.measurements.T, record.corrections().T, strict=True)
+        ]
+        axes, (line,), _ = couple_axes(record, axes, record.stretches(), 3.0)
+        return (
+            np.array([line.rms_nm, axes[0].noise_nm]),
+            np.array([line.rms_error_nm, axes[0].noise_error_nm]),
+        )
+
+    values, held = couple(0.6, 0.0)
+    _, errors = couple(0.6, 0.06)
+    moved, _ = couple(0.606, 0.0)
+    assert np.sqrt(errors**2 - held**2) == pytest.approx(10 * np.abs(moved - values), rel=0.2)

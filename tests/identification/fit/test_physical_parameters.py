@@ -1,13 +1,20 @@
-"""Tests of whiteness: how often they refuse white noise, and what they see."""
+"""Whiteness, errors at a held gain, and the process of turbulence that falls as tilt does."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from support.recorded_loops import integrator_loop
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.physical_parameters import whiteness
+from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.order_search import search_model
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
+from lbt_synth.identification.fit.physical_parameters import (
+    describe_axis,
+    parameter_covariance,
+    whiteness,
+)
 
 RATE = 1000.0
 
@@ -38,3 +45,54 @@ def test_whiteness_of_white_noise_in_segments() -> None:
         # 120 trials: at most 6 below 1 %, and 16 below 5 %, with a probability of 0.999
         assert np.all(np.sum(np.array(p_values) < 0.01, axis=0) <= 6)
         assert np.all(np.sum(np.array(p_values) < 0.05, axis=0) <= 16)
+
+
+def expected_periodogram(air: lbt.Atmosphere, noise: float, gain: float) -> LoopPeriodogram:
+    """Return what the periodograms of a minute of an integrator's loop scatter about."""
+    f = np.arange(1, 30_000) / 60
+    delay = np.exp(-2j * np.pi * f / RATE)
+    loop = 0.4 * delay**2 / (1 - delay)  # from measurements to the corrections in them
+    measured = gain**2 * air.psd(f) + 2 / RATE * noise**2
+    measured = measured / np.abs(1 + gain * loop) ** 2
+    return LoopPeriodogram(
+        frequency_hz=f,
+        measured=measured,
+        crossed=loop.real * measured,
+        corrected=np.abs(loop) ** 2 * measured,
+        count=np.ones(f.size),
+        frame_rate_hz=RATE,
+        resolution_hz=1 / 60,
+    )
+
+
+@pytest.mark.parametrize("wind", [8.0, 20.0])
+def test_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
+    """Without chance in the data only the model can."""
+    air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=wind, diameter_m=8.22)
+    search = Search(data=expected_periodogram(air, 5.0, 0.6))
+    model = search_model(search)
+    error = float(np.sqrt(parameter_covariance(model)[0, 0]))
+    assert abs(model.spectrum.log_gain - np.log(0.6)) < 0.2 * error
+    # the process of the design is near to what was fitted, down to the noise
+    axis = describe_axis(search, model, error, "")
+    process = axis.turbulence.psd(axis.frequency_hz) + 2 / RATE * (axis.noise_nm / 0.6) ** 2
+    log_ratio = np.log(process / axis.fitted_nm2_hz)
+    assert np.max(np.abs(log_ratio[axis.frequency_hz > 0.3])) < 0.25
+    assert axis.turbulence.order == 3
+    assert axis.turbulence.rms_nm == pytest.approx(air.tilt_rms_nm, rel=0.05)
+
+
+def test_errors_at_a_held_gain_are_those_of_a_free_one() -> None:
+    y, c = integrator_loop(lines=((45, 0.02, 25),), gain=0.2, frames=12_000)
+    free = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    held = lbt.identification.identify_axis(
+        y[:, 0],
+        c[:, 0],
+        frame_rate_hz=RATE,
+        sensor_gain=free.sensor_gain,
+        sensor_gain_error=free.sensor_gain_error,
+    )
+    assert held.noise_error_nm == pytest.approx(free.noise_error_nm, rel=0.01)
+    (one,), (other,) = free.lines, held.lines
+    assert other.rms_error_nm == pytest.approx(one.rms_error_nm, rel=0.01)
+    assert held.sensor_gain_error == pytest.approx(free.sensor_gain_error)

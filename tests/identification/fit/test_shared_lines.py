@@ -7,6 +7,9 @@ import pytest
 from support.recorded_loops import integrator_loop, open_record
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.coupled_axes import _joint_search
+from lbt_synth.identification.fit.joint_whittle import JointSpectrum
+from lbt_synth.identification.fit.shared_lines import Place, _fit_directions, _tie
 
 
 def shaking(degrees: float, *, hz: float = 31.0, rms: float = 60.0) -> lbt.Vibration:
@@ -100,3 +103,15 @@ def test_axes_that_share_nothing_are_those_that_were_found_alone() -> None:
         )
         assert axis.parts == alone.parts
         assert axis.noise_nm == alone.noise_nm
+
+
+def test_a_line_that_begins_on_the_wrong_side_of_an_axis_is_taken_across() -> None:
+    record = open_record(((shaking(36), 0),))
+    axes = lbt.identify(record).axes
+    search = _joint_search(record, axes, record.stretches(), 3.0)
+    joint = JointSpectrum(axes=tuple(axis.fitted_model.spectrum for axis in axes))
+    for degrees in (36, -36):
+        made = _tie(joint, Place(0, 1), Place(1, 1), shaking(degrees).direction)
+        fit = _fit_directions(search, made)
+        assert fit is not None
+        assert np.cos(fit.joint.ties[0].phase) == pytest.approx(1)
