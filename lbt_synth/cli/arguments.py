@@ -53,6 +53,14 @@ def add_output(parser: ArgumentParser, text: str, *, required: bool = True) -> N
     parser.add_argument("-o", "--output", required=required, help=text)
 
 
+def add_unit(parser: ArgumentParser) -> None:
+    """Add the unit of wavefronts in tables, texts, figures and pages."""
+    from lbt_synth.storage.display_unit import UNITS
+
+    text = "what tables, figures and pages show wavefronts in (default nm; JSON and CSV stay in nm)"
+    add_option(parser, "--unit", UNITS, text)
+
+
 def add_outputs(parser: ArgumentParser) -> None:
     """Add any number of tables and figures."""
     text = "table (.csv) or figure (.png, .pdf, .svg); repeatable"
@@ -81,6 +89,8 @@ def design(parser: ArgumentParser) -> None:
     """Design a controller and write its gain file."""
     from lbt_synth.cli.method_options import add_method_options
 
+    add_unit(parser)
+
     add_config(parser)
     add_method_options(parser)
     add_output(parser, GAIN_FILE)
@@ -88,6 +98,7 @@ def design(parser: ArgumentParser) -> None:
 
 def show(parser: ArgumentParser) -> None:
     """Show a gain file: design, loop, margins, certificate."""
+    add_unit(parser)
     add_gain(parser)
     add_switch(parser, "--matrices", "print the gains and the controller")
 
@@ -117,6 +128,7 @@ def export(parser: ArgumentParser) -> None:
 
 def sigma(parser: ArgumentParser) -> None:
     """Plot singular values of one or several designs."""
+    add_unit(parser)
     add_gains(parser, "+")
     text = "real sensor gain, as a factor on the one that each design assumes"
     add_option(parser, "--sensor-gain", float, text, 1.0)
@@ -125,6 +137,7 @@ def sigma(parser: ArgumentParser) -> None:
 
 def report(parser: ArgumentParser) -> None:
     """Write a page about designs in the loop of a configuration."""
+    add_unit(parser)
     add_config(parser)
     add_gains(parser, "+")
     add_option(parser, "--title", str, "heading of the page (default: names the configuration)")
@@ -134,6 +147,7 @@ def report(parser: ArgumentParser) -> None:
 
 def simulate(parser: ArgumentParser) -> None:
     """Close the loop in the time domain, beside the exact answer."""
+    add_unit(parser)
     add_config(parser)
     add_gain(parser)
     add_option(parser, "--frames", int, "frames to keep")
@@ -263,11 +277,15 @@ def _add_record(parser: ArgumentParser) -> None:
 
 
 def _add_missing_facts(parser: ArgumentParser) -> None:
+    from lbt_synth.storage.display_unit import UNITS
+
     facts = parser.add_argument_group("what the file does not say")
     add_option(facts, "--kind", ("closed-loop", "open-loop", "spectrum"))
     add_option(facts, "--frame-rate-hz", float, "frame rate [Hz]")
     add_option(facts, "--delay-frames", float, "total delay [frames]")
-    add_option(facts, "--unit", str, "of the measurements: nm, um, m, mas, arcsec, urad, rad")
+    text = "of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too"
+    add_option(facts, "--unit", str, text)
+    add_option(facts, "--show-unit", UNITS, "what results are shown in (JSON and CSV stay in nm)")
     add_option(facts, "--command-unit", str, "of the commands (default: --unit)")
     add_option(facts, "--diameter-m", float, "telescope diameter [m], for angles")
     add_option(facts, "--obstruction", float, "as a fraction of the diameter")
@@ -319,6 +337,7 @@ def robustness(parser: ArgumentParser) -> None:
     It is that of filters redesigned at each error, or of the designs of gain files at many sensor
     gains.
     """
+    add_unit(parser)
     add_config(parser)
     add_gains(parser)
     redesigned = parser.add_argument_group("without gain files")
@@ -339,6 +358,7 @@ def robustness(parser: ArgumentParser) -> None:
 
 def tradeoff(parser: ArgumentParser) -> None:
     """Design filters from the least norm to the least variance, and compare their sensor gains."""
+    add_unit(parser)
     add_config(parser)
     text = "levels of the norm, from the least of any filter to that of the Kalman filter, 2 to 200"
     add_option(parser, "--points", int, text, 9)
@@ -349,6 +369,7 @@ def tradeoff(parser: ArgumentParser) -> None:
 
 def limits(parser: ArgumentParser) -> None:
     """Show how far designs are from the least residual of any linear controller."""
+    add_unit(parser)
     add_config(parser)
     add_gains(
         parser,
@@ -360,6 +381,7 @@ def limits(parser: ArgumentParser) -> None:
 
 def mirror(parser: ArgumentParser) -> None:
     """Show the step of the mirror's local loop, and what ignoring its dynamics costs."""
+    add_unit(parser)
     add_config(parser)
     text = "half width of the band in which the mirror counts as settled"
     add_option(parser, "--tolerance", float, text, 0.1)
@@ -375,6 +397,7 @@ def modal(parser: ArgumentParser) -> None:
 
 def study(parser: ArgumentParser) -> None:
     """Try controllers on many samples of what the loop may meet; resumes if started again."""
+    add_unit(parser)
     parser.add_argument("study", metavar="file", help="study file (YAML)")
     add_output(parser, "directory of the study")
     _add_engine(parser)

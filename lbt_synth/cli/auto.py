@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli import command_repairs, loop_records
+from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
@@ -15,6 +16,7 @@ from lbt_synth.identification.method_choice import MethodChoice
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.identification.prediction.residual_row import ResidualRow
 from lbt_synth.loop import Imaging, close_loop, loop_margins
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fill_row
 
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
@@ -25,6 +27,7 @@ def run(arguments: Namespace) -> Report:
     gain = require_gain_name(arguments.output)
     places = loop_records.find_places(arguments, arguments.model, gain=gain)
     record = loop_records.read_record(arguments, LEAST_SECONDS)
+    choose_unit(arguments, record.diameter_m)
     if isinstance(record, SpectrumRecord):
         raise ProblemError(
             "auto tests its design on the recorded series; got a spectrum. Try lbt-synth identify "
@@ -89,9 +92,9 @@ def _add_comparison(
     if record.commands is not None:
         ran = table[RAN]
         report.notes.append(
-            f"gain over what ran, on unseen data: residual {ran.replayed_nm:.4g} -> "
-            f"{best.replayed_nm:.4g} nm, {imaging.label} (tip and tilt) {ran.strehl:.3f} -> "
-            f"{best.strehl:.3f}."
+            f"gain over what ran, on unseen data: residual {nm_text(ran.replayed_nm, '.4g')} -> "
+            f"{nm_text(best.replayed_nm, '.4g')}, {imaging.label} (tip and tilt) "
+            f"{ran.strehl:.3f} -> {best.strehl:.3f}."
         )
         report.data["gain_over_what_ran"] = {
             "residual_nm": [ran.replayed_nm, best.replayed_nm],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli.design_description import describe_design
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
@@ -25,6 +26,7 @@ def run(arguments: Namespace) -> Report:
     request = design_request(arguments.method, given, _WORDING)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     with show_spinner(f"designing ({request.method.name})", quiet=arguments.json):
         design = config.design(request)
     path = save_gain(arguments.output, design)

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from lbt_synth.cli import loop_records
+from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.loop_inputs import given_options, load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
@@ -38,6 +39,7 @@ def run(arguments: Namespace) -> Report:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
     given = {} if arguments.gain is None else load_designs([arguments.gain])
     whole = _load(arguments)
+    choose_unit(arguments, whole.diameter_m)
     live = live_axes(whole)
     record = whole if len(live) in (0, whole.axes) else _load(arguments, live)
     with count_progress(total=_STEPS, what="diagnosing", quiet=arguments.json) as count:

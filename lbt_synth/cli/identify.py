@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli import command_repairs, loop_records
+from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.identification import LoopRecord, SpectrumRecord, identify
@@ -14,6 +15,7 @@ def run(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
     places = loop_records.find_places(arguments, arguments.output)
     record = loop_records.read_record(arguments)
+    choose_unit(arguments, record.diameter_m)
     options = loop_records.identification_options(arguments, record)
     notes: tuple[str, ...] = ()
     if isinstance(record, LoopRecord):

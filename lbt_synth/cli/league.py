@@ -11,6 +11,7 @@ from typing import Any
 from lbt_synth import studies
 from lbt_synth.cli import loop_records
 from lbt_synth.cli.command_repairs import judge_record
+from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.engine import choose_engine, require_jobs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
@@ -40,6 +41,8 @@ def run(arguments: Namespace) -> Report:
     refuse_replacing([*paths, *([pdf] if pdf else [])], arguments.files)
     with show_spinner("reading", quiet=arguments.json):
         records, options, notes = _read_records(arguments)
+    diameters = {record.diameter_m for record in records.values()}
+    choose_unit(arguments, diameters.pop() if len(diameters) == 1 else None)
     make_directory(folder)
     total = len(records) * arguments.splits * len(able)
     with (

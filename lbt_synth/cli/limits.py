@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth import studies
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import load_designs, loop_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
@@ -14,12 +15,14 @@ from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.report.figures import limits_figure
+from lbt_synth.storage.display_unit import nm_text
 
 
 def run(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
     require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     files = load_designs(arguments.gains)
     with show_spinner("comparing", quiet=arguments.json):
         designs = _config_designs(config)
@@ -75,8 +78,8 @@ def _limit_notes(study: studies.LimitStudy) -> list[str]:
         low, high = study.band_hz
         notes.append(
             f"least worst residual with the vibration anywhere from {low:g} to {high:g} Hz: "
-            f"{study.band.rms_nm:.6g} nm rms (a filter of infinite order achieves "
-            f"{study.band.achieved_nm:.6g})"
+            f"{nm_text(study.band.rms_nm, '.6g', unit='nm rms')} (a filter of infinite order "
+            f"achieves {nm_text(study.band.achieved_nm, '.6g')})"
         )
     return notes
 

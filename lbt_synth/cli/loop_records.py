@@ -38,6 +38,7 @@ from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
+from lbt_synth.storage.display_unit import shown_format, shown_unit
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 
 _FACTS = (  # that a file may not hold
@@ -301,7 +302,7 @@ def add_model(report: Report, model: IdentifiedModel) -> None:
         "Turbulence, noise and sensor",
         ("quantity", "axis", "value", "error", "unit"),
         [
-            (quantity, name, cell_text(value, digits), cell_text(error, ".2g"), unit)
+            (quantity, name, *_shown_cells(value, digits, error, unit))
             for name, axis in named_axes
             for quantity, value, digits, error, unit in _background(axis)
             if value is not None
@@ -330,6 +331,13 @@ def add_model(report: Report, model: IdentifiedModel) -> None:
     report.data["axes"] = [_axis_record(axis) for axis in model.axes]
     report.data["vibrations"] = [asdict(line) for line in model.parts]
     report.data["model_notes"] = model.notes
+
+
+def _shown_cells(value: float, digits: str, error: float | None, unit: str) -> tuple[str, str, str]:
+    """Return the cells of a value, its error and its unit."""
+    name, factor = shown_unit(unit)
+    size = None if error is None else factor * error
+    return cell_text(factor * value, shown_format(digits, factor)), cell_text(size, ".2g"), name
 
 
 def _direction_text(line: IdentifiedLine, names: Sequence[str]) -> str:

@@ -33,6 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     arguments = build_parser(named).parse_args(words)
     from lbt_synth.report.provenance import creation_time  # slow to import for --help
+    from lbt_synth.storage.display_unit import own_display_unit
 
     try:
         creation_time()  # refuses a wrong SOURCE_DATE_EPOCH before the libraries read it
@@ -40,7 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if signal.getsignal(signal.SIGINT) is _stop_loading:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             signal.signal(signal.SIGTERM, _terminate)
-        report = command.run(arguments)
+        with own_display_unit():
+            report = command.run(arguments)
     except LbtSynthError as error:
         message = _name_options(str(error), vars(arguments))
         if arguments.json:

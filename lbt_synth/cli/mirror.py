@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth import studies
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
@@ -39,6 +40,7 @@ def run(arguments: Namespace) -> Report:
     """Show how the mirror of a configuration settles, and compare designs on it."""
     require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     hardware, shell = config.hardware, _require_local_loop(config)
     step = shell.step_response(arguments.tolerance)
     with show_spinner("designing", quiet=arguments.json):

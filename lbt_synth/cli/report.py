@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from typing import Any
 
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
@@ -29,6 +30,7 @@ def run(arguments: Namespace) -> Report:
         raise ProblemError("--title must hold at least one letter; got an empty text.")
     require_letters(arguments.title or "", "--title")
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     designs = load_designs(arguments.gains)
     files = dict(zip(designs, arguments.gains, strict=True))
     total = count_steps(len(designs)) + 1

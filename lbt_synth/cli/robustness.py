@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from lbt_synth import studies
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import given_options, load_designs, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
@@ -34,6 +35,7 @@ def run(arguments: Namespace) -> Report:
     require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     _refuse_unused_options(arguments)
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     return (_map_designs if arguments.gains else _redesign)(config, arguments)
 
 

@@ -6,6 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from lbt_synth.cli.design_description import describe_design
+from lbt_synth.cli.display import choose_design_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
@@ -18,6 +19,7 @@ from lbt_synth.storage.rows import fact_table, json_record
 def run(arguments: Namespace) -> Report:
     """Describe the design in a gain file, what a frame costs, and its matrices if asked for."""
     design = load_gain(arguments.gain)
+    choose_design_unit(arguments, design)
     report = describe_design(design, matrices=arguments.matrices)
     cost = frame_cost(design)
     report.data |= {"file": arguments.gain, "frame_cost": json_record(cost)}

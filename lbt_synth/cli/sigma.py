@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from typing import Any
 
+from lbt_synth.cli.display import choose_design_unit
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure
@@ -13,6 +14,7 @@ from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.report.figures import sigma_figure
 from lbt_synth.report.figures.style import save_figure
+from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import columns, json_record, json_units
 
 
@@ -20,6 +22,7 @@ def run(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
     require_figure(arguments.output, inputs=arguments.gains)
     designs = load_designs(arguments.gains)
+    choose_design_unit(arguments, *designs.values())
     with show_spinner("drawing", quiet=arguments.json):
         figure = sigma_figure(designs, sensor_gain=arguments.sensor_gain)
     margins = {name: _margins(design, arguments.sensor_gain) for name, design in designs.items()}
@@ -27,12 +30,15 @@ def run(arguments: Namespace) -> Report:
     units = json_units(LoopMargins) | ({"gamma": "nm", "rms": "nm"} if physical else {})
     report = Report(data={"designs": margins, "units": units, "sensor_gain": arguments.sensor_gain})
     shown = [each for each in columns(LoopMargins) if each.heading]
-    quantities = [("norm", "gamma", units.get("gamma", "")), ("stable", "stable", "")]
-    quantities += [(each.heading, each.key, each.unit) for each in shown]
+    unit, factor = shown_unit(units.get("gamma", ""))
+    norms = [factor * known["gamma"] if "gamma" in known else None for known in margins.values()]
+    quantities = [("stable", "stable", "")]
+    quantities += [(each.heading, each.key, each.shown_unit) for each in shown]
     report.add_table(
         f"Margins at sensor gain {arguments.sensor_gain:g}",
         ("quantity", *margins, "unit"),
-        [
+        [("norm", *norms, unit)]
+        + [
             (heading, *(known.get(key) for known in margins.values()), unit)
             for heading, key, unit in quantities
         ],

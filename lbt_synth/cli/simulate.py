@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import given_options, loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure, write_telemetry
@@ -35,6 +36,7 @@ from lbt_synth.models import Truth
 from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import column, columns, fill_row, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
 
@@ -63,6 +65,7 @@ def run(arguments: Namespace) -> Report:
         require_telemetry_name(arguments.telemetry)
         require_writable(arguments.telemetry, inputs=inputs)
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     design = load_gain(arguments.gain)
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
@@ -123,20 +126,21 @@ def _describe_simulation(
             "seed": simulation.seed,
         }
     )
+    nm_rms, factor = shown_unit("nm rms")
     simulated = {
         "strehl_exact": 100 * float(np.mean(strehls)),
-        "residual_exact_nm": float(np.sqrt(np.mean(simulation.rms_nm**2))),
+        "residual_exact_nm": factor * float(np.sqrt(np.mean(simulation.rms_nm**2))),
     }
     report.add_table(
         f"{design.method} in the loop: {cases} run{'s' * (cases > 1)} of {frames} frames; "
         f"{imaging.label}",
         ("quantity", "simulated", "exact", "unit"),
         [
-            (each.heading, simulated.get(each.name), each.text(exact), each.unit)
+            (each.heading, simulated.get(each.name), each.text(exact), each.shown_unit)
             for each in columns(exact)
             if each.name in simulated or getattr(exact, each.name) is not None
         ]
-        + [("commands", command_rms, None, "nm rms")],
+        + [("commands", factor * command_rms, None, nm_rms)],
     )
     return report
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from lbt_synth import studies
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.engine import choose_engine, require_jobs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
@@ -30,6 +31,7 @@ def run(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     with show_spinner("reading the study, designing", quiet=arguments.json):
         loaded = studies.load_study(arguments.study, directory=folder)
+    choose_config_unit(arguments, loaded.config)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:
         return _dry_run(loaded, arguments)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import track_progress
 from lbt_synth.config import load_config
 from lbt_synth.report.figures import tradeoff_figure
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import tradeoff
 from lbt_synth.studies.tradeoff import FAMILIES
 from lbt_synth.validation import integer
@@ -20,6 +22,7 @@ def run(arguments: Namespace) -> Report:
     count = integer(arguments.points, "--points", at_least=2)
     taps = integer(arguments.taps, "--taps", at_least=1)
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     points = list(
         track_progress(
             tradeoff(config.plant, points=count, taps=taps),
@@ -33,8 +36,8 @@ def run(arguments: Namespace) -> Report:
     report.add_rows("points", "Trade-off of variance, norm and sensor gain", points)
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
     report.notes.append(
-        f"the least norm of any filter lies between {least.gamma_infeasible:.9g} and "
-        f"{least.gamma_least:.9g} nm"
+        f"the least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
+        f"{nm_text(least.gamma_least, '.9g')}"
     )
     write_outputs(report, arguments.output, points, figure=lambda: tradeoff_figure(points))
     return report

@@ -6,6 +6,7 @@ from lbt_synth.cli.output import Report
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.loop import ResidualLimit
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import compare_in_truth
 
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
@@ -14,7 +15,8 @@ _NAME = "this design"
 
 def say_limit(limit: ResidualLimit) -> str:
     """Return the sentence on the limit of a truth."""
-    return f"least residual of any linear controller in the truth: {limit.rms_nm:.6g} nm rms"
+    least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
+    return f"least residual of any linear controller in the truth: {least}"
 
 
 def add_truth(report: Report, design: Design, config: Config) -> None:

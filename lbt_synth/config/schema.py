@@ -362,6 +362,9 @@ class FileSection(Section):
     """A whole configuration file; an identified system knows no telescope and no atmosphere."""
 
     version: int = Field(ge=1, le=1, description="version of the layout: 1")
+    units: Literal["nm", "mas", "urad"] | None = Field(
+        default=None, description="what commands show wavefronts in: nm (default), mas or urad"
+    )
     telescope: TelescopeSection | None = Field(default=None, description="the pupil")
     atmosphere: AtmosphereSection | None = Field(default=None, description="the turbulence")
     sensor: SensorSection = Field(description="noise of the measurements")

@@ -13,6 +13,7 @@ from lbt_synth.identification.commands.gain_interval import unstable_gains
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.likeliest_gain import agrees
 from lbt_synth.loop import close_loop, residual_budget
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray
 
 _APART = 3.0  # standard errors of a gain that are allowed
@@ -88,8 +89,8 @@ def design_for_gains(
         careful = _robust(model, bad, intervals, design_robustly, command_scale_known)
     note = (
         f"to be stable at sensor gains of {_words(intervals)}, the design leaves "
-        f"{_residual_nm(careful, model):.3g} nm in the model; without that it would leave "
-        f"{_residual_nm(made, model):.3g} nm"
+        f"{nm_text(_residual_nm(careful, model))} in the model; without that it would leave "
+        f"{nm_text(_residual_nm(made, model))}"
     )
     if not command_scale_known and unstable_gains(made, intervals / [_HALF, 1.0]) is None:
         note += " (--command-scale 1: the commands were recorded at the size that was applied)"

@@ -28,6 +28,7 @@ from lbt_synth.identification.prediction.forward_chaining import (
 from lbt_synth.identification.prediction.paired_residuals import PairedResiduals
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.methods.registry import default_method, method_named, record_methods
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 
 _SPLITS = 2
@@ -177,7 +178,7 @@ def _describe_choice(
         share = difference / residuals.measured_nm2(usual)
         word = (
             f"the {title} is chosen: of the frames after its training it leaves less than the "
-            f"{method_named(usual).title}, by {difference:.3g} +- {error:.2g} nm^2 "
+            f"{method_named(usual).title}, by {nm_text(difference, error_nm=error, unit='nm^2')} "
             f"({100 * share:.2g} % of the measured variance)"
         )
     else:

@@ -12,6 +12,7 @@ import numpy as np
 
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import ClosedLoop
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray
 
 _SHARE = 0.3  # of the residual
@@ -27,7 +28,7 @@ def note_drift(record: LoopRecord, loop: ClosedLoop, residual_nm: FloatArray) ->
     for i, left in enumerate(np.abs(rejected) @ away):
         if left > _SHARE * residual_nm[i]:
             yield (
-                f"axis {i} of the record stands {mean[i]:.3g} nm off zero and drifts by "
-                f"{speed[i]:.3g} nm/s. The filter sees that, and leaves up to {left:.2g} nm of it. "
-                "Offload it to the telescope"
+                f"axis {i} of the record stands {nm_text(mean[i])} off zero and drifts by "
+                f"{nm_text(speed[i])}/s. The filter sees that, and leaves up to "
+                f"{nm_text(left, '.2g')} of it. Offload it to the telescope"
             )

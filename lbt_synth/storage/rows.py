@@ -12,6 +12,7 @@ from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
 
+from lbt_synth.storage.display_unit import shown_format, shown_unit
 from lbt_synth.storage.tables import Table, csv_bytes
 
 Row = TypeVar("Row")
@@ -35,7 +36,12 @@ class Column:
     @property
     def title(self) -> str:
         """The heading with the unit."""
-        return f"{self.heading} [{self.unit}]" if self.unit else self.heading
+        return f"{self.heading} [{self.shown_unit}]" if self.unit else self.heading
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit of the numbers in tables, as it is shown."""
+        return shown_unit(self.unit)[0]
 
     @property
     def raw_unit(self) -> str:
@@ -45,9 +51,10 @@ class Column:
     def text(self, row: Any) -> str:
         """Return the cell of a row."""
         value = getattr(row, self.name)
-        if self.scale != 1 and value is not None:
-            value = self.scale * value
-        return cell_text(value, self.format, missing=self.missing)
+        factor = shown_unit(self.unit)[1]
+        if self.scale * factor != 1 and value is not None:
+            value = self.scale * factor * value
+        return cell_text(value, shown_format(self.format, factor), missing=self.missing)
 
 
 def column(
@@ -164,7 +171,7 @@ def fact_table(caption: str, *rows: Any) -> Table:
         caption=caption,
         headings=("quantity", "value", "unit"),
         rows=tuple(
-            (each.heading, each.text(row), each.unit)
+            (each.heading, each.text(row), each.shown_unit)
             for row in rows
             for each in columns(row)
             if each.heading and getattr(row, each.name) not in (None, "")

@@ -14,6 +14,7 @@ from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop import ClosedLoop, residual_budget
 from lbt_synth.models import SinusoidalVibration, Spectrum, Truth, Vibration
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -42,8 +43,9 @@ class UnexpectedPower:
         if self.low_hz == self.high_hz:
             where = f"at {self.low_hz:.4g} Hz"
         return (
-            f"the truth has {self.what} {where} on axis {self.mode}, {self.true_nm:.3g} nm, and "
-            f"the design expects {self.expected_nm:.3g} nm there: {self.left_nm:.3g} nm are left"
+            f"the truth has {self.what} {where} on axis {self.mode}, {nm_text(self.true_nm)}, and "
+            f"the design expects {nm_text(self.expected_nm)} there: {nm_text(self.left_nm)} are "
+            "left"
         )
 
 

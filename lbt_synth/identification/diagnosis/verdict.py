@@ -10,6 +10,7 @@ from lbt_synth.identification.diagnosis.diagnosis import Diagnosis
 from lbt_synth.identification.diagnosis.line_origins import LineRow
 from lbt_synth.identification.diagnosis.running_loop import count_frames, law_row
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, LIMIT, RAN
+from lbt_synth.storage.display_unit import nm_text
 
 NARROW = 0.3  # modulus margin
 _GOOD_ENOUGH = 1.03  # times the least residual, that no change is worth
@@ -103,19 +104,19 @@ def _residual_sentence(found: Diagnosis) -> str:
     whole = total.running_nm if by_running else total.best_nm
     where = {line.name: _direction_text(line.row) for line in found.lines}
     named = [
-        f"{nm:.3g} nm of the {part}{where.get(part, '')}"
+        f"{nm_text(nm)} of the {part}{where.get(part, '')}"
         for part, nm in of[:_PARTS]
         if nm**2 >= _LEAST_PART * whole**2
     ]
     if not by_running:
-        return f"By the model the {found.best} would leave {whole:.3g} nm: {_join(named)}."
+        return f"By the model the {found.best} would leave {nm_text(whole)}: {_join(named)}."
     measured = ""
     if ran is not None and np.isfinite(ran.replayed_nm):
         measured = (
-            f"It leaves {ran.replayed_nm:.3g} +- {ran.replayed_error_nm:.2g} nm on unseen data "
+            f"It leaves {nm_text(ran.replayed_nm, error_nm=ran.replayed_error_nm)} on unseen data "
             f"(Strehl ratio {ran.strehl:.3f}), by the model "
         )
-    return f"{measured or 'By the model it leaves '}{whole:.3g} nm: {_join(named)}."
+    return f"{measured or 'By the model it leaves '}{nm_text(whole)}: {_join(named)}."
 
 
 def _direction_text(row: LineRow) -> str:
@@ -144,8 +145,8 @@ def _advice_sentence(found: Diagnosis) -> str:
     limit = found.row(LIMIT)
     bound = ""
     if limit is not None:
-        bound = f"; by the model no linear controller leaves less than {limit.model_nm:.3g} nm"
-    leaves = f"{best.replayed_nm:.3g} +- {best.replayed_error_nm:.2g} nm"
+        bound = f"; by the model no linear controller leaves less than {nm_text(limit.model_nm)}"
+    leaves = f"{nm_text(best.replayed_nm, error_nm=best.replayed_error_nm)}"
     if ran is None or ran.replayed is None:
         return f"The {found.best} leaves least, {leaves} (Strehl ratio {best.strehl:.3f}{bound})."
     difference, error = ran.replayed.above(best.replayed)
@@ -156,12 +157,12 @@ def _advice_sentence(found: Diagnosis) -> str:
     if slow_nm < _NEARLY * best.replayed_nm:
         other = "" if found.best == INTEGRATOR else f", the {found.best} {leaves}"
         return (
-            f"First change the gain{_gain_text(found)}: the {INTEGRATOR} leaves {slow_nm:.3g} nm "
+            f"First change the gain{_gain_text(found)}: the {INTEGRATOR} leaves {nm_text(slow_nm)} "
             f"on unseen data{other}{bound}."
         )
     return (
         f"First change the controller: the {found.best} leaves {leaves} on unseen data (Strehl "
-        f"ratio {best.strehl:.3f}), the {INTEGRATOR} {slow_nm:.3g} nm{bound}."
+        f"ratio {best.strehl:.3f}), the {INTEGRATOR} {nm_text(slow_nm)}{bound}."
     )
 
 

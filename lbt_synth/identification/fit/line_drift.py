@@ -24,6 +24,7 @@ from lbt_synth.identification.fit.identified_model import (
 )
 from lbt_synth.identification.fit.periodogram import TAPER, half_angle_square, tukey
 from lbt_synth.identification.stretches import Stretches
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _REACH_HZ = 3.0  # of the band on either side, and between lines that may be one
@@ -102,7 +103,7 @@ def describe_drifts(
             for old, new in zip(covered, drift.correct(covered), strict=True):
                 parts[parts.index(old)] = new
             notes.append(
-                f"warning: axis {i} has a sinusoid of {drift.rms_nm:.3g} nm that drifts by "
+                f"warning: axis {i} has a sinusoid of {nm_text(drift.rms_nm)} that drifts by "
                 f"{drift.rate_hz_s:.2g} Hz/s, {drift.range_hz:.2g} Hz in {drift.duration_s:.3g} s "
                 f"around {drift.frequency_hz:.4g} Hz; {_LINES[len(covered) > 1]} for it"
             )

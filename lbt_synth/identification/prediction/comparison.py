@@ -31,6 +31,7 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 RAN = "what ran"
@@ -296,8 +297,9 @@ def _note_starts(rows: Sequence[PredictionRow], loops: Mapping[str, ClosedLoop])
         if start > _START_SHARE * float(np.mean(np.sum(row.replayed.measured_nm**2, axis=1))):
             yield (
                 f"the state of the {row.name} before the record is not known: slow modes (pole "
-                f"{loops[row.name].spectral_radius:.6f}) may contribute up to {start**0.5:.2g} nm "
-                "to its residual on the data, which its error holds. A longer record tells more"
+                f"{loops[row.name].spectral_radius:.6f}) may contribute up to "
+                f"{nm_text(start**0.5, '.2g')} to its residual on the data, which its error holds. "
+                "A longer record tells more"
             )
 
 

@@ -15,6 +15,7 @@ from lbt_synth.identification.records.columns import nm_per
 from lbt_synth.identification.records.faults import Finding, RecordHealth, findings_in, merge_notes
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models import PositionLoop
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
 _LARGEST_NM = 1e100  # a larger number is none: its square would overflow
@@ -238,7 +239,7 @@ def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
     for axis, (first, last) in enumerate(ends.T):
         if max(first, last) > _TREND * min(first, last):
             said.append(
-                f"axis {axis} is not stationary: the rms difference of two frames is {first:.3g} "
-                f"nm in the first quarter and {last:.3g} nm in the last"
+                f"axis {axis} is not stationary: the rms difference of two frames is "
+                f"{nm_text(first)} in the first quarter and {nm_text(last)} in the last"
             )
     return said

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.report.charts.line_styles import MARKERS
+from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.validation import FloatArray, choice, float_array, frozen_copy, set_fields
 
 _KEY = re.compile(r"[a-z][a-z0-9-]*")
@@ -186,7 +187,10 @@ Kind = TypeVar("Kind", Curve, Area, Rule, Span, Bars, Flags, Map)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Panel:
-    """One pair of axes and what is drawn in them, the first things at the bottom."""
+    """One pair of axes and what is drawn in them, the first things at the bottom.
+
+    Axes in nm become axes in the unit that is shown.
+    """
 
     x: Axis  # The axis along the bottom
     y: Axis  # The axis along the left
@@ -197,7 +201,10 @@ class Panel:
     height_in: float | None = None  # Height of the axes on paper [inch]
 
     def __post_init__(self) -> None:
-        set_fields(self, marks=tuple(self.marks), categories=tuple(self.categories))
+        x, along = _shown_axis(self.x)
+        y, up = _shown_axis(self.y)
+        marks = tuple(_rescale(mark, along, up) for mark in self.marks)
+        set_fields(self, x=x, y=y, marks=marks, categories=tuple(self.categories))
         for bars in self.select(Bars):
             if bars.values.size != len(self.categories):
                 raise DimensionError(
@@ -229,6 +236,35 @@ class Chart:
                 raise ProblemError(f"a chart must have words for its {name}; got none.")
         if not self.panels or self.columns < 1:
             raise ProblemError("a chart must have at least one panel and one column.")
+
+
+def _shown_axis(axis: Axis) -> tuple[Axis, float]:
+    """Return an axis in the unit that is shown, and the factor to it."""
+    unit, factor = shown_unit(axis.unit)
+    if factor == 1:
+        return axis, factor
+    low, high = (None if end is None else factor * end for end in (axis.low, axis.high))
+    return replace(axis, unit=unit, low=low, high=high), factor
+
+
+def _rescale(mark: Mark, along: float, up: float) -> Mark:
+    """Return a mark with its places along x and up y multiplied by factors."""
+    factors = dict.fromkeys(("x", "values") if isinstance(mark, Bars) else ("x",), along)
+    factors |= dict.fromkeys(("y", "error"), up)
+    if isinstance(mark, Rule | Span):
+        factors |= dict.fromkeys(("at", "low", "high"), along if mark.axis == "x" else up)
+    elif isinstance(mark, Map):
+        unit, depth = shown_unit(mark.unit)
+        factors |= dict.fromkeys(("values", "low", "high", "levels"), depth)
+        mark = replace(mark, unit=unit)
+    else:
+        factors |= dict.fromkeys(("low", "high"), along if isinstance(mark, Bars) else up)
+    scaled: Any = {
+        name: tuple(factor * each for each in value) if isinstance(value, tuple) else factor * value
+        for name, factor in factors.items()
+        if factor != 1 and (value := getattr(mark, name, None)) is not None
+    }
+    return replace(mark, **scaled) if scaled else mark
 
 
 def require_key(key: str) -> str:

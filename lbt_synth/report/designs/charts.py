@@ -23,6 +23,7 @@ from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, map_panels, str
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
 from lbt_synth.report.page.words import chart
+from lbt_synth.storage.display_unit import nm_text, shown_unit
 
 _PANELS = 6  # of one chart that has a panel per design: they fit a sheet
 
@@ -36,7 +37,7 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
     charts = []
     if norms:
         curves = [stable_curve(name, names, f, values) for name, values in norms.items()]
-        peaks = [f"{name} {number_text(float(np.max(n)), 3)} nm" for name, n in norms.items()]
+        peaks = [f"{name} {nm_text(float(np.max(n)))}" for name, n in norms.items()]
         panel = frequency_panel("disturbances to error", "nm", curves, rules)
         charts.append(chart("sigma", [panel], peaks=listing_text(peaks)))
     if report.stable:
@@ -95,8 +96,11 @@ def _strehl_chart(report: DesignReport) -> Chart:
 def _residual_chart(report: DesignReport) -> Chart:
     study = report.limits
     panel = limits_panel(study, FREQUENCY_ERROR, study.shift_hz, str)
-    limits = [f"{rule.name} {fixed_text(rule.at, 1)} nm" for rule in panel.select(Rule)]
-    worst = [f"{row.design} {fixed_text(row.worst_nm, 1)} nm" for row in study.rows if row.stable]
+    _, factor = shown_unit("nm")
+    limits = [  # of the panel, which are in the unit that is shown
+        f"{rule.name} {nm_text(rule.at / factor, '.1f')}" for rule in panel.select(Rule)
+    ]
+    worst = [f"{row.design} {nm_text(row.worst_nm, '.1f')}" for row in study.rows if row.stable]
     return chart(
         "limits",
         [panel],
@@ -167,7 +171,7 @@ def pole_and_step_charts(report: DesignReport) -> list[Chart]:
 def _step_chart(report: DesignReport) -> Chart:
     runs = {one.name: report.simulations[one.name] for one in report.stable}
     peaks = [
-        f"{name} {fixed_text(float(np.max(np.abs(run.step_residual_nm[5:]))), 0)} nm"
+        f"{name} {nm_text(float(np.max(np.abs(run.step_residual_nm[5:]))), '.0f')}"
         for name, run in runs.items()
     ]
     panels = []
@@ -195,7 +199,9 @@ def simulation_charts(report: DesignReport) -> list[Chart]:
         return []
     duration = fixed_text(float(next(iter(runs.values())).time_s[-1]), 2)
     reach = 1.05 * max(float(np.max(np.abs(run.series_nm[:, 0]))) for run in runs.values())
-    left = [f"{name} {fixed_text(run.residual_nm, 1)} nm rms" for name, run in runs.items()]
+    left = [
+        f"{name} {nm_text(run.residual_nm, '.1f', unit='nm rms')}" for name, run in runs.items()
+    ]
     series, spectra = [], []
     for name, run in runs.items():
         look, f = report.names.index(name), run.frequency_hz

@@ -24,6 +24,7 @@ from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import paragraph
 from lbt_synth.report.provenance import creator_name, require_letters, time_text, versions_table
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import row_table
 
 
@@ -153,7 +154,7 @@ def _situation_text(report: DesignReport) -> str:
     hardware, truth = report.config.hardware, report.config.truth
     lines = [
         f"a {'sinusoid' if isinstance(line, SinusoidalVibration) else 'resonance'} of "
-        f"{number_text(line.rms_nm)} nm rms at {number_text(line.frequency_hz)} Hz"
+        f"{nm_text(line.rms_nm, '.6g', unit='nm rms')} at {number_text(line.frequency_hz)} Hz"
         for line in stationary_vibrations(truth.vibrations)
     ]
     noise = truth.noise_per_measurement(hardware.n_measurements)

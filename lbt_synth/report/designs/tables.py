@@ -20,6 +20,7 @@ from lbt_synth.report.number_text import (
     number_text,
     signed_text,
 )
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Column, columns, row_table
 from lbt_synth.storage.tables import Cell, Table
 
@@ -85,7 +86,7 @@ def truth_table(report: DesignReport) -> Table:
 
 
 def _title(each: Column) -> str:
-    return f"{each.help} [{each.unit}]" if each.unit else each.help
+    return f"{each.help} [{each.shown_unit}]" if each.unit else each.help
 
 
 def _text(each: Column | None, row: AssessmentRow) -> str:
@@ -99,7 +100,7 @@ def _limit_title(name: str, limit: ResidualLimit | BandLimit | None, where: str)
     """Return the title of percents above a limit, or none where the limit says nothing."""
     if limit is None or not limit.rms_nm > 0:
         return {}
-    return {name: f"above the limit of {fixed_text(limit.rms_nm, 1)} nm{where} [%]"}
+    return {name: f"above the limit of {nm_text(limit.rms_nm, '.1f')}{where} [%]"}
 
 
 def certificate_table(one: DesignAssessment) -> Table:

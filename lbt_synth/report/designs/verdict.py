@@ -10,6 +10,7 @@ import numpy as np
 from lbt_synth.report.designs.assessment import DesignAssessment
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.number_text import NO_BREAK, fixed_text, listing_text, signed_text
+from lbt_synth.storage.display_unit import nm_text
 
 KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
 
@@ -45,21 +46,22 @@ def verdict(report: DesignReport) -> str:
     if report.stable:
         sentences.insert(0, _least_sentence(report))
     # a number stays in one line with its unit
-    return re.sub(r"(?<=\d) (?=%|nm|Hz)", NO_BREAK, " ".join(sentences))
+    return re.sub(r"(?<=\d) (?=%|nm|mas|urad|Hz)", NO_BREAK, " ".join(sentences))
 
 
 def _least_sentence(report: DesignReport) -> str:
     stable = report.stable
     best = min(stable, key=lambda one: one.residual_nm)
-    least = fixed_text(best.residual_nm, 1)
+    shown = {one.name: nm_text(one.residual_nm, ".1f", unit="nm rms") for one in stable}
+    least = shown[best.name]
     # designs that show the same number as the best are as good
-    equal = [one.name for one in stable if fixed_text(one.residual_nm, 1) == least]
+    equal = [name for name, text in shown.items() if text == least]
     verb = "leave" if len(equal) > 1 else "leaves"
     several = len(stable) > 1
     where = ", if the vibrations are where the configuration has them"
     return (
         f"{f'Of {len(stable)} stable designs, ' if several else ''}{listing_text(equal)} "
-        f"{verb} {'the least, ' if several else ''}{least} nm rms (Strehl ratio "
+        f"{verb} {'the least, ' if several else ''}{least} (Strehl ratio "
         f"{fixed_text(100 * best.strehl, 1)} %){where if report.config.truth.vibrations else ''}."
     )
 

@@ -13,8 +13,9 @@ from lbt_synth.identification import Diagnosis
 from lbt_synth.linear import Controller
 from lbt_synth.report.charts.description import Axis, Bars, Chart, Curve, Mark, Panel
 from lbt_synth.report.figures.identification import identification_panels
-from lbt_synth.report.number_text import fixed_text, listing_text, number_text
+from lbt_synth.report.number_text import listing_text, number_text
 from lbt_synth.report.page.words import chart
+from lbt_synth.storage.display_unit import nm_text
 
 _POINTS = 400  # bands of a curve on a page, each with its least and its largest value
 _RESIDUAL = Axis(label="residual", unit="nm rms", low=0)
@@ -33,7 +34,7 @@ def residual_charts(found: Diagnosis) -> list[Chart]:
             Bars(name="model", values=np.array([row.model_nm for row in rows]), look=1),
         )
         names = [row.name for row in rows]
-        said = [f"{row.name} {fixed_text(row.replayed_nm, 1)} nm" for row in rows]
+        said = [f"{row.name} {nm_text(row.replayed_nm, '.1f')}" for row in rows]
         charts.append(chart("residuals", [_bar_panel(bars, names)], values=listing_text(said)))
     if costs := found.costs:
         columns = {"loop that ran": "running_nm", "best design": "best_nm"}
@@ -42,7 +43,7 @@ def residual_charts(found: Diagnosis) -> list[Chart]:
             for look, (name, field) in enumerate(columns.items())
         )
         said = [
-            f"{row.part} {fixed_text(row.running_nm, 1)} and {fixed_text(row.best_nm, 1)} nm"
+            f"{row.part} {nm_text(row.running_nm, '.1f')} and {nm_text(row.best_nm, '.1f')}"
             for row in costs
         ]
         panel = _bar_panel(bars, [row.part for row in costs])

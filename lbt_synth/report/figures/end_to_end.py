@@ -12,6 +12,7 @@ from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Map, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import EndToEndEntry
 
 _SHOWN_MAS = 700.0  # from the centre of the image to its edges
@@ -93,7 +94,7 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
             y=Axis(label="residual", unit="nm rms wavefront"),
             marks=tuple(
                 Curve(
-                    name=f"{name}, {run.rms_nm[axis]:.0f} nm rms",
+                    name=f"{name}, {nm_text(run.rms_nm[axis], '.0f', unit='nm rms')}",
                     x=seconds,
                     y=run.residual_nm[:, axis],
                     look=axis,

@@ -13,6 +13,7 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.report.charts.description import Area, Axis, Curve, Flags, Panel, Span
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray, require_instance
 
 _BANDS = 240  # of equal ratio over which the periodogram is averaged
@@ -172,7 +173,7 @@ def _spectrum_panel(model: IdentifiedModel, i: int, density: Axis) -> Panel:
     if axis.sensor_gain_error is not None:
         gain = f"{axis.sensor_gain:.3f} ± {axis.sensor_gain_error:.3f}"
     return Panel(
-        title=f"{name}noise {axis.noise_nm:.3g} nm, gain {gain}",
+        title=f"{name}noise {nm_text(axis.noise_nm)}, gain {gain}",
         x=_frequency(axis),
         y=density,
         marks=(
@@ -193,7 +194,7 @@ def _spectrum_panel(model: IdentifiedModel, i: int, density: Axis) -> Panel:
 def _line_text(line: IdentifiedLine) -> str:
     """Return frequency and rms of a line on its axis, and the direction if both axes share it."""
     along = "" if line.direction is None else f", {line.direction_deg:.0f}°"
-    return f"{line.frequency_hz:.2f} Hz, {line.rms_nm:.3g} nm{along}"
+    return f"{line.frequency_hz:.2f} Hz, {nm_text(line.rms_nm)}{along}"
 
 
 def _cumulative_curves(axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -> list[Curve]:

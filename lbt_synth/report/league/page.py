@@ -14,6 +14,7 @@ from lbt_synth.report.charts.description import Axis, Bars, Chart, Panel
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import chart, paragraph
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, percent_column, row_table, table_row
 from lbt_synth.studies import LeagueResult, RecordScores, StandingRow
 from lbt_synth.studies.league.standings import relative_residual, root_with_error
@@ -194,7 +195,7 @@ def _residual_chart(rows: Sequence[StandingRow]) -> Chart:
         marks=(bars,),
         categories=tuple(row.entry for row in ranked),
     )
-    listing = "; ".join(f"{row.entry} {row.residual_nm:.1f} nm" for row in ranked)
+    listing = "; ".join(f"{row.entry} {nm_text(row.residual_nm, '.1f')}" for row in ranked)
     return chart("league", [panel], listing=listing)
 
 

@@ -1,0 +1,86 @@
+"""Every command that prints a wavefront prints it in the unit that is asked for."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+from lbt_synth.cli.main import main
+
+CONFIG = str(LBT_YAML)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("units")
+    config = lbt.load_config(CONFIG)
+    lbt.save_gain(folder / "k.fits", config.design("kalman"))
+    assert (
+        main(["simulate", CONFIG, str(folder / "k.fits"), "--telemetry", str(folder / "n.fits")])
+        == 0
+    )
+    return folder
+
+
+COMMANDS = {
+    "design": (CONFIG, "--method", "kalman", "-o", "{}/d.fits"),
+    "show": ("{}/k.fits",),
+    "simulate": (CONFIG, "{}/k.fits", "-o", "{}/s.svg"),
+    "limits": (CONFIG, "{}/k.fits", "-o", "{}/l.svg"),
+    "robustness": (CONFIG,),
+    "sigma": ("{}/k.fits", "-o", "{}/g.svg"),
+    "identify": ("{}/n.fits", "-o", "{}/i.yaml"),
+}
+
+
+def run(capsys, files, command, *options):
+    words = [word.format(files) for word in COMMANDS[command]]
+    assert main([command, *words, *options]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("unit", ["mas", "urad"])
+def test_no_nanometre_is_left(capsys, files, command, unit):
+    option = "--show-unit" if command == "identify" else "--unit"
+    out = run(capsys, files, command, option, unit)
+    assert unit in out
+    assert re.findall(r".*\bnm\b.*", out) == []
+
+
+def test_the_numbers_are_those_of_the_diameter(capsys, files):
+    in_nm, in_mas = (
+        float(
+            re.search(r"estimation error, rms +([\d.]+)", run(capsys, files, "show", *o)).group(1)
+        )
+        for o in ((), ("--unit", "mas"))
+    )
+    assert in_nm / in_mas == pytest.approx(lbt.models.nm_per_mas(8.22), rel=1e-5)
+    assert "nm" in run(capsys, files, "show")  # the choice was that of one command
+
+
+def test_json_stays_in_nanometres(capsys, files):
+    one, other = (
+        json.loads(run(capsys, files, "limits", "--json", *o)) for o in ((), ("--unit", "mas"))
+    )
+    assert one == other
+
+
+def test_a_configuration_may_choose(capsys, files, tmp_path):
+    own = tmp_path / "own.yaml"
+    own.write_text(LBT_YAML.read_text() + "\nunits: mas\n")
+    assert main(["robustness", str(own)]) == 0
+    assert "residual [mas]" in capsys.readouterr().out
+    assert main(["robustness", str(own), "--unit", "nm"]) == 0
+    assert "residual [nm]" in capsys.readouterr().out
+
+
+def test_an_angle_needs_a_diameter(capsys, tmp_path):
+    plant = lbt.load_config(CONFIG).plant
+    lbt.save_gain(tmp_path / "bare.fits", lbt.kalman(plant))
+    assert main(["show", str(tmp_path / "bare.fits"), "--unit", "mas"]) == 2
+    assert "telescope's diameter, which is not known here" in capsys.readouterr().err
