@@ -11,6 +11,7 @@ from .integrator import integrator as integrator
 from .integrator import integrator_gain_limit as integrator_gain_limit
 from .integrator import model_integrator as model_integrator
 from .integrator import optimal_integrator as optimal_integrator
+from .integrator_law import IntegratorLaw as IntegratorLaw
 from .kalman import kalman as kalman
 from .loop_shaping import ShapedDesign as ShapedDesign
 from .loop_shaping import shape as shape

@@ -1,4 +1,4 @@
-"""The classical integrator, its gain limit and its best gain (paper, III-C, erratum 4)."""
+"""The classical integrator, its gain limit and its best gains (paper, III-C, erratum 4)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth.design.certificate import Certificate, certify_loop
+from lbt_synth.design.integrator_law import PURE, IntegratorLaw
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
-from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.errors import InfeasibleError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,
@@ -23,7 +24,7 @@ from lbt_synth.loop import (
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.validation import (
     ComplexArray,
-    frozen_copy,
+    FloatArray,
     number,
     require_instance,
     set_fields,
@@ -33,11 +34,13 @@ TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as fractions of the 
 # A line far above the bandwidth leaves one minimum with its amplification and one without: the
 # trials are as close as these where the loop is fast.
 _TRIALS = np.concatenate([np.geomspace(TRIED_GAINS[0], 0.1, 12), np.linspace(0.1, 0.999, 46)[1:]])
+_BISECTIONS = 27  # from a trial to the next one; 1e-9 of the gain
+_LEAST_GAIN = 1e-3  # as a part of that of a usual loop: two integrators are stable there or never
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegratorDesign(Design):
-    """The classical controller ``u(k) = u(k-1) + gain R y(k)``.
+    """The classical controller ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
 
     Attributes
     ----------
@@ -45,14 +48,17 @@ class IntegratorDesign(Design):
         The loop.
     gain : float
         Integrator gain, per unit of sensor gain.
+    law : IntegratorLaw
+        Leak, zero and second integrator, and the margins that the certificate checks.
     """
 
     controller: Controller = field(init=False)
     loop_hardware: LoopHardware
     gain: float
+    law: IntegratorLaw = PURE
 
     def __post_init__(self) -> None:
-        set_fields(self, controller=_integrator_controller(self.loop_hardware, self.gain))
+        set_fields(self, controller=self.law.controller(self.loop_hardware, self.gain))
 
     @property
     def hardware(self) -> LoopHardware | None:
@@ -66,11 +72,17 @@ class IntegratorDesign(Design):
 
     def recertify(self) -> Certificate:
         """Compute the certificate again from the matrices."""
-        return replace(UNCERTIFIED, checks=(certify_loop(self.loop_hardware, self.controller),))
+        stable = certify_loop(self.loop_hardware, self.controller)
+        checks = [stable]
+        if stable.passed and self.law.demands:
+            checks += self.law.checks(close_loop(self.loop_hardware, self.controller))
+        return replace(UNCERTIFIED, checks=tuple(checks))
 
 
-def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
-    """Integrator ``u(k) = u(k-1) + gain R y(k)``.
+def integrator(
+    hardware: LoopHardware, *, gain: float | None = None, law: IntegratorLaw = PURE
+) -> IntegratorDesign:
+    """Integrator ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
 
     R is the pseudoinverse of the sensor matrix times the influence matrix.
 
@@ -78,8 +90,11 @@ def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
     ----------
     hardware : LoopHardware
         The loop.
-    gain : float
-        Gain, above 0 and below :func:`integrator_gain_limit`.
+    gain : float, optional
+        Gain, above 0 and below :func:`integrator_gain_limit`; by default the largest one that
+        keeps the margins that the law demands.
+    law : IntegratorLaw, optional
+        Leak, zero and second integrator, and demands; by default a pure integrator.
 
     Returns
     -------
@@ -89,9 +104,11 @@ def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
     Raises
     ------
     ProblemError
-        If the gain is not a positive number.
+        If the gain is not a positive number, or neither a gain nor a demand is given.
+    InfeasibleError
+        If no gain keeps the margins that are demanded.
     CertificateError
-        If the loop is not stable at unit sensor gain.
+        If at unit sensor gain the loop is not stable, or does not keep these margins.
 
     Examples
     --------
@@ -99,14 +116,25 @@ def integrator(hardware: LoopHardware, *, gain: float) -> IntegratorDesign:
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     >>> bool(max(abs(lbt.integrator(path, gain=0.25).poles)) < 1)
     True
+    >>> half = lbt.design.IntegratorLaw(modulus_margin=0.5)
+    >>> round(lbt.integrator(path, law=half).gain, 3)
+    0.454
     """
-    return _design_with_gain(
-        hardware, number(gain, "gain", above=0), route="closed form", status="given"
-    )
+    if gain is not None:
+        given = number(gain, "gain", above=0)
+        return _design_with_gain(hardware, given, law, route="closed form", status="given")
+    if not law.demands:
+        raise ProblemError(
+            "an integrator needs a gain or a demand; got neither. Try gain=0.3, or "
+            "law=IntegratorLaw(phase_margin_deg=45)."
+        )
+    allowed = _allowed_gains(hardware, law, _TRIALS * hardware_gain_limit(hardware, law))
+    most = float(np.exp(allowed[-1]))
+    return _design_with_gain(hardware, most, law, route="search", status="largest gain")
 
 
 def _design_with_gain(
-    hardware: LoopHardware, gain: float, *, route: str, status: str
+    hardware: LoopHardware, gain: float, law: IntegratorLaw, *, route: str, status: str
 ) -> IntegratorDesign:
     """Make the design of a gain and certify it."""
     design = IntegratorDesign(
@@ -115,6 +143,7 @@ def _design_with_gain(
         solver=SolverReport(route=route, status=status, iterations=0),
         loop_hardware=hardware,
         gain=gain,
+        law=law,
     )
     return with_certificate(design, f"Lower the gain {gain:.6g}.")
 
@@ -153,25 +182,78 @@ def integrator_gain_limit(delay_frames: float) -> float:
     return _limit_above(hardware, 0.5 / d)  # stable: well below the limit of the next whole delay
 
 
-def hardware_gain_limit(hardware: LoopHardware) -> float:
-    """Gain at which an integrator loop becomes unstable, with the dynamics of the mirror."""
-    if hardware.mirror is None:
+def hardware_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> float:
+    """Gain at which the loop of a law becomes unstable, with the dynamics of the mirror."""
+    if hardware.mirror is None and law.is_pure:
         return integrator_gain_limit(hardware.delay_frames)
     single = hardware.single_mode()
     taps = single.mirror_taps
     mean_delay_frames = 1 + float(np.abs(np.arange(taps.size) @ taps))
-    gain = 0.5 / mean_delay_frames
-    while not close_loop(single, _integrator_controller(single, gain)).is_stable:
+    gain = least = 0.5 / mean_delay_frames
+    while not close_loop(single, law.controller(single, gain)).is_stable:
         gain /= 2
-    return _limit_above(single, gain)
+        if gain < _LEAST_GAIN * least:
+            # two integrators are stable at small gains where c / (1 - c) + 1 exceeds the delay
+            ratio = mean_delay_frames / (mean_delay_frames - 1)
+            highest = hardware.frame_rate_hz * np.log(ratio) / (2 * np.pi)
+            raise InfeasibleError(
+                f"no gain of two integrators is stable at a delay of {mean_delay_frames:.3g} "
+                f"frames without a zero_hz below {highest:.3g}; "
+                f"got {'none' if law.zero_hz is None else f'{law.zero_hz:g}'}."
+            )
+    return _limit_above(single, gain, law)
 
 
-def _limit_above(hardware: LoopHardware, gain: float) -> float:
+def _limit_above(hardware: LoopHardware, gain: float, law: IntegratorLaw = PURE) -> float:
     """Return the gain limit of a loop that is stable with a given gain."""
-    return gain * stable_sensor_gains(hardware, _integrator_controller(hardware, gain))[1]
+    return gain * stable_sensor_gains(hardware, law.controller(hardware, gain))[1]
 
 
-def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign:
+def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArray) -> FloatArray:
+    """Return logarithms of gains that keep the demands of a law: the trials and both ends.
+
+    Of several intervals it is the one with the largest gains.
+    """
+
+    def excess(log_gain: float) -> float:
+        """Return the least margin over its demand, less 1."""
+        loop = close_loop(hardware, law.controller(hardware, float(np.exp(log_gain))))
+        if not loop.is_stable:
+            return -1.0
+        return min(found / law.demands[name] for name, found in law.margins(loop).items()) - 1
+
+    tried = np.log(trials)
+    over = np.array([excess(trial) for trial in tried])
+    kept = np.flatnonzero(over >= 0)
+    if not kept.size:
+        best = int(np.argmax(over))
+        demands = " and ".join(f"{name} {least:g}" for name, least in law.demands.items())
+        raise InfeasibleError(
+            f"no gain keeps {demands}; the nearest is gain {trials[best]:.3g}, which has "
+            f"{100 * (1 + over[best]):.3g} % of the margin. Demand less."
+        )
+    last = int(kept[-1])
+    outside = np.flatnonzero(over[:last] < 0)
+    first = int(outside[-1]) + 1 if outside.size else 0
+    ends = [tried[first : last + 1]]
+    if first > 0:
+        ends.insert(0, _last_allowed(excess, tried[first], tried[first - 1]))
+    if last + 1 < tried.size:
+        ends.append(_last_allowed(excess, tried[last], tried[last + 1]))
+    return np.unique(np.concatenate(ends))
+
+
+def _last_allowed(excess: Callable[[float], float], inner: float, outer: float) -> FloatArray:
+    """Return the end of an interval between a point inside it and one outside, from inside."""
+    for _ in range(_BISECTIONS):
+        middle = (inner + outer) / 2
+        inner, outer = (middle, outer) if excess(middle) >= 0 else (inner, middle)
+    return np.array([inner])
+
+
+def optimal_integrator(
+    hardware: LoopHardware, truth: Truth, *, law: IntegratorLaw = PURE
+) -> IntegratorDesign:
     """Integrator whose gain leaves the least residual for a given truth.
 
     Parameters
@@ -180,18 +262,23 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
         The loop.
     truth : Truth
         Disturbances, noise and sensor gain.
+    law : IntegratorLaw, optional
+        Leak, zero and second integrator, and margins to keep at unit sensor gain; by default a
+        pure integrator without a demand.
 
     Returns
     -------
     IntegratorDesign
-        Certified design. The gain is within a relative 1e-6 of the best among those that are
-        stable at unit sensor gain as well; ``solver.status`` says when that limit,
+        Certified design. The gain is within a relative 1e-6 of the best among those that at
+        unit sensor gain are stable and keep the margins; ``solver.status`` says when that limit,
         not the truth, decided.
 
     Raises
     ------
     ProblemError
         If nothing disturbs the loop.
+    InfeasibleError
+        If no gain keeps the margins that are demanded.
     CertificateError
         If the design does not pass its checks.
 
@@ -209,16 +296,20 @@ def optimal_integrator(hardware: LoopHardware, truth: Truth) -> IntegratorDesign
         raise ProblemError(
             "the truth must disturb the loop; got no turbulence, vibration or noise."
         )
-    return _least_residual(hardware, lambda loop: residual_budget(loop, truth), truth.sensor_gain)
+    return _least_residual(
+        hardware, law, lambda loop: residual_budget(loop, truth), truth.sensor_gain
+    )
 
 
-def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
+def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> IntegratorDesign:
     """Integrator whose gain leaves the least residual where a plant's model is the truth.
 
     Parameters
     ----------
     plant : TipTiltPlant
         Turbulence of each mode, vibrations, noise and loop.
+    law : IntegratorLaw, optional
+        As that of :func:`optimal_integrator`.
 
     Returns
     -------
@@ -227,6 +318,8 @@ def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
 
     Raises
     ------
+    InfeasibleError
+        If no gain keeps the margins that are demanded.
     CertificateError
         If the design does not pass its checks.
 
@@ -241,24 +334,27 @@ def model_integrator(plant: TipTiltPlant) -> IntegratorDesign:
     True
     """
     require_instance(plant, TipTiltPlant)
-    return _least_residual(plant.hardware, lambda loop: model_budget(loop, plant), 1.0)
+    return _least_residual(plant.hardware, law, lambda loop: model_budget(loop, plant), 1.0)
 
 
 def _least_residual(
-    hardware: LoopHardware, budget: Callable[[ClosedLoop], ResidualBudget], sensor_gain: float
+    hardware: LoopHardware,
+    law: IntegratorLaw,
+    budget: Callable[[ClosedLoop], ResidualBudget],
+    sensor_gain: float,
 ) -> IntegratorDesign:
     """Refine each local minimum over a grid of gains, and design with the least."""
-    limit = hardware_gain_limit(hardware) / max(1.0, sensor_gain)
+    gains = _TRIALS * hardware_gain_limit(hardware, law) / max(1.0, sensor_gain)
+    trials = _allowed_gains(hardware, law, gains) if law.demands else np.log(gains)
 
     def variance(log_gain: float) -> float:
-        controller = _integrator_controller(hardware, float(np.exp(log_gain)))
+        controller = law.controller(hardware, float(np.exp(log_gain)))
         try:
             loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
             return budget(loop).rms_nm ** 2
         except UnstableLoopError:
             return np.inf
 
-    trials = np.log(_TRIALS * limit)
     values = np.array([variance(trial) for trial in trials])
     walls = np.concatenate([[np.inf], values, [np.inf]])
     low = np.flatnonzero((values < walls[:-2]) & (values <= walls[2:])).tolist()
@@ -273,16 +369,7 @@ def _least_residual(
     ]
     best = int(np.argmin([found.fun for found in refined]))
     limited = low[best] == trials.size - 1  # the largest gain that was tried
-    status = "limited by stability at unit sensor gain" if limited else "least residual"
-    return _design_with_gain(
-        hardware, float(np.exp(refined[best].x)), route="search", status=status
-    )
-
-
-def _integrator_controller(hardware: LoopHardware, gain: float) -> Controller:
-    """Return an integrator whose state x(k+1) is its command u(k)."""
-    reconstructor = frozen_copy(np.linalg.pinv(hardware.sensor @ hardware.influence))
-    m, q = reconstructor.shape
-    return Controller(
-        A=np.eye(m), B=gain * reconstructor, C=np.eye(m), D=np.zeros((m, q)), dt_s=hardware.dt_s
-    )
+    limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
+    status = f"limited by {limit}" if limited else "least residual"
+    gain = float(np.exp(refined[best].x))
+    return _design_with_gain(hardware, gain, law, route="search", status=status)

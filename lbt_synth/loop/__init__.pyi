@@ -1,3 +1,6 @@
+from .broken_loops import BrokenLoop as BrokenLoop
+from .broken_loops import MarginPoint as MarginPoint
+from .broken_loops import broken_loops as broken_loops
 from .budget import ResidualBudget as ResidualBudget
 from .budget import model_budget as model_budget
 from .budget import residual_budget as residual_budget

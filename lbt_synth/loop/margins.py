@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from lbt_synth.linear import Controller, hinf_norm, structured_norm
-from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.budget import resonance_edges
+from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
@@ -103,21 +101,18 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     """
     loop.require_stable()
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
-    phases, crossovers = [np.inf], [0.0]
-    for index in range(loop.hardware.n_measurements):
-        for frequency, lag in _crossings(loop, index):
-            phases.append(np.degrees(lag))
-            crossovers.append(frequency)
+    broken = broken_loops(loop)
+    crossovers = [point.frequency_hz for one in broken for point in one.gain_crossings]
     delay = _delay_margin_frames(loop)
     disk = _disk_margin(loop)
     return LoopMargins(
         modulus=1 / float(hinf_norm(loop.output_sensitivity())),
         gain_low=low / loop.sensor_gain,
         gain_high=high / loop.sensor_gain,
-        phase_deg=float(min(phases)),
+        phase_deg=phase_margin_deg(broken),
         delay_s=delay / loop.hardware.frame_rate_hz,
         delay_frames=delay,
-        crossover_hz=float(max(crossovers)),
+        crossover_hz=max(crossovers, default=0.0),
         disk=disk,
         disk_gain_low=max(2 - disk, 0.0) / (2 + disk),
         disk_gain_high=(2 + disk) / (2 - disk) if disk < 2 else np.inf,
@@ -222,26 +217,3 @@ def _delay_margin_frames(loop: ClosedLoop) -> float:
     for _ in range(_DIVISIONS):
         step = first_unstable(*step) or step
     return float(step[0])
-
-
-def _crossings(loop: ClosedLoop, index: int) -> list[tuple[float, float]]:
-    """Frequencies [Hz] where one broken loop has unit gain, and its phase from -1 there [rad].
-
-    With measurement i broken and the rest closed, ``1 + l_i = 1 / S_ii``.
-    """
-    system = loop.output_sensitivity()
-
-    def broken(frequency: float | np.ndarray) -> np.ndarray:
-        response = system.frequency_response(np.atleast_1d(frequency))[:, index, index]
-        return np.asarray(1 / response - 1)
-
-    nodes, _ = gauss_panels(resonance_edges(loop), 12)
-    excess = np.abs(broken(nodes)) - 1
-    found = []
-    for i in np.nonzero(excess[1:] * excess[:-1] < 0)[0]:
-        frequency = brentq(
-            lambda f: float(np.abs(broken(f)[0]) - 1), nodes[i], nodes[i + 1], xtol=1e-12
-        )
-        phase = float(np.angle(broken(frequency)[0]))
-        found.append((float(frequency), float(np.mod(phase + np.pi, 2 * np.pi))))
-    return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -12,47 +12,103 @@ from lbt_synth.validation import number
 
 if TYPE_CHECKING:
     from lbt_synth.design.integrator import IntegratorDesign
+    from lbt_synth.design.integrator_law import IntegratorLaw
     from lbt_synth.design.record import DesignRecord
+
+_SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides its gain
 
 
 class IntegratorOptions(Section):
     """Options of the integrator."""
 
     gain: float | None = Field(
-        default=None, gt=0, description="its gain (default: the best for the truth)"
+        default=None,
+        gt=0,
+        description="its gain (default: the best for the truth that keeps the margins)",
+    )
+    phase_margin_deg: float | None = Field(
+        default=None, gt=0, lt=180, description="least phase margin [deg]", examples=[45]
+    )
+    modulus_margin: float | None = Field(
+        default=None, gt=0, lt=1, description="least modulus margin", examples=[0.5]
+    )
+    leak: float = Field(
+        default=1.0, gt=0, le=1, description="part of a command that is left after a frame"
+    )
+    integrators: int = Field(
+        default=1, ge=1, le=2, description="how many in series; two need a zero"
+    )
+    zero_hz: float | None = Field(
+        default=None,
+        gt=0,
+        description="corner of a zero [Hz]: of a PI controller, or of the lag compensator of a "
+        "double integrator",
     )
 
 
 @table_row
 class IntegratorFacts:
-    """The only number of an integrator."""
+    """Gain and law of an integrator."""
 
     gain: float = column("gain")
+    leak: float | None = column("left of a command after a frame")
+    integrators: int | None = column("integrators")
+    zero_hz: float | None = column("corner of the zero", unit="Hz")
+    phase_margin_demand_deg: float | None = column("phase margin demanded", unit="deg")
+    modulus_margin_demand: float | None = column("modulus margin demanded")
+
+
+def _law(values: dict[str, Any]) -> IntegratorLaw:
+    from lbt_synth.design.integrator_law import IntegratorLaw
+
+    return IntegratorLaw(**values)
 
 
 def _build(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign:
     from lbt_synth.design.integrator import integrator, optimal_integrator
 
-    if options.gain is None:
-        return optimal_integrator(inputs.hardware, inputs.truth)
-    return integrator(inputs.hardware, gain=options.gain)
+    section: IntegratorOptions | None = inputs.method_section(METHOD.name)
+    own = options.model_dump(exclude_unset=True)
+    usual = {} if section is None else section.model_dump(exclude_unset=True)
+    if own.keys() & _SIZES:
+        usual = {name: value for name, value in usual.items() if name not in _SIZES}
+    values = usual | own
+    gain = values.pop("gain", None)
+    law = _law(values)
+    if gain is None:
+        return optimal_integrator(inputs.hardware, inputs.truth, law=law)
+    return integrator(inputs.hardware, gain=gain, law=law)
 
 
 def _pack(design: IntegratorDesign) -> DesignRecord:
     from lbt_synth.design.record import DesignRecord
 
-    return DesignRecord(meta={"integrator_gain": design.gain})
+    changes = design.law.changes()
+    return DesignRecord(
+        meta={"integrator_gain": design.gain} | ({"integrator_law": changes} if changes else {})
+    )
 
 
 def _unpack(record: DesignRecord) -> IntegratorDesign:
     from lbt_synth.design.integrator import IntegratorDesign
 
-    gain = number(record.meta["integrator_gain"], "integrator_gain", above=0)
-    return IntegratorDesign(**record.common(), loop_hardware=record.hardware(), gain=gain)
+    return IntegratorDesign(
+        **record.common(),
+        loop_hardware=record.hardware(),
+        gain=number(record.meta["integrator_gain"], "integrator_gain", above=0),
+        law=_law(record.meta.get("integrator_law", {})),
+    )
 
 
 def _describe(design: IntegratorDesign) -> Description:
-    return Description(facts=IntegratorFacts(gain=design.gain))
+    changes = design.law.changes()
+    facts = IntegratorFacts(
+        gain=design.gain,
+        **{name: changes.get(name) for name in ("leak", "integrators", "zero_hz")},
+        phase_margin_demand_deg=design.law.phase_margin_deg,
+        modulus_margin_demand=design.law.modulus_margin,
+    )
+    return Description(facts=facts)
 
 
 METHOD = Method(
@@ -60,6 +116,7 @@ METHOD = Method(
     title="integrator",
     label="integrator",
     options=IntegratorOptions,
+    section=IntegratorOptions,
     build=_build,
     pack=_pack,
     unpack=_unpack,

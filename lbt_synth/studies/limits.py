@@ -15,12 +15,14 @@ from lbt_synth.loop import (
     ClosedLoop,
     Imaging,
     ResidualLimit,
+    broken_loops,
     close_loop,
     least_residual,
     least_worst_residual,
     residual_budget,
     strehl,
 )
+from lbt_synth.loop.broken_loops import phase_margin_deg
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
@@ -58,6 +60,12 @@ class LimitRow:
         unit="%",
         format=".2f",
         help="The same over the limit for the band, less 1; nan where there is none",
+    )
+    phase_margin_deg: float = column(
+        "phase margin",
+        unit="deg",
+        format=".1f",
+        help="Least phase margin of the loop in the truth, each measurement broken in turn",
     )
     stable: bool = column(help="Whether the loop is stable with the real sensor gain")
 
@@ -177,6 +185,7 @@ def limits(
                 above_limit_percent=above_percent(residual_nm, limit.rms_nm if limit else np.nan),
                 worst_nm=worst_nm,
                 above_band_limit_percent=above_percent(worst_nm, band.rms_nm if band else np.nan),
+                phase_margin_deg=phase_margin_deg(broken_loops(loop)) if loop.is_stable else np.nan,
                 stable=loop.is_stable,
             )
         )

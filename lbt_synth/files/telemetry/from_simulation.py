@@ -89,7 +89,7 @@ def telemetry_from_simulation(
     if design is not None:
         require_instance(design, Design)
     gains = None
-    if isinstance(design, IntegratorDesign):
+    if isinstance(design, IntegratorDesign) and design.law.is_pure:
         gains = np.full(hardware.n_commands, design.gain)
     residual, strehl = simulation.residual_nm[case], None
     if imaging is not None and residual.shape[1] <= 2:  # the jitter of an image has two axes

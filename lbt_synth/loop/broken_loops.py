@@ -1,0 +1,201 @@
+"""Responses of a loop that is broken at one measurement, and the points where margins are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.loop.budget import resonance_edges
+from lbt_synth.loop.closed_loop import ClosedLoop
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only
+
+_SAME = 1e-6  # relative difference of responses of equal axes
+_LARGEST = 1e6  # loop gain beyond which the sensitivity is rounding to a large part
+_UNIFORM = 512  # frequencies at equal steps, beside those around resonances
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarginPoint:
+    """A point of a broken loop from which a margin is read.
+
+    Attributes
+    ----------
+    frequency_hz : float
+        Where it is [Hz].
+    response : complex
+        The broken loop there.
+    """
+
+    frequency_hz: float
+    response: complex
+
+    @property
+    def phase_deg(self) -> float:
+        """Further phase lag that takes this point to -1 [deg], where its gain is one."""
+        return float(np.degrees(np.mod(np.angle(self.response) + np.pi, 2 * np.pi)))
+
+    @property
+    def gain(self) -> float:
+        """Factor on the gain that takes this point to -1, where its phase is -180 degrees."""
+        return 1 / abs(self.response)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BrokenLoop:
+    """A loop broken at one measurement, the others closed: ``1 / S_ii - 1`` over frequency.
+
+    Attributes
+    ----------
+    measurements : tuple of int
+        The measurements, from 0, that have this response.
+    frequency_hz : (f,) ndarray
+        Frequencies up to half the frame rate [Hz], more of them around resonances.
+    response : (f,) complex ndarray
+        The loop gain; the loop is critical where it is -1.
+    gain_crossings : tuple of MarginPoint
+        Where the gain is one, with increasing frequency.
+    phase_crossings : tuple of MarginPoint
+        Where the phase is -180 degrees, with increasing frequency.
+    """
+
+    measurements: tuple[int, ...]
+    frequency_hz: FloatArray
+    response: ComplexArray
+    gain_crossings: tuple[MarginPoint, ...]
+    phase_crossings: tuple[MarginPoint, ...]
+
+    @property
+    def gain_db(self) -> FloatArray:
+        """Gain [dB], (f,)."""
+        return frozen_copy(20 * np.log10(np.maximum(np.abs(self.response), 1e-300)))
+
+    @property
+    def phase_deg(self) -> FloatArray:
+        """Phase without jumps [deg], (f,); between -270 and 90 at the lowest frequency."""
+        phase = np.degrees(np.unwrap(np.angle(self.response)))
+        return frozen_copy(phase - 360 * np.ceil((phase[0] - 90) / 360))
+
+    @property
+    def phase_margin(self) -> MarginPoint | None:
+        """The gain crossing with the least phase margin; None without a crossing."""
+        return min(self.gain_crossings, key=lambda point: point.phase_deg, default=None)
+
+    @property
+    def gain_margins(self) -> tuple[MarginPoint, ...]:
+        """The phase crossings from which a rise and a fall of the gain reach -1 first."""
+        rise = [point for point in self.phase_crossings if point.gain > 1]
+        fall = [point for point in self.phase_crossings if point.gain < 1]
+        return tuple(
+            nearest(points, key=lambda point: point.gain)
+            for nearest, points in ((max, fall), (min, rise))
+            if points
+        )
+
+
+def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
+    """Break a stable loop at each measurement in turn, the others closed.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The loop.
+
+    Returns
+    -------
+    tuple of BrokenLoop
+        One for each response; measurements whose responses are equal share it.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is not stable.
+
+    Examples
+    --------
+    An integrator of gain 0.5 in a two-frame loop has a phase margin of 90 - 3 asin(0.25) degrees:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> both = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
+    >>> (found,) = lbt.loop.broken_loops(both)
+    >>> found.measurements, round(found.phase_margin.phase_deg, 2)
+    ((0, 1), 46.57)
+    """
+    loop.require_stable()
+    system, nyquist = loop.output_sensitivity(), loop.hardware.frame_rate_hz / 2
+    nodes, _ = gauss_panels(resonance_edges(loop), 12)
+    uniform = np.linspace(0, nyquist, _UNIFORM + 1)[1:]
+    grid = frozen_copy(np.unique(np.concatenate([nodes, uniform])))
+
+    def broken(frequency_hz: FloatArray) -> ComplexArray:
+        """Return the response of each broken loop, (f, q); with S, ``1 + l_i = 1 / S_ii``."""
+        sensitivity = system.frequency_response(frequency_hz)
+        return np.asarray(1 / np.diagonal(sensitivity, axis1=1, axis2=2) - 1)
+
+    responses = broken(grid)
+    shared: list[list[int]] = []
+    for index, own in enumerate(responses.T):
+        like = (group for group in shared if _is_same(own, responses[:, group[0]]))
+        group = next(like, None)
+        if group is None:
+            shared.append([index])
+        else:
+            group.append(index)
+    return tuple(_examine(broken, grid, responses, group) for group in shared)
+
+
+def phase_margin_deg(loops: tuple[BrokenLoop, ...]) -> float:
+    """Return the least phase margin of broken loops [deg]; inf without a gain crossing."""
+    points = (point for broken in loops for point in broken.gain_crossings)
+    return min((point.phase_deg for point in points), default=np.inf)
+
+
+def _examine(
+    broken: Callable[[FloatArray], ComplexArray],
+    grid: FloatArray,
+    responses: ComplexArray,
+    group: list[int],
+) -> BrokenLoop:
+    """Return the broken loop of measurements with the same response."""
+    own = responses[:, group[0]]
+
+    def at(frequency_hz: float) -> complex:
+        return complex(broken(np.array([frequency_hz]))[0, group[0]])
+
+    def crossings(value: Callable[[complex], float], level: FloatArray) -> list[MarginPoint]:
+        """Refine where a value of the response, (f,) on the grid, changes its sign."""
+        found = []
+        for i in np.flatnonzero(level[1:] * level[:-1] < 0):
+            ends = float(grid[i]), float(grid[i + 1])
+            sizes = [value(at(f)) for f in ends]
+            if sizes[0] * sizes[1] < 0:
+                f = float(brentq(lambda f: value(at(f)), *ends, xtol=1e-12))
+            else:  # only rounding had changed its sign
+                f = ends[int(abs(sizes[1]) < abs(sizes[0]))]
+            found.append(MarginPoint(frequency_hz=f, response=at(f)))
+        return found
+
+    across = crossings(lambda response: response.imag, own.imag[:-1])
+    for end in (0.0, float(grid[-1])):  # where a response is real
+        with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is infinite
+            across.append(MarginPoint(frequency_hz=end, response=at(end).real))
+    return BrokenLoop(
+        measurements=tuple(group),
+        frequency_hz=grid,
+        response=read_only(own.copy()),
+        gain_crossings=tuple(crossings(lambda response: abs(response) - 1, np.abs(own) - 1)),
+        phase_crossings=tuple(
+            sorted(
+                (point for point in across if -_LARGEST < point.response.real < 0),
+                key=lambda point: point.frequency_hz,
+            )
+        ),
+    )
+
+
+def _is_same(own: ComplexArray, other: ComplexArray) -> bool:
+    return bool(np.allclose(own, other, rtol=_SAME, atol=0))
