@@ -33,10 +33,19 @@ def suggest_word(word: str, known: Iterable[str]) -> str:
 
 
 class LbtSynthError(Exception):
-    """Base class of every error that this package raises on purpose."""
+    """Base class of every error that this package raises on purpose.
+
+    Attributes
+    ----------
+    in_python : str
+        Advice at the end of the message for scripts alone; the command line leaves it out.
+    """
+
+    in_python: str = ""
 
     def __init__(self, message: str = "", **data: Any) -> None:
-        super().__init__(shorten_middle(message))
+        advice = data.get("in_python", "")
+        super().__init__(shorten_middle(f"{message} {advice}" if advice else message))
         for name, value in data.items():
             if not hasattr(type(self), name):
                 raise TypeError(f"{type(self).__name__} has no attribute {name!r}.")

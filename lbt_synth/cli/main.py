@@ -9,10 +9,9 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import re
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from lbt_synth.cli.streams import discard, print_error, reopen_closed
 from lbt_synth.errors import LbtSynthError, SynthesisError
@@ -44,7 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with own_display_unit():
             report = command.run(arguments)
     except LbtSynthError as error:
-        message = _name_options(str(error), vars(arguments))
+        from lbt_synth.cli.surface import say_error  # after what it says may have failed
+
+        message = say_error(error, arguments)
         if arguments.json:
             print(json.dumps({"error": type(error).__name__, "message": message}))
         print_error(f"error: {message}")
@@ -60,22 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     report.print(as_json=arguments.json)
     return DONE if report.passed else FAILED
-
-
-def _name_options(message: str, arguments: Mapping[str, object]) -> str:
-    """Name the command's options where a message names arguments of functions.
-
-    With a configuration, a message may name its keys instead.
-    """
-    if "config" in arguments:
-        return message
-    words = re.compile(r"(?<![\w.'\"/-])[a-z]+(?:_[a-z]+)+(?!\w|\(|\[|\.\w)")
-
-    def name(found: re.Match[str]) -> str:
-        word = found.group()
-        return "--" + word.replace("_", "-") if word in arguments else word
-
-    return words.sub(name, message)
 
 
 def _stop_loading(*_: object) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+from typing import Any, NoReturn, cast
 
 import lbt_synth
 from lbt_synth.cli import arguments
+from lbt_synth.cli.argument_kinds import add_switch
 from lbt_synth.cli.streams import printable
 from lbt_synth.errors import ProblemError, suggest_word
 
@@ -65,7 +66,7 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
         command = commands.add_parser(
             name, help=text.splitlines()[0].rstrip("."), description=" ".join(text.split())
         )
-        arguments.add_switch(command, "--json", "print one JSON object instead")
+        add_switch(command, "--json", "print one JSON object instead")
         if name in named:
             add_arguments(command)
     return parser
@@ -78,5 +79,19 @@ def command_help(name: str = "") -> str:
         return parser.format_help()
     if name not in COMMANDS:
         raise ProblemError(f"there is no command {name!r}; {suggest_word(name, COMMANDS)}")
-    commands = parser._subparsers._group_actions[0]  # type: ignore[union-attr]
-    return str(commands.choices[name].format_help())  # type: ignore[index]
+    return _command_parser(parser, name).format_help()
+
+
+def command_options(name: str) -> dict[str, tuple[str, Any]]:
+    """Return the longest spelling and the default of each option of a command, by its argument."""
+    actions = _command_parser(build_parser(name), name)._actions
+    return {
+        action.dest: (max(action.option_strings, key=len), action.default)
+        for action in actions
+        if action.option_strings and action.dest != "help"
+    }
+
+
+def _command_parser(parser: argparse.ArgumentParser, name: str) -> argparse.ArgumentParser:
+    commands = parser._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    return cast(dict[str, argparse.ArgumentParser], commands)[name]

@@ -13,6 +13,7 @@ from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import given_options, load_designs, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import count_progress, track_progress
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
@@ -42,8 +43,8 @@ def run(arguments: Namespace) -> Report:
 def _refuse_unused_options(arguments: Namespace) -> None:
     """Refuse the options of redesigning beside gain files, and those of maps without them."""
     redesign: tuple[str, ...] = ("sensor_gain", "gamma_ratio")
-    maps: tuple[str, ...] = ("errors_hz", "sensor_gains", "delay_errors")
-    names = {name: f"--{name.replace('_', '-')}" for name in (*redesign, *maps)}
+    maps: tuple[str, ...] = ("errors_hz", "sensor_gains", "delay_errors_frames")
+    names = {name: words for name, (words, _) in command_options(arguments.command).items()}
     unused, reason = maps, "goes with gain files, whose designs stay as they are; name some"
     if arguments.gains:
         unused, reason = redesign, "is for redesigning, without gain files; the options of these "
@@ -83,7 +84,7 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     settings = config.settings.robustness
     errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(config.errors_hz))
     gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
-    delays = arguments.delay_errors or settings.delay_errors_frames
+    delays = arguments.delay_errors_frames or settings.delay_errors_frames
     for gain in gains:
         number(gain, "--sensor-gains", above=0)
     designs = load_designs(arguments.gains)

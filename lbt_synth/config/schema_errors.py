@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from lbt_synth.config.schema import EACH, ONE, FileSection
 from lbt_synth.errors import suggest_word
@@ -17,14 +18,19 @@ def describe_error(
     details = error.errors()
     # an unknown key says more than the missing one that it was meant to be
     first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
-    location = tuple(p for p in first["loc"] if p not in ("ar1", "ar2", "ar", ONE, EACH))
+    location = _plain_location(first)
     key = _key_path(location)
     more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = _list_keys(schema, location[:-1])
         return f"unknown key {key}; {suggest_word(str(location[-1]), known)}{more}", key
+    missing = [_key_path(_plain_location(d)) for d in details if d["type"] == "missing"]
     if first["type"] == "missing":
-        return f"the key {key} is missing.{more}", key
+        if len(missing) == 1:
+            return f"the key {key} is missing.{more}", key
+        rest = len(details) - len(missing)
+        more = f" ({rest} more after these.)" if rest else ""
+        return f"the keys {', '.join(missing)} are missing.{more}", key
     if first["type"] == "value_error":
         return f"{key}: {first['ctx']['error']}.{more}", key
     if first["type"] == "too_short" and key.endswith("vibrations"):
@@ -36,6 +42,11 @@ def describe_error(
         return f"{key} must be a mapping of keys; got {first['input']!r}.{more}", key
     text = first["msg"][0].lower() + first["msg"][1:]
     return f"{key}: {text}; got {first['input']!r}.{more}", key
+
+
+def _plain_location(detail: ErrorDetails) -> tuple[int | str, ...]:
+    """Return where a mistake is, without the tags of what may stand there."""
+    return tuple(p for p in detail["loc"] if p not in ("ar1", "ar2", "ar", ONE, EACH))
 
 
 def _key_path(location: tuple[int | str, ...]) -> str:

@@ -57,7 +57,7 @@ BAD = [
     (("design", CONFIG, "--method", "magic", "-o", "OUT.fits"), 2, "invalid choice"),
     (("design", CONFIG), 2, "required"),
     (("show", "none.fits"), 2, "cannot read none.fits"),
-    (("show", CONFIG), 2, "must end in"),
+    (("show", CONFIG), 2, "is a configuration, expected a gain file"),
     (("verify", "DAMAGED.fits"), 2, "damaged"),
     (("sigma", "DAMAGED.fits", "-o", "OUT.png"), 2, "damaged"),
     (("sigma", "KALMAN", "-o", "OUT.gif"), 2, "must end in .png"),

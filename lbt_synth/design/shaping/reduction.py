@@ -89,12 +89,15 @@ def reduce_poles(
 
     accepted, loss = attempt(candidates[0])
     if accepted is None or loss > tolerance:
-        best = f"the best lost {100 * loss:.3g} %" if np.isfinite(loss) else "none was feasible"
+        states = order + hardware.mirror_system.whole.n_states
+        best, advice = "none was feasible", f"Try states={2 * states}."
+        if np.isfinite(loss):
+            best = f"the best lost {100 * loss:.3g} %"
+            advice = f"Try states={2 * states} or loss={1.1 * loss:.2g}."
         raise InfeasibleError(
-            f"no controller of {order + hardware.mirror_system.whole.n_states} states per mode "
-            f"came within {100 * tolerance:.3g} % of the long parameter's "
-            f"{long.objective_nm:.4g} nm (root of the whole objective): {best}. "
-            "Allow more states or a larger loss."
+            f"no controller of {states} states per mode came within {100 * tolerance:.3g} % of the "
+            f"long parameter's {long.objective_nm:.4g} nm (root of the whole objective): {best}. "
+            f"{advice}"
         )
     kept, failed = 0, len(candidates)
     while failed - kept > 1:  # fewer poles lose more: bisection

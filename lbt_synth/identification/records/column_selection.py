@@ -163,7 +163,7 @@ def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> 
         raise ProblemError(
             f"{join_names(found)} are all named as {role}"
             f"{', and not each of an axis of its own' if of_axes else ''}; choose by "
-            f"columns={{'{role}': ...}} (--columns {role}=...)."
+            f"columns={{'{role}': ...}}."
         )
     if not of_axes:
         return found
@@ -209,8 +209,4 @@ def join_names(columns: Sequence[Column]) -> str:
 
 def _how_to_choose(columns: Sequence[Column], *roles: str) -> str:
     wanted = ", ".join(f"'{role}': ..." for role in roles)
-    options = " ".join(f"{role}=..." for role in roles)
-    return (
-        f"; got {join_names(columns)}. Choose by columns={{{wanted}}} (--columns {options}), by "
-        "names or numbers from 0."
-    )
+    return f"; got {join_names(columns)}. Choose by columns={{{wanted}}}, names or numbers from 0."

@@ -45,6 +45,11 @@ def unit_name(text: str) -> str | None:
     return found if found in UNITS else None
 
 
+def is_angle(text: str) -> bool:
+    """Whether a text is a unit of tilt, which becomes a wavefront by the telescope."""
+    return unit_name(text) in _MAS
+
+
 def density_unit(text: str) -> tuple[str, int] | None:
     """Split the unit of a spectrum into a unit and its power, 1 or 2; None for others."""
     word = text.strip()

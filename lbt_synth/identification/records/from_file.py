@@ -123,7 +123,7 @@ def load_record(
         "source": str(source),
     }
     with name_in_errors(source):
-        if _is_telemetry(source):
+        if is_telemetry(source):
             if kind not in (None, "closed_loop") or columns is not None or commands is not None:
                 raise ProblemError(
                     "telemetry holds measurements and commands: kind must be closed_loop "
@@ -141,7 +141,8 @@ def load_record(
         return build_record(series, contents, averages=averages, **given)
 
 
-def _is_telemetry(path: Path) -> bool:
+def is_telemetry(path: Path) -> bool:
+    """Whether a file is telemetry of this package or of the AOT standard."""
     try:
         if path.suffix.lower() in FITS:
             with open_input(path, TelemetryError) as stream:
@@ -276,8 +277,8 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
     if (response is None and q != n) or (response is not None and q > n > 2):
         raise ProblemError(
             f"this telemetry has {q} measurements and {f'{n} modes' if n != q else 'no modes'}: "
-            "slopes without modal coefficients. Multiply them by the reconstructor of the loop: "
-            "Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R, ...)."
+            "slopes without modal coefficients. Multiply them by the reconstructor of the loop.",
+            in_python="As Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R).",
         )
     if response is None or np.array_equal(response, np.eye(n)):
         return None
@@ -294,8 +295,9 @@ def _influence(seen: Telemetry) -> FloatArray | None:
     n, m, influence = seen.modes, seen.commands.shape[1], seen.influence_matrix
     if influence is None and m != n:
         raise ProblemError(
-            f"this telemetry has {m} commands of {n} modes, and no influence matrix; give it "
-            "to Telemetry(influence_matrix=...), (modes, commands)."
+            f"this telemetry has {m} commands of {n} modes, and no influence matrix (modes, "
+            "commands).",
+            in_python="Give it to Telemetry(influence_matrix=...).",
         )
     is_identity = influence is None or np.array_equal(influence, np.eye(n))
     return None if is_identity else influence

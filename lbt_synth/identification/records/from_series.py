@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from lbt_synth.identification.records.columns import (
     Column,
     density_unit,
     hz_per,
+    is_angle,
     nm_per,
     same_unit,
     seconds_per,
@@ -60,6 +61,9 @@ def build_record(
             f"averages are only for a spectrum; the record is of kind {series.kind}."
         )
     facts = {name: _find_fact(contents, name, given[name]) for name in _FACTS[kind]}
+    if kind == "loop":
+        units = {series.role: unit, "commands": command_unit or unit}
+        _require_facts(series, contents, units, facts)
     own_unit = _find_unit(series.columns[series.role], unit, contents, kind)
     if kind == "spectrum":
         return _build_spectrum(series, contents, own_unit, source=source, **facts)
@@ -92,6 +96,31 @@ def build_record(
             "time_ms, or give frame_rate_hz."
         )
     return record
+
+
+def _require_facts(
+    series: Series, contents: Contents, units: Mapping[str, str | None], facts: Mapping[str, Any]
+) -> None:
+    """Refuse a loop of which several facts are missing, all of them in one message."""
+    of_file = "".join(map(str, contents.facts.get("unit", {}).values()))
+    found = [
+        (column, column.unit or of_file or unit or "")
+        for role, unit in units.items()
+        for column in series.columns.get(role, ())
+    ]
+    bare = [column for column, unit in found if not unit]
+    angles = facts["diameter_m"] is None and any(is_angle(unit) for _, unit in found)
+    no_rate = facts["frame_rate_hz"] is None and "times" not in series.columns
+    no_delay = facts["delay_frames"] is None and "commands" in series.columns
+    checks = (
+        (bare, f"the unit of {join_names(bare)}: give unit ({_UNITS['loop']})"),
+        (angles, "the telescope, by which angles become nm: give diameter_m"),
+        (no_rate, "the frame rate: give frame_rate_hz, or the times"),
+        (no_delay, "the total delay: give delay_frames"),
+    )
+    missing = [text for lacks, text in checks if lacks]
+    if len(missing) > 1:
+        raise ProblemError(f"nothing tells {'; '.join(missing)}.")
 
 
 def _find_fact(contents: Contents, name: str, given: Any) -> Any:

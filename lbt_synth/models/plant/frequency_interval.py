@@ -34,8 +34,7 @@ class FrequencyInterval:
         plant.parts()  # refuses the memory of a mixed filter
         if not plant.vibrations:
             raise ProblemError(
-                "an interval of frequencies needs a vibration; got a plant without any. Try "
-                "kalman or hinf."
+                "an interval of frequencies needs a vibration; got a plant without any."
             )
         first = plant.vibrations[0]
         for line in plant.vibrations:
@@ -44,8 +43,9 @@ class FrequencyInterval:
                 raise ProblemError(
                     "one uncertain frequency at a time: the vibrations must share frequency and "
                     f"damping; got {first.frequency_hz:.6g} Hz with {first.damping:.6g} and "
-                    f"{line.frequency_hz:.6g} Hz with {line.damping:.6g}. Try a plant with one of "
-                    "them (without spread_hz in a configuration), or kalman with spread_plant."
+                    f"{line.frequency_hz:.6g} Hz with {line.damping:.6g}. Keep one of "
+                    "them in the model, without spread_hz.",
+                    in_python="spread_plant covers several of them for a Kalman filter.",
                 )
         check_fields(self)
         for end in (self.low_hz, self.high_hz):

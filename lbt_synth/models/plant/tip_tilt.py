@@ -130,8 +130,9 @@ class TipTiltPlant(EstimationProblem):
         if not 1 <= delay <= LONGEST_HORIZON:
             raise ProblemError(
                 f"horizon must leave the loop a delay of 1 to {LONGEST_HORIZON} frames; got "
-                f"{steps}, which makes {delay:g}. For an estimate without a loop, make an "
-                "EstimationProblem of the plant's matrices."
+                f"{steps}, which makes {delay:g}.",
+                in_python="For an estimate without a loop, make an EstimationProblem of the "
+                "plant's matrices.",
             )
         return assemble(replace(self.parts(), hardware=replace(hw, delay_frames=delay)))
 

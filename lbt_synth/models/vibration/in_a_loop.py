@@ -41,8 +41,8 @@ def stationary_vibrations(
         if isinstance(vibration, DriftingVibration):
             raise ProblemError(
                 "this needs a truth that is stationary; got a vibration that drifts from "
-                f"{vibration.start_hz:.6g} to {vibration.end_hz:.6g} Hz. Simulate it, or take a "
-                "Vibration or SinusoidalVibration at the frequencies in question."
+                f"{vibration.start_hz:.6g} to {vibration.end_hz:.6g} Hz. Simulate it, or take "
+                "vibrations that stay, at the frequencies in question."
             )
         still.append(vibration)
     return tuple(still)

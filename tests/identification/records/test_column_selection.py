@@ -136,7 +136,7 @@ def test_x_and_y_may_be_a_clock_and_its_series(tmp_path, series):
     for each, names in ((path, "x_nm, y_nm"), (clock, "x, y_nm")):
         with pytest.raises(
             lbt.errors.ProblemError,
-            match=rf"{names} are all named as .*columns=.* \(--columns \w+=\.\.\.\)",
+            match=rf"{names} are all named as .*columns=\{{'\w+': \.\.\.\}}",
         ):
             lbt.load_record(each, kind="open_loop", frame_rate_hz=RATE)
     chosen = {"open_loop": ("x_nm", "y_nm")}
@@ -155,7 +155,7 @@ def test_a_clock_without_a_name_is_no_axis(tmp_path, series):
     np.savetxt(path, np.column_stack([np.arange(FRAMES) / RATE, series[0][:, 0]]))
     with pytest.raises(
         lbt.errors.ProblemError,
-        match=r"needs columns of open_loop; got a column.*\(--columns open_loop=\.\.\.\)",
+        match=r"needs columns of open_loop; got a column.*columns=\{'open_loop': \.\.\.\}",
     ):
         lbt.load_record(path, kind="open_loop", unit="nm", frame_rate_hz=RATE)
     seen = lbt.load_record(path, columns={"times": 0, "open_loop": 1}, unit="nm")

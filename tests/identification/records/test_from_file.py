@@ -300,7 +300,11 @@ def gapped(folder):
         ),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": 0}, "delay_frames must be at least 1; got 0"),
         (["y_nm", "u_nm", "a", "b"], {"delay_frames": "two"}, "delay_frames must be a number"),
-        (["y_nm", "u_nm", "a", "b"], {"frame_rate_hz": None}, "frame rate is not known; give fra"),
+        (
+            ["y_nm", "u_nm", "a", "b"],
+            {"frame_rate_hz": None},
+            "nothing tells the frame rate: give fra",
+        ),
         (["y_nm", "u_nm", "t [h]", "b"], {}, "times must be in one of s, ms, us, ns; got 'h'"),
     ],
 )

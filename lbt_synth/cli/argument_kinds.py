@@ -1,0 +1,64 @@
+"""Kinds of arguments that several commands have: options, switches, files and outputs."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, _ActionsContainer
+from collections.abc import Sequence
+from typing import Any
+
+GAIN_FILE = "gain file (.fits, .npz or .json)"
+FIGURE = "figure (.png, .pdf or .svg)"
+
+
+def add_option(
+    parser: _ActionsContainer,
+    name: str,
+    kind: type[Any] | Sequence[str],
+    text: str = "",
+    default: float | None = None,
+    **more: Any,
+) -> None:
+    """Add an option of a type or of some choices; its help ends with its default."""
+    if default is not None:
+        text += f" (default {default:g})"
+    more |= {"type": kind} if isinstance(kind, type) else {"choices": kind}
+    parser.add_argument(name, help=text, default=default, **more)
+
+
+def add_switch(parser: _ActionsContainer, name: str, text: str) -> None:
+    """Add an option without a value."""
+    parser.add_argument(name, action="store_true", help=text)
+
+
+def add_config(parser: ArgumentParser) -> None:
+    """Add a configuration."""
+    parser.add_argument("config", help="configuration file (YAML)")
+
+
+def add_gain(parser: ArgumentParser) -> None:
+    """Add one gain file."""
+    parser.add_argument("gain", help=GAIN_FILE)
+
+
+def add_gains(parser: ArgumentParser, nargs: str = "*", text: str = GAIN_FILE) -> None:
+    """Add gain files."""
+    parser.add_argument("gains", nargs=nargs, metavar="gain", help=text)
+
+
+def add_output(parser: ArgumentParser, text: str, *, required: bool = True) -> None:
+    """Add one output."""
+    parser.add_argument("-o", "--output", required=required, help=text)
+
+
+def add_unit(parser: ArgumentParser) -> None:
+    """Add the unit of wavefronts in tables, texts, figures and pages."""
+    from lbt_synth.storage.display_unit import UNITS
+
+    text = "what tables, figures and pages show wavefronts in (default nm; JSON and CSV stay in nm)"
+    add_option(parser, "--unit", UNITS, text)
+
+
+def add_outputs(parser: ArgumentParser) -> None:
+    """Add any number of tables and figures."""
+    text = "table (.csv) or figure (.png, .pdf, .svg); repeatable"
+    parser.add_argument("-o", "--output", action="append", default=[], help=text)
