@@ -11,6 +11,7 @@ import json
 import os
 import signal
 import sys
+from argparse import Namespace
 from collections.abc import Sequence
 
 from lbt_synth.cli.streams import discard, print_error, reopen_closed
@@ -36,6 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         creation_time()  # refuses a wrong SOURCE_DATE_EPOCH before the libraries read it
+    except LbtSynthError as error:
+        return _fail(error, str(error), arguments)
+    try:
         command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
         if signal.getsignal(signal.SIGINT) is _stop_loading:
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -45,11 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except LbtSynthError as error:
         from lbt_synth.cli.surface import say_error  # after what it says may have failed
 
-        message = say_error(error, arguments)
-        if arguments.json:
-            print(json.dumps({"error": type(error).__name__, "message": message}))
-        print_error(f"error: {message}")
-        return FAILED if isinstance(error, SynthesisError) else WRONG
+        return _fail(error, say_error(error, arguments), arguments)
     except MemoryError:
         print_error("error: not enough memory; ask for less.")
         return WRONG
@@ -61,6 +61,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     report.print(as_json=arguments.json)
     return DONE if report.passed else FAILED
+
+
+def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:
+    """Print what failed, and return the exit status."""
+    if arguments.json:
+        print(json.dumps({"error": type(error).__name__, "message": message}))
+    print_error(f"error: {message}")
+    return FAILED if isinstance(error, SynthesisError) else WRONG
 
 
 def _stop_loading(*_: object) -> None:

@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from lbt_synth.cli.parser import command_options
 from lbt_synth.config.load import read_mapping
 from lbt_synth.config.schema import FileSection
-from lbt_synth.errors import ConfigError, LbtSynthError
+from lbt_synth.errors import ConfigError, LbtSynthError, OutputError
 from lbt_synth.files import load_gain
 from lbt_synth.identification.records.from_file import is_telemetry
 
@@ -38,7 +38,7 @@ _ENDINGS = {".png": "figure", ".pdf": "figure", ".svg": "figure", ".html": "page
 
 def say_error(error: LbtSynthError, arguments: Namespace) -> str:
     """Return the message of an error in the words of a command that was run."""
-    if misplaced := _misplaced_files(arguments):
+    if not isinstance(error, OutputError) and (misplaced := _misplaced_files(arguments)):
         return misplaced
     message = str(error)
     cause: BaseException | None = error
