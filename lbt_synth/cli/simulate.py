@@ -93,7 +93,7 @@ def run(arguments: Namespace) -> Report:
     report.data["sensor_gain"] = config.sensor_gain * truth.sensor_gain
     report.notes += _simulation_notes(config, design, strehls, settle, drifts=truth.drifts)
     if arguments.output is not None:
-        title = f"{design.method}: first run above, mean spectrum of all runs below"
+        title = f"{design.method}: the first second above, mean spectrum of all runs below"
         figure = simulation_figure(simulation, title=title)
         report.note_written(save_figure(figure, arguments.output))
     if arguments.telemetry is not None:

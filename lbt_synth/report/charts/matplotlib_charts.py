@@ -306,7 +306,10 @@ def _draw_map(axes: Axes, found: Map) -> Any:
     if inner:
         shades = [scales.level_colour(level, found.low, found.high) for level in inner]
         lines = axes.contour(found.x, found.y, shown, levels=inner, linewidths=0.8, colors=shades)
-        axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+        texts = axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+        boxes = [text.get_window_extent().extents for text in texts]
+        for text, stays in zip(texts, scales.keep_apart(boxes), strict=True):
+            text.set_visible(stays)
     for left, right, low, high in scales.blank_cells(np.isnan(found.values), x, y):
         axes.fill_between([left, right], low, high, **_BLANK)
     return image

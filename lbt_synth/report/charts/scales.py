@@ -12,6 +12,7 @@ from lbt_synth.report.charts.description import Area, Axis, Bars, Curve, Map, Pa
 from lbt_synth.validation import BoolArray, FloatArray
 
 STREHL_LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
+_DECADES = 8  # of a logarithmic scale at most: a zero must not stretch it
 _ROOM = 0.04  # around what is drawn, as a part of its extent
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -65,6 +66,7 @@ def _axis_ends(
     low, high = (float(shown.min()), float(shown.max())) if shown.size else (1.0, 1.0)
     if axis.log:
         low, high = math.log(low), math.log(high)
+        low = max(low, high - _DECADES * math.log(10))
     if high - low <= 1e-12 * max(abs(low), abs(high)):
         half = 0.5 if axis.log or low == 0 else abs(low) / 10
         low, high = low - half, high + half
@@ -88,6 +90,18 @@ def _is_cut(values: FloatArray, end: float, *, marked: bool) -> bool:
     """Whether an end of a scale cuts a marker, or a line that runs along it."""
     at_end = np.isclose(values, end, rtol=1e-9, atol=1e-12)
     return bool(np.any(at_end) if marked else np.any(at_end[1:] & at_end[:-1]))
+
+
+def keep_apart(boxes: Sequence[tuple[float, float, float, float]]) -> list[bool]:
+    """Return which boxes (left, bottom, right, top) stay if none may cover one before it."""
+    kept: list[tuple[float, float, float, float]] = []
+    stay = []
+    for left, bottom, right, top in boxes:
+        apart = (right < k[0] or k[2] < left or top < k[1] or k[3] < bottom for k in kept)
+        stay.append(all(apart))
+        if stay[-1]:
+            kept.append((left, bottom, right, top))
+    return stay
 
 
 def log_ticks(low: float, high: float) -> list[float]:

@@ -78,7 +78,6 @@ def _strehl_chart(report: DesignReport) -> Chart:
         f"{signed_text(float(report.errors_hz[np.argmin(strehl)]))} Hz"
         for name, strehl in worst.items()
     ]
-    least = 100 * min(float(np.min(strehl)) for strehl in worst.values())
     curves = [
         stable_curve(
             one.name,
@@ -88,7 +87,7 @@ def _strehl_chart(report: DesignReport) -> Chart:
         )
         for one in report.assessments
     ]
-    panel = strehl_panel(curves, max(0.0, 10 * np.floor((least - 5) / 10)))
+    panel = strehl_panel(curves)
     gain = number_text(report.real_gain)
     return chart("robustness", [panel], gain=gain, ends=listing_text(ends))
 

@@ -228,7 +228,7 @@ def _innovations_panel(axis: IdentifiedAxis) -> Panel:
     even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
     bound = _KOLMOGOROV / np.sqrt(test.effective)
     excess = test.cumulative - even
-    reach = 1.2 * max(bound, float(np.max(np.abs(excess))))
+    reach = max(2 * bound, 1.2 * float(np.max(np.abs(excess))))
     return Panel(
         title="innovations, less white noise",
         x=_frequency(axis),

@@ -14,6 +14,7 @@ from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.validation import FloatArray
 
+_DEEPEST = 1e5  # below the highest value: a zero at the Nyquist frequency is no scale
 _POINTS = 1200  # of a grid of frequencies
 FREQUENCY = Axis(label="frequency", unit="Hz", log=True)
 # Frequencies, largest singular values of the rejection and of the noise transfer, (f,) each; the
@@ -88,7 +89,10 @@ def frequency_panel(
     label: str, unit: str, marks: Sequence[Mark], rules: Sequence[Rule], *, title: str = ""
 ) -> Panel:
     """Return a panel of transfer functions over frequency."""
-    y = Axis(label=f"\u03c3\u0304, {label}", unit=unit, log=True)
+    values = np.concatenate([np.zeros(1), *(mark.y for mark in marks if isinstance(mark, Curve))])
+    floor = float(np.max(values)) / _DEEPEST
+    low = floor if np.any(values[1:] < floor) and floor > 0 else None
+    y = Axis(label=f"\u03c3\u0304, {label}", unit=unit, log=True, low=low)
     return Panel(x=FREQUENCY, y=y, marks=(*marks, *rules), title=title)
 
 

@@ -86,9 +86,10 @@ def robustness_figure(
     return draw_figure([strehl_panel(curves)], axes=axes)
 
 
-def strehl_panel(curves: Sequence[Curve], low: float = 0.0) -> Panel:
-    """Return curves of the Strehl ratio over the frequency error."""
-    y = Axis(label="Strehl ratio", unit="%", low=low)
+def strehl_panel(curves: Sequence[Curve]) -> Panel:
+    """Return curves of the Strehl ratio over the frequency error, on a scale that they fill."""
+    least = min((float(np.nanmin(curve.y)) for curve in curves if curve.y.size), default=0.0)
+    y = Axis(label="Strehl ratio", unit="%", low=max(0.0, 10 * np.floor((least - 5) / 10)))
     return Panel(x=FREQUENCY_ERROR, y=y, marks=tuple(curves), height_in=2.5)
 
 

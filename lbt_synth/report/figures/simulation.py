@@ -11,6 +11,8 @@ from lbt_synth.report.charts.description import Axis, Curve, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import FREQUENCY
 
+_SERIES_S = 1.0  # of a series, in which single oscillations are seen
+
 
 def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None) -> Figure:
     """Residual series and spectra before and after the correction.
@@ -18,7 +20,7 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
     Parameters
     ----------
     run : Simulation
-        A run; its first case is drawn, the spectra are means over all cases.
+        A run; the first second of its first case is drawn, the spectra are means over all cases.
     title : str, optional
         Title of the figure.
     axes : Axes or sequence of Axes, optional
@@ -49,11 +51,13 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
 
     _, frames, n = run.residual_nm.shape
     names = ("tip", "tilt") if n <= 2 else [f"mode {i}" for i in range(n)]
-    time = np.arange(frames) / run.frame_rate_hz
+    shown = min(frames, int(np.ceil(_SERIES_S * run.frame_rate_hz)))
+    time = np.arange(shown) / run.frame_rate_hz
     series, spectra = [], []
     for i in range(n):
-        y = run.residual_nm[0, :, i]
-        series.append(Curve(name=names[i], x=time, y=y, look=i, width=0.5, opacity=0.8, dash=0))
+        y = run.residual_nm[0, :shown, i]
+        name = f"{names[i]}, residual"
+        series.append(Curve(name=name, x=time, y=y, look=i, width=0.8, opacity=0.8, dash=0))
         # the residual is solid, what there was before it is dotted
         for data, word, dash in ((run.total_nm, "open loop", 3), (run.residual_nm, "residual", 0)):
             f, s = welch(data[:, :, i], fs=run.frame_rate_hz, nperseg=min(frames, 2048), axis=1)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from lbt_synth.report.charts.description import Area, Axis, Curve, Panel
 from lbt_synth.report.charts.scales import (
+    keep_apart,
     log_tick_texts,
     log_ticks,
     scale_ends,
@@ -27,6 +28,7 @@ from lbt_synth.report.charts.scales import (
         (Axis(label="x"), [], (0.9, 1.1)),
         (Axis(label="x", log=True), [], (np.exp(-0.5), np.exp(0.5))),
         (Axis(label="x"), [0.0], (-0.5, 0.5)),
+        (Axis(label="x", log=True), [1e-17, 10.0], (1e-7, 10.0)),  # a zero is no scale
     ],
 )
 def test_ends_of_scales(axis, values, ends):
@@ -85,3 +87,8 @@ def test_labels_do_not_overlap(wanted):
     assert np.all((places > 0) & (places < 1))
     if wanted and np.all(np.diff([-0.03, *wanted, 1.03]) > 0.06):
         assert places == pytest.approx(wanted)
+
+
+def test_of_labels_that_cover_each_other_the_first_stays():
+    boxes = [(0, 0, 2, 1), (1, 0, 3, 1), (2.5, 0, 4, 1), (0, 2, 2, 3)]
+    assert keep_apart(boxes) == [True, False, True, True]

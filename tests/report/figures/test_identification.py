@@ -7,6 +7,8 @@ import pytest
 from support.eris import eris_model
 
 import lbt_synth as lbt
+from lbt_synth.report.charts.description import Span
+from lbt_synth.report.figures.identification import identification_panels
 
 
 @pytest.fixture(scope="module")
@@ -33,3 +35,10 @@ def test_figure_of_a_short_spectrum(model):
             x, y = plot.transAxes.transform(text.get_position())
             assert edges.x0 < x < edges.x1
             assert y > top
+
+
+def test_the_interval_of_white_noise_does_not_fill_its_panel(model):
+    panel = identification_panels(model, {})[-1]
+    (band,) = panel.select(Span)
+    assert panel.y.high >= 2 * band.high
+    assert panel.y.low <= 2 * band.low

@@ -18,6 +18,7 @@ def test_robustness_figure_draws_the_paper_beside(config):
     (axis,) = lbt.report.figures.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
     assert legend(axis) == ["Kalman", "Kalman, paper", "H∞"]
     assert "[%]" in axis.get_ylabel()
+    assert 50 < axis.get_ylim()[0] < 80  # the scale is that of what is there
     assert "[Hz]" in axis.get_xlabel()
 
 

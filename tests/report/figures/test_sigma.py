@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from support.figures import legend
 from support.intervals import IntervalDesigns
 
 import lbt_synth as lbt
+from lbt_synth.report.charts.description import Curve
+from lbt_synth.report.figures.loop import frequency_panel
 
 
 def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
@@ -56,3 +59,12 @@ def made():
 def test_the_sigma_figure_draws_its_error(made):
     figure = lbt.report.figures.sigma_figure({"interval": made["hinf", 1.0]}, unit_weights=True)
     assert len(figure.axes) == 3
+
+
+def test_a_zero_at_the_nyquist_frequency_is_no_scale():
+    f = np.geomspace(1, 400, 50)
+    curve = Curve(name="a", x=f, y=np.abs(1 - f / 400) + 1e-17)
+    panel = frequency_panel("noise to residual", "-", [curve], [])
+    assert panel.y.low == pytest.approx(curve.y.max() * 1e-5)
+    tame = frequency_panel("noise to residual", "-", [Curve(name="a", x=f, y=f)], [])
+    assert tame.y.low is None
