@@ -44,7 +44,6 @@ def design(parser: ArgumentParser) -> None:
     from lbt_synth.cli.method_options import add_method_options
 
     add_unit(parser)
-
     add_config(parser)
     add_method_options(parser)
     add_output(parser, GAIN_FILE)
@@ -83,10 +82,34 @@ def export(parser: ArgumentParser) -> None:
 def sigma(parser: ArgumentParser) -> None:
     """Plot singular values of one or several designs."""
     add_unit(parser)
+    _add_view(parser)
+
+
+def bode(parser: ArgumentParser) -> None:
+    """Plot gain and phase of loops over frequency, with their margins."""
+    _add_view(parser)
+
+
+def nyquist(parser: ArgumentParser) -> None:
+    """Plot loops in the complex plane, with their modulus and disk margins."""
+    _add_view(parser)
+
+
+def nichols(parser: ArgumentParser) -> None:
+    """Plot gain over phase of loops, with their margins."""
+    _add_view(parser)
+
+
+def step(parser: ArgumentParser) -> None:
+    """Plot residual and command of loops after a step of the wavefront."""
+    _add_view(parser)
+
+
+def _add_view(parser: ArgumentParser) -> None:
     add_gains(parser, "+")
     text = "real sensor gain, as a factor on the one that each design assumes"
     add_option(parser, "--sensor-gain", float, text, 1.0)
-    add_output(parser, FIGURE)
+    add_outputs(parser)
 
 
 def report(parser: ArgumentParser) -> None:

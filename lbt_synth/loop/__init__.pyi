@@ -21,6 +21,8 @@ from .margins import stable_sensor_gains as stable_sensor_gains
 from .simulation.run import Simulation as Simulation
 from .simulation.run import filter_series as filter_series
 from .simulation.run import simulate as simulate
+from .step_response import LoopStep as LoopStep
+from .step_response import step_response as step_response
 from .strehl import Imaging as Imaging
 from .strehl import jitter_strehl as jitter_strehl
 from .strehl import series_strehl as series_strehl

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.budget import resonance_edges
+from lbt_synth.loop.budget import distinct_edges, pole_edges, resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only
 
-_SAME = 1e-6  # relative difference of responses of equal axes
+_SAME = 1e-9  # difference of sensitivities of equal axes
 _LARGEST = 1e6  # loop gain beyond which the sensitivity is rounding to a large part
 _UNIFORM = 512  # frequencies at equal steps, beside those around resonances
 
@@ -127,7 +127,9 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
     """
     loop.require_stable()
     system, nyquist = loop.output_sensitivity(), loop.hardware.frame_rate_hz / 2
-    nodes, _ = gauss_panels(resonance_edges(loop), 12)
+    poles = pole_edges(loop.controller.to_statespace().poles)  # resonances of the open loop
+    edges = distinct_edges(np.concatenate([resonance_edges(loop) / nyquist, poles[poles > 1e-6]]))
+    nodes, _ = gauss_panels(edges * nyquist, 12)
     uniform = np.linspace(0, nyquist, _UNIFORM + 1)[1:]
     grid = frozen_copy(np.unique(np.concatenate([nodes, uniform])))
 
@@ -198,4 +200,5 @@ def _examine(
 
 
 def _is_same(own: ComplexArray, other: ComplexArray) -> bool:
-    return bool(np.allclose(own, other, rtol=_SAME, atol=0))
+    """Whether two responses are equal, by their sensitivities."""
+    return bool(np.allclose(1 / (1 + own), 1 / (1 + other), rtol=_SAME, atol=_SAME))

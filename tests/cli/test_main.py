@@ -60,7 +60,7 @@ BAD = [
     (("show", CONFIG), 2, "is a configuration, expected a gain file"),
     (("verify", "DAMAGED.fits"), 2, "damaged"),
     (("sigma", "DAMAGED.fits", "-o", "OUT.png"), 2, "damaged"),
-    (("sigma", "KALMAN", "-o", "OUT.gif"), 2, "must end in .png"),
+    (("sigma", "KALMAN", "-o", "OUT.gif"), 2, "must end in .csv, .png"),
     (("sigma", "KALMAN", "KALMAN", "-o", "OUT.png"), 2, "given once"),
     (("sigma", "KALMAN", "--sensor-gain", "-1", "-o", "OUT.png"), 2, "above 0"),
     (("simulate", CONFIG, "KALMAN", "--frames", "0"), 2, "at least 1"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.loop import ClosedLoop, close_loop, filter_series, simulate
+from lbt_synth.loop import ClosedLoop, close_loop, simulate, step_response
 from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy
@@ -17,7 +17,6 @@ STEP_NM = 100.0
 _MOST_FRAMES = 8192  # of a run
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
 _EXCERPT = 400  # frames that are drawn
-_STEP_FRAMES = 120
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +64,7 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
         spectra.append(density.mean(axis=0).sum(axis=1))
     strehls = run.strehl(config.imaging)
     shown = min(frames, _EXCERPT)
-    step_time_s, step_residual, step_command = step_response(loop)
+    step = step_response(loop)
     return DesignSimulation(
         strehl=float(np.mean(strehls)),
         residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
@@ -77,20 +76,10 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
         open_nm2_hz=frozen_copy(spectra[0][1:]),
         residual_nm2_hz=frozen_copy(spectra[1][1:]),
         exact_nm2_hz=frozen_copy(exact_spectrum(loop, truth, frequency, length)[1:]),
-        step_time_s=step_time_s,
-        step_residual_nm=step_residual,
-        step_command_nm=step_command,
+        step_time_s=step.time_s,
+        step_residual_nm=STEP_NM * step.residual,
+        step_command_nm=STEP_NM * step.command,
     )
-
-
-def step_response(loop: ClosedLoop) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times [s], residual and first command after a step on the first axis [nm]."""
-    n = loop.hardware.modes
-    inputs = np.zeros((_STEP_FRAMES, n + loop.hardware.n_measurements))
-    inputs[:, 0] = STEP_NM
-    outputs = filter_series(loop.system, inputs)
-    time_s = np.arange(_STEP_FRAMES) / loop.hardware.frame_rate_hz
-    return frozen_copy(time_s), frozen_copy(outputs[:, 0]), frozen_copy(outputs[:, n])
 
 
 def exact_spectrum(

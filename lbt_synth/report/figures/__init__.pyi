@@ -4,9 +4,13 @@ from .limits import limits_figure as limits_figure
 from .loop import loop_figure as loop_figure
 from .mirror import mirror_figure as mirror_figure
 from .modal import modal_figure as modal_figure
+from .open_loops import bode_figure as bode_figure
+from .open_loops import nichols_figure as nichols_figure
+from .open_loops import nyquist_figure as nyquist_figure
 from .robustness import robustness_figure as robustness_figure
 from .robustness import robustness_map_figure as robustness_map_figure
 from .sigma import sigma_figure as sigma_figure
 from .simulation import simulation_figure as simulation_figure
+from .step import step_figure as step_figure
 from .tracking import tracking_figure as tracking_figure
 from .tradeoff import tradeoff_figure as tradeoff_figure

@@ -19,6 +19,11 @@ from lbt_synth.report.figures.loop import (
     stable_curve,
     vibration_rules,
 )
+from lbt_synth.validation import FloatArray
+
+# Frequencies [Hz], largest singular values of error, rejection and noise transfer, (f,) each; None
+# for what a design does not have, or an unstable loop
+SigmaCurves = tuple[FloatArray, FloatArray | None, FloatArray | None, FloatArray | None]
 
 
 def sigma_figure(
@@ -66,30 +71,47 @@ def sigma_figure(
     """
     if not designs:
         raise ProblemError("a sigma plot needs at least one design; got none.")
-    names, lines_hz = list(designs), _vibration_frequencies(designs.values())
-    rules = vibration_rules(lines_hz)
-    estimators = {k: d for k, d in designs.items() if isinstance(d, EstimatorDesign)}
-    loops = {
-        name: close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
-        for name, design in designs.items()
-        if design.hardware is not None
+    names, rules = list(designs), vibration_rules(_vibration_frequencies(designs.values()))
+    found = sigma_curves(designs, sensor_gain=sensor_gain, unit_weights=unit_weights)
+    errors = [
+        stable_curve(name, names, f, error)
+        for name, (f, error, *_) in found.items()
+        if error is not None
+    ]
+    norms = {
+        name: (f, rejection, noise)
+        for name, (f, _, rejection, noise) in found.items()
+        if designs[name].hardware is not None
     }
     panels: list[Panel] = []
-    if estimators:
-        curves = []
-        for name, design in estimators.items():
-            problem = design.problem
-            system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
-            grid = frequency_grid(1 / system.dt_s, lines_hz)
-            curves.append(stable_curve(name, names, grid, largest_singular_values(system, grid)))
-        physical = all(design.hardware is not None for design in estimators.values())
+    if errors:
+        estimators = [each for each in designs.values() if isinstance(each, EstimatorDesign)]
+        physical = all(design.hardware is not None for design in estimators)
         unit = "nm" if physical and not unit_weights else "-"
-        panels.append(frequency_panel("disturbances to error", unit, curves, rules))
-    if loops:
-        norms = {name: loop_norms(loop, lines_hz) for name, loop in loops.items()}
+        panels.append(frequency_panel("disturbances to error", unit, errors, rules))
+    if norms:
         title = f"closed loops at sensor gain {sensor_gain:g}"
         panels += loop_panels(norms, rules, names, title=title)
     return draw_figure(panels, axes=axes)
+
+
+def sigma_curves(
+    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, unit_weights: bool = False
+) -> dict[str, SigmaCurves]:
+    """Return what is drawn of each design, over frequencies that are dense around vibrations."""
+    lines_hz, found = _vibration_frequencies(designs.values()), {}
+    for name, design in designs.items():
+        f, error = frequency_grid(1 / design.controller.dt_s, lines_hz), None
+        rejection = noise = None
+        if isinstance(design, EstimatorDesign):
+            problem = design.problem
+            system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
+            error = largest_singular_values(system, f)
+        if design.hardware is not None:
+            loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
+            _, rejection, noise = loop_norms(loop, lines_hz)
+        found[name] = f, error, rejection, noise
+    return found
 
 
 def _vibration_frequencies(designs: Iterable[Design]) -> list[float]:

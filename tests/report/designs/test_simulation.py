@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.report.designs.simulation import exact_spectrum, step_response
+from lbt_synth.report.designs.simulation import exact_spectrum
 
 
 def test_simulations_agree_with_the_exact_answer(report):
@@ -32,17 +32,3 @@ def test_the_exact_spectrum_has_the_exact_power():
     density = exact_spectrum(loop, truth, grid, length)
     power = np.sum(density[1:-1]) * 800 / length  # the ends hold half a bin
     assert np.sqrt(power) == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=2e-3)
-
-
-def test_a_step_is_answered_frame_by_frame():
-    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
-    time_s, residual, command = step_response(loop)
-    assert time_s[:2] == pytest.approx([0, 0.002])
-    # two frames pass before anything moves: y(1) sees the step, u(1) acts in frame 2
-    expected, u = [100.0], [0.0]
-    for k in range(1, 20):
-        u.append(u[-1] + 0.5 * expected[k - 1])
-        expected.append(100.0 - u[k - 1])
-    assert residual[:20] == pytest.approx(expected)
-    assert command[:20] == pytest.approx(u)
