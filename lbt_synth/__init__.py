@@ -1,24 +1,36 @@
 """Certified convex synthesis of tip/tilt controllers for adaptive optics.
 
 The names of a design script and the rooms are listed in ``__init__.pyi`` and are imported when
-first used, so that ``import lbt_synth`` costs next to nothing.
+first used, so that ``import lbt_synth`` costs nothing.
 """
-
-from pathlib import Path
-from typing import Any
-
-import lazy_loader
-
-_import_lazily, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.2.0"
 
 
-def __getattr__(name: str) -> Any:
+def _read_names():
+    """Return what looks names up, lists them for ``dir``, and lists them for ``import *``."""
+    known = globals()
+    if "_names" not in known:
+        import lazy_loader
+
+        known["_names"] = lazy_loader.attach_stub(__name__, __file__)
+    return known["_names"]
+
+
+def __dir__():
+    return _read_names()[1]()
+
+
+def __getattr__(name):
     """Import a name when it is first used, or say in which room it is."""
+    import_lazily, _, names = _read_names()
+    if name == "__all__":
+        return names
     try:
-        return _import_lazily(name)
+        return import_lazily(name)
     except AttributeError:
+        from pathlib import Path
+
         package = Path(__file__).parent
         for file in (package / "errors.py", *sorted(package.glob("*/**/__init__.pyi"))):
             text = file.read_text(encoding="utf-8")

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 
 from lbt_synth.cli.streams import discard, print_error, reopen_closed
 from lbt_synth.errors import LbtSynthError, SynthesisError
@@ -41,10 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(error, str(error), arguments)
     try:
         command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
-        if signal.getsignal(signal.SIGINT) is _stop_loading:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            signal.signal(signal.SIGTERM, _terminate)
-        with own_display_unit():
+        with _interruptible(), own_display_unit():
             report = command.run(arguments)
     except LbtSynthError as error:
         from lbt_synth.cli.surface import say_error  # after what it says may have failed
@@ -71,10 +69,22 @@ def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:
     return FAILED if isinstance(error, SynthesisError) else WRONG
 
 
-def _stop_loading(*_: object) -> None:
-    """End at once: nothing is written yet, and compiled modules take no interruption."""
-    os.write(2, b"lbt-synth: interrupted\n")
-    os._exit(INTERRUPTED)
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let signals raise exceptions where they would end the process at once."""
+    handlers: dict[int, Callable[[int, FrameType | None], object]] = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: _terminate,
+    }
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_DFL:  # not the console script
+        handlers = {}
+    try:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        yield
+    finally:
+        for number in handlers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _terminate(*_: object) -> None:
@@ -82,9 +92,7 @@ def _terminate(*_: object) -> None:
 
 
 def entry_point() -> None:
-    """Run the console script, and survive interruption, closed pipes and full disks."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored
-        signal.signal(signal.SIGINT, _stop_loading)
+    """Run a command for a shell, and survive closed pipes and full disks."""
     reopen_closed()
     try:
         try:

@@ -82,6 +82,8 @@ class _RateColumn(bars.ProgressColumn):
 @contextmanager
 def _progress_bar(*, quiet: bool, rate: bool = False) -> Iterator[bars.Progress]:
     console = Console(stderr=True)
+    hidden = quiet or not console.is_terminal
+    console.quiet = hidden  # a bar that is disabled ends with an empty line in some versions
     bar = bars.Progress(
         bars.TextColumn("{task.description}"),
         bars.BarColumn(),
@@ -89,7 +91,7 @@ def _progress_bar(*, quiet: bool, rate: bool = False) -> Iterator[bars.Progress]
         *([_RateColumn()] if rate else []),
         bars.TimeRemainingColumn(),
         console=console,
-        disable=quiet or not console.is_terminal,
+        disable=hidden,
         transient=True,
     )
 

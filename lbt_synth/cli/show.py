@@ -11,18 +11,26 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config.load import config_from_text
-from lbt_synth.files import load_gain
+from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.interop import frame_cost
 from lbt_synth.storage.rows import fact_table, json_record
 
 
 def run(arguments: Namespace) -> Report:
     """Describe the design in a gain file, what a frame costs, and its matrices if asked for."""
-    design = load_gain(arguments.gain)
+    design, digest = load_with_digest(arguments.gain)
     choose_design_unit(arguments, design)
     report = describe_design(design, matrices=arguments.matrices)
     cost = frame_cost(design)
-    report.data |= {"file": arguments.gain, "frame_cost": json_record(cost)}
+    report.data |= {"file": arguments.gain, "digest": digest, "frame_cost": json_record(cost)}
+    unproved = ["route and status of the solver"]
+    unproved += ["assumptions"] * bool(design.assumptions)
+    unproved += ["configuration, and so the truth"] * bool(design.configuration)
+    report.data["not_proved"] = unproved
+    report.notes += [
+        f"proved: the certificate, computed again from this file of digest {digest}.",
+        f"not proved, the file's word: {'; '.join(unproved)}.",
+    ]
     report.tables.append(fact_table("Cost per frame, as exported to C", cost))
     if design.configuration:
         with show_spinner("comparing in the truth", quiet=arguments.json):

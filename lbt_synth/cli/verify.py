@@ -10,11 +10,19 @@ from lbt_synth.files.gain_file.store import read_design
 
 def run(arguments: Namespace) -> Report:
     """Recompute the certificate of a gain file."""
-    design, _ = read_design(arguments.gain)
+    design, digest = read_design(arguments.gain)
     certificate = design.certificate
     report = Report(
-        data={"file": arguments.gain, "method": design.method, "passed": certificate.passed},
-        notes=[f"{arguments.gain}: {'verified' if certificate.passed else 'NOT VERIFIED'}"],
+        data={
+            "file": arguments.gain,
+            "digest": digest,
+            "method": design.method,
+            "passed": certificate.passed,
+        },
+        notes=[
+            f"{arguments.gain}: {'verified' if certificate.passed else 'NOT VERIFIED'}",
+            f"digest {digest}",
+        ],
         passed=certificate.passed,
     )
     report.add_rows("checks", "Certificate", certificate.checks)

@@ -4,29 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
-from pydantic import (
-    Discriminator,
-    Field,
-    Tag,
-    create_model,
-    model_validator,
-)
+from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
-from lbt_synth.methods.method import Count, Damping, Fraction, NonNegative, Positive
+from lbt_synth.methods import quantities as q
 from lbt_synth.methods.method import Section as MethodSection
 from lbt_synth.methods.registry import all_methods
-
-ONE, EACH = "one", "each"  # one value for all axes, or a list with one per axis
-
-
-def _tag_one_or_each(value: Any) -> str:
-    return EACH if isinstance(value, list) else ONE
-
-
-PositiveOrEach = Annotated[
-    Annotated[Positive, Tag(ONE)] | Annotated[list[Positive], Field(min_length=1), Tag(EACH)],
-    Discriminator(_tag_one_or_each),
-]
+from lbt_synth.models.loop_hardware import LONGEST_DELAY
 
 
 class Section(MethodSection):
@@ -47,11 +30,11 @@ class Section(MethodSection):
 class TelescopeSection(Section):
     """The pupil."""
 
-    diameter_m: Positive = Field(description="diameter of the pupil [m]")
+    diameter_m: q.Metres = Field(le=1e3, description="diameter of the pupil [m]")
     obstruction: float = Field(
         default=0.0,
         ge=0,
-        lt=1,
+        le=0.99,
         description="central obstruction over the diameter",
     )
 
@@ -59,34 +42,36 @@ class TelescopeSection(Section):
 class AtmosphereSection(Section):
     """The turbulence; ``outer_scale_m: null`` is Kolmogorov."""
 
-    seeing_arcsec: Positive = Field(description="seeing [arcsec]")
-    outer_scale_m: Positive | None = Field(description="outer scale [m], null for Kolmogorov")
-    wind_speed_m_s: Positive = Field(description="wind speed [m/s]")
-    seeing_wavelength_um: Positive = Field(default=0.5, description="wavelength of the seeing [um]")
+    seeing_arcsec: q.Arcseconds = Field(description="seeing [arcsec]")
+    outer_scale_m: q.Metres | None = Field(description="outer scale [m], null for Kolmogorov")
+    wind_speed_m_s: q.MetresPerSecond = Field(description="wind speed [m/s]")
+    seeing_wavelength_um: q.Micrometres = Field(
+        default=0.5, description="wavelength of the seeing [um]"
+    )
 
 
 class PyramidSection(Section):
     """Pyramid sensor, from which the noise is computed."""
 
-    wavelength_um: Positive = Field(description="sensing wavelength [um]")
-    modulation_lambda_over_d: Positive = Field(description="modulation radius [lambda/D]")
-    subapertures_across: Count = Field(description="subapertures over the diameter")
-    photons: Positive = Field(description="photons per subaperture and frame")
-    read_noise_electrons: NonNegative = Field(description="read noise per pixel [electrons]")
+    wavelength_um: q.Micrometres = Field(description="sensing wavelength [um]")
+    modulation_lambda_over_d: q.Gain = Field(description="modulation radius [lambda/D]")
+    subapertures_across: q.Count = Field(le=1000, description="subapertures over the diameter")
+    photons: q.Ratio = Field(description="photons per subaperture and frame")
+    read_noise_electrons: q.RatioFromZero = Field(description="read noise per pixel [electrons]")
 
 
 class SensorSection(Section):
     """Measurement noise: given, or from a pyramid."""
 
-    noise_nm: PositiveOrEach | None = Field(
+    noise_nm: q.NanometresOrEach | None = Field(
         default=None,
         description="noise per frame [nm rms], or one per measurement",
     )
-    noise_mas: Positive | None = Field(default=None, description="noise per frame [mas]")
+    noise_mas: q.Milliarcseconds | None = Field(default=None, description="noise per frame [mas]")
     pyramid: PyramidSection | None = Field(
         default=None, description="a pyramid, whose noise is computed"
     )
-    matrix: list[list[float]] | None = Field(
+    matrix: list[list[q.Entry]] | None = Field(
         default=None, description="rows: measurements by modes (default: identity)"
     )
 
@@ -101,24 +86,28 @@ class SensorSection(Section):
 class LocalLoopSection(Section):
     """The mirror's local position loop: its gains, or the frequency and damping they make."""
 
-    natural_frequency_hz: Positive = Field(description="frequency of the mode itself [Hz]")
-    damping: NonNegative = Field(description="damping ratio of that mode")
-    bandwidth_hz: Positive | None = Field(default=None, description="frequency with the loop [Hz]")
-    bandwidth_damping: Positive | None = Field(
+    natural_frequency_hz: q.Hertz = Field(description="frequency of the mode itself [Hz]")
+    damping: q.RatioFromZero = Field(description="damping ratio of that mode")
+    bandwidth_hz: q.Hertz | None = Field(default=None, description="frequency with the loop [Hz]")
+    bandwidth_damping: q.Ratio | None = Field(
         default=None, description="damping with the loop, 0.7"
     )
-    proportional_per_s2: NonNegative | None = Field(
-        default=None, description="position gain [1/s^2]"
+    proportional_per_s2: float | None = Field(
+        default=None, ge=0, le=1e12, description="position gain [1/s^2]"
     )
-    derivative_per_s: NonNegative | None = Field(default=None, description="velocity gain [1/s]")
-    feed_forward: NonNegative = Field(default=1.0, description="feed-forward over holding force")
-    sampling_hz: Positive = Field(
+    derivative_per_s: q.RatioFromZero | None = Field(
+        default=None, description="velocity gain [1/s]"
+    )
+    feed_forward: q.RatioFromZero = Field(
+        default=1.0, description="feed-forward over holding force"
+    )
+    sampling_hz: q.Hertz = Field(
         default=72_000.0, description="rate, whole multiple of the frame rate [Hz]"
     )
-    delay_samples: int = Field(
-        default=1, ge=0, description="computing delay of the local loop [samples]"
+    delay_samples: q.Whole = Field(
+        default=1, description="computing delay of the local loop [samples]"
     )
-    ramp_samples: Count = Field(default=1, description="samples over which a command is ramped")
+    ramp_samples: q.Count = Field(default=1, description="samples over which a command is ramped")
 
     @model_validator(mode="after")
     def _require_one_kind_of_gains(self) -> LocalLoopSection:
@@ -136,8 +125,8 @@ class LocalLoopSection(Section):
 class MirrorSection(Section):
     """Deformable mirror; ``modes`` counts the controlled ones, for modal designs and end to end."""
 
-    modes: Count | None = Field(default=None, description="number of controlled modes")
-    influence_matrix: list[list[float]] | None = Field(
+    modes: q.Count | None = Field(default=None, description="number of controlled modes")
+    influence_matrix: list[list[q.Entry]] | None = Field(
         default=None, description="rows: modes by commands (default: identity)"
     )
     local_loop: LocalLoopSection | None = Field(
@@ -149,8 +138,10 @@ class LoopSection(Section):
     """Timing, and how many axes there are."""
 
     axes: int | None = Field(default=None, ge=1, le=2, description="number of axes (default 2)")
-    frame_rate_hz: Positive = Field(description="frame rate [Hz]")
-    delay_frames: float = Field(default=2.0, ge=1, le=20, description="total delay [frames]")
+    frame_rate_hz: q.Hertz = Field(ge=0.1, description="frame rate [Hz]")
+    delay_frames: float = Field(
+        default=2.0, ge=1, le=LONGEST_DELAY, description="total delay [frames]"
+    )
 
 
 class _LineSection(Section):
@@ -158,14 +149,16 @@ class _LineSection(Section):
     axis: Literal["tip", "tilt", "both"] | None = Field(
         default=None, description="tip, tilt or both"
     )
-    direction_deg: float | None = Field(default=None, description="angle from tip to tilt [deg]")
-    frequency_hz: Positive = Field(description="frequency [Hz], below half the frame rate")
-    rms_nm: Positive | None = Field(default=None, description="standard deviation [nm rms]")
-    rms_mas: Positive | None = Field(default=None, description="standard deviation [mas]")
-    frequency_error_hz: NonNegative | None = Field(
+    direction_deg: q.Degrees | None = Field(
+        default=None, description="angle from tip to tilt [deg]"
+    )
+    frequency_hz: q.Hertz = Field(description="frequency [Hz], below half the frame rate")
+    rms_nm: q.Nanometres | None = Field(default=None, description="standard deviation [nm rms]")
+    rms_mas: q.Milliarcseconds | None = Field(default=None, description="standard deviation [mas]")
+    frequency_error_hz: q.HertzFromZero | None = Field(
         default=None, description="how far the true frequency may be off [Hz]; 0 where it is known"
     )
-    frequency_error_percent: NonNegative | None = Field(
+    frequency_error_percent: q.RatioFromZero | None = Field(
         default=None, description="the same in percent of the frequency"
     )
 
@@ -190,8 +183,8 @@ class _LineSection(Section):
 class VibrationSection(_LineSection):
     """A vibration of the model; ``spread_hz`` makes several ``lines`` of it."""
 
-    damping: Damping = Field(description="damping ratio")
-    spread_hz: Positive | None = Field(default=None, description="half width of its interval [Hz]")
+    damping: q.Damping = Field(description="damping ratio")
+    spread_hz: q.Hertz | None = Field(default=None, description="half width of its interval [Hz]")
     lines: int | None = Field(
         default=None, ge=1, le=64, description="how many lines cover it (default 5)"
     )
@@ -209,13 +202,11 @@ class TrueVibrationSection(_LineSection):
     kind: Literal["sinusoid", "resonance", "drift"] = Field(
         description="sinusoid, resonance or drift"
     )
-    damping: Damping | None = Field(
+    damping: q.Damping | None = Field(
         default=None, description="damping ratio of a resonance or a drift"
     )
-    end_hz: Positive | None = Field(
-        default=None, description="frequency at the end of a drift [Hz]"
-    )
-    duration_s: Positive | None = Field(default=None, description="duration of a drift [s]")
+    end_hz: q.Hertz | None = Field(default=None, description="frequency at the end of a drift [Hz]")
+    duration_s: q.Seconds | None = Field(default=None, description="duration of a drift [s]")
 
     @model_validator(mode="after")
     def _require_what_the_kind_needs(self) -> TrueVibrationSection:
@@ -245,8 +236,8 @@ class ArSection(Section):
     """Auto-regressive turbulence by its coefficients."""
 
     kind: Literal["ar"] = Field(description="any order, by its coefficients")
-    coefficients: list[float] = Field(min_length=1, description="of past values, newest first")
-    driving_rms_nm: Positive = Field(description="rms of the driving noise [nm]")
+    coefficients: list[q.Entry] = Field(min_length=1, description="of past values, newest first")
+    driving_rms_nm: float = Field(ge=1e-6, le=1e6, description="rms of the driving noise [nm]")
 
 
 TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discriminator="kind")]
@@ -256,14 +247,14 @@ class ModelSection(Section):
     """What the design assumes; leave ``vibrations`` out for a plant without any."""
 
     turbulence: Annotated[
-        Annotated[TurbulenceSection, Tag(ONE)]
-        | Annotated[list[TurbulenceSection], Field(min_length=1), Tag(EACH)],
-        Discriminator(_tag_one_or_each),
+        Annotated[TurbulenceSection, Tag(q.ONE)]
+        | Annotated[list[TurbulenceSection], Field(min_length=1), Tag(q.EACH)],
+        Discriminator(q.tag_one_or_each),
     ] = Field(description="model of the turbulence, or one per axis")
     vibrations: list[VibrationSection] | None = Field(
         default=None, min_length=1, description="the vibrations, if there are any"
     )
-    sensor_gain: PositiveOrEach = Field(
+    sensor_gain: q.GainOrEach = Field(
         default=1.0, description="sensor gain that the design assumes, or one per measurement"
     )
 
@@ -276,10 +267,11 @@ class TruthSection(Section):
         description="spectrum of the turbulence",
     )
     vibrations: Annotated[
-        Annotated[Literal["model"], Tag(ONE)] | Annotated[list[TrueVibrationSection], Tag(EACH)],
-        Discriminator(_tag_one_or_each),
+        Annotated[Literal["model"], Tag(q.ONE)]
+        | Annotated[list[TrueVibrationSection], Tag(q.EACH)],
+        Discriminator(q.tag_one_or_each),
     ] = Field(default=[], description="the vibrations, or model: those of the model")
-    sensor_gain: PositiveOrEach = Field(
+    sensor_gain: q.GainOrEach = Field(
         default=1.0, description="real sensor gain, or one per measurement"
     )
 
@@ -287,8 +279,12 @@ class TruthSection(Section):
 class ImagingSection(Section):
     """The camera."""
 
-    wavelength_um: Positive = Field(default=2.2, description="wavelength of the Strehl ratio [um]")
-    other_modes_strehl: Fraction = Field(default=1.0, description="Strehl ratio of all other modes")
+    wavelength_um: q.Micrometres = Field(
+        default=2.2, description="wavelength of the Strehl ratio [um]"
+    )
+    other_modes_strehl: q.Fraction = Field(
+        default=1.0, description="Strehl ratio of all other modes"
+    )
 
 
 def _design_section() -> type[Section]:
@@ -312,16 +308,16 @@ else:
 class SimulationSection(Section):
     """Time-domain runs."""
 
-    frames: int = Field(default=8000, ge=2, description="frames recorded")
-    cases: Count = Field(default=4, description="independent runs")
-    seed: int = Field(default=0, ge=0, description="seed of the random series")
-    settle_frames: int = Field(default=2000, ge=0, description="frames before those recorded")
+    frames: q.Count = Field(default=8000, ge=2, description="frames recorded")
+    cases: q.Count = Field(default=4, description="independent runs")
+    seed: int = Field(default=0, ge=0, lt=2**128, description="seed of the random series")
+    settle_frames: q.Whole = Field(default=2000, description="frames before those recorded")
 
 
 class RobustnessSection(Section):
     """The studies over a frequency error, a sensor gain and a delay error."""
 
-    errors_hz: Annotated[list[float], Field(min_length=1)] | None = Field(
+    errors_hz: Annotated[list[q.Shift], Field(min_length=1)] | None = Field(
         default=None,
         description="true frequency less the assumed one, of the vibration that moves most [Hz] "
         "(default: 15 steps over the stated errors, or over 17.5 % and at most 3.5 Hz)",
@@ -330,12 +326,12 @@ class RobustnessSection(Section):
         default="driving",
         description="what a shifted vibration keeps: its driving or its own rms",
     )
-    sensor_gains: list[Positive] = Field(
+    sensor_gains: list[q.Gain] = Field(
         default=[x / 40 for x in range(10, 53)],
         min_length=1,
         description="real sensor gains of maps",
     )
-    delay_errors_frames: list[float] = Field(
+    delay_errors_frames: list[q.Shift] = Field(
         default=[0.0], min_length=1, description="real delay less the design's [frames]"
     )
 
@@ -343,19 +339,23 @@ class RobustnessSection(Section):
 class EndToEndSection(Section):
     """The end-to-end simulation; the other sections describe its system."""
 
-    pixels: int = Field(default=60, ge=8, description="pixels across the pupil")
-    frames: int = Field(default=1600, ge=2, description="frames of the exposure")
-    settle_frames: int = Field(default=400, ge=200, description="frames before it")
-    gain: NonNegative = Field(
+    pixels: int = Field(default=60, ge=8, le=10_000, description="pixels across the pupil")
+    frames: q.Count = Field(default=1600, ge=2, description="frames of the exposure")
+    settle_frames: q.Count = Field(default=400, ge=200, description="frames before it")
+    gain: q.RatioFromZero = Field(
         default=0.5, description="integrator gain of every mode without a filter"
     )
     leak: float = Field(default=0.97, ge=0, le=1, description="leak of the integrators")
-    leak_from_mode: int = Field(default=50, ge=2, description="first mode with a leak")
-    actuators_across: int = Field(default=31, ge=3, description="actuators across the mirror")
-    wind_direction_deg: float = Field(
+    leak_from_mode: q.Count = Field(default=50, ge=2, description="first mode with a leak")
+    actuators_across: int = Field(
+        default=31, ge=3, le=1000, description="actuators across the mirror"
+    )
+    wind_direction_deg: q.Degrees = Field(
         default=0.0, description="direction of the wind [deg]; 0 is along tip"
     )
-    calibration_nm: Positive = Field(default=20.0, description="amplitude of the calibration [nm]")
+    calibration_nm: q.Nanometres = Field(
+        default=20.0, description="amplitude of the calibration [nm]"
+    )
 
 
 class FileSection(Section):

@@ -7,8 +7,9 @@ from typing import Any, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from lbt_synth.config.schema import EACH, ONE, FileSection
+from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import suggest_word
+from lbt_synth.methods.quantities import EACH, ONE
 
 
 def describe_error(

@@ -12,7 +12,6 @@ from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
@@ -20,6 +19,7 @@ _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the in
 _WIDEST = 1e4
 _AT_ONCE = 32  # gains, whose loops are in memory together
 _DIVISION, _DIVISIONS = 64, 3  # of the delays in which the delay margin is sought
+_LONGEST = 100  # delay up to which it is sought [frames]
 
 
 @table_row
@@ -209,7 +209,7 @@ def _delay_margin_frames(loop: ClosedLoop) -> float:
         unstable = np.flatnonzero(~ClosedLoops.of(matrices, hardware, gains, delays).stable)
         return None if unstable.size == 0 else tuple(further[unstable[0] : unstable[0] + 2])
 
-    low, high, longest = 0.0, 1.0, LONGEST_DELAY - hardware.delay_frames
+    low, high, longest = 0.0, 1.0, _LONGEST - hardware.delay_frames
     while (step := first_unstable(low, min(high, longest))) is None:
         if high >= longest:
             return np.inf

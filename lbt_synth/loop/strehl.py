@@ -357,7 +357,7 @@ def annular_otf(radius: FloatArray, obstruction: float) -> FloatArray:
     """
     rho, eps = np.asarray(radius, dtype=np.float64), obstruction
     overlap = _lens(rho, 0.5, 0.5)
-    if eps > 0:
+    if eps > 1e-8:  # the area of a smaller one is rounding
         overlap = overlap - 2 * _lens(rho, 0.5, eps / 2) + _lens(rho, eps / 2, eps / 2)
     return np.asarray(overlap / (np.pi / 4 * (1 - eps**2)))
 

@@ -36,6 +36,7 @@ class BoundOptions(Section):
     gamma_ratio: float = Field(
         default=1.2,
         ge=1,
+        le=1e9,
         description="bound of the norm as a multiple of the least norm",
         json_schema_extra={
             "hint": "At 1 the bound is the least one; far above it the filter is the Kalman filter."

@@ -23,7 +23,10 @@ class LqgOptions(Section):
     """Options of the LQG controller."""
 
     command_weight: float = Field(
-        default=0.0, ge=0, description="weight of the squared command beside the squared residual"
+        default=0.0,
+        ge=0,
+        le=1e12,
+        description="weight of the squared command beside the squared residual",
     )
 
 

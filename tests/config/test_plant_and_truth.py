@@ -121,7 +121,7 @@ def test_a_configuration_may_have_one(tmp_path):
         ("kind: sinusoid\n      end_hz: 23", "end_hz and duration_s go with kind: drift"),
         ("kind: sinusoid\n      damping: 0.1", "damping goes with kind: resonance"),
         ("kind: drift\n      end_hz: 500\n      duration_s: 60", r"\[0\].end_hz: must lie below"),
-        ("kind: drift\n      end_hz: -3\n      duration_s: 60", "greater than 0"),
+        ("kind: drift\n      end_hz: -3\n      duration_s: 60", "greater than or equal to 0.001"),
         (
             "kind: drift\n      end_hz: 2\n      duration_s: 60\n      damping: 0.5",
             r"truth.vibrations\[0\]: .* frequency above that",
@@ -144,7 +144,7 @@ def test_priors_of_a_configuration(tmp_path):
     for keys, text in (
         ({"lines": 3}, r"vibrations\[0\]: lines goes with spread_hz, and only with it"),
         ({"spread_hz": 20.0}, r"model.vibrations\[0\].spread_hz: the half width must be below 20"),
-        ({"spread_hz": -1.0}, "greater than 0"),
+        ({"spread_hz": -1.0}, "greater than or equal to 0.001"),
         ({"spread_hz": 1.0, "lines": 65}, "less than or equal to 64"),
         ({"frequency_hz": 399.0, "spread_hz": 9.0}, r"vibrations\[0\].spread_hz: .*Nyquist"),
     ):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import trapezoid
 from support import predictions
 from support.plants import lbt_axis_plant
 from support.uneven_axes import LINES, LOOPS, QUICK, RATE, SLOW, TABLE, one_axis
@@ -80,7 +81,7 @@ def test_a_measured_spectrum_against_brute_force():
     loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
     fine = np.linspace(5, 100, 3392 * 20 + 1)
     power = np.abs(loop.sensitivity(fine)[:, 0, 0]) ** 2
-    expected = np.trapezoid(table.psd(fine) * power, fine)
+    expected = trapezoid(table.psd(fine) * power, fine)
     budget = lbt.residual_budget(loop, lbt.Truth(turbulence=table))
     assert budget.turbulence_nm**2 == pytest.approx(expected, rel=1e-5)
 

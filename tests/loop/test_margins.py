@@ -161,3 +161,17 @@ def test_a_loop_that_hardly_does_anything_has_no_delay_margin():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     lazy = lbt.integrator(path, gain=0.001).controller
     assert lbt.loop_margins(lbt.close_loop(path, lazy)).delay_frames == np.inf
+
+
+def test_a_delay_margin_may_be_longer_than_any_delay():
+    """A slow loop bears more delay than a loop is made with; of a slow mirror the mean counts."""
+    shell = lbt.models.PositionLoop.from_bandwidth(
+        natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=8000
+    )
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell)
+    slow = lbt.Controller(A=1.0, B=0.03, C=1.0, D=0.0, dt_s=1 / 800)
+    margin = lbt.loop_margins(lbt.close_loop(path, slow)).delay_frames
+    mean = 1 + path.mirror_taps @ np.arange(path.mirror_taps.size)
+    limit = 0.5 + np.pi / (4 * np.arcsin(0.03 / 2))  # delay at which the gain is the limit
+    assert mean + margin == pytest.approx(limit, abs=0.1)
+    assert margin > 20

@@ -253,7 +253,7 @@ def facts(shown):
             items = value.items() if isinstance(value, dict) else enumerate(value)
             for key, each in items:
                 walk(each, (*place, key))
-        elif not any(key in (*NOTES, "file", "route", "passed") for key in place):
+        elif not any(key in (*NOTES, "file", "route", "passed", "digest") for key in place):
             found[place] = value
 
     walk(json.loads(shown), ())
@@ -277,12 +277,15 @@ def differ(one, other):
 
 
 def judge(edit, folder, commands=COMMANDS):
-    """What comes of an edit: "refused", "no other design", "certified" or "traceback".
+    """What comes of an edit: one of "refused", "no other design", "another claim that holds",
+    "certified" or "traceback".
 
     Where one of the commands takes the file, the others are asked, too.
 
     "certified" is a file that a command takes, although it says another design of the same
     fields; "no other design" one whose controller, claims and matrices are those of the original.
+    "another claim that holds" is the same controller with another band or term of its objective:
+    all that ``show`` says else is the same, and what is claimed was computed again and reached.
     """
     path = folder / f"edited.{edit.ending}"
     try:
@@ -305,6 +308,10 @@ def judge(edit, folder, commands=COMMANDS):
     own = facts_of_original(edit.design)
     status, shown, _ = run_quietly(command("show", path))
     found = facts(shown) if status == 0 else {}
-    if found.keys() == own.keys() and not any(differ(found[k], own[k]) for k in own):
+    changed = {k[0] for k in own.keys() | found.keys() if differ(own.get(k), found.get(k))}
+    if not changed:
         return "no other design"
+    promise = edit.place[:3] == ("meta", "shaped", "specifications")
+    if promise and found and changed <= {"terms", "limit_nm", "above_limit_percent"}:
+        return "another claim that holds"
     return f"certified by {', '.join(taken)}"

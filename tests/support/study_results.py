@@ -10,7 +10,7 @@ def draw_points(kind, n, dimensions, seed):
     if kind == "independent":
         return np.random.default_rng(seed).random((n, dimensions))
     engine = qmc.Sobol if kind == "sobol" else qmc.LatinHypercube
-    return engine(dimensions, rng=seed).random(n)
+    return engine(dimensions, seed=seed).random(n)
 
 
 def make_columns(parameters, strehls, **changes):

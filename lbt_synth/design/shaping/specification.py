@@ -49,7 +49,7 @@ class Specification:
     Raises
     ------
     ProblemError
-        If one of them is of another kind.
+        If one of them is of another kind, or a demand is given twice.
 
     Examples
     --------
@@ -74,6 +74,10 @@ class Specification:
             if not isinstance(demand, Demand):
                 known = ", ".join(kind.__name__ for kind in get_args(Demand))
                 raise ProblemError(f"a demand must be one of {known}; got {type(demand).__name__}.")
+        written = [to_metadata(demand) for demand in demands]
+        for index, demand in enumerate(demands):
+            if written[index] in written[:index]:
+                raise ProblemError(f"each demand must be given once; got twice {demand.label!r}.")
         gains = [leaf.sensor_gain for leaf in leaves(self.objective)]
         gains += [d.sensor_gain for d in demands if isinstance(d, Attenuation)]
         low, high = min(1.0, *gains), max(1.0, *gains)

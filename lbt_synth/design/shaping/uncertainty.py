@@ -16,6 +16,7 @@ from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
 from lbt_synth.linear.norms import largest_real_part
 from lbt_synth.models import LoopHardware
+from lbt_synth.models.mirror.frame_rate_system import instant_mirror
 from lbt_synth.validation import FloatArray, Positive
 
 _HOLDS_ONE = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
@@ -116,7 +117,7 @@ class DelayError(CheckedFields):
         low, high = max(d - self.frames, 1.0), d + self.frames
         whole = np.arange(np.ceil(low), np.floor(high) + 1)
         others = [float(other) for other in np.setdiff1d([low, high, *whole], d)]
-        there = [replace(hardware, delay_frames=other).mirror_taps for other in others]
+        there = [instant_mirror(other).taps for other in others]
         taps = [polysub(one, hardware.mirror_taps).astype(np.float64) for one in there]
         return list(zip(others, taps, strict=True))
 

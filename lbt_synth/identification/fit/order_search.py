@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
@@ -164,7 +165,7 @@ def _fit_background(search: Search, gain: float) -> FittedModel | None:
     zero = np.zeros_like(f)
     smooth = replace(data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight)
     white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
-    slow = max(float(np.trapezoid(d, f)) - white, 0.1 * white)
+    slow = max(float(trapezoid(d, f)) - white, 0.1 * white)
     known = replace(search, gain=gain)
     ground = SpectrumModel(
         float(np.log(gain)), float(np.log(white)), known.log_angle(fitting.STARTING_CORNER_HZ), ()

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
+from lbt_synth.models.mirror.frame_rate_system import Response, mirror_system, tapped_mirror
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
@@ -213,7 +213,7 @@ def _mirrors_by_delay(
     """Yield rows, fractions and mirrors by whole delay, or by delay if the mirror has dynamics."""
     if hardware.mirror is not None:
         for delay in np.unique(delay_frames):
-            mirror = replace(hardware, delay_frames=float(delay)).mirror_system.whole
+            mirror = mirror_system(hardware.mirror, hardware.frame_rate_hz, float(delay)).whole
             rows = np.flatnonzero(delay_frames == delay)
             yield rows, np.zeros(rows.size), (mirror, mirror)
         return

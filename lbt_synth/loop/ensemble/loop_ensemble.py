@@ -10,6 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
+from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.spectra import spectrum_key
 from lbt_synth.validation import (
     FloatArray,
@@ -84,7 +85,7 @@ class LoopEnsemble:
     sensor_gain : float or (p,) array_like, optional
         Real sensor gain of each loop relative to the sensor matrix.
     delay_frames : float or (p,) array_like, optional
-        Real total delay [frames], at least 1; that of the loop by default.
+        Real total delay [frames], 1 to 20; that of the loop by default.
     noise_nm : float, (p,) or (p, q) array_like, optional
         Standard deviation of the noise on each measurement per frame [nm].
     turbulence : Spectrum, FrozenFlows, ModalTurbulence, sequence of these, or None, optional
@@ -125,6 +126,8 @@ class LoopEnsemble:
             if name == "delay_frames" and self.delay_frames is None:
                 continue
             value = real_array(getattr(self, name), name)
+            if name == "delay_frames" and np.any(value > LONGEST_DELAY):
+                raise ProblemError(f"{name} must be at most {LONGEST_DELAY}; got {value.max():g}.")
             if np.any(value < bound) or (name == "sensor_gain" and np.any(value == 0)):
                 word = "above" if name == "sensor_gain" else "at least"
                 raise ProblemError(f"{name} must be {word} {bound:g}; got {value.min():.6g}.")

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 from scipy.special import ndtr, ndtri
 
-from lbt_synth.methods.method import Positive, Section
+from lbt_synth.methods.method import Section
 from lbt_synth.validation import FloatArray
 
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
@@ -19,7 +19,7 @@ class NormalSection(Section):
     """A normal distribution, cut at low and high if they are given."""
 
     mean: float
-    deviation: Positive
+    deviation: Annotated[float, Field(gt=0)]
     low: float | None = None
     high: float | None = None
 
@@ -85,7 +85,7 @@ class ParameterSection(Section):
     uniform: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
     normal: NormalSection | None = None
     list_: Annotated[list[float], Field(min_length=1)] | None = Field(default=None, alias="list")
-    weights: Annotated[list[Positive], Field(min_length=1)] | None = None
+    weights: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] | None = None
     also: list[str] = Field(default_factory=list)
 
     @model_validator(mode="before")

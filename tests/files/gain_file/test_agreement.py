@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 from support.gain_file_edits import (
     COMMANDS,
     ENDINGS,
     ORIGINALS,
+    Edit,
     command,
     judge,
     random_edits,
@@ -16,7 +18,9 @@ from support.gain_file_edits import (
     saved,
 )
 
-HARMLESS = ("refused", "no other design", "cannot be written")
+from lbt_synth.files.gain_file.store import load_with_digest
+
+HARMLESS = ("refused", "no other design", "another claim that holds", "cannot be written")
 QUICK = ("kalman", "bare", "integrator")
 
 
@@ -57,3 +61,22 @@ def test_no_edit_is_taken_for_a_certified_design(tmp_path, capsys):
         print(f"| all | {' | '.join(str(sum(c[k] for c in counts.values())) for k in kinds)} |")
         print(*told, sep="\n")
     assert not [entry for entry in told if entry[0] not in HARMLESS]
+
+
+def test_another_claim_that_holds_has_another_digest(tmp_path):
+    """The band's worst frequency is at its other end: from 9.09 Hz on it promises no less."""
+    place = ("meta", "shaped", "specifications", 0, "objective", "terms", 1, "low_hz")
+    edit = Edit("shaped", "json", place, "times 1.01", 9.09)
+    assert judge(edit, tmp_path, ("verify",)) == "another claim that holds"
+    contents = (saved("shaped", "json"), saved("shaped", "json").changed(edit))
+    digests = [load_with_digest(each.write(tmp_path / "g.json"))[1] for each in contents]
+    assert digests[0] != digests[1]
+    wider = replace(edit, place=(*place[:-1], "high_hz"), value=12.0)  # it leaves more there
+    assert judge(wider, tmp_path, ("verify",)) == "refused"
+
+
+def test_a_demand_that_is_there_twice_is_refused(tmp_path):
+    place = ("meta", "shaped", "specifications", 0, "demands")
+    demands = saved("shaped", "json").parts["meta"]["shaped"]["specifications"][0]["demands"]
+    edit = Edit("shaped", "json", place, "longer", [*demands, *demands])
+    assert judge(edit, tmp_path, ("verify",)) == "refused"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
+from scipy.integrate import quad, trapezoid
 
 from lbt_synth.identification.fit.periodogram import (
     TAPER,
@@ -35,7 +35,7 @@ def test_smearing_is_the_integral_that_defines_it(width: float, distance: float)
     t = np.linspace(0, 1, 1201)
     r = np.array([correlation(float(x)) for x in t])
     kernel = r * np.exp(-2 * np.pi * width * t) * np.cos(2 * np.pi * distance * t)
-    smeared = 2 * np.trapezoid(kernel, t)
+    smeared = 2 * trapezoid(kernel, t)
     line = width / np.pi / (width**2 + distance**2)
     found = log_smearing(width, np.array([distance]))[0][0]
     assert found == pytest.approx(np.log(smeared / line), abs=5e-3)

@@ -11,6 +11,7 @@ WRONG = [
     ({"sensor_gain": [np.nan, 1]}, lbt.errors.ProblemError, "finite"),
     ({"noise_nm": -1.0}, lbt.errors.ProblemError, "noise_nm must be at least 0"),
     ({"delay_frames": [0.5, 2]}, lbt.errors.ProblemError, "delay_frames must be at least 1"),
+    ({"delay_frames": [2, 20.5]}, lbt.errors.ProblemError, "delay_frames must be at most 20"),
     (
         {"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]},
         lbt.errors.DimensionError,

@@ -86,6 +86,7 @@ def test_retuning_moves_only_the_vibration():
         ({"noise_nm": [[1.0, 2.0], [2.0, 1.0]]}, "noise_nm must be positive definite"),
         ({"noise_nm": np.eye(3)}, "to match the measurements"),
         ({"delay_frames": 0.5}, "delay_frames must be at least 1; got 0.5"),
+        ({"delay_frames": 20.5}, "delay_frames must be at most 20; got 20.5"),
         ({"sensor_gain": 0}, "sensor_gain must be above 0"),
         ({"sensor_matrix": np.eye(3), "influence_matrix": np.eye(2)}, "to match sensor_matrix"),
         ({"sensor_matrix": [[np.nan, 0], [0, 1]]}, "sensor_matrix must be finite"),

@@ -176,7 +176,7 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
         ({"parameters": f"{{'{ONE}': {{fixed: 1, also: ['{ONE}']}}}}"}, "is given twice", None),
         (
             {"parameters": f"{{'{ONE}': {{uniform: [0, 5]}}}}"},
-            r"parameters\.truth.*rms_nm at 0: .*greater than 0",
+            r"parameters\.truth.*rms_nm at 0: .*greater than",
             None,
         ),
         (
