@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from lbt_synth.methods.method import Description, DesignInputs, Method, Section
+from lbt_synth.methods.quantities import Gain, Hertz
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
@@ -21,9 +22,8 @@ _SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides its gain
 class IntegratorOptions(Section):
     """Options of the integrator."""
 
-    gain: float | None = Field(
+    gain: Gain | None = Field(
         default=None,
-        gt=0,
         description="its gain (default: the best for the truth that keeps the margins)",
     )
     phase_margin_deg: float | None = Field(
@@ -38,9 +38,8 @@ class IntegratorOptions(Section):
     integrators: int = Field(
         default=1, ge=1, le=2, description="how many in series; two need a zero"
     )
-    zero_hz: float | None = Field(
+    zero_hz: Hertz | None = Field(
         default=None,
-        gt=0,
         description="corner of a zero [Hz]: of a PI controller, or of the lag compensator of a "
         "double integrator",
     )

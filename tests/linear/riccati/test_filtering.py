@@ -200,7 +200,7 @@ def test_a_slow_line_of_little_damping_is_no_line_without_any(numbers):
     plant = slow_line(*numbers)
     found = lbt.linear.kalman_riccati(plant)
     peer = scipy.linalg.solve_discrete_are(plant.A.T, plant.C.T, plant.Q, plant.R, s=plant.S)
-    assert found.P == pytest.approx(peer, rel=1e-4)  # of which 1e-5 are the peer's
+    assert found.P == pytest.approx(peer, rel=1e-5)
     certificate = lbt.design.certify_filter(plant, found.gain_predictor, least_variance=True)
     assert certificate.passed
 
