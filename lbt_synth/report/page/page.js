@@ -1,4 +1,10 @@
 "use strict";
+// A table that is wider than the screen says that it can be moved.
+for (const place of document.querySelectorAll(".scroll")) {
+  new ResizeObserver(() => {
+    place.classList.toggle("wide", place.scrollWidth > place.clientWidth + 1);
+  }).observe(place);
+}
 // The drawings in the page are replaced by charts with hover and zoom, if these can be made.
 (async function () {
   const root = document.documentElement;

@@ -123,7 +123,7 @@ def _write_section(pdf: FPDF, section: Section, *, first: bool) -> None:
     """Set a section; its heading is not left alone at the foot of a sheet."""
     opening = 0.0
     for block in section.blocks:  # up to the first thing that is no text
-        opening += block_height(next(split_by_sheets(block)) if isinstance(block, Chart) else block)
+        opening += block_height(_first_row(block) if isinstance(block, Chart) else block)
         if not isinstance(block, Paragraph | Notice):
             break
     if not first:
@@ -143,7 +143,7 @@ def _write_section(pdf: FPDF, section: Section, *, first: bool) -> None:
                 for part in block.by_columns(_COLUMNS):
                     _write_table(pdf, part)
             case Chart():
-                for chart in split_by_sheets(block):
+                for chart in split_by_sheets(block, HEIGHT - _BOTTOM - pdf.y):
                     _write_chart(pdf, chart)
     pdf.y += 0.15
 
@@ -243,12 +243,21 @@ def _column_widths(pdf: FPDF, rows: list[tuple[Cell, ...]]) -> list[float]:
     return [min(width, cap) for width in natural]
 
 
-def split_by_sheets(chart: Chart) -> Iterator[Chart]:
-    """Yield charts that each fit a sheet below the heading of a section, in whole rows."""
+def _first_row(chart: Chart) -> Chart:
+    return replace(chart, panels=chart.panels[: chart.columns])
+
+
+def split_by_sheets(chart: Chart, left_in: float = _ROOM) -> Iterator[Chart]:
+    """Yield charts of whole rows that each fit a sheet below the heading of a section.
+
+    The first one fits what is left of a sheet, if a row does.
+    """
     parts: list[tuple[Panel, ...]] = [()]
+    first = left_in if block_height(_first_row(chart)) <= left_in else _ROOM
     for start in range(0, len(chart.panels), chart.columns):
         row = chart.panels[start : start + chart.columns]
-        if parts[-1] and block_height(replace(chart, panels=parts[-1] + row)) > _ROOM:
+        room = _ROOM if len(parts) > 1 else first
+        if parts[-1] and block_height(replace(chart, panels=parts[-1] + row)) > room:
             parts.append(row)
         else:
             parts[-1] += row

@@ -191,6 +191,22 @@ def test_it_fits_a_phone(browser, pages, name):
 
 
 @pytest.mark.browser
+def test_a_table_wider_than_the_screen_says_so(browser, pages):
+    script = """
+        return [...document.querySelectorAll(".scroll")].map(e => [
+          e.scrollWidth > e.clientWidth + 1,
+          getComputedStyle(e, "::before").content.includes("scroll sideways"),
+        ])
+    """
+    opened(browser, pages["report"], PHONE)
+    phone = browser.execute_script(script)
+    assert any(wide for wide, _ in phone)
+    assert all(wide == said for wide, said in phone)
+    opened(browser, pages["report"], DESK)
+    assert all(wide == said for wide, said in browser.execute_script(script))
+
+
+@pytest.mark.browser
 @pytest.mark.parametrize("name", ["report", "study", "marks", "hostile"])
 def test_it_fits_a_sheet_of_paper(browser, pages, name):
     opened(browser, pages[name])

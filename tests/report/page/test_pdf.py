@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def pages_of(pdf):
 def test_a_pdf_has_its_pages_and_no_date(sheets):
     pdf = sheets
     assert pdf.startswith(b"%PDF")
-    assert pages_of(pdf) == 4
+    assert pages_of(pdf) == 3
     assert b"CreationDate" not in pdf
     assert b"/Title (Page of first)" in pdf
     assert b"/MediaBox [0 0 595.44 841.68]" in pdf
@@ -51,7 +52,17 @@ def test_high_charts_continue_on_the_next_sheet(count):
             Section(key="b", title="B", blocks=(chart,)),
         ),
     )
-    assert pages_of(page_pdf(page)) == len(parts) + (count >= 6)
+    assert pages_of(page_pdf(page)) == max(len(parts), 2 if count >= 6 else 1)
+
+
+def test_a_chart_begins_on_what_is_left_of_a_sheet():
+    panel = Panel(x=Axis(label="x"), y=Axis(label="y"), marks=())
+    chart = Chart(key="c", title="t", caption="c", alt="a", panels=(panel,) * 3)
+    row = block_height(replace(chart, panels=(panel,)))
+    two = block_height(replace(chart, panels=(panel,) * 2))
+    assert [len(part.panels) for part in split_by_sheets(chart, two)] == [2, 1]
+    assert [len(part.panels) for part in split_by_sheets(chart, row)] == [1, 2]
+    assert [len(part.panels) for part in split_by_sheets(chart, 0.9 * row)] == [3]
 
 
 def test_bars_fit_a_sheet():
