@@ -163,8 +163,7 @@ def design_from_record(
     gains |= {"announced": announced, "allowed": allowed}
     fit_model = partial(identify_likeliest, record, **gains, **options)
     design = partial(_design, gamma_ratio=gamma_ratio)
-    fit, test = split_halves(record.stretches(), record.frames)
-    half = fit_model(stretches=fit)
+    half = fit_model(stretches=split_halves(record.stretches(), record.frames)[0])
     if allowed is not None:
         assumptions += _judge_gains(half, accept_record)
     found = None
@@ -179,18 +178,7 @@ def design_from_record(
         method = found.method
     step(1)
     name = method_named(method).title
-    held_out = prediction_against_data(
-        half.plant(),
-        record.pseudo_open_loop(half.sensor_gains),
-        {name: design(method, half)},
-        stretches=record.stretches(),
-        fit=fit,
-        test=test,
-        measurements=None if record.commands is None else record.measurements,
-        noise_error_nm=[axis.noise_error_nm for axis in half.axes],
-        imaging=Imaging() if imaging is None else imaging,
-        taps=taps,
-    )
+    held_out = _test_on_unseen(record, half, {name: design(method, half)}, imaging, taps)
     step(1)
     safe = design_for_gains(
         fit_model,
@@ -220,6 +208,29 @@ def design_from_record(
             *_note_short(usable, model, row),
         ),
         choice=found,
+    )
+
+
+def _test_on_unseen(
+    record: LoopRecord,
+    half: IdentifiedModel,
+    designs: Mapping[str, Design],
+    imaging: Imaging | None,
+    taps: int,
+) -> PredictionTable:
+    """Return what designs for the model of the first half leave of the second."""
+    fit, test = split_halves(record.stretches(), record.frames)
+    return prediction_against_data(
+        half.plant(),
+        record.pseudo_open_loop(half.sensor_gains),
+        designs,
+        stretches=record.stretches(),
+        fit=fit,
+        test=test,
+        measurements=None if record.commands is None else record.measurements,
+        noise_error_nm=[axis.noise_error_nm for axis in half.axes],
+        imaging=Imaging() if imaging is None else imaging,
+        taps=taps,
     )
 
 
