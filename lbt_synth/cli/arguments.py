@@ -287,8 +287,8 @@ def _add_repairs(parser: ArgumentParser) -> None:
     add_option(needs, "--command-rotation-deg", float, text, 0.0)
     text = "matrix from them to the axes of the measurements, row after row"
     add_option(needs, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
-    text = "factor; 1 says that they were recorded at the size that was applied"
-    add_option(needs, "--command-scale", float, text)
+    text = "factor, of both axes or of each; 1 says that they were recorded as large as applied"
+    add_option(needs, "--command-scale", float, text, nargs="+")
 
 
 def _add_prior_knowledge(parser: ArgumentParser) -> None:

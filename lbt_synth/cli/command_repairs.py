@@ -24,7 +24,7 @@ def given_repair(arguments: Namespace) -> CommandRepair:
         sign=tuple(arguments.command_sign or ()),
         rotation_deg=arguments.command_rotation_deg,
         matrix=tuple(arguments.command_matrix or ()),
-        scale=1.0 if arguments.command_scale is None else arguments.command_scale,
+        scale=arguments.command_scale or 1.0,
     )
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import FloatArray, integer, number, read_only, real_array
+from lbt_synth.validation import FloatArray, integer, number, read_only, real_array, set_fields
 
 _SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 MIRROR = np.diag([1.0, -1.0])
@@ -35,8 +36,9 @@ class CommandRepair:
         Angle by which the commands turn, from the first axis to the second [deg].
     matrix : tuple of float, optional
         Matrix from commands to the axes of the measurements, in rows.
-    scale : float, optional
-        Factor of the commands.
+    scale : float or sequence of float, optional
+        Factor of the commands of both axes, or of each: from volts or counts to the unit of the
+        measurements, for example.
 
     Raises
     ------
@@ -57,9 +59,12 @@ class CommandRepair:
     sign: tuple[int, ...] = ()
     rotation_deg: float = 0.0
     matrix: tuple[float, ...] = ()
-    scale: float = 1.0
+    scale: float | tuple[float, ...] = 1.0
 
     def __post_init__(self) -> None:
+        given = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
+        scales = tuple(number(scale, "command_scale", above=0) for scale in given)
+        set_fields(self, scale=scales[0] if len(set(scales)) == 1 else scales)
         shift = integer(self.shift_frames, "command_shift_frames", at_least=-_MOST_SHIFT)
         number(shift, "command_shift_frames", at_most=_MOST_SHIFT)
         for limit in self.limit_nm:
@@ -68,7 +73,6 @@ class CommandRepair:
             raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
         number(self.rotation_deg, "command_rotation_deg", at_least=-180, at_most=180)
         real_array(self.matrix, "command_matrix")
-        number(self.scale, "command_scale", above=0)
 
     @property
     def options(self) -> str:
@@ -85,9 +89,13 @@ class CommandRepair:
             f"--command-sign {values(self.sign)}" if self.sign else "",
             f"--command-rotation-deg {self.rotation_deg:g}" if self.rotation_deg else "",
             f"--command-matrix {values(self.matrix)}" if self.matrix else "",
-            f"--command-scale {self.scale:g}" if self.scale != 1 else "",
+            f"--command-scale {values(self._scales)}" if self.scale != 1 else "",
         ]
         return " ".join(filter(None, words))
+
+    @property
+    def _scales(self) -> tuple[float, ...]:
+        return self.scale if isinstance(self.scale, tuple) else (self.scale,)
 
     def turn(self, axes: int) -> FloatArray:
         """Return the matrix that swap, sign, rotation, matrix and scale are together."""
@@ -96,7 +104,11 @@ class CommandRepair:
                 "swapped or rotated commands need two axes; the record has one. Leave "
                 f"{self.options} out, or choose two columns."
             )
-        out = self.scale * np.eye(axes)
+        if len(self._scales) not in (1, axes):
+            raise ProblemError(
+                f"command_scale must be one factor, or {axes}; got {list(self._scales)}."
+            )
+        out = np.diag(np.broadcast_to(np.array(self._scales), axes))
         if self.matrix:
             if len(self.matrix) != axes**2:
                 raise ProblemError(

@@ -62,6 +62,7 @@ def test_the_matrix_of_a_repair_is_applied_in_the_order_of_its_fields() -> None:
     [
         ({"sign": (2,)}, "command_sign must be 1 or -1"),
         ({"scale": 0.0}, "command_scale must be above 0"),
+        ({"scale": (1.0, -2.0)}, "command_scale must be above 0"),
         ({"limit_nm": (-1.0,)}, "command_limit_nm must be above 0"),
         ({"shift_frames": 101}, "command_shift_frames must be at most 100"),
         ({"rotation_deg": 181.0}, "command_rotation_deg must be at most 180"),
@@ -94,3 +95,12 @@ def test_an_open_loop_has_nothing_to_repair() -> None:
     seen = lbt.identification.loop_record(y, frame_rate_hz=1000, unit="nm")
     with pytest.raises(lbt.errors.ProblemError, match="open loop"):
         repair_commands(seen, CommandRepair(sign=(-1,)))
+
+
+def test_each_axis_may_have_its_scale():
+    volts = CommandRepair(scale=[500.0, 480.0])
+    assert volts.options == "--command-scale 500 480"
+    assert volts.turn(2).tolist() == [[500.0, 0.0], [0.0, 480.0]]
+    assert CommandRepair(scale=(2.0, 2.0)) == CommandRepair(scale=2.0)
+    with pytest.raises(lbt.errors.ProblemError, match="command_scale must be one factor, or 1"):
+        volts.turn(1)
