@@ -76,15 +76,17 @@ def show_view(
 
 
 def _curves(points: Sequence[Any], kind: type[Any]) -> dict[str, dict[str, list[float]]]:
-    """Return lists of the numbers of each design; what it does not have is left out."""
-    numbers = [field.name for field in fields(kind) if field.name != "design"]
+    """Return lists of the numbers of each design; what it has none of is left out."""
+    names = [field.name for field in fields(kind) if field.name != "design"]
     curves: dict[str, dict[str, list[float]]] = {}
     for point in points:
-        own = curves.setdefault(point.design, {})
-        for name in numbers:
-            if not np.isnan(value := getattr(point, name)):
-                own.setdefault(name, []).append(value)
-    return curves
+        own = curves.setdefault(point.design, {name: [] for name in names})
+        for name in names:
+            own[name].append(getattr(point, name))
+    return {
+        design: {name: values for name, values in own.items() if not np.isnan(values).all()}
+        for design, own in curves.items()
+    }
 
 
 def add_margins(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:

@@ -14,7 +14,7 @@ from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only
 
 _SAME = 1e-9  # difference of sensitivities of equal axes
-_LARGEST = 1e6  # loop gain beyond which the sensitivity is rounding to a large part
+_LARGEST = 1e6  # loop gain beyond which, and below its inverse, much is rounding
 _UNIFORM = 512  # frequencies at equal steps, beside those around resonances
 
 
@@ -75,9 +75,16 @@ class BrokenLoop:
 
     @property
     def phase_deg(self) -> FloatArray:
-        """Phase without jumps [deg], (f,); between -270 and 90 at the lowest frequency."""
-        phase = np.degrees(np.unwrap(np.angle(self.response)))
-        return frozen_copy(phase - 360 * np.ceil((phase[0] - 90) / 360))
+        """Phase without jumps [deg], (f,); between -270 and 90 at the lowest frequency.
+
+        It is nan where the response is zero but for rounding, as at half the frame rate for a
+        delay of half a frame.
+        """
+        phase = np.full(self.response.size, np.nan)
+        known = np.abs(self.response) > 1 / _LARGEST
+        unwrapped = np.degrees(np.unwrap(np.angle(self.response[known])))
+        phase[known] = unwrapped - 360 * np.ceil((unwrapped[:1] - 90) / 360)
+        return frozen_copy(phase)
 
     @property
     def phase_margin(self) -> MarginPoint | None:
@@ -192,7 +199,7 @@ def _examine(
         gain_crossings=tuple(crossings(lambda response: abs(response) - 1, np.abs(own) - 1)),
         phase_crossings=tuple(
             sorted(
-                (point for point in across if -_LARGEST < point.response.real < 0),
+                (point for point in across if 1 / _LARGEST < -point.response.real < _LARGEST),
                 key=lambda point: point.frequency_hz,
             )
         ),

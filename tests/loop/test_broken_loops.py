@@ -85,3 +85,13 @@ def test_an_unstable_loop_has_no_margins():
     fast = lbt.Controller(A=1.0, B=1.2, C=1.0, D=0.0, dt_s=1 / RATE)
     with pytest.raises(lbt.errors.UnstableLoopError):
         lbt.loop.broken_loops(lbt.close_loop(hardware, fast))
+
+
+def test_a_response_that_vanishes_has_no_phase_there():
+    """Half a frame of delay: ``(1 + z^-1) / 2`` is 0 at half the frame rate."""
+    (found,) = broken(0.3, delay=2.5)
+    omega = 2 * np.pi * found.frequency_hz / RATE
+    assert np.isnan(found.phase_deg[-1])
+    assert np.allclose(found.phase_deg[:-1], -90 - np.degrees(2 * omega[:-1]), atol=1e-4)
+    (rise,) = found.gain_margins
+    assert rise.frequency_hz == pytest.approx(RATE / 8)

@@ -150,7 +150,8 @@ def bode_figure(
         f, gain, phase, _ = each.points
         gains.append(each.curve(f, _within(gain, gain)))
         phases.append(each.curve(f, phase))
-        lowest, highest = min(lowest, float(phase.min())), max(highest, float(phase.max()))
+        lowest = min(lowest, float(np.nanmin(phase)))
+        highest = max(highest, float(np.nanmax(phase)))
         for frequency_hz, ends in _gain_marks(found):
             gain_marks += _mark("gain margin", [frequency_hz] * 2, ends, "square")
         for frequency_hz, ends in _phase_marks(found):
