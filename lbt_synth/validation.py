@@ -31,6 +31,7 @@ Positive: TypeAlias = Annotated[float, ("above", 0)]
 NotNegative: TypeAlias = Annotated[float, ("at_least", 0)]
 Obstruction: TypeAlias = Annotated[float, ("at_least", 0), ("below", 1)]
 Count: TypeAlias = Annotated[int, ("at_least", 1)]
+_PARTS = "plant", "hardware", "truth", "design", "controller", "model"  # of larger objects
 _RELATIONS = {
     "above": operator.gt,
     "at_least": operator.ge,
@@ -284,4 +285,20 @@ def require_instance(value: object, kind: type[Any], name: str = "") -> None:
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         start = f"{name} must be" if name else "expected"
-        raise ProblemError(f"{start} {article} {kind.__name__}; got {type(value).__name__}.")
+        raise ProblemError(
+            f"{start} {article} {kind.__name__}; got {type(value).__name__}."
+            f"{suggest_part(value, kind)}"
+        )
+
+
+def suggest_part(value: object, kind: type[Any]) -> str:
+    """Return the sentence that names the part of an object that is of a class, or nothing."""
+    makers = {kind.__name__, *(each.__name__ for each in kind.__subclasses__())}
+    for name in _PARTS:
+        part = getattr(value, name, None)
+        if isinstance(part, kind):
+            designer = ", or its method design" if callable(getattr(value, "design", None)) else ""
+            return f" Try its {name}{designer}."
+        if getattr(part, "__annotations__", {}).get("return") in makers:
+            return f" Try its {name}()."
+    return ""

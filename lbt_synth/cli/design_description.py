@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
+from lbt_synth.design.facts import DesignFacts, without_units
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
-from lbt_synth.storage.tables import Table
+from lbt_synth.models.loop_hardware import LoopFacts
+from lbt_synth.storage.rows import fact_table, json_record
 
 _SMALL_MODULUS = 0.3
-
-
-@table_row
-class DesignFacts:
-    """What every design has."""
-
-    method: str = column("method")
-    route: str = column("route")
-    n_states: int = column("states of the controller")
-
-
-@table_row
-class LoopFacts:
-    """The loop that a design is for."""
-
-    frame_rate_hz: float = column("frame rate", unit="Hz")
-    delay_frames: float = column("total delay", unit="frames")
-    settling_ms: float | None = column("settling time of the mirror, to 10 %", unit="ms")
 
 
 def describe_design(design: Design, *, matrices: bool = False) -> Report:
@@ -55,12 +38,12 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
     margins = None
     if design.hardware is not None:
         facts.append(_loop_facts(report, design.hardware))
-        margins = loop_margins(close_loop(design.hardware, design.controller))
+        margins = loop_margins(close_loop(design.hardware, design))
         report.data["margins"] = json_record(margins)
         report.notes += _loop_notes(design, design.hardware, report.data)
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *([] if margins is None else [margins]))
-    report.tables.append(_without_units(printed) if margins is None else printed)
+    report.tables.append(without_units(printed) if margins is None else printed)
     report.notes += described.notes
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
     report.data["assumptions"] = design.assumptions
@@ -76,19 +59,13 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
     return report
 
 
-def _without_units(table: Table) -> Table:
-    """Return the facts of a bare estimation problem, whose signals have no units."""
-    return replace(table, rows=tuple((*row[:2], "") for row in table.rows))
-
-
 def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
     """Return the facts of a loop; the data get its mirror, if that has dynamics."""
-    settling_ms = None
+    facts = hardware.facts()
     if hardware.mirror is not None:
         settling_s = hardware.mirror.step_response().settling_s
         report.data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
-        settling_ms = 1e3 * settling_s
-    return fill_row(LoopFacts, hardware, settling_ms=settling_ms)
+    return facts
 
 
 def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:

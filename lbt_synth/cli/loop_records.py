@@ -8,8 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.loop_inputs import given_options
 from lbt_synth.cli.output import Report
@@ -19,7 +17,6 @@ from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
     IdentifiedAxis,
-    IdentifiedLine,
     IdentifiedModel,
     LinePrior,
     LoopRecord,
@@ -31,6 +28,7 @@ from lbt_synth.identification import (
 )
 from lbt_synth.identification.auto import RecordedDesign
 from lbt_synth.identification.commands.repair import repair_commands
+from lbt_synth.identification.fit.model_tables import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.line_priors import load_accelerations
 from lbt_synth.identification.records.record import LEAST_SECONDS
@@ -38,8 +36,6 @@ from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
-from lbt_synth.storage.display_unit import shown_format, shown_unit
-from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 
 _FACTS = (  # that a file may not hold
     *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
@@ -232,14 +228,14 @@ def _add_spectra(report: Report, record: SpectrumRecord) -> None:
         ("axis", "from [Hz]", "to [Hz]", "rms [nm]"),
         [
             (name, f[0], f[-1], f"{rms:.1f}")
-            for name, rms in zip(_axis_names(record.axes), record.rms_nm, strict=True)
+            for name, rms in zip(axis_names(record.axes), record.rms_nm, strict=True)
         ],
     )
     report.notes += [f"note: {note}" for note in record.notes]
 
 
 def _add_series(report: Report, record: LoopRecord) -> None:
-    health, names = record.health, _axis_names(record.axes)
+    health, names = record.health, axis_names(record.axes)
     report.data["record"] = record_data(record)
     text = f"{record.duration_s:.4g} s, {_loop_kind(record)}, {_axes_text(record.axes)}"
     rows = [
@@ -275,53 +271,11 @@ def _axes_text(count: int) -> str:
     return "1 axis" if count == 1 else f"{count} axes"
 
 
-def _axis_names(count: int) -> list[str]:
-    return ["tip", "tilt"] if count == 2 else ["-"] * count
-
-
-@table_row
-class VibrationRow:
-    """A vibration on one axis, or along a direction over both."""
-
-    axis: str = column("axis")  # or the direction
-    frequency_hz: float = column("f", unit="Hz", format=".3f")
-    frequency_error_hz: float = column("+-", unit="Hz", format=".2g")
-    damping: str = column("damping")  # one that is not resolved has a bound, and no error
-    damping_error: float | None = column("+-", format=".2g")
-    rms_nm: float = nm_column("rms", format=".2f")
-    rms_error_nm: float = column("+-", unit="nm", format=".2g")
-    prominence: float = column("over the rest", format=".3g")
-    origin: str = column("origin")
-
-
 def add_model(report: Report, model: IdentifiedModel) -> None:
     """Add the tables of an identified model, its notes, and its numbers."""
-    names = _axis_names(len(model.axes))
-    named_axes = list(zip(names, model.axes, strict=True))
-    report.add_table(
-        "Turbulence, noise and sensor",
-        ("quantity", "axis", "value", "error", "unit"),
-        [
-            (quantity, name, *_shown_cells(value, digits, error, unit))
-            for name, axis in named_axes
-            for quantity, value, digits, error, unit in _background(axis)
-            if value is not None
-        ],
-    )
-    lines = [
-        fill_row(
-            VibrationRow,
-            line,
-            axis=_direction_text(line, names),
-            damping=f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
-            damping_error=line.damping_error if line.resolved else None,
-            origin=line.kind + ", announced" * line.announced,
-        )
-        for line in model.parts
-    ]
-    if lines:
-        report.tables.append(row_table("Vibrations", lines))
-    else:
+    named_axes = list(zip(axis_names(len(model.axes)), model.axes, strict=True))
+    report.tables += model_tables(model)
+    if not model.parts:
         report.notes.append("no vibration stands out of the turbulence and the noise.")
     report.notes += [marked_note(note) for note in model.notes]
     for name, axis in named_axes:
@@ -331,37 +285,6 @@ def add_model(report: Report, model: IdentifiedModel) -> None:
     report.data["axes"] = [_axis_record(axis) for axis in model.axes]
     report.data["vibrations"] = [asdict(line) for line in model.parts]
     report.data["model_notes"] = model.notes
-
-
-def _shown_cells(value: float, digits: str, error: float | None, unit: str) -> tuple[str, str, str]:
-    """Return the cells of a value, its error and its unit."""
-    name, factor = shown_unit(unit)
-    size = None if error is None else factor * error
-    return cell_text(factor * value, shown_format(digits, factor)), cell_text(size, ".2g"), name
-
-
-def _direction_text(line: IdentifiedLine, names: Sequence[str]) -> str:
-    """Return the axis of a line, or the direction of one that both axes share."""
-    assert line.direction is not None  # of the parts of a model
-    if np.count_nonzero(line.direction) == 1:
-        return names[int(np.argmax(line.direction))]
-    error = line.direction_error_deg
-    return f"{line.direction_deg:.4g}{'' if error is None else f' +- {error:.1g}'} deg"
-
-
-def _background(
-    axis: IdentifiedAxis,
-) -> tuple[tuple[str, float | None, str, float | None, str], ...]:
-    """Return each quantity, its value, how it is written, its standard error and its unit."""
-    slow = axis.turbulence_fit
-    return (
-        ("turbulence, rms", slow.rms_nm, ".1f", slow.rms_error_nm, "nm"),
-        ("turbulence, frequency", slow.frequency_hz, ".4g", slow.frequency_error_hz, "Hz"),
-        ("turbulence, damping", slow.damping, ".3g", slow.damping_error, ""),
-        ("turbulence, roll-off", slow.corner_hz, ".3g", slow.corner_error_hz, "Hz"),
-        ("noise per frame", axis.noise_nm, ".3f", axis.noise_error_nm, "nm"),
-        ("sensor gain", axis.sensor_gain, ".4f", axis.sensor_gain_error, ""),
-    )
 
 
 def marked_note(note: str) -> str:

@@ -34,6 +34,7 @@ from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -44,7 +45,7 @@ _MOST_NODES, _DEEPEST, _MOST_DIGITS = 2**16, 40, 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Config:
+class Config(Summarised):
     """A configuration and what it describes.
 
     Attributes
@@ -76,6 +77,13 @@ class Config:
     noise_nm: float | FloatArray
     sensor_gain: float
     source: Path
+
+    def _brief(self) -> str:
+        return f"{self.source.name}, {self.hardware._brief()}"
+
+    def _summarise(self) -> Summary:
+        plant, truth = self.plant._summarise(), self.truth._summarise()
+        return Summary(tables=[*plant.tables, *truth.tables], curve=plant.curve)
 
     @property
     def hardware(self) -> LoopHardware:

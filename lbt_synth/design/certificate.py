@@ -22,7 +22,8 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import column
+from lbt_synth.storage.rows import column, row_table
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray, frozen_copy, number, set_fields
 
 GAIN_TOLERANCE = 1e-6
@@ -63,7 +64,7 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Certificate:
+class Certificate(Summarised):
     """Evidence that a design is what it says, computed from its matrices alone.
 
     Attributes
@@ -85,6 +86,15 @@ class Certificate:
     def passed(self) -> bool:
         """Whether every check passed."""
         return all(check.passed for check in self.checks)
+
+    def _brief(self) -> str:
+        failed = [check.name for check in self.checks if not check.passed]
+        if failed:
+            return f"failed: {', '.join(failed)}"
+        return f"{len(self.checks)} of {len(self.checks)} checks passed"
+
+    def _summarise(self) -> Summary:
+        return Summary(tables=[row_table("Certificate", self.checks)] if self.checks else [])
 
     @property
     def rms(self) -> float:

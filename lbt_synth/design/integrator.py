@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth.design.certificate import Certificate, certify_loop
+from lbt_synth.design.facts import IntegratorFacts
 from lbt_synth.design.integrator_law import PURE, IntegratorLaw
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError, UnstableLoopError
@@ -64,6 +65,16 @@ class IntegratorDesign(Design):
     def hardware(self) -> LoopHardware | None:
         """Loop that the design is for."""
         return self.loop_hardware
+
+    def facts(self) -> IntegratorFacts:
+        """Return the gain and the law, where it is not the usual one."""
+        changes = self.law.changes()
+        return IntegratorFacts(
+            gain=self.gain,
+            **{name: changes.get(name) for name in ("leak", "integrators", "zero_hz")},
+            phase_margin_demand_deg=self.law.phase_margin_deg,
+            modulus_margin_demand=self.law.modulus_margin,
+        )
 
     @property
     def poles(self) -> ComplexArray:

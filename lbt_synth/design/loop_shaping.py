@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design.certificate import Certificate, Check, certify_loop
+from lbt_synth.design.facts import RobustFacts
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.design.shaping.channel import (
     Channel,
@@ -24,6 +25,7 @@ from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
+from lbt_synth.storage.rows import fill_row
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -150,7 +152,7 @@ def shape(
     return with_certificate(design, "Try more functions, or looser demands.")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShapedDesign(Design):
     """A controller shaped in the closed loop, mode by mode.
 
@@ -217,13 +219,12 @@ class ShapedDesign(Design):
         specs = enumerate(self.specifications)
         return tuple((mode, demand.label) for mode, spec in specs for demand in spec.demands)
 
-    def __repr__(self) -> str:
-        """Return one line: what it is, not its matrices."""
-        return (
-            f"ShapedDesign(method={self.method!r}, modes={len(self.parameters)}, "
-            f"states_per_mode={self.states_per_mode}, objective_nm={self.objective_nm}, "
-            f"passed={self.certificate.passed})"
-        )
+    def facts(self) -> RobustFacts:
+        """Return what the controller is, beside the limits over its bands."""
+        from lbt_synth.design.model_limits import shaped_limit
+
+        limit_nm, above = shaped_limit(self)
+        return fill_row(RobustFacts, self, limit_nm=limit_nm, above_limit_percent=above)
 
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
         """Residual of each term in the real loop: mode, what it is, [nm rms]."""

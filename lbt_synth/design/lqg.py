@@ -28,6 +28,7 @@ from lbt_synth.design.certificate import (
     certify_filter,
     certify_loop,
 )
+from lbt_synth.design.facts import LqgFacts, model_facts
 from lbt_synth.design.result import UNCERTIFIED, EstimatorDesign, SolverReport, with_certificate
 from lbt_synth.errors import DimensionError, InfeasibleError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, solve_dare
@@ -83,6 +84,10 @@ class LqgDesign(EstimatorDesign):
     def knows_mirror(self) -> bool:
         """True: the regulator knows the mirror."""
         return True
+
+    def facts(self) -> LqgFacts:
+        """Return what the controller leaves, beside what is possible."""
+        return model_facts(LqgFacts, self)
 
     @property
     def estimation(self) -> TipTiltPlant:

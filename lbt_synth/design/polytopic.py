@@ -14,6 +14,7 @@ from lbt_synth.design.certificate import (
     certify_error,
     certify_loop,
 )
+from lbt_synth.design.facts import PolytopicFacts, model_facts
 from lbt_synth.design.result import UNCERTIFIED, EstimatorDesign, SolverReport, with_certificate
 from lbt_synth.design.worst_case import bound_worst_error, error_size, search_worst_error
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
@@ -74,6 +75,11 @@ class PolytopicDesign(EstimatorDesign):
     def interval(self) -> FrequencyInterval:
         """The plants of the interval."""
         return FrequencyInterval(plant=self.problem, half_width_hz=self.half_width_hz)
+
+    def facts(self) -> PolytopicFacts:
+        """Return what the filter guarantees over its interval, beside the worst that was found."""
+        ratio = self.bound_guaranteed / self.worst_achieved
+        return model_facts(PolytopicFacts, self, self.interval, guaranteed_over_found=ratio)
 
     @property
     def poles(self) -> ComplexArray:

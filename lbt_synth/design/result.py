@@ -21,6 +21,7 @@ from lbt_synth.design.certificate import (
     certify_infeasible,
     certify_loop,
 )
+from lbt_synth.design.facts import FilterFacts, model_facts, summarise_design
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
 from lbt_synth.linear.estimation_problem import decorrelate
@@ -31,6 +32,7 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
 )
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
+from lbt_synth.storage.summaries import Summarised, Summary, count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 ORIGIN = "distance from its Riccati filter"
@@ -56,7 +58,7 @@ class SolverReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Design:
+class Design(Summarised):
     """A certified controller.
 
     Attributes
@@ -92,6 +94,18 @@ class Design:
     def knows_mirror(self) -> bool:
         """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
         return True
+
+    def facts(self) -> Any:
+        """Return the numbers that this kind of design has, a row; None if there are none."""
+        return None
+
+    def _brief(self) -> str:
+        loop = "" if self.hardware is None else f", {self.hardware._brief()}"
+        route = "" if self.solver.route in self.method else f" by {self.solver.route}"
+        return f"{self.method}{route}, {count_text(self.controller.n_states, 'state')}{loop}"
+
+    def _summarise(self) -> Summary:
+        return summarise_design(self)
 
     @property
     def poles(self) -> ComplexArray:
@@ -214,6 +228,10 @@ class FilterDesign(EstimatorDesign):
             The system.
         """
         return (problem or self.problem).error_system(self.gain_predictor)
+
+    def facts(self) -> FilterFacts:
+        """Return what the filter achieves, beside what it was asked for and what is possible."""
+        return model_facts(FilterFacts, self)
 
     @property
     def is_bounded(self) -> bool:

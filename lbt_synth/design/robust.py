@@ -19,7 +19,7 @@ from lbt_synth.validation import number, require_instance, sequence
 def robust(
     plant: TipTiltPlant,
     *,
-    bands: Sequence[VibrationBand] | Sequence[Sequence[VibrationBand]],
+    bands: Sequence[VibrationBand] | Sequence[Sequence[VibrationBand]] = (),
     sensor_gain: tuple[float, float] = (1.0, 1.0),
     scenarios: Sequence[float] = (1.0,),
     modulus_margin: float = 0.45,
@@ -34,13 +34,14 @@ def robust(
 
     For each mode it minimises, summed over some sensor gains, the variance of turbulence and
     noise plus the worst residual of a vibration in each band; under a modulus margin at unit
-    sensor gain, and stability for every sensor gain of an interval.
+    sensor gain, and stability for every sensor gain of an interval. ``config.design("robust")``
+    makes one of the section ``design.robust`` of a configuration.
 
     Parameters
     ----------
     plant : TipTiltPlant
         Loop, noise and turbulence; its vibrations are not used, the bands take their place.
-    bands : sequence of VibrationBand, or one sequence per mode
+    bands : sequence of VibrationBand, or one sequence per mode, optional
         Bands, each with the rms of its vibration. In one sequence, every mode may have all of
         them.
     sensor_gain : tuple of float, optional

@@ -27,9 +27,11 @@ from lbt_synth.identification.record_drift import note_drift
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
+from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.registry import gain_robust_method, method_named, record_methods
 from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import choice, number, require_instance
 
 _GAMMA_RATIO = 1.2
@@ -39,7 +41,7 @@ _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordedDesign:
+class RecordedDesign(Summarised):
     """A controller designed from a record.
 
     Attributes
@@ -68,6 +70,19 @@ class RecordedDesign:
     name: str
     notes: tuple[str, ...]
     choice: MethodChoice | None = None
+
+    @property
+    def controller(self) -> Controller:
+        """The controller of the design."""
+        return self.design.controller
+
+    def _brief(self) -> str:
+        return f"{self.name}, {self.model.hardware._brief()}"
+
+    def _summarise(self) -> Summary:
+        """Return the facts of the design, and the notes."""
+        found = self.design._summarise()
+        return replace(found, notes=(*found.notes, *self.notes))
 
 
 def design_from_record(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller
+from lbt_synth.linear.state_space import as_controller
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import FloatArray, set_fields
 
@@ -88,9 +88,7 @@ def frame_cost(design: Design | Controller) -> FrameCost:
     >>> cost.multiplications, cost.additions, cost.dense_multiplications
     (1, 1, 4)
     """
-    controller = design.controller if isinstance(design, Design) else design
-    if not isinstance(controller, Controller):
-        raise ProblemError(f"expected a Design or a Controller; got {type(design).__name__}.")
+    controller = as_controller(design)
     whole = block_matrix(controller)
     rows, columns = whole.shape
     terms = np.count_nonzero(whole, axis=1)

@@ -9,7 +9,15 @@ from scipy.linalg import block_diag
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
 from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
-from lbt_synth.validation import FloatArray, definite, frozen_copy, integer, matrix, set_fields
+from lbt_synth.validation import (
+    FloatArray,
+    definite,
+    frozen_copy,
+    integer,
+    matrix,
+    set_fields,
+    suggest_part,
+)
 
 LONGEST_HORIZON = 100  # samples
 
@@ -17,9 +25,10 @@ LONGEST_HORIZON = 100  # samples
 def require_problem(problem: object) -> None:
     """Refuse anything but an estimation problem."""
     if not isinstance(problem, EstimationProblem):
+        hint = suggest_part(problem, EstimationProblem)
+        hint = hint or " Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
         raise ProblemError(
-            "expected an EstimationProblem, such as a plant; got "
-            f"{type(problem).__name__}. Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
+            f"expected an EstimationProblem, such as a plant; got {type(problem).__name__}.{hint}"
         )
 
 
@@ -78,6 +87,12 @@ class EstimationProblem(LinearSystem):
             raise DefinitenessError(
                 f"{error} Every measurement needs noise of its own: add a column to D."
             ) from error
+
+    def _shown_system(self) -> tuple[StateSpace, str]:
+        """Return the system from w to the estimated signal."""
+        D = np.zeros((len(self.L), self.B.shape[1]))
+        system = StateSpace(A=self.A, B=self.B, C=self.L, D=D, dt_s=self.dt_s)
+        return system, "largest singular value from w to z"
 
     @property
     def Q(self) -> FloatArray:

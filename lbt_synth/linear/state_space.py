@@ -8,7 +8,7 @@ output is read from the *new* state, ``u(k) = C x(k+1) + D y(k)``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,8 @@ from scipy.linalg import matrix_balance, schur
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.batched import solve_stack
+from lbt_synth.storage.rows import column, fact_table, table_row
+from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -24,13 +26,25 @@ from lbt_synth.validation import (
     real_array,
     set_fields,
     square,
+    suggest_part,
 )
 
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
 
 
+@table_row
+class SystemFacts:
+    """Sizes and poles of a linear system."""
+
+    n_states: int = column("states")
+    inputs: int = column("inputs")
+    outputs: int = column("outputs")
+    frame_rate_hz: float | None = column("frame rate", unit="Hz")
+    spectral_radius: float = column("largest modulus of a pole")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LinearSystem:
+class LinearSystem(Summarised):
     """Four matrices of matching sizes, and a sampling period."""
 
     A: FloatArray
@@ -52,6 +66,27 @@ class LinearSystem:
     def n_states(self) -> int:
         """Number of states."""
         return int(self.A.shape[0])
+
+    def _brief(self) -> str:
+        rate = "" if self.dt_s == 1 else f", {1 / self.dt_s:.6g} Hz"
+        sizes = zip((self.n_states, *self.D.shape[::-1]), ("state", "input", "output"), strict=True)
+        return ", ".join(count_text(*size) for size in sizes) + rate
+
+    def _summarise(self) -> Summary:
+        facts = SystemFacts(
+            n_states=self.n_states,
+            inputs=self.D.shape[1],
+            outputs=self.D.shape[0],
+            frame_rate_hz=None if self.dt_s == 1 else 1 / self.dt_s,
+            spectral_radius=float(np.max(np.abs(np.linalg.eigvals(self.A)))),
+        )
+        system, caption = self._shown_system()
+        return Summary(tables=[fact_table("System", facts)], curve=sigma_sparkline(system, caption))
+
+    def _shown_system(self) -> tuple[StateSpace, str]:
+        """Return the system of the sparkline, and what its largest singular value is."""
+        system = StateSpace(A=self.A, B=self.B, C=self.C, D=self.D, dt_s=self.dt_s)
+        return system, "largest singular value"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -206,6 +241,14 @@ class StateSpace(LinearSystem):
         return response
 
 
+def sigma_sparkline(system: StateSpace, caption: str) -> Sparkline:
+    """Return the largest singular value of a system over three decades below Nyquist."""
+    frequency_hz = np.geomspace(1e-3, 0.999, 400) / (2 * system.dt_s)
+    response = system.frequency_response(frequency_hz)
+    values = np.asarray(np.linalg.norm(response, 2, axis=(1, 2)))
+    return Sparkline(caption=caption, frequency_hz=frequency_hz, values=values)
+
+
 def balancing_scales(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> FloatArray:
     """Powers of two that balance ``[[|A|, entry], [leaving', 0]]``, (n + 1,)."""
     border = np.block([[np.abs(A), entry[:, None]], [leaving[None, :], np.zeros((1, 1))]])
@@ -293,9 +336,34 @@ class Controller(LinearSystem):
             A=self.A, B=self.B, C=self.C @ self.A, D=self.C @ self.B + self.D, dt_s=self.dt_s
         )
 
+    def _shown_system(self) -> tuple[StateSpace, str]:
+        """Return its textbook form."""
+        return self.to_statespace(), "largest singular value"
+
     def start(self) -> RunningController:
         """Return a running copy with a zero state, to be stepped sample by sample."""
         return RunningController(self)
+
+
+@runtime_checkable
+class HasController(Protocol):
+    """Anything that holds a controller, such as a design."""
+
+    @property
+    def controller(self) -> Controller:
+        """The controller."""
+        ...
+
+
+def as_controller(given: Controller | HasController, *, others: str = "") -> Controller:
+    """Return a controller, or that of a design; refuse anything else."""
+    found = given if isinstance(given, Controller) else getattr(given, "controller", None)
+    if not isinstance(found, Controller):
+        raise ProblemError(
+            f"controller must be a Controller{others}, or a design; got {type(given).__name__}."
+            f"{suggest_part(given, Controller)}"
+        )
+    return found
 
 
 @dataclass(slots=True, eq=False)

@@ -20,11 +20,24 @@ from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import fact_table, fill_row, nm_column, table_row
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
+@table_row
+class BudgetFacts:
+    """The residual by origin."""
+
+    rms_nm: float = nm_column("residual", unit="nm rms")
+    turbulence_nm: float = nm_column("  turbulence", unit="nm rms")
+    vibration_nm: float = nm_column("  vibrations", unit="nm rms")
+    noise_nm: float = nm_column("  noise", unit="nm rms")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ResidualBudget:
+class ResidualBudget(Summarised):
     """Stationary residual of a loop, by origin.
 
     Attributes
@@ -39,6 +52,12 @@ class ResidualBudget:
     noise_nm2: FloatArray
     random_vibration_nm2: FloatArray
     line_amplitudes_nm: ComplexArray
+
+    def _brief(self) -> str:
+        return f"{nm_text(self.rms_nm, '.4g')} rms, {len(self.noise_nm2)} modes"
+
+    def _summarise(self) -> Summary:
+        return Summary(tables=[fact_table("Residual", fill_row(BudgetFacts, self))])
 
     @property
     def gaussian_nm2(self) -> FloatArray:
@@ -117,6 +136,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     >>> round(budget.noise_nm**2, 9)
     3.0
     """
+    require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     if loop.sensor_gain != truth.sensor_gain:
         raise ProblemError(

@@ -10,16 +10,29 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.linear.state_space import HasController, as_controller, sigma_sparkline
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
-from lbt_synth.validation import ComplexArray, FloatArray, number
+from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance
 
 # A loop whose slowest pole is closer to the unit circle than this is called marginal.
 STABILITY_MARGIN = 1e-9
+REJECTION = "largest singular value of the rejection"
+
+
+@table_row
+class ClosedLoopFacts:
+    """What a closed loop is."""
+
+    sensor_gain: float = column("sensor gain over the assumed one")
+    is_stable: bool = column("stable")
+    spectral_radius: float = column("largest modulus of a pole")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ClosedLoop:
+class ClosedLoop(Summarised):
     """Closed loop from ``[phi_tot (n), noise (q)]`` to ``[phi_res (n), u (m), y (q)]``.
 
     Made by :func:`close_loop`.
@@ -40,6 +53,16 @@ class ClosedLoop:
     hardware: LoopHardware
     controller: Controller
     sensor_gain: float
+
+    def _brief(self) -> str:
+        return f"{self.hardware._brief()}, sensor gain {self.sensor_gain:.4g}"
+
+    def _summarise(self) -> Summary:
+        facts = self.hardware.facts(), fill_row(ClosedLoopFacts, self)
+        return Summary(
+            tables=[fact_table("Loop", *facts)],
+            curve=sigma_sparkline(self.rejection(), REJECTION),
+        )
 
     @property
     def spectral_radius(self) -> float:
@@ -105,7 +128,7 @@ class ClosedLoop:
 
 
 def close_loop(
-    hardware: LoopHardware, controller: Controller, *, sensor_gain: float = 1.0
+    hardware: LoopHardware, controller: Controller | HasController, *, sensor_gain: float = 1.0
 ) -> ClosedLoop:
     """Close the loop of :class:`LoopHardware` around a controller.
 
@@ -113,8 +136,8 @@ def close_loop(
     ----------
     hardware : LoopHardware
         Sensor, mirror and delay.
-    controller : Controller
-        From y(k) to u(k).
+    controller : Controller or Design
+        From y(k) to u(k), or a design that holds it.
     sensor_gain : float, optional
         Real sensor gain relative to the sensor matrix.
 
@@ -136,17 +159,19 @@ def close_loop(
     >>> lbt.close_loop(path, lazy).is_stable
     True
     """
+    require_instance(hardware, LoopHardware, "hardware")
     gain = number(sensor_gain, "sensor_gain", above=0)
-    A0, A1, B, C0, C1, D = _checked_loop_matrices(hardware, controller)
+    own = as_controller(controller)
+    A0, A1, B, C0, C1, D = _checked_loop_matrices(hardware, own)
     system = StateSpace(A=A0 + gain * A1, B=B, C=C0 + gain * C1, D=D, dt_s=hardware.dt_s)
-    return ClosedLoop(system=system, hardware=hardware, controller=controller, sensor_gain=gain)
+    return ClosedLoop(system=system, hardware=hardware, controller=own, sensor_gain=gain)
 
 
 def radii_by_gain(
-    hardware: LoopHardware, controller: Controller
+    hardware: LoopHardware, controller: Controller | HasController
 ) -> Callable[[FloatArray], FloatArray]:
     """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
-    A0, A1, *_ = _checked_loop_matrices(hardware, controller)
+    A0, A1, *_ = _checked_loop_matrices(hardware, as_controller(controller))
 
     def radii(sensor_gains: FloatArray) -> FloatArray:
         loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1

@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.linear import Controller, hinf_norm, structured_norm
+from lbt_synth.linear.state_space import HasController
 from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import number
+from lbt_synth.storage.rows import column, fact_table, table_row
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.validation import number, require_instance
 
 _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
 _WIDEST = 1e4
@@ -23,13 +25,19 @@ _LONGEST = 100  # delay up to which it is sought [frames]
 
 
 @table_row
-class LoopMargins:
+class LoopMargins(Summarised):
     """Margins of a stable loop.
 
     For the phase each measurement is broken in turn, the others closed; gain and delay change in
     all of them at once. The disk margin is of all measurements at once, each with a gain and a
     phase of its own.
     """
+
+    def _brief(self) -> str:
+        return f"modulus {self.modulus:.3g}, phase {self.phase_deg:.3g} deg"
+
+    def _summarise(self) -> Summary:
+        return Summary(tables=[fact_table("Margins", self)])
 
     modulus: float = column(
         "modulus margin",
@@ -99,6 +107,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     >>> margins.gain_low, round(margins.gain_high, 6)
     (0.0, 2.0)
     """
+    require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
     broken = broken_loops(loop)
@@ -121,7 +130,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
 
 
 def stable_sensor_gains(
-    hardware: LoopHardware, controller: Controller, *, nominal: float = 1.0
+    hardware: LoopHardware, controller: Controller | HasController, *, nominal: float = 1.0
 ) -> tuple[float, float]:
     """Interval of sensor gains around a nominal one for which the loop is stable.
 
@@ -132,8 +141,8 @@ def stable_sensor_gains(
     ----------
     hardware : LoopHardware
         Sensor, mirror and delay.
-    controller : Controller
-        The controller.
+    controller : Controller or Design
+        The controller, or a design that holds it.
     nominal : float, optional
         Gain inside the interval.
 

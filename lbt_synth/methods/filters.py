@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from lbt_synth.methods.method import Description, Method, Section
-from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
-    from lbt_synth.design.result import EstimatorDesign, FilterDesign
+    from lbt_synth.design.result import FilterDesign
 
 _CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
 
@@ -25,7 +24,6 @@ Horizon = Annotated[
         json_schema_extra={"instead": "Set loop.delay_frames in the configuration instead."},
     ),
 ]
-LIMIT_IN_MODEL = "least residual of any linear controller in it"  # heading, below the residual
 BOUNDS = frozenset({"gamma", "gamma_ratio", "rms"})  # at most one is given
 
 
@@ -49,38 +47,10 @@ class BoundOptions(Section):
         return {"gamma_ratio": self.gamma_ratio} if self.gamma is None else {"gamma": self.gamma}
 
 
-@table_row
-class FilterFacts:
-    """What a filter achieves, beside what it was asked for and what is possible."""
-
-    rms: float = column("estimation error, rms", unit="nm")
-    gamma: float = column("estimation error, H-infinity norm", unit="nm")
-    residual_nm: float | None = column("residual in its model, rms", unit="nm")
-    limit_nm: float | None = column(LIMIT_IN_MODEL, unit="nm")
-    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
-    rms_requested: float | None = column("rms asked for", unit="nm")
-    gamma_requested: float | None = column("bound asked for", unit="nm")
-    gamma_least: float | None = column(
-        "least norm of any filter, upper bound", unit="nm", format=".9g"
-    )
-    gamma_infeasible: float | None = column(
-        "least norm of any filter, lower bound", unit="nm", format=".9g"
-    )
-
-
-def limit_facts(design: EstimatorDesign) -> dict[str, Any]:
-    """Return residual and limit of a design's own model, and how far the design is above it."""
-    from lbt_synth.design.model_limits import model_limit
-
-    names = ("residual_nm", "limit_nm", "above_limit_percent")
-    found = (None, None, None) if design.hardware is None else model_limit(design)
-    return dict(zip(names, found, strict=True))
-
-
 def _describe_filter(design: FilterDesign) -> Description:
     """Describe a filter."""
     return Description(
-        facts=fill_row(FilterFacts, design, **limit_facts(design)),
+        facts=design.facts(),
         matrices={"gain_predictor": design.gain_predictor, "gain_filter": design.gain_filter},
     )
 

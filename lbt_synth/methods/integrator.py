@@ -8,7 +8,6 @@ from pydantic import Field
 
 from lbt_synth.methods.method import Description, DesignInputs, Method, Section
 from lbt_synth.methods.quantities import Gain, Hertz
-from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:
@@ -43,18 +42,6 @@ class IntegratorOptions(Section):
         description="corner of a zero [Hz]: of a PI controller, or of the lag compensator of a "
         "double integrator",
     )
-
-
-@table_row
-class IntegratorFacts:
-    """Gain and law of an integrator."""
-
-    gain: float = column("gain")
-    leak: float | None = column("left of a command after a frame")
-    integrators: int | None = column("integrators")
-    zero_hz: float | None = column("corner of the zero", unit="Hz")
-    phase_margin_demand_deg: float | None = column("phase margin demanded", unit="deg")
-    modulus_margin_demand: float | None = column("modulus margin demanded")
 
 
 def _law(values: dict[str, Any]) -> IntegratorLaw:
@@ -100,14 +87,7 @@ def _unpack(record: DesignRecord) -> IntegratorDesign:
 
 
 def _describe(design: IntegratorDesign) -> Description:
-    changes = design.law.changes()
-    facts = IntegratorFacts(
-        gain=design.gain,
-        **{name: changes.get(name) for name in ("leak", "integrators", "zero_hz")},
-        phase_margin_demand_deg=design.law.phase_margin_deg,
-        modulus_margin_demand=design.law.modulus_margin,
-    )
-    return Description(facts=facts)
+    return Description(facts=design.facts())
 
 
 METHOD = Method(

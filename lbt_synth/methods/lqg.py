@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from lbt_synth.methods.filters import LIMIT_IN_MODEL, limit_facts
 from lbt_synth.methods.method import Description, DesignInputs, Method, Section
-from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import frozen_copy, number
 
 if TYPE_CHECKING:
@@ -28,17 +26,6 @@ class LqgOptions(Section):
         le=1e12,
         description="weight of the squared command beside the squared residual",
     )
-
-
-@table_row
-class LqgFacts:
-    """What an LQG controller leaves, beside what is possible."""
-
-    rms: float = column("residual in its model, rms", unit="nm")
-    gamma: float = column("residual, H-infinity norm", unit="nm")
-    limit_nm: float | None = column(LIMIT_IN_MODEL, unit="nm")
-    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
-    command_weight: float = column("weight of the command")
 
 
 def _build(inputs: DesignInputs, options: LqgOptions) -> LqgDesign:
@@ -85,9 +72,7 @@ def _unpack(record: DesignRecord) -> LqgDesign:
 
 
 def _describe(design: LqgDesign) -> Description:
-    _, limit_nm, above = limit_facts(design).values()  # the residual is its rms
-    facts = fill_row(LqgFacts, design, limit_nm=limit_nm, above_limit_percent=above)
-    return Description(facts=facts)
+    return Description(facts=design.facts())
 
 
 METHOD = Method(

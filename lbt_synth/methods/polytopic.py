@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from lbt_synth.methods.filters import LIMIT_IN_MODEL, Horizon, limit_facts
+from lbt_synth.methods.filters import Horizon
 from lbt_synth.methods.method import Description, DesignInputs, Method, Section
-from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import choice, number
 
 if TYPE_CHECKING:
@@ -31,26 +30,6 @@ class PolytopicOptions(Section):
         description="what is minimised over the interval: hinf (H-infinity norm) or h2 (rms)",
     )
     horizon: Horizon = 1
-
-
-@table_row
-class PolytopicFacts:
-    """What a filter guarantees over its interval, beside the worst that was found."""
-
-    rms: float = column("estimation error at the centre, rms", unit="nm")
-    gamma: float = column("estimation error at the centre, H-infinity norm", unit="nm")
-    residual_nm: float | None = column("residual in its model, rms", unit="nm")
-    limit_nm: float | None = column(LIMIT_IN_MODEL, unit="nm")
-    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
-    half_width_hz: float = column("half width of the interval of frequencies", unit="Hz")
-    low_hz: float = column("interval of frequencies, from", unit="Hz")
-    high_hz: float = column("interval of frequencies, to", unit="Hz")
-    norm: str = column("norm that is bounded on the interval")
-    bound_guaranteed: float = column("norm on the interval, guaranteed", unit="nm", format=".9g")
-    worst_achieved: float = column("norm on the interval, worst found", unit="nm", format=".9g")
-    guaranteed_over_found: float = column("  guaranteed over found", format=".6f")
-    worst_frequency_hz: float = column("  found at", unit="Hz")
-    bound_programme: float = column("  bound of the programme", unit="nm", format=".9g")
 
 
 def _build(inputs: DesignInputs, options: PolytopicOptions) -> PolytopicDesign:
@@ -91,10 +70,8 @@ def _unpack(record: DesignRecord) -> PolytopicDesign:
 
 
 def _describe(design: PolytopicDesign) -> Description:
-    ratio = design.bound_guaranteed / design.worst_achieved
-    extra = {**limit_facts(design), "guaranteed_over_found": ratio}
     return Description(
-        facts=fill_row(PolytopicFacts, design, design.interval, **extra),
+        facts=design.facts(),
         matrices={f"predictor_{name}": getattr(design.predictor, name) for name in "ABC"},
     )
 

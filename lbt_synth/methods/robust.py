@@ -21,7 +21,7 @@ from lbt_synth.methods.robust_section import (
     BandSection,
     RobustSection,
 )
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:
@@ -37,18 +37,6 @@ _MOST_BANDS = 6  # around lines of a plant
 _BAND = 0.02  # half width of such a band, over its frequency
 _PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes minutes
 _GAIN_BAND, _GAIN_MARGIN, _GAIN_FUNCTIONS = 0.003, 0.25, 60  # if only the gain is uncertain
-
-
-@table_row
-class RobustFacts:
-    """What a robust controller is, beside the limits over its bands."""
-
-    states_per_mode: int = column("states of one mode, past commands included")
-    loss: float = column("objective above the long parameter's", unit="%", scale=100)
-    limit_nm: float = column("least worst residual over its bands, all modes", unit="nm")
-    above_limit_percent: float = column("residual at unit sensor gain above it", unit="%")
-    objective_nm: tuple[float, ...] = column(unit="nm")
-    long_objective_nm: tuple[float, ...] = column(unit="nm")
 
 
 @table_row
@@ -305,9 +293,6 @@ def _unpack(record: DesignRecord) -> ShapedDesign:
 
 
 def _describe(design: ShapedDesign) -> Description:
-    from lbt_synth.design.model_limits import shaped_limit
-
-    limit_nm, above = shaped_limit(design)
     notes = []
     if design.is_reduced and design.loss < 0:
         notes.append(
@@ -317,7 +302,7 @@ def _describe(design: ShapedDesign) -> Description:
     demands = [DemandRow(demand=label, mode=m + 1) for m, label in design.demand_labels()]
     terms = [TermRow(term=text, mode=m + 1, rms_nm=rms) for m, text, rms in design.terms_nm()]
     return Description(
-        facts=fill_row(RobustFacts, design, limit_nm=limit_nm, above_limit_percent=above),
+        facts=design.facts(),
         tables=(
             RowTable(key="demands", title="Demands", rows=demands),
             RowTable(key="terms", title="Residual of each term", rows=terms),

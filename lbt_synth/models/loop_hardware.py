@@ -10,13 +10,24 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_system
 from lbt_synth.models.mirror.position_loop import PositionLoop
+from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, matrix
 
 LONGEST_DELAY = 20  # of a loop [frames]; each is a state of every matrix
 
 
+@table_row
+class LoopFacts:
+    """The loop that a design is for."""
+
+    frame_rate_hz: float = column("frame rate", unit="Hz")
+    delay_frames: float = column("total delay", unit="frames")
+    settling_ms: float | None = column("settling time of the mirror, to 10 %", unit="ms")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopHardware:
+class LoopHardware(Summarised):
     """Sensor, mirror and delay around which a controller closes the loop.
 
     In frames k of ``1 / frame_rate_hz``, with d the total delay::
@@ -126,6 +137,20 @@ class LoopHardware:
     def n_measurements(self) -> int:
         """Number of measurements q."""
         return int(self.sensor.shape[0])
+
+    def facts(self) -> LoopFacts:
+        """Return what tables say of the loop."""
+        settled = self.mirror
+        settling_ms = None if settled is None else 1e3 * settled.step_response().settling_s
+        return fill_row(LoopFacts, self, settling_ms=settling_ms)
+
+    def _brief(self) -> str:
+        axes = "1 axis" if self.modes == 1 else f"{self.modes} axes"
+        moving = "" if self.mirror is None else ", a mirror with dynamics"
+        return f"{axes} at {self.frame_rate_hz:g} Hz, delay {self.delay_frames:g} frames{moving}"
+
+    def _summarise(self) -> Summary:
+        return Summary(tables=[fact_table("Loop", self.facts())])
 
     @property
     def dt_s(self) -> float:

@@ -8,9 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.ar_model import ARModel
+from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
 from lbt_synth.models.vibration.in_a_loop import TrueVibration, stationary_vibrations
+from lbt_synth.storage.rows import fact_table
+from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
 from lbt_synth.validation import (
     FloatArray,
     Positive,
@@ -20,9 +24,11 @@ from lbt_synth.validation import (
     one_or_each,
 )
 
+_SHOWN_FROM_HZ, _SHOWN_TO_HZ = 0.1, 300.0  # of a sparkline
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Truth:
+class Truth(Summarised):
     """Disturbances and sensor of the real loop.
 
     Parameters
@@ -95,6 +101,20 @@ class Truth:
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
             frequency_errors_hz=self._checked_errors(),
+        )
+
+    def _brief(self) -> str:
+        lines = count_text(len(self.vibrations), "vibration")
+        return f"{lines}, sensor gain {self.sensor_gain:.4g}"
+
+    def _summarise(self) -> Summary:
+        parts = self.turbulence if isinstance(self.turbulence, tuple) else (self.turbulence,)
+        noise = np.asarray(self.noise_nm)
+        facts = disturbance_facts(parts, self.vibrations, noise, self.sensor_gain)
+        shown = next((part for part in parts if part is not None), None)
+        return Summary(
+            tables=[fact_table("Truth", facts)],
+            curve=None if shown is None else _spectrum_sparkline(shown),
         )
 
     def _checked_errors(self) -> tuple[float, ...] | None:
@@ -177,3 +197,12 @@ class Truth:
         """
         noise = one_or_each(self.noise_nm, "noise_nm", measurements)
         return frozen_copy(np.broadcast_to(noise, (measurements,)))
+
+
+def _spectrum_sparkline(spectrum: Spectrum) -> Sparkline:
+    """Return the density of the turbulence from 0.1 Hz to 300 Hz or the Nyquist frequency."""
+    rate_hz = spectrum.frame_rate_hz if isinstance(spectrum, ARModel) else _SHOWN_TO_HZ * 2
+    frequency_hz = np.geomspace(_SHOWN_FROM_HZ, min(_SHOWN_TO_HZ, rate_hz / 2), 200)
+    values = spectrum.psd(frequency_hz)
+    caption = "turbulence [nm^2/Hz]"
+    return Sparkline(caption=caption, frequency_hz=frequency_hz, values=values)

@@ -165,8 +165,11 @@ def row_table(caption: str, rows: Sequence[Any], *, without: Collection[str] = (
     )
 
 
-def fact_table(caption: str, *rows: Any) -> Table:
-    """Return a table with one line per value of the rows, leaving out None and empty texts."""
+def fact_table(caption: str, *rows: Any, only: Collection[str] = ()) -> Table:
+    """Return a table with one line per value of the rows, leaving out None and empty texts.
+
+    With names of fields only these are in it.
+    """
     return Table(
         caption=caption,
         headings=("quantity", "value", "unit"),
@@ -174,7 +177,9 @@ def fact_table(caption: str, *rows: Any) -> Table:
             (each.heading, each.text(row), each.shown_unit)
             for row in rows
             for each in columns(row)
-            if each.heading and getattr(row, each.name) not in (None, "")
+            if each.heading
+            and (not only or each.name in only)
+            and getattr(row, each.name) not in (None, "")
         ),
         words=(2,),
     )

@@ -43,7 +43,7 @@ def test_costs_of_whole_matrices(tmp_path, designs):
 
 
 def test_costs_need_a_controller():
-    with pytest.raises(lbt.errors.ProblemError, match="expected a Design or a Controller; got int"):
+    with pytest.raises(lbt.errors.ProblemError, match="must be a Controller, or a design; got int"):
         lbt.interop.frame_cost(3)
 
 

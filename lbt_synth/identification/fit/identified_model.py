@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from lbt_synth.identification.fit.model_tables import model_tables
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.models import (
@@ -18,6 +19,8 @@ from lbt_synth.models import (
     Vibration,
     tip_tilt_plant,
 )
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
 from lbt_synth.validation import FloatArray
 
 Kind = Literal["line", "broad", "turbulence"]
@@ -164,7 +167,7 @@ class Whiteness:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IdentifiedAxis:
+class IdentifiedAxis(Summarised):
     """One axis: turbulence, lines, noise and sensor gain.
 
     Attributes
@@ -218,6 +221,10 @@ class IdentifiedAxis:
     fitted_model: FittedModel
     data: LoopPeriodogram
 
+    def _brief(self) -> str:
+        lines = count_text(len(self.lines), "line")
+        return f"{nm_text(self.rms_nm)} rms, {lines}, noise {nm_text(self.noise_nm)}"
+
     @property
     def lines(self) -> tuple[IdentifiedLine, ...]:
         """The narrow lines."""
@@ -232,7 +239,7 @@ class IdentifiedAxis:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IdentifiedModel:
+class IdentifiedModel(Summarised):
     """The axes of a loop as they were identified.
 
     Attributes
@@ -257,6 +264,20 @@ class IdentifiedModel:
     delay_frames: float
     mirror: PositionLoop | None = None
     notes: tuple[str, ...] = ()
+
+    def _brief(self) -> str:
+        return f"{self.hardware._brief()}, {count_text(len(self.parts), 'resonance')}"
+
+    def _summarise(self) -> Summary:
+        """Return turbulence, noise, sensor and vibrations, with the spectrum of the first axis."""
+        first = self.axes[0]
+        above = first.frequency_hz > 0
+        curve = Sparkline(
+            caption="fitted spectrum [nm^2/Hz]",
+            frequency_hz=first.frequency_hz[above],
+            values=first.fitted_nm2_hz[above],
+        )
+        return Summary(tables=model_tables(self), notes=self.notes, curve=curve)
 
     @property
     def sensor_gains(self) -> tuple[float, ...]:

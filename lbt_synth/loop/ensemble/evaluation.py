@@ -17,6 +17,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.batched import transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
+from lbt_synth.linear.state_space import as_controller
 from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops, LoopGroup
 from lbt_synth.loop.ensemble.loop_ensemble import (
@@ -133,7 +134,7 @@ def ensemble_residuals(
 
     Parameters
     ----------
-    controller : Controller or sequence of Controller
+    controller : Controller, Design, or sequence of these
         One controller for all loops, or one per loop, all with as many states.
     hardware : LoopHardware
         Sensor and mirror of all loops; the ensemble may have other delays.
@@ -172,9 +173,9 @@ def ensemble_residuals(
     """
     require_instance(hardware, LoopHardware)
     require_instance(ensemble, LoopEnsemble)
-    each = [controller] if isinstance(controller, Controller) else list(controller)
+    given = controller if isinstance(controller, list | tuple) else [controller]
+    each = [as_controller(one) for one in given]
     for one in each:
-        require_instance(one, Controller)
         require_matching_controller(hardware, one)
     sizes, count = sorted({one.n_states for one in each}), ensemble.loops
     if len(each) not in (1, count) or len(sizes) != 1:

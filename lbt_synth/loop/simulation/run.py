@@ -10,10 +10,12 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, RunningController
 from lbt_synth.linear.block_filtering import filter_series as filter_series
+from lbt_synth.linear.state_space import HasController, as_controller
 from lbt_synth.loop.closed_loop import close_loop
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.storage.summaries import Summarised
 from lbt_synth.validation import FloatArray, frozen_copy, integer
 
 _SETTLED = 1e-4  # decay of the slowest mode after which a loop has settled
@@ -36,7 +38,7 @@ class SteppedController(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Simulation:
+class Simulation(Summarised):
     """Series of a closed loop, after it has settled.
 
     Attributes
@@ -60,6 +62,10 @@ class Simulation:
     frame_rate_hz: float
     seed: int
 
+    def _brief(self) -> str:
+        cases, frames, modes = self.residual_nm.shape
+        return f"{cases} x {frames} frames of {modes} modes at {self.frame_rate_hz:g} Hz"
+
     @property
     def rms_nm(self) -> FloatArray:
         """Residual of each case over all modes [nm rms], (cases,)."""
@@ -71,7 +77,7 @@ class Simulation:
 
 
 def simulate(
-    controller: Controller | SteppedController,
+    controller: Controller | HasController | SteppedController,
     truth: Truth,
     *,
     hardware: LoopHardware,
@@ -89,7 +95,7 @@ def simulate(
 
     Parameters
     ----------
-    controller : Controller or object with ``step(y)`` and ``reset()``
+    controller : Controller, Design or object with ``step(y)`` and ``reset()``
         The controller; a :class:`Controller` runs at the speed of matrix products.
     truth : Truth
         Disturbances, noise and sensor gain.
@@ -136,17 +142,13 @@ def simulate(
     frames = integer(frames, "frames", at_least=1)
     cases = integer(cases, "cases", at_least=1)
     seed = integer(seed, "seed", at_least=0)
-    if isinstance(controller, Controller):
+    if isinstance(controller, SteppedController):
+        default = _DEFAULT_SETTLING
+    else:
+        controller = as_controller(controller, others=", an object with step(y) and reset()")
         loop = close_loop(hardware, controller, sensor_gain=truth.sensor_gain)
         loop.require_stable()
         default = settling_frames(loop.spectral_radius)
-    elif isinstance(controller, SteppedController):
-        default = _DEFAULT_SETTLING
-    else:
-        raise ProblemError(
-            "controller must be a Controller, or an object with step(y) and reset(); "
-            f"got {type(controller).__name__}."
-        )
     settle = default
     if settle_frames is not None:
         settle = integer(settle_frames, "settle_frames", at_least=0)

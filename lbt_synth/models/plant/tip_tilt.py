@@ -23,12 +23,16 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
+from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models.ar_model import ARModel, padded_coefficients
+from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.full_state import FullStatePlant
 from lbt_synth.models.plant.parts import PlantParts, held_frames, noise_factor
 from lbt_synth.models.vibration.resonance import Vibration
+from lbt_synth.storage.rows import fact_table
+from lbt_synth.storage.summaries import Summary, count_text
 from lbt_synth.validation import FloatArray, frozen_copy, integer, one_or_each
 
 
@@ -52,6 +56,19 @@ class TipTiltPlant(EstimationProblem):
     hardware: LoopHardware
     turbulence: tuple[ARModel, ...]
     vibrations: tuple[Vibration, ...]
+
+    def _brief(self) -> str:
+        lines = count_text(len(self.vibrations), "vibration")
+        return f"{self.hardware._brief()}, {count_text(self.n_states, 'state')}, {lines}"
+
+    def _summarise(self) -> Summary:
+        deviations = np.sqrt(np.diag(self.R))
+        facts = disturbance_facts(self.turbulence, self.vibrations, deviations)
+        system, caption = self._shown_system()
+        return Summary(
+            tables=[fact_table("Plant", self.hardware.facts(), facts)],
+            curve=sigma_sparkline(system, caption),
+        )
 
     def full(self) -> FullStatePlant:
         """Return the same plant with the mirror's states, which are past commands if it settles.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import ModuleType
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -250,3 +251,15 @@ def test_turbulence_of_the_plant_is_the_atmospheres(model, example):
     made = plant.vibrations[0].ar_model(1000)
     assert made.coefficients == pytest.approx(air.coefficients, rel=1e-9)
     assert made.rms_nm == pytest.approx(air.rms_nm, rel=1e-9)
+
+
+def test_a_printed_model_lists_its_vibrations_with_their_errors(model):
+    shown = [line.split() for line in str(model).splitlines()]
+    for part in model.parts:
+        row = next(row for row in shown if f"{part.frequency_hz:.3f}" in row)
+        assert f"{part.frequency_error_hz:.2g}" in row
+        assert f"{part.rms_nm:.2f}" in row
+    assert len(repr(model)) <= 100
+    assert len(repr(model.axes[0])) <= 100
+    page = ElementTree.fromstring(model._repr_html_())
+    assert len(list(page.iter("figure"))) == 1
