@@ -122,6 +122,20 @@ def report(parser: ArgumentParser) -> None:
     add_output(parser, "page to write, one file that opens offline (.html)")
 
 
+def explore(parser: ArgumentParser) -> None:
+    """Open a page of sliders in the browser, to see designs while the loop and the sky change."""
+    add_config(parser)
+    add_gains(parser, text="gain files to show beside the design of the sliders")
+    text = "name or address to serve at (default localhost: this machine only; others can write "
+    add_option(parser, "--host", str, text + "files with the page)")
+    parser.set_defaults(host="localhost")
+    add_option(parser, "--port", int, "port to serve at, 0 for any that is free", 5006)
+    text = "host:port under which a browser reaches the page through a tunnel; repeatable"
+    parser.add_argument("--origin", action="append", default=[], metavar="HOST:PORT", help=text)
+    text = "directory that the page saves into (default: this one)"
+    parser.add_argument("-o", "--output", default=".", help=text)
+
+
 def simulate(parser: ArgumentParser) -> None:
     """Close the loop in the time domain, beside the exact answer."""
     add_unit(parser)

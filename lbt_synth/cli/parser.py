@@ -22,6 +22,7 @@ COMMANDS = {
         *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
         *(arguments.diagnose, arguments.league),
         *(arguments.robustness, arguments.tradeoff, arguments.limits, arguments.report),
+        arguments.explore,
         *(arguments.end_to_end, arguments.end_to_end_table),
         *(arguments.mirror, arguments.modal, arguments.study, arguments.paper),
         *(arguments.help, arguments.completion),

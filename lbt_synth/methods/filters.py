@@ -37,7 +37,9 @@ class BoundOptions(Section):
         le=1e9,
         description="bound of the norm as a multiple of the least norm",
         json_schema_extra={
-            "hint": "At 1 the bound is the least one; far above it the filter is the Kalman filter."
+            "hint": "At 1 the bound is the least one; far above it the filter is the Kalman "
+            "filter.",
+            "slider": [1.0, 3.0],
         },
     )
     horizon: Horizon = 1

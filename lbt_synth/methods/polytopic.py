@@ -23,7 +23,10 @@ class PolytopicOptions(Section):
     """Options of the filter for an interval."""
 
     half_width_hz: float = Field(
-        ge=0, description="half width of the interval of vibration frequencies [Hz]", examples=[1]
+        ge=0,
+        description="half width of the interval of vibration frequencies [Hz]",
+        examples=[1],
+        json_schema_extra={"slider": [0.0, 4.0]},
     )
     norm: Literal["hinf", "h2"] = Field(
         default="hinf",

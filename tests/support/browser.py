@@ -14,7 +14,6 @@ OPTIONS = (
     "--disable-component-update",
     "--disable-sync",
     "--disable-dev-shm-usage",
-    "--host-resolver-rules=MAP * ~NOTFOUND",
 )
 
 PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
@@ -29,6 +28,20 @@ function* walk(node) {
   for (const child of node.children) yield* walk(child);
 }
 """
+
+
+def chromium(profile, *hosts):
+    """Start headless Chromium, to which no names are known but those of hosts."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = "/usr/bin/chromium"
+    rules = ", ".join(["MAP * ~NOTFOUND", *(f"EXCLUDE {host}" for host in hosts)])
+    for option in (*OPTIONS, f"--host-resolver-rules={rules}", f"--user-data-dir={profile}"):
+        options.add_argument(option)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    service = webdriver.ChromeService(executable_path="/usr/bin/chromedriver")
+    return webdriver.Chrome(options=options, service=service)
 
 
 def opened(browser, address, screen=DESK, *, script=True):

@@ -42,12 +42,25 @@ _AXIS = {
 }
 
 
-def panel_figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str]]) -> Any:
+def panel_figure(
+    panel: Panel,
+    shared: dict[Any, Any],
+    named: dict[str, list[str]],
+    sources: dict[str, Any] | None = None,
+) -> Any:
     """Return the figure of a panel.
 
-    Equal scales are taken from ``shared``; the models of each name are added to ``named``.
+    Equal scales are taken from ``shared``; the models of each name are added to ``named``, and the
+    sources of the columns of :func:`panel_columns` to ``sources``.
     """
-    from bokeh.models import BoxZoomTool, PanTool, Range1d, ResetTool, WheelZoomTool
+    from bokeh.models import (
+        BoxZoomTool,
+        ColumnDataSource,
+        PanTool,
+        Range1d,
+        ResetTool,
+        WheelZoomTool,
+    )
     from bokeh.plotting import figure as new_figure
 
     zoom = BoxZoomTool(match_aspect=panel.equal)
@@ -71,18 +84,70 @@ def panel_figure(panel: Panel, shared: dict[Any, Any], named: dict[str, list[str
     figure.toolbar.update(logo=None, active_drag=zoom, active_scroll=None)
     figure.grid.grid_line_color = "#e0e0e0"
     figure.outline_line_color = None
-    _style_axis(figure.xaxis[0], panel.x, across)
-    _style_axis(figure.yaxis[0], panel.y, up)
+    set_scales(figure, panel)
+    own = {} if sources is None else sources
+    own |= {key: ColumnDataSource(columns) for key, columns in panel_columns(panel).items()}
+    points = {
+        id(curve): {"x": "x", "y": f"y{j}", "source": own[f"curves-{i}"]}
+        for i, group in enumerate(_curve_groups(panel))
+        for j, curve in enumerate(group)
+    }
+    for i, rule in enumerate(panel.select(Rule)):
+        points[id(rule)] = {rule.axis: rule.axis, "source": own[f"rule-{i}"]}
     for mark in panel.marks:
-        models = _draw(figure, panel, mark)
+        models = _draw(figure, panel, mark, points.get(id(mark), {}))
         if mark.name and models:
             named.setdefault(mark.name, []).extend(model.id for model in models)
     if panel.categories:
         names = {i: scales.shorten(name, 24) for i, name in enumerate(panel.categories)}
         figure.yaxis[0].update(ticker=list(names), major_label_overrides=names, axis_label=None)
         figure.ygrid.grid_line_color = None
-    _hover_curves(figure, panel)
+    _hover_curves(figure, panel, own)
     return figure
+
+
+def set_scales(figure: Any, panel: Panel) -> None:
+    """Give the axes of a figure the scales and ticks of a panel."""
+    axes = ((figure.xaxis[0], figure.x_range), (figure.yaxis[0], figure.y_range))
+    for (axis, shown), own, ends in zip(
+        axes, (panel.x, panel.y), scales.scale_ends(panel), strict=True
+    ):
+        if (shown.start, shown.end) != ends:
+            shown.update(start=ends[0], end=ends[1])
+        _style_axis(axis, own, ends)
+
+
+def panel_columns(panel: Panel) -> dict[str, dict[str, FloatArray]]:
+    """Return the columns of what a panel draws: one source per group of curves, one per rule.
+
+    Curves of the same abscissae are a group: x, the ordinate of each, and the height ``at`` which
+    their values are shown.
+    """
+    columns: dict[str, dict[str, FloatArray]] = {}
+    for i, group in enumerate(_curve_groups(panel)):
+        heights = [np.array(curve.y) for curve in group]
+        x = np.array(group[0].x)
+        if panel.x.log:
+            x = np.where(x > 0, x, np.nan)
+        if panel.y.log:
+            heights = [np.where(y > 0, y, np.nan) for y in heights]
+        columns[f"curves-{i}"] = {"x": x} | {f"y{j}": y for j, y in enumerate(heights)}
+        if group[0].hover:
+            at = _mean_height(np.array(heights), log=panel.y.log)
+            columns[f"curves-{i}"]["at"] = at
+    for i, rule in enumerate(panel.select(Rule)):
+        columns[f"rule-{i}"] = {rule.axis: np.array([rule.at])}
+    return columns
+
+
+def _curve_groups(panel: Panel) -> list[list[Curve]]:
+    """Return the curves that have points, those with a line and the same abscissae together."""
+    groups: dict[object, list[Curve]] = {}
+    for curve in panel.select(Curve):
+        if curve.x.size:
+            joined = curve.line and curve.hover
+            groups.setdefault(curve.x.tobytes() if joined else curve, []).append(curve)
+    return list(groups.values())
 
 
 def _height(panel: Panel) -> int:
@@ -106,11 +171,15 @@ def _style_axis(axis: Any, own: Axis, ends: tuple[float, float]) -> None:
         axis.major_label_overrides = dict(zip(ticks, scales.log_tick_texts(ticks), strict=True))
 
 
-def _draw(figure: Any, panel: Panel, mark: Mark) -> list[Any]:
-    """Draw a mark, and return the models that a legend hides with it."""
+def _draw(figure: Any, panel: Panel, mark: Mark, points: dict[str, Any]) -> list[Any]:
+    """Draw a mark, and return the models that a legend hides with it.
+
+    The points of a curve, or the place of a rule, are columns of a source; without them the curve
+    is empty.
+    """
     match mark:
         case Curve():
-            return _draw_curve(figure, panel, mark)
+            return _draw_curve(figure, mark, points) if points else []
         case Area():
             alpha = 1.0 if mark.solid else SHADE
             shade = colour(mark.look)
@@ -120,7 +189,7 @@ def _draw(figure: Any, panel: Panel, mark: Mark) -> list[Any]:
             # a list would be a column of the source
             strokes = " ".join(f"{round(3 * s)}" for s in dashes(mark.dash)) or "solid"
             style = {"line_color": GREY, "line_width": 1.2, "line_dash": strokes}
-            return [draw(**{mark.axis: [mark.at]}, **style)]
+            return [draw(**points, **style)]
         case Span():
             draw = figure.vstrip if mark.axis == "x" else figure.hstrip
             ends = {f"{mark.axis}0": [mark.low], f"{mark.axis}1": [mark.high]}
@@ -136,11 +205,7 @@ def _draw(figure: Any, panel: Panel, mark: Mark) -> list[Any]:
     return []
 
 
-def _draw_curve(figure: Any, panel: Panel, curve: Curve) -> list[Any]:
-    if not curve.x.size:
-        return []
-    x = np.where(curve.x > 0, curve.x, np.nan) if panel.x.log else np.array(curve.x)
-    y = np.where(curve.y > 0, curve.y, np.nan) if panel.y.log else np.array(curve.y)
+def _draw_curve(figure: Any, curve: Curve, points: dict[str, Any]) -> list[Any]:
     shade, drawn = colour(curve.look), []
     if curve.line:
         number = curve.look if curve.dash is None else curve.dash
@@ -148,17 +213,17 @@ def _draw_curve(figure: Any, panel: Panel, curve: Curve) -> list[Any]:
         style = {"line_color": shade, "line_width": 1.25 * curve.width, "line_dash": strokes}
         style["line_alpha"] = curve.opacity
         if curve.step:
-            drawn.append(figure.step(x, y, mode=curve.step, **style))
+            drawn.append(figure.step(**points, mode=curve.step, **style))
         else:
-            drawn.append(figure.line(x, y, **style))
+            drawn.append(figure.line(**points, **style))
     if curve.error is not None:
-        drawn.append(figure.segment(x, y - curve.error, x, y + curve.error, line_color=shade))
+        ends = (curve.x, curve.y - curve.error, curve.x, curve.y + curve.error)
+        drawn.append(figure.segment(*ends, line_color=shade))
     if curve.marker is not None:
         name = marker_name(curve.marker, curve.look)
         drawn.append(
             figure.scatter(
-                x,
-                y,
+                **points,
                 marker=_GLYPHS.get(name, name),
                 size=1.6 * curve.size,
                 line_color=shade,
@@ -279,33 +344,25 @@ def _add_hover(
     )
 
 
-def _hover_curves(figure: Any, panel: Panel) -> None:
+def _hover_curves(figure: Any, panel: Panel, sources: dict[str, Any]) -> None:
     """Show the values of all curves of the same abscissae in one box."""
-    from bokeh.models import ColumnDataSource
-
-    groups: dict[object, list[Curve]] = {}
-    for curve in panel.select(Curve):
-        if curve.x.size and curve.hover:
-            groups.setdefault(curve.x.tobytes() if curve.line else curve, []).append(curve)
-    for group in groups.values():
-        joined = group[0].line
-        columns: dict[str, FloatArray] = {"x": np.array(group[0].x)}
-        columns |= {f"y{i}": np.array(curve.y) for i, curve in enumerate(group)}
+    for i, group in enumerate(_curve_groups(panel)):
+        if not group[0].hover:
+            continue
+        joined, source = group[0].line, sources[f"curves-{i}"]
         tips = [(panel.x.label, _value_format("x", panel.x.unit))]
         tips += [
-            (curve.name or panel.y.label, _value_format(f"y{i}", panel.y.unit))
-            for i, curve in enumerate(group)
+            (curve.name or panel.y.label, _value_format(f"y{j}", panel.y.unit))
+            for j, curve in enumerate(group)
         ]
         # what the box follows: the finite mean, or the points themselves
-        columns["at"] = _mean_height(np.array([curve.y for curve in group]), log=panel.y.log)
-        source = ColumnDataSource(columns)
         follower = (
             figure.line("x", "at", source=source, line_alpha=0)
             if joined
             else figure.scatter("x", "at", source=source, size=12, line_alpha=0, fill_alpha=0)
         )
         mode = "vline" if joined else "mouse"
-        _add_hover(figure, follower, tips, columns, mode=mode, line_policy="nearest")
+        _add_hover(figure, follower, tips, source.data, mode=mode, line_policy="nearest")
 
 
 def _mean_height(heights: FloatArray, *, log: bool) -> FloatArray:

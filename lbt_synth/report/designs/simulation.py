@@ -91,18 +91,16 @@ def exact_spectrum(
     Welch's method makes of it with a Hann window w of that length:
     ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the window's Fourier transform.
     """
-    from scipy.signal import get_window  # slow to import
-
     n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
     inside = np.clip(frequency_hz, frequency_hz[1] / 2, None)  # spectra may be infinite at 0
-    rejection = loop.sensitivity(inside)
+    response = loop.system.frequency_response(inside)[:, :n]
+    rejection, noise_transfer = response[:, :, :n], response[:, :, n:]
     total = np.zeros(frequency_hz.size)
     for spectrum, modes in truth.turbulence_groups(n):
         gain = np.sum(np.abs(rejection[:, :, list(modes)]) ** 2, axis=(1, 2))
         total += gain * spectrum.psd(inside)
-    noise = loop.noise_transfer(inside) * truth.noise_per_measurement(loop.hardware.n_measurements)
+    noise = noise_transfer * truth.noise_per_measurement(loop.hardware.n_measurements)
     total += np.sum(np.abs(noise) ** 2, axis=(1, 2)) * 2 / rate
-    window = get_window("hann", length)
     for line in stationary_vibrations(truth.vibrations):
         direction = checked_direction(line, loop.hardware)
         if isinstance(line, Vibration):
@@ -111,7 +109,19 @@ def exact_spectrum(
             continue
         left = line.amplitude_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
         power = float(np.sum(np.abs(left) ** 2)) / 2
-        offset = 2j * np.pi * (frequency_hz - line.frequency_hz) / rate
-        image = np.exp(-np.outer(offset, np.arange(length))) @ window
-        total += power * np.abs(image) ** 2 / (rate * np.sum(window**2))
+        offset = 2 * np.pi * (frequency_hz - line.frequency_hz) / rate
+        # the sum of the squares of a Hann window is 3/8 of its length
+        total += power * _hann_transform(offset, length) ** 2 / (rate * 0.375 * length)
     return total
+
+
+def _hann_transform(angle: FloatArray, length: int) -> FloatArray:
+    """Modulus of the Fourier transform of a periodic Hann window at angles [rad], (f,)."""
+    step = 2 * np.pi / length
+    shifted = angle + step * np.array([[-1.0], [0.0], [1.0]])
+    half = np.sin(shifted / 2)
+    safe = np.where(half == 0, 1.0, half)
+    # kernels of Dirichlet with the phase of their middle, of which neighbours differ in sign
+    kernels = np.where(half == 0, length, np.sin(length * shifted / 2) / safe)
+    phases = np.exp(-0.5j * (length - 1) * shifted)
+    return np.asarray(np.abs(np.array([-0.25, 0.5, -0.25]) @ (kernels * phases)))

@@ -110,13 +110,21 @@ def stable_curve(
 
 
 def frequency_grid(
-    rate_hz: float, special_hz: Sequence[float] = (), *, decades: float = 3.6
+    rate_hz: float,
+    special_hz: Sequence[float] = (),
+    *,
+    decades: float = 3.6,
+    points: int = _POINTS,
+    near: int = 60,
 ) -> FloatArray:
-    """Logarithmic grid up to Nyquist, denser around special frequencies."""
+    """Logarithmic grid up to Nyquist, denser around special frequencies.
+
+    It has so many points, and so many more near each special one, on either side of it.
+    """
     nyquist = rate_hz / 2
-    grids = [np.geomspace(nyquist / 10**decades, nyquist, _POINTS)]
+    grids = [np.geomspace(nyquist / 10**decades, nyquist, points)]
     for centre in special_hz:
-        spread = np.geomspace(1e-4, 0.2, 60)
+        spread = np.geomspace(1e-4, 0.2, near)
         grids += [centre * (1 + spread), centre * (1 - spread), np.array([centre])]
     grid = np.unique(np.concatenate(grids))
     return grid[(grid > 0) & (grid <= nyquist)]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lbt_synth.loop import Simulation
-from lbt_synth.report.charts.description import Axis, Curve, Panel
+from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import FREQUENCY
 
@@ -77,7 +77,7 @@ def series_panel(
     return Panel(x=x, y=y, marks=tuple(curves), title=title, height_in=height_in)
 
 
-def spectra_panel(curves: Sequence[Curve], *, title: str = "") -> Panel:
+def spectra_panel(marks: Sequence[Mark], *, title: str = "") -> Panel:
     """Return power spectra over frequency."""
     y = Axis(label="power spectrum", unit="nm²/Hz", log=True)
-    return Panel(x=FREQUENCY, y=y, marks=tuple(curves), title=title, height_in=2.2)
+    return Panel(x=FREQUENCY, y=y, marks=tuple(marks), title=title, height_in=2.2)

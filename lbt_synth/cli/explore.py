@@ -1,0 +1,61 @@
+"""The command explore: a page of sliders in the browser, served from here."""
+
+from __future__ import annotations
+
+import re
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+from lbt_synth.cli.loop_inputs import load_designs
+from lbt_synth.cli.output import Report
+from lbt_synth.config import load_config
+from lbt_synth.errors import ProblemError
+from lbt_synth.report.explore.exploration import explore, first_wish, quick_view, whole_view
+from lbt_synth.storage.atomic_files import require_writable
+
+_MOST_PORTS = 65535
+_LOCAL = ("localhost", "127.0.0.1", "::1")
+
+
+def run(arguments: Namespace) -> Report:
+    """Serve the page until it is interrupted."""
+    if not 0 <= arguments.port <= _MOST_PORTS:
+        raise ProblemError(f"--port must be from 0 to {_MOST_PORTS}; got {arguments.port}.")
+    if not arguments.host:
+        raise ProblemError("--host must be a name or an address; got an empty text.")
+    for origin in arguments.origin:
+        if not re.fullmatch(r"[^\s:/]+:\d+", origin):
+            raise ProblemError(f"--origin must be HOST:PORT, as localhost:8080; got {origin!r}.")
+    folder = Path(arguments.output)
+    require_writable(folder / "explored-1.yaml")
+    config = load_config(arguments.config)
+    exploration = explore(config, load_designs(arguments.gains))
+    first = whole_view(exploration, quick_view(exploration, first_wish()))
+
+    from lbt_synth.report.explore.server import Site, serve  # bokeh's server, slow to import
+
+    site, told = Site(exploration=exploration, first=first, folder=folder), []
+
+    def announce(url: str) -> None:
+        stream = sys.stderr if arguments.json else sys.stdout
+        print(f"Open {url} in a browser. Ctrl-C ends.", file=stream, flush=True)
+        if arguments.host not in _LOCAL:
+            print(
+                "note: whoever reaches this address can use the page and write new files into "
+                f"{folder}.",
+                file=stream,
+                flush=True,
+            )
+        told.append(url)
+
+    serve(
+        site,
+        host=arguments.host,
+        port=arguments.port,
+        origins=arguments.origin,
+        announce=announce,
+    )
+    report = Report(data={"url": told[0]})
+    report.note_files(site.saved)
+    return report

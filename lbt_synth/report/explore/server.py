@@ -1,0 +1,267 @@
+"""The server of the page of sliders: one session per open page, designs in threads of their own."""
+
+from __future__ import annotations
+
+import errno
+import json
+import socket
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from bokeh.core.properties import String
+from bokeh.model import DataModel
+from bokeh.server.server import Server
+
+from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.methods.registry import all_methods
+from lbt_synth.report.charts.bokeh_live import LivePanel
+from lbt_synth.report.charts.line_styles import colour, dashes
+from lbt_synth.report.explore.exploration import (
+    Exploration,
+    View,
+    describe_moves,
+    judge,
+    quick_view,
+    whole_view,
+)
+from lbt_synth.report.explore.lane import Lane
+from lbt_synth.report.explore.panels import Shown, explore_charts
+from lbt_synth.report.explore.save import save_view
+from lbt_synth.report.explore.wish import Wish
+from lbt_synth.storage.rows import row_table
+
+_QUICK_S = 0.3  # a design that takes longer is made when a slider is released, in its own lane
+_MOST_KEPT = 5
+_SWITCH_S = 0.0005  # after which a thread that computes lets another go on
+_UNUSED_MS = 3_600_000  # after which the session of a page that sleeps is dropped
+
+
+class Exchange(DataModel):  # type: ignore[misc]  # bokeh has no types
+    """What a page and its session tell each other, as JSON."""
+
+    wish = String("")
+    answer = String("")
+    verdict = String("")
+    saved = String("")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Site:
+    """What all pages of a server share."""
+
+    exploration: Exploration
+    first: View
+    folder: Path
+    saved: list[Path] = field(default_factory=list)  # files that its pages wrote
+
+
+class Session:
+    """One open page."""
+
+    def __init__(self, document: Any, site: Site) -> None:
+        self._document, self._site, self._view = document, site, site.first
+        self._number = 0
+        self._seconds: dict[str, float] = {}  # of the processor for the last design of a method
+        self._kept: dict[str, Shown] = {}
+        self._quick, self._slow, self._third = Lane(), Lane(), Lane()
+        self._exchange = Exchange(name="exchange")
+        charts = explore_charts(site.first.shown, site.first.lines_hz, site.first.shift_hz)
+        self._panels = {one.key: LivePanel(one.key) for one in charts}
+        for panel in self._panels.values():
+            document.add_root(panel.root)
+        next(iter(self._panels.values())).root.tags = [self._exchange]
+        self._show_view(0, site.first)
+        self._exchange.on_change("wish", lambda _, __, new: self._hear(json.loads(new)))
+        self._third.submit(partial(self._form_verdict, 0, site.first))
+        document.on_session_destroyed(self._close)
+        here = files("lbt_synth.report")
+        document.template = (here / "explore/page.html.jinja").read_text(encoding="utf-8")
+        document.title = f"Explore {site.exploration.config.source.name}"
+        document.template_variables.update(
+            {
+                "heading": document.title,
+                "charts": charts,
+                "knobs": site.exploration.knobs,
+                "methods": {m.name: m.title for m in all_methods().values()},
+                "method": site.first.wish.method,
+                "folder": str(site.folder),
+                "style": (here / "page/page.css").read_text(encoding="utf-8")
+                + (here / "explore/page.css").read_text(encoding="utf-8"),
+                "script": (here / "explore/page.js").read_text(encoding="utf-8"),
+            }
+        )
+
+    def _hear(self, message: Mapping[str, Any]) -> None:
+        """Do what the page asks for."""
+        match message["do"]:
+            case "design":
+                wish = Wish(method=str(message["method"]), values=dict(message["values"]))
+                quick = self._seconds.get(wish.method, _QUICK_S) < _QUICK_S
+                lane = self._quick if quick else self._slow
+                number, final = int(message["number"]), bool(message["final"])
+                lane.submit(partial(self._work, lane, number, wish, final))
+            case "keep":
+                self._keep()
+            case "drop":
+                self._kept.pop(str(message["name"]), None)
+                self._show_view(self._number, self._view)
+            case "save":
+                self._save()
+
+    def _work(self, lane: Lane, number: int, wish: Wish, final: bool) -> None:
+        """Design in a thread: show the curves first, then what they leave, then the verdict."""
+        exploration, start = self._site.exploration, time.thread_time()
+        try:
+            view = quick_view(exploration, wish, self._view)
+            self._seconds[wish.method] = time.thread_time() - start
+            self._later(self._show_view, number, view)
+            if lane.is_waiting:
+                return
+            view = whole_view(exploration, view)
+            self._later(self._show_view, number, view)
+        except Exception as error:
+            self._later(self._complain, number, error)
+            return
+        if final:
+            self._third.submit(partial(self._form_verdict, number, view))
+
+    def _form_verdict(self, number: int, view: View) -> None:
+        try:
+            text = judge(view)
+        except LbtSynthError as error:
+            text = str(error)
+        self._later(self._say_verdict, number, text)
+
+    def _later(self, action: Callable[..., None], *arguments: Any) -> None:
+        """Run an action on the document from any thread."""
+        self._document.add_next_tick_callback(partial(action, *arguments))
+
+    def _show_view(self, number: int, view: View) -> None:
+        """Show a view, unless a newer one is shown."""
+        if number < self._number:
+            return
+        self._number, self._view = number, view
+        shown = {**view.shown, **self._kept}
+        for chart in explore_charts(shown, view.lines_hz, view.shift_hz):
+            self._panels[chart.key].show(chart.panels[0])
+        rows = [
+            replace(one.performance.row, design=name)
+            for name, one in shown.items()
+            if one.performance is not None
+        ]
+        table = row_table("", rows)
+        self._answer(
+            number=number,
+            whole=view.is_whole,
+            slow=self._seconds.get(view.wish.method, 0.0) > _QUICK_S,
+            headings=table.headings,
+            rows=[[cell.text for cell in row] for row in table.cells()],
+            legend=[
+                {
+                    "name": name,
+                    "colour": colour(look),
+                    "dashes": " ".join(f"{2 * stroke:g}" for stroke in dashes(look)),
+                    "kept": name in self._kept,
+                }
+                for look, name in enumerate(shown)
+            ],
+        )
+
+    def _answer(self, **content: Any) -> None:
+        self._exchange.answer = json.dumps(content)
+
+    def _complain(self, number: int, error: Exception) -> None:
+        """Say why a wish has no design; the curves stay those of the last one."""
+        if number < self._number:
+            return
+        self._number = number
+        known = isinstance(error, LbtSynthError)
+        self._answer(
+            number=number, error=str(error) if known else f"{type(error).__name__}: {error}"
+        )
+
+    def _say_verdict(self, number: int, text: str) -> None:
+        if number == self._number:
+            self._exchange.verdict = json.dumps({"number": number, "text": text})
+
+    def _keep(self) -> None:
+        """Keep the curves of the design that is shown."""
+        exploration = self._site.exploration
+        view = self._view if self._view.is_whole else whole_view(exploration, self._view)
+        moves = describe_moves(exploration, view.wish)
+        name = f"{view.name}, {moves}" if moves else f"{view.name}, kept"
+        self._kept.pop(name, None)
+        if len(self._kept) == _MOST_KEPT:
+            del self._kept[next(iter(self._kept))]
+        self._kept[name] = view.shown[view.name]
+        self._show_view(self._number, view)
+
+    def _save(self) -> None:
+        try:
+            saved = save_view(self._site.exploration, self._view, self._site.folder)
+        except LbtSynthError as error:
+            self._exchange.saved = json.dumps({"time": time.time(), "error": str(error)})
+            return
+        self._site.saved.extend(saved.files)
+        names, commands = [str(path) for path in saved.files], saved.commands
+        self._exchange.saved = json.dumps(
+            {"time": time.time(), "files": names, "commands": commands}
+        )
+
+    def _close(self, _: Any) -> None:
+        for lane in (self._quick, self._slow, self._third):
+            lane.close()
+
+
+def serve(
+    site: Site, *, host: str, port: int, origins: Sequence[str], announce: Callable[[str], None]
+) -> None:
+    """Serve the page until it is interrupted; ProblemError if there is no such place to serve.
+
+    ``origins`` are further addresses, as host:port, under which browsers may reach the page.
+    """
+
+    def open_page(document: Any) -> None:
+        Session(document, site)
+
+    place = _require_free(host, port)
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+    own = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
+    server = Server(
+        {"/": open_page},
+        address=host,
+        port=place,
+        allow_websocket_origin=[*own, *origins],
+        unused_session_lifetime_milliseconds=_UNUSED_MS,
+    )
+    # a thread that computes must not keep curves from being sent
+    sys.setswitchinterval(_SWITCH_S)
+    server.start()
+    try:
+        announce(f"http://{name}:{place}/")
+        server.io_loop.start()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.stop()
+
+
+def _require_free(host: str, port: int) -> int:
+    """Return a port that is free at a host, for 0 any; refuse one that is not."""
+    try:
+        for family, *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            with socket.create_server((address[0], port), family=family) as probe:
+                port = probe.getsockname()[1]
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            text = f"--port {port} is in use; give another one, or 0 for any that is free."
+        else:
+            text = f"cannot serve at --host {host} --port {port}: {error.strerror}."
+        raise ProblemError(text) from error
+    return port

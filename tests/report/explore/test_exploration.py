@@ -1,0 +1,68 @@
+"""From a wish to what the page shows."""
+
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.report.explore.exploration import (
+    describe_moves,
+    explore,
+    first_wish,
+    judge,
+    quick_view,
+    whole_view,
+)
+from lbt_synth.report.explore.wish import Wish
+
+
+@pytest.fixture(scope="module")
+def exploration():
+    config = lbt.load_config("examples/lbt.yaml")
+    return explore(config, {"old": lbt.integrator(config.hardware, gain=0.3)})
+
+
+def test_a_view_begins_with_its_own_design(exploration):
+    view = quick_view(exploration, first_wish())
+    assert list(view.shown) == ["Kalman", "old"]
+    assert view.name == "Kalman"
+    assert not view.is_whole
+    assert all(one.performance is None for one in view.shown.values())
+    whole = whole_view(exploration, view)
+    assert whole.is_whole
+    assert [one.performance.row.design for one in whole.shown.values()] == ["Kalman", "old"]
+    after = quick_view(exploration, Wish(method="hinf", values={"gain": 0.7}), whole)
+    lent = [one.performance for one in after.shown.values()]
+    assert lent == [one.performance for one in whole.shown.values()]
+    assert not after.is_whole
+
+
+def test_names_are_unique(exploration):
+    again = explore(exploration.config, {"Kalman": lbt.kalman(exploration.config.plant)})
+    assert list(quick_view(again, first_wish()).shown) == ["Kalman by the sliders", "Kalman"]
+
+
+def test_a_design_for_another_loop_is_refused(exploration):
+    other = lbt.integrator(lbt.LoopHardware(frame_rate_hz=500), gain=0.3)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="slow must run at the configuration's 800 Hz"
+    ):
+        explore(exploration.config, {"slow": other})
+
+
+def test_the_verdict(exploration):
+    view = quick_view(exploration, first_wish())
+    budget = lbt.residual_budget(
+        lbt.close_loop(view.config.hardware, view.design.controller), view.config.truth
+    )
+    text = judge(view)
+    assert text.startswith(f"Kalman leaves {budget.rms_nm:.1f} nm rms, Strehl ratio 83.6 %")
+    assert "above the least of any linear controller" in text
+    assert "Margins: modulus 0." in text
+    assert text.endswith("checks of its certificate passed.")
+    unstable = quick_view(exploration, Wish(method="kalman", values={"gain": 2.4}))
+    assert judge(unstable).startswith("Kalman is UNSTABLE in this loop.")
+
+
+def test_moves_in_words(exploration):
+    wish = Wish(method="hinf", values={"delay": 2.5, "hinf-gamma_ratio": 1.3, "robust-band": 1.0})
+    assert describe_moves(exploration, wish) == "total delay 2.5 frames, gamma ratio 1.3"
+    assert describe_moves(exploration, first_wish()) == ""

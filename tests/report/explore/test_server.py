@@ -1,0 +1,335 @@
+"""The page of sliders in Chromium: every slider, every curve, keyboard, phone, files."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+from queue import Queue
+
+import pytest
+from bokeh.document import Document
+from support.browser import DESK, PHONE, chain, chromium
+from support.configs import write_config
+from support.explore import asked, await_state, choose, five_lines, move, reset, select, served
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+from lbt_synth.report.explore import server
+from lbt_synth.report.explore.exploration import explore, first_wish, quick_view, whole_view
+from lbt_synth.report.explore.server import Session, Site
+
+# numbers of all sources, by the chart that draws them
+CURVES = """
+const numbers = {};
+for (const root of Bokeh.documents[0].roots()) {
+  const figure = root.children[0][0];
+  numbers[root.name] = JSON.stringify(figure.renderers.map(
+    (one) => Object.entries(one.data_source.data).map(([name, column]) => [name, [...column]])));
+}
+return numbers;
+"""
+
+
+class Page:
+    """A document whose callbacks run when the test says so."""
+
+    def __init__(self, site):
+        self.document, self._later = Document(), Queue()
+        self.document.add_next_tick_callback = self._later.put
+        self.session = Session(self.document, site)
+        self.exchange = self.document.get_model_by_name("exchange")
+
+    def ask(self, **message):
+        self.exchange.wish = json.dumps({"method": "kalman", "final": False, **message})
+
+    def wait(self, name, found):
+        """Run what is to be done on the document until the page hears this."""
+        while not found(heard := json.loads(getattr(self.exchange, name) or "{}")):
+            self._later.get(timeout=30)()
+        return heard
+
+    def close(self):
+        self.session._close(None)
+
+
+@pytest.fixture
+def own(tmp_path):
+    exploration = explore(lbt.load_config(LBT_YAML), {})
+    first = whole_view(exploration, quick_view(exploration, first_wish()))
+    page = Page(Site(exploration=exploration, first=first, folder=tmp_path))
+    yield page
+    page.close()
+
+
+def is_whole(number):
+    return lambda heard: heard.get("number") == number and heard.get("whole", True)
+
+
+def test_a_wish_is_answered(own):
+    before = own.wait("answer", is_whole(0))
+    own.ask(do="design", number=1, values={"delay": 3}, final=True)
+    after = own.wait("answer", is_whole(1))
+    assert after["rows"][0][0] == before["rows"][0][0] == "Kalman"
+    assert after["rows"] != before["rows"]
+    said = own.wait("verdict", lambda heard: heard.get("number") == 1)
+    assert f"leaves {after['rows'][0][1]} nm rms" in said["text"]
+
+
+def test_an_error_is_said_and_the_curves_stay(own):
+    shown = own.wait("answer", is_whole(0))
+    own.ask(do="design", number=1, method="kalmann", values={})
+    assert "Did you mean kalman" in own.wait("answer", is_whole(1))["error"]
+    own.ask(do="design", number=2, values={"delay": "three"})
+    assert own.wait("answer", is_whole(2))["error"].startswith("ValueError: ")
+    own.ask(do="design", number=3, values={})
+    assert own.wait("answer", is_whole(3))["rows"] == shown["rows"]
+
+
+def test_results_that_come_late_are_not_shown(own):
+    view = own.session._view
+    own.ask(do="design", number=5, values={"gain": 0.5})
+    newest = own.wait("answer", is_whole(5))
+    own.session._show_view(4, view)
+    own.session._complain(4, ValueError("late"))
+    assert json.loads(own.exchange.answer) == newest
+
+
+def test_kept_curves_are_named_by_their_moves(own, monkeypatch):
+    own.ask(do="keep")
+    own.ask(do="design", number=1, values={"delay": 2.5})
+    own.wait("answer", is_whole(1))
+    own.ask(do="keep", again=1)
+    names = [entry["name"] for entry in json.loads(own.exchange.answer)["legend"]]
+    assert names == ["Kalman", "Kalman, kept", "Kalman, total delay 2.5 frames"]
+    own.ask(do="drop", name=names[1])
+    assert [e["name"] for e in json.loads(own.exchange.answer)["legend"]] == [names[0], names[2]]
+    monkeypatch.setattr(server, "_MOST_KEPT", 1)
+    own.ask(do="design", number=2, values={"gain": 0.5})
+    own.wait("answer", is_whole(2))
+    own.ask(do="keep", again=2)
+    names = [entry["name"] for entry in json.loads(own.exchange.answer)["legend"]]
+    assert names == ["Kalman", "Kalman, real sensor gain 0.5"]
+
+
+def test_a_save_that_fails_is_said(own, tmp_path):
+    own.ask(do="save")
+    saved = json.loads(own.exchange.saved)
+    assert Path(saved["files"][0]).name == "explored-1.yaml"
+    assert len(own.session._site.saved) == 3
+    own.session._site = replace(own.session._site, folder=tmp_path / "nowhere")
+    own.ask(do="save", again=1)
+    assert "cannot write" in json.loads(own.exchange.saved)["error"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("explore")
+
+
+@pytest.fixture(scope="module")
+def address(folder):
+    config = lbt.load_config(write_config(folder, five_lines()))
+    lbt.save_gain(folder / "old.fits", lbt.integrator(config.hardware, gain=0.3))
+    with served(folder / "c.yaml", folder / "old.fits", folder=folder) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def simple(folder):
+    with served(LBT_YAML, folder=folder) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def driver(tmp_path_factory):
+    pytest.importorskip("selenium")
+    driver = chromium(tmp_path_factory.mktemp("profile"), "localhost")
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def page(driver, address):
+    """The page as it opens, at a desk; nothing may be wrong in its console at the end."""
+    show(driver, address, DESK)
+    yield driver
+    said = [entry for entry in driver.get_log("browser") if entry["level"] != "INFO"]
+    assert said == []
+
+
+def show(driver, address, screen):
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    driver.get_log("browser")
+    driver.get_log("performance")
+    driver.get(address)
+    await_state(driver, "judged", 0)
+
+
+def visible_sliders(page):
+    script = "return [...document.querySelectorAll('.knob:not([hidden]) input')].map(e => e.id)"
+    return page.execute_script(script)
+
+
+def await_true(found):
+    end = time.monotonic() + 30
+    while not found():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def await_rows(page, count):
+    await_true(lambda: len(page.find_elements("css selector", "#facts tbody tr")) == count)
+
+
+def verdict(page):
+    return page.find_element("id", "verdict").text
+
+
+@pytest.mark.browser
+def test_every_slider_moves_curves(page):
+    changed = set()
+    keys = visible_sliders(page)
+    assert len(keys) == 8
+    for key in keys:
+        before, said = page.execute_script(CURVES), verdict(page)
+        move(page, key, 0.1 if key == "spread" else 0.62, final=True)
+        await_state(page, "judged", asked(page))
+        after = page.execute_script(CURVES)
+        moved = {name for name in after if after[name] != before[name]}
+        assert moved, key
+        assert verdict(page) != said, key
+        changed |= moved
+        reset(page)
+        assert page.execute_script(CURVES) == before, key
+    assert changed == set(after)
+
+
+@pytest.mark.browser
+def test_sliders_follow_the_method(page):
+    before = set(visible_sliders(page))
+    choose(page, "hinf")
+    (own,) = set(visible_sliders(page)) - before
+    curves = page.execute_script(CURVES)
+    move(page, own, 0.3, final=True)
+    assert page.execute_script(CURVES) != curves
+
+
+@pytest.mark.browser
+def test_the_page_lives_while_a_slow_design_runs(page, simple):
+    show(page, simple, DESK)
+    select(page, "robust")
+    await_true(page.find_element("id", "busy").is_displayed)
+    assert "robust-modulus_margin" in visible_sliders(page)
+    select(page, "kalman")
+    await_state(page, "judged", 2)
+    assert "Kalman" in verdict(page)
+    assert not page.find_element("id", "busy").is_displayed()
+
+
+@pytest.mark.browser
+def test_kept_curves_stay_beside(page):
+    rows = "#facts tbody tr"
+    assert [row.text.split()[0] for row in page.find_elements("css selector", rows)] == [
+        "Kalman",
+        "old",
+    ]
+    move(page, "gain", 0.5, final=True)
+    page.find_element("id", "keep").click()
+    await_rows(page, 3)
+    move(page, "gain", 0.2, final=True)
+    texts = [row.text for row in page.find_elements("css selector", rows)]
+    assert texts[2].startswith("Kalman, real sensor gain 1.35")
+    assert texts[2].split()[-3:] != texts[0].split()[-3:]
+    page.find_element("css selector", "#facts button").click()
+    await_rows(page, 2)
+
+
+@pytest.mark.browser
+def test_files_are_saved(page, folder):
+    move(page, "delay", 0.3, final=True)
+    page.find_element("id", "save").click()
+    box = page.find_element("id", "saved")
+    await_true(lambda: box.text)
+    assert "lbt-synth design explored-1.yaml --method kalman" in box.text
+    saved = lbt.load_config(folder / "explored-1.yaml")
+    assert saved.hardware.delay_frames == 2.5
+    assert lbt.load_gain(folder / "explored-1.fits").certificate.passed
+
+
+@pytest.mark.browser
+def test_what_cannot_be_designed_is_said(page):
+    select(page, "lqg")
+    move(page, "delay", 0.3, final=True)
+    assert "without a command weight" in page.find_element("id", "error").text
+    move(page, "delay", 0.2, final=True)
+    assert page.find_element("id", "error").text == ""
+
+
+@pytest.mark.browser
+def test_the_keyboard_moves_sliders(page):
+    keys, focused = chain(page), "return document.activeElement.id"
+    for _ in range(40):
+        keys.send_keys("\ue004").perform()
+        if page.execute_script(focused) == "gain":
+            break
+    assert page.execute_script(focused) == "gain"
+    text = page.find_element("id", "gain").get_attribute("aria-valuetext")
+    keys.send_keys("\ue014").perform()  # to the right
+    await_state(page, "judged", asked(page))
+    assert page.find_element("id", "gain").get_attribute("aria-valuetext") != text
+
+
+@pytest.mark.browser
+def test_everything_has_a_name_for_those_who_listen(page):
+    page.execute_cdp_cmd("Accessibility.enable", {})
+    nodes = page.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    named = {
+        role: [node["name"]["value"] for node in nodes if node.get("role", {}).get("value") == role]
+        for role in ("slider", "combobox", "button", "image", "status")
+    }
+    assert "measurement noise" in named["slider"]
+    assert named["combobox"] == ["Method"]
+    assert {"Keep", "Save", "Reset"} <= set(named["button"])
+    assert all(named["slider"])
+    assert len(named["slider"]) == 8
+    live = page.find_element("id", "verdict")
+    assert live.get_attribute("aria-live") == "polite"
+    assert live.get_attribute("role") == "status"
+
+
+@pytest.mark.browser
+def test_it_fits_a_phone(page, address):
+    show(page, address, {**PHONE, "width": 390})
+    sizes = page.execute_script(
+        "return [document.documentElement.scrollWidth, innerWidth,"
+        " ...[...document.querySelectorAll('.plot')].map(e => e.getBoundingClientRect().width)]"
+    )
+    assert sizes[0] <= 390
+    assert min(sizes[2:]) > 250
+    assert page.find_element("id", "delay").is_displayed()
+
+
+@pytest.mark.browser
+def test_nothing_is_asked_from_elsewhere(page, address):
+    asked_for = {
+        found
+        for entry in page.get_log("performance")
+        if '"Network.requestWillBeSent"' in entry["message"]
+        for found in re.findall(r'"url":"([^"]*)"', entry["message"])
+    }
+    assert asked_for
+    assert all(url.startswith((address, "data:", "blob:")) for url in asked_for)
+
+
+@pytest.mark.browser
+def test_another_origin_is_refused(driver, address):
+    driver.get("data:text/html,<title>elsewhere</title>")
+    script = (
+        "const [url, done] = arguments, socket = new WebSocket(url, ['bokeh', 'x']);"
+        "socket.onopen = () => done('open'); socket.onerror = () => done('refused');"
+    )
+    assert driver.execute_async_script(script, address.replace("http", "ws") + "ws") == "refused"
+    driver.get_log("browser")
