@@ -34,6 +34,9 @@ _OPTIONS_IN_DIGEST = {
     *("route", "horizon", "gamma", "gamma_ratio", "rms", "taps"),
     *("norm", "half_width_hz", "command_weight", "gain"),
 }
+# keys of a configuration that came later: where they are not given, the digest is that of before
+_LATER_KEYS = {"units", "frequency_error_hz", "frequency_error_percent", "integrator"}
+_ERRORS_IN_DIGEST = [x / 2 for x in range(-7, 8)]  # where none are given; no study uses them
 # The oldest version whose results this one repeats to rounding: studies that it began are read
 # and resumed. Raise it with any change that moves a result.
 _SAME_RESULTS_SINCE = "0.1.0"
@@ -170,13 +173,26 @@ def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> st
     for section in study["controllers"].values():
         del section["file"]
         section |= dict.fromkeys(_OPTIONS_IN_DIGEST - section.keys())
+    whole = _without_later_keys(config.settings.model_dump())
+    if whole["robustness"]["errors_hz"] is None:
+        whole["robustness"]["errors_hz"] = _ERRORS_IN_DIGEST
     content = {
         "version": _SAME_RESULTS_SINCE,
         "study": study,
-        "config": config.settings.model_dump(),
+        "config": whole,
         "gains": gains,
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _without_later_keys(values: Any) -> Any:
+    """Leave out keys that came later and are not given."""
+    if isinstance(values, list):
+        return [_without_later_keys(value) for value in values]
+    if not isinstance(values, dict):
+        return values
+    kept = {k: v for k, v in values.items() if v is not None or k not in _LATER_KEYS}
+    return {key: _without_later_keys(value) for key, value in kept.items()}
 
 
 def _parameters(settings: StudySection, config: Config, source: Path) -> tuple[Parameter, ...]:
