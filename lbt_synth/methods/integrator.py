@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from lbt_synth.methods.method import Description, DesignInputs, Method, Section
-from lbt_synth.methods.quantities import Gain, Hertz
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:
@@ -21,8 +20,10 @@ _SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides its gain
 class IntegratorOptions(Section):
     """Options of the integrator."""
 
-    gain: Gain | None = Field(
+    gain: float | None = Field(
         default=None,
+        ge=1e-3,
+        le=1e3,
         description="its gain (default: the best for the truth that keeps the margins)",
     )
     phase_margin_deg: float | None = Field(
@@ -37,8 +38,10 @@ class IntegratorOptions(Section):
     integrators: int = Field(
         default=1, ge=1, le=2, description="how many in series; two need a zero"
     )
-    zero_hz: Hertz | None = Field(
+    zero_hz: float | None = Field(
         default=None,
+        ge=1e-3,
+        le=1e6,
         description="corner of a zero [Hz]: of a PI controller, or of the lag compensator of a "
         "double integrator",
     )

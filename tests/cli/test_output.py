@@ -54,7 +54,7 @@ def test_the_same_rows_are_printed_three_times(tmp_path, capsys, command):
     assert list(written[0]) == list(data[key][0])
     assert len(written) == len(data[key])
     for name, unit in data["units"].items():
-        assert unit in ("nm", "nm rms", "Hz", "%", "frames")
+        assert unit in ("nm", "nm rms", "Hz", "%", "frames", "deg")
         assert name in data or all(name in row for row in data[key])
     for row, record in zip(written, data[key], strict=True):
         for name, value in record.items():

@@ -15,7 +15,7 @@ from lbt_synth.cli.parser import COMMANDS
 READ_ONLY = {"show", "verify"}  # they write nothing
 
 
-WITHOUT_INPUTS = {"paper"}
+WITHOUT_INPUTS = {"paper", "init", "schema", "help", "completion", "explore"}
 
 
 # Inputs by their names in a directory, and arguments; OUT is where the output goes, under the
@@ -27,6 +27,10 @@ CASES = {
     "export c": ("gain.fits", ("gain.fits", "--format", "c", "-o", "OUT.c")),
     "export c header": ("gain.fits", ("gain.fits", "--format", "c", "-o", "other.c"), "other.h"),
     "sigma": ("gain.fits", ("gain.fits", "-o", "OUT.png")),
+    "bode": ("gain.fits", ("gain.fits", "-o", "OUT.png")),
+    "nyquist": ("gain.fits", ("gain.fits", "-o", "a.csv", "-o", "OUT.png")),
+    "nichols": ("gain.fits", ("gain.fits", "-o", "OUT.pdf")),
+    "step": ("gain.fits", ("gain.fits", "-o", "OUT.csv")),
     "simulate": ("gain.fits", ("config.yaml", "gain.fits", "-o", "OUT.png")),
     "simulate config": ("config.yaml", ("config.yaml", "gain.fits", "-o", "OUT.png")),
     "simulate telemetry": (

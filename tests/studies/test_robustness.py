@@ -346,7 +346,7 @@ WRONG = [
     ({"sensor_gains": [0.5, 0]}, "sensor_gains must be above 0"),
     ({"sensor_gains": "wide"}, "sensor_gains must be an array of numbers"),
     ({"delay_errors_frames": [-1.5]}, "delay_errors_frames must be at least -1"),
-    ({"delay_errors_frames": [99]}, "together must lie between 1 and 100"),
+    ({"delay_errors_frames": [99]}, "together must lie between 1 and 20"),
 ]
 
 

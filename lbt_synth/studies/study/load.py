@@ -17,6 +17,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, refuse_config
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
+from lbt_synth.methods.integrator import METHOD as INTEGRATOR
 from lbt_synth.methods.request import Wording, design_request
 from lbt_synth.studies.study.sample import (
     Sample,
@@ -35,7 +36,7 @@ _OPTIONS_IN_DIGEST = {
     *("norm", "half_width_hz", "command_weight", "gain"),
 }
 # keys of a configuration that came later: where they are not given, the digest is that of before
-_LATER_KEYS = {"units", "frequency_error_hz", "frequency_error_percent", "integrator"}
+_LATER_KEYS = {"units", "frequency_error_hz", "frequency_error_percent", INTEGRATOR.name}
 _ERRORS_IN_DIGEST = [x / 2 for x in range(-7, 8)]  # where none are given; no study uses them
 # The oldest version whose results this one repeats to rounding: studies that it began are read
 # and resumed. Raise it with any change that moves a result.
