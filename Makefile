@@ -84,4 +84,4 @@ docs: $(VENV)/.ready     ## the documentation, warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
 
 clean:
-	rm -rf $(OUT) $(VENV) docs/_build docs/api/generated .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(OUT) $(VENV) docs/_build docs/api/generated docs/gallery .pytest_cache .mypy_cache .ruff_cache

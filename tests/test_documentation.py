@@ -100,7 +100,7 @@ def test_the_reference_has_the_names_of_the_stubs(house):
     assert "\n   InfeasibleError\n" in pages["errors"]
 
 
-SCRIPTS = sorted([*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/*.py")])
+SCRIPTS = sorted([*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/**/*.py")])
 
 
 def module_path(node):
