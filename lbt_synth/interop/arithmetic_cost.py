@@ -6,7 +6,7 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.linear import Controller
-from lbt_synth.linear.state_space import as_controller
+from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import FloatArray, set_fields
 

@@ -8,7 +8,7 @@ output is read from the *new* state, ``u(k) = C x(k+1) + D y(k)``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +26,6 @@ from lbt_synth.validation import (
     real_array,
     set_fields,
     square,
-    suggest_part,
 )
 
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
@@ -343,27 +342,6 @@ class Controller(LinearSystem):
     def start(self) -> RunningController:
         """Return a running copy with a zero state, to be stepped sample by sample."""
         return RunningController(self)
-
-
-@runtime_checkable
-class HasController(Protocol):
-    """Anything that holds a controller, such as a design."""
-
-    @property
-    def controller(self) -> Controller:
-        """The controller."""
-        ...
-
-
-def as_controller(given: Controller | HasController, *, others: str = "") -> Controller:
-    """Return a controller, or that of a design; refuse anything else."""
-    found = given if isinstance(given, Controller) else getattr(given, "controller", None)
-    if not isinstance(found, Controller):
-        raise ProblemError(
-            f"controller must be a Controller{others}, or a design; got {type(given).__name__}."
-            f"{suggest_part(given, Controller)}"
-        )
-    return found
 
 
 @dataclass(slots=True, eq=False)

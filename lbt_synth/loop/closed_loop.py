@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
-from lbt_synth.linear.state_space import HasController, as_controller, sigma_sparkline
+from lbt_synth.linear.held_controller import HasController, as_controller
+from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.linear import Controller, hinf_norm, structured_norm
-from lbt_synth.linear.state_space import HasController
+from lbt_synth.linear.held_controller import HasController
 from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops

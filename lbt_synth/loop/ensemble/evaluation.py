@@ -16,8 +16,8 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.batched import transpose
+from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.linear.lyapunov import stationary_covariances
-from lbt_synth.linear.state_space import as_controller
 from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops, LoopGroup
 from lbt_synth.loop.ensemble.loop_ensemble import (

@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, RunningController
 from lbt_synth.linear.block_filtering import filter_series as filter_series
-from lbt_synth.linear.state_space import HasController, as_controller
+from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.loop.closed_loop import close_loop
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.strehl import Imaging, series_strehl
