@@ -4,7 +4,7 @@ Needs the extra ``e2e`` (``make e2e`` installs it); from the repository::
 
     python benchmarks/export_specula.py {double,single} GAIN.fits [TRANSFER_FUNCTIONS.fits]
 
-The gain file is given to SsrFilter, the transfer functions (``lbt-synth export --format iir``)
+The gain file is given to SsrFilter, the transfer functions (``lbt-synth export --for iir``)
 to IirFilter. Printed: the largest difference of the commands over the largest command, in the
 closed loop of examples/lbt.yaml and on 150 random measurements.
 """

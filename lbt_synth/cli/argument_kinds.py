@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, _ActionsContainer
+from argparse import Action, ArgumentParser, Namespace, _ActionsContainer
 from collections.abc import Sequence
 from typing import Any
 
@@ -62,3 +62,22 @@ def add_outputs(parser: ArgumentParser) -> None:
     """Add any number of tables and figures."""
     text = "table (.csv) or figure (.png, .pdf, .svg); repeatable"
     parser.add_argument("-o", "--output", action="append", default=[], help=text)
+
+
+class TargetChoice(Action):
+    """Take the name of a target; without one, print all of them and end."""
+
+    def __call__(
+        self,
+        parser: ArgumentParser,
+        namespace: Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Store the name, or print the targets."""
+        if values is None:
+            from lbt_synth.cli.export import list_targets
+
+            list_targets()
+            parser.exit()
+        setattr(namespace, self.dest, values)

@@ -10,6 +10,7 @@ from argparse import ArgumentParser
 from lbt_synth.cli.argument_kinds import (
     FIGURE,
     GAIN_FILE,
+    TargetChoice,
     add_config,
     add_gain,
     add_gains,
@@ -63,20 +64,30 @@ def verify(parser: ArgumentParser) -> None:
 
 def export(parser: ArgumentParser) -> None:
     """Write the controller of a gain file for a real-time computer or another program."""
+    from lbt_synth.interop.target import target_names
+
     add_gain(parser)
+    text = "the program that loads the file; without NAME, list what each computes, and end"
     add_option(
         parser,
-        "--format",
-        ("c", "mat", "iir"),
-        "c: C99 source and header; mat: MATLAB; iir: transfer functions for SPECULA's IirFilter "
-        "(axes that decouple)",
+        "--for",
+        target_names(),
+        text,
+        action=TargetChoice,
+        nargs="?",
         required=True,
+        dest="target",
+        metavar="NAME",
     )
     types = ("double", "single")
     add_option(parser, "--precision", types, "c: type of all numbers (default double)")
     text = "c: prefix of the C names (default: the output's name without its ending)"
     add_option(parser, "--name", str, text)
-    add_output(parser, "file to write: .c (the .h goes beside it), .mat or .fits")
+    add_option(parser, "--order", int, "dao: M of the RTC's configuration (default 20)")
+    text = "dao: columns of the matrix (default: the modes of the design)"
+    add_option(parser, "--modes", int, text)
+    text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy"
+    add_output(parser, text)
 
 
 def sigma(parser: ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""The command export: a gain file as C source, a MATLAB file or transfer functions."""
+"""The command export: a gain file in the form that another program loads."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.gain_file.store import load_with_digest
-from lbt_synth.interop import Exported, export_c, export_iir, export_mat, frame_cost
+from lbt_synth.interop import Exported, frame_cost, target_named
+from lbt_synth.interop.target import target_names
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
 
 _SINGLE_SUFFICES = 1e-3  # of the largest command
-_C_OPTIONS = ("precision", "name")
+_OPTIONS = ("precision", "name", "order", "modes")
 
 
 @table_row
@@ -34,18 +34,24 @@ class ExportFacts:
 
 def run(arguments: Namespace) -> Report:
     """Write the controller of a gain file for another program."""
-    for option in _C_OPTIONS:
-        if getattr(arguments, option) is not None and arguments.format != "c":
-            raise ProblemError(f"--{option} goes with --format c; got --format {arguments.format}.")
-    target = Path(arguments.output)
-    header = [target.parent / f"{target.stem}.h"] if arguments.format == "c" else []
-    require_writable(target, *header, inputs=[arguments.gain])
+    target = target_named(arguments.target)
+    options = {name: getattr(arguments, name) for name in _OPTIONS}
+    options = {name: value for name, value in options.items() if value is not None}
+    for option in options:
+        if option not in target.options:
+            fitting = " or ".join(n for n in target_names() if option in target_named(n).options)
+            raise ProblemError(
+                f"--{option} goes with --for {fitting}; got --for {arguments.target}."
+            )
+    output = Path(arguments.output)
+    beside = [output.parent / (output.stem + target.beside)] if target.beside else []
+    require_writable(output, *beside, inputs=[arguments.gain])
     design, digest = load_with_digest(arguments.gain)
     with show_spinner("exporting", quiet=arguments.json):
-        written = _export_as(arguments, design, digest)
+        written = target.write(output, design, gain_digest=digest, **options)
     cost = frame_cost(design)
     report = Report(
-        data={"gain": arguments.gain, "gain_digest": digest, "format": arguments.format}
+        data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
     )
     facts = fill_row(
         ExportFacts,
@@ -57,18 +63,21 @@ def run(arguments: Namespace) -> Report:
         stable_single=math.isfinite(written.error_single),
     )
     report.data |= {"frame_cost": json_record(cost), **json_record(facts)}
-    report.tables.append(fact_table("Export", facts, *([cost] if arguments.format == "c" else [])))
+    report.tables.append(fact_table("Export", facts, *([cost] if arguments.target == "c" else [])))
+    if written.checks:
+        report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
     report.notes += _precision_notes(arguments, written)
     report.note_files(written.files)
     return report
 
 
-def _export_as(arguments: Namespace, design: Design, digest: str) -> Exported:
-    if arguments.format == "c":
-        options = {"precision": arguments.precision or "double", "name": arguments.name}
-        return export_c(arguments.output, design, gain_digest=digest, **options)
-    export = export_mat if arguments.format == "mat" else export_iir
-    return export(arguments.output, design, gain_digest=digest)
+def list_targets() -> None:
+    """Print how each target computes."""
+    report = Report()
+    for name in target_names():
+        target = target_named(name)
+        report.tables.append(fact_table(f"{name}: {target.file}", target.arithmetic))
+    report.print(as_json=False)
 
 
 def _precision_notes(arguments: Namespace, written: Exported) -> list[str]:
@@ -77,7 +86,7 @@ def _precision_notes(arguments: Namespace, written: Exported) -> list[str]:
             f"note: in single precision commands are off by {written.error:.2g} of the largest "
             "one. Export with --precision double."
         ]
-    if arguments.format == "iir" and not written.error_single <= _SINGLE_SUFFICES:
+    if arguments.target == "iir" and not written.error_single <= _SINGLE_SUFFICES:
         effect = (
             "the loop is unstable"
             if math.isinf(written.error_single)

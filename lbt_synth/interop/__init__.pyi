@@ -1,6 +1,7 @@
 from .arithmetic_cost import FrameCost as FrameCost
 from .arithmetic_cost import frame_cost as frame_cost
 from .c.export import export_c as export_c
+from .dao.export import export_dao as export_dao
 from .export_checks import Exported as Exported
 from .iir.export import export_iir as export_iir
 from .matlab.export import export_mat as export_mat
@@ -11,3 +12,6 @@ from .specula.end_to_end_run import EndToEndRun as EndToEndRun
 from .specula.simulation import EndToEndSetup as EndToEndSetup
 from .specula.simulation import run_end_to_end as run_end_to_end
 from .specula.system import EndToEndSystem as EndToEndSystem
+from .target import Arithmetic as Arithmetic
+from .target import Target as Target
+from .target import target_named as target_named

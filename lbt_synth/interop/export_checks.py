@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth
-from lbt_synth.design import Design, certify_loop
+from lbt_synth.design import Check, Design, certify_loop
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.state_space import LinearSystem
@@ -135,11 +135,14 @@ class Exported:
         on white noise elsewhere.
     error_single : float
         The same in single precision; inf if the loop is then unstable.
+    checks : tuple of Check
+        The proof in the loop, with the numbers of the file.
     """
 
     files: tuple[Path, ...]
     error: float
     error_single: float
+    checks: tuple[Check, ...] = ()
 
 
 def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:

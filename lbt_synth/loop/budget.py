@@ -213,7 +213,13 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
             "the loop must have the plant's sensor, mirror and delay; got another. Close it with "
             "close_loop(plant.hardware, controller)."
         )
+    return plant_budget(loop, plant)
+
+
+def plant_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
+    """Return what a plant's disturbances and noise leave in any loop, at its own sensor gain."""
     loop.require_stable()
+    one = loop.hardware
     n, q = one.modes, one.n_measurements
     turbulence, vibration = np.zeros((2, n, n))
     for model, direction in zip(plant.turbulence, np.eye(n), strict=True):

@@ -36,7 +36,7 @@ def gains(tmp_path_factory):
 def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
     out = tmp_path / "ctl.c"
     status, text, error = run(
-        capsys, "export", gains["kalman"], "--format", "c", "-o", out, "--precision", "single"
+        capsys, "export", gains["kalman"], "--for", "c", "-o", out, "--precision", "single"
     )
     assert (status, error) == (0, "")
     assert f"written: {out}" in text
@@ -45,7 +45,7 @@ def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
     ours = designs["kalman"].controller.start()
     assert np.allclose(Compiled(out, single=True).step([1, 2]), ours.step([1, 2]), rtol=1e-6)
     status, text, _ = run(
-        capsys, "export", gains["kalman"], "--format", "c", "-o", out, "--name", "tip", "--json"
+        capsys, "export", gains["kalman"], "--for", "c", "-o", out, "--name", "tip", "--json"
     )
     data = json.loads(text)
     assert status == 0
@@ -57,10 +57,10 @@ def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
 
 def test_export_mat_and_iir_at_the_terminal(tmp_path, capsys, designs, gains):
     out = tmp_path / "k.mat"
-    assert run(capsys, "export", gains["hinf"], "--format", "mat", "-o", out)[0] == 0
+    assert run(capsys, "export", gains["hinf"], "--for", "matlab", "-o", out)[0] == 0
     assert loadmat(out, simplify_cells=True)["new_state"]["A"].shape == (10, 10)
     out = tmp_path / "k.fits"
-    status, text, _ = run(capsys, "export", gains["kalman"], "--format", "iir", "-o", out)
+    status, text, _ = run(capsys, "export", gains["kalman"], "--for", "iir", "-o", out)
     assert status == 0
     assert "difference from the controller" in text
     assert "note:" not in text
@@ -75,7 +75,7 @@ def test_a_transfer_function_that_single_precision_breaks_gets_a_note(
 ):
     prior = lbt.kalman(lbt.models.spread_plant(loaded.plant, half_width_hz=half_width_hz, lines=3))
     gain = lbt.save_gain(tmp_path / "g.fits", prior)
-    arguments = ("export", gain, "--format", "iir", "-o", tmp_path / "k.fits")
+    arguments = ("export", gain, "--for", "iir", "-o", tmp_path / "k.fits")
     status, text, _ = run(capsys, *arguments)
     assert status == 0
     assert f"note: in single precision, SPECULA's default, {effect}" in text
@@ -97,7 +97,7 @@ def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys, mon
     gain = lbt.save_gain(tmp_path / "g.fits", slow)
     odd = with_controller(slow, large), "0" * 64
     monkeypatch.setattr("lbt_synth.cli.export.load_with_digest", lambda path: odd)
-    arguments = ("export", gain, "--format", "c", "-o", tmp_path / "k.c")
+    arguments = ("export", gain, "--for", "c", "-o", tmp_path / "k.c")
     status, text, _ = run(capsys, *arguments, "--precision", "single")
     assert status == 0
     assert re.search(r"note: in single precision commands are off by [\d.]+ of the largest", text)
@@ -105,25 +105,25 @@ def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys, mon
 
 
 BAD = [
-    (("KALMAN", "--format", "mat", "-o", "k.mat", "--name", "x"), 2, "--name goes with --format c"),
+    (("KALMAN", "--for", "matlab", "-o", "k.mat", "--name", "x"), 2, "--name goes with --for c"),
     (
-        ("KALMAN", "--format", "iir", "-o", "k.fits", "--precision", "single"),
+        ("KALMAN", "--for", "iir", "-o", "k.fits", "--precision", "single"),
         2,
         "--precision goes with",
     ),
-    (("KALMAN", "--format", "c", "-o", "k.c", "--precision", "half"), 2, "invalid choice"),
-    (("KALMAN", "--format", "c", "-o", "k.c", "--name", "2x"), 2, "prefix of the C names"),
-    (("KALMAN", "--format", "c", "-o", "kal man.c"), 2, "must end in .c"),
-    (("KALMAN", "--format", "c", "-o", "k.mat"), 2, "must end in .c"),
-    (("KALMAN", "--format", "mat", "-o", "k.c"), 2, "must end in .mat"),
-    (("KALMAN", "--format", "iir", "-o", "k.mat"), 2, "must end in .fits"),
-    (("KALMAN", "--format", "iir", "-o", "KALMAN"), 2, "must not replace the input"),
-    (("KALMAN", "--format", "c", "-o", "none/k.c"), 2, "no directory none"),
-    (("KALMAN", "--format", "pdf", "-o", "k.pdf"), 2, "invalid choice"),
+    (("KALMAN", "--for", "c", "-o", "k.c", "--precision", "half"), 2, "invalid choice"),
+    (("KALMAN", "--for", "c", "-o", "k.c", "--name", "2x"), 2, "prefix of the C names"),
+    (("KALMAN", "--for", "c", "-o", "kal man.c"), 2, "must end in .c"),
+    (("KALMAN", "--for", "c", "-o", "k.mat"), 2, "must end in .c"),
+    (("KALMAN", "--for", "matlab", "-o", "k.c"), 2, "must end in .mat"),
+    (("KALMAN", "--for", "iir", "-o", "k.mat"), 2, "must end in .fits"),
+    (("KALMAN", "--for", "iir", "-o", "KALMAN"), 2, "must not replace the input"),
+    (("KALMAN", "--for", "c", "-o", "none/k.c"), 2, "no directory none"),
+    (("KALMAN", "--for", "pdf", "-o", "k.pdf"), 2, "invalid choice"),
     (("KALMAN", "-o", "k.c"), 2, "required"),
-    (("none.fits", "--format", "c", "-o", "k.c"), 2, "cannot read none.fits"),
-    (("DAMAGED.fits", "--format", "c", "-o", "k.c"), 2, "damaged"),
-    (("PRIOR", "--format", "iir", "-o", "k.fits"), 1, "do not hold the poles"),
+    (("none.fits", "--for", "c", "-o", "k.c"), 2, "cannot read none.fits"),
+    (("DAMAGED.fits", "--for", "c", "-o", "k.c"), 2, "damaged"),
+    (("PRIOR", "--for", "iir", "-o", "k.fits"), 1, "do not hold the poles"),
 ]
 
 

@@ -293,9 +293,9 @@ def test_every_command_runs(tmp_path, capsys, model):
     )
     assert front["points"]
     checked_output(capsys, "verify", gain)
-    for form in ("c", "mat", "iir"):
-        exported = tmp_path / f"x.{ {'c': 'c', 'mat': 'mat', 'iir': 'fits'}[form] }"
-        checked_output(capsys, "export", gain, "-o", exported, "--format", form)
+    for target, ending in {"c": "c", "dao": "npy", "iir": "fits", "matlab": "mat"}.items():
+        exported = tmp_path / f"x.{ending}"
+        checked_output(capsys, "export", gain, "-o", exported, "--for", target)
         assert exported.exists()
 
 

@@ -22,10 +22,10 @@ WITHOUT_INPUTS = {"paper", "init", "schema", "help", "completion", "explore"}
 # name of the input that it would replace.
 CASES = {
     "design": ("config.yaml", ("config.yaml", "--method", "integrator", "-o", "OUT.fits")),
-    "export mat": ("gain.fits", ("gain.fits", "--format", "mat", "-o", "OUT.mat")),
-    "export iir": ("gain.fits", ("gain.fits", "--format", "iir", "-o", "OUT.fits")),
-    "export c": ("gain.fits", ("gain.fits", "--format", "c", "-o", "OUT.c")),
-    "export c header": ("gain.fits", ("gain.fits", "--format", "c", "-o", "other.c"), "other.h"),
+    "export mat": ("gain.fits", ("gain.fits", "--for", "matlab", "-o", "OUT.mat")),
+    "export iir": ("gain.fits", ("gain.fits", "--for", "iir", "-o", "OUT.fits")),
+    "export c": ("gain.fits", ("gain.fits", "--for", "c", "-o", "OUT.c")),
+    "export c header": ("gain.fits", ("gain.fits", "--for", "c", "-o", "other.c"), "other.h"),
     "sigma": ("gain.fits", ("gain.fits", "-o", "OUT.png")),
     "bode": ("gain.fits", ("gain.fits", "-o", "OUT.png")),
     "nyquist": ("gain.fits", ("gain.fits", "-o", "a.csv", "-o", "OUT.png")),
@@ -112,7 +112,7 @@ def test_an_output_that_is_an_input_is_refused(
 @pytest.mark.parametrize(
     ("command", "arguments", "source"),
     [
-        ("export", ("gain.fits", "--format", "iir", "-o", "gain.fits"), "gain.fits"),
+        ("export", ("gain.fits", "--for", "iir", "-o", "gain.fits"), "gain.fits"),
         ("simulate", ("config.yaml", "gain.fits", "--telemetry", "./gain.fits"), "gain.fits"),
         ("telemetry", ("series.fits", "-o", "../DIR/series.fits"), "series.fits"),
         pytest.param(

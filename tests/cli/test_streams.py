@@ -152,7 +152,7 @@ SAID = {  # what each command does with files that are there, its status, and a 
     "design": (("CONFIG", "--method", "kalman", "-o", "OUT.fits"), 0, "written: OUT.fits"),
     "show": (("GAIN",), 0, "| quantity"),
     "verify": (("GAIN",), 0, "spectral radius"),
-    "export": (("GAIN", "--format", "c", "-o", "OUT.c"), 0, "written: OUT.c"),
+    "export": (("GAIN", "--for", "c", "-o", "OUT.c"), 0, "written: OUT.c"),
     "sigma": (("GAIN", "-o", "OUT.png"), 0, "written: OUT.png"),
     "bode": (("GAIN", "-o", "OUT.csv"), 0, "written: OUT.csv"),
     "nyquist": (("GAIN",), 0, "modulus margin"),

@@ -13,6 +13,7 @@ EXPORTS = {
     "k.c": lbt.interop.export_c,
     "k.mat": lbt.interop.export_mat,
     "k.fits": lbt.interop.export_iir,
+    "k.npy": lbt.interop.export_dao,
 }
 
 

@@ -231,7 +231,7 @@ def command(name, path):
         "verify": [path],
         "show": [path, "--matrices", "--json"],
         "simulate": [LBT_YAML, path, "--frames", "8", "--cases", "1"],
-        "export": [path, "--format", "c", "-o", path.with_name("k.c")],
+        "export": [path, "--for", "c", "-o", path.with_name("k.c")],
     }
     return [name, *map(str, options[name])]
 

@@ -23,6 +23,7 @@ from lbt_synth.interop.export_checks import (
     rehearsal_error,
     require_exportable,
 )
+from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.linear import Controller
 from lbt_synth.storage.atomic_files import write_together
 from lbt_synth.validation import choice
@@ -249,3 +250,19 @@ def _wrap(terms: list[tuple[str, str]], column: int) -> str:
 
 def _count(number: int, word: str) -> str:
     return f"{number} {word}" + ("" if number == 1 else "s")
+
+
+TARGET = Target(
+    arithmetic=Arithmetic(
+        program="real-time computers, from C99 source",
+        precision="double or single",
+        sums="each row of [A, B] and of [C, D] from left to right",
+        state="new state: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)",
+        clipping="none: it assumes that its commands are applied",
+        limits="none",
+    ),
+    file="source and header (.c, .h)",
+    write=export_c,
+    beside=".h",
+    options=("precision", "name"),
+)

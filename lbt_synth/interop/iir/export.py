@@ -18,6 +18,7 @@ from lbt_synth.interop.export_checks import (
     rehearsal_error,
     require_exportable,
 )
+from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
@@ -140,13 +141,13 @@ def _rehearse(design: Design, num: FloatArray, den: FloatArray, dtype: Any) -> f
     """Return the rehearsal's error; inf where the loop is unstable, however slowly it grows."""
     if design.hardware is not None:
         top, bottom = (frozen_copy(part.astype(dtype)) for part in (num, den))
-        written = _build_controller(top, bottom, design.controller.dt_s)
+        written = build_controller(top, bottom, design.controller.dt_s)
         if not certify_loop(design.hardware, written).passed:
             return float("inf")
     return rehearsal_error(design, DirectForm(num, den, dtype))
 
 
-def _build_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
+def build_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
     """Build the controller of these coefficients; the last state of each axis is its command."""
     axes = []
     for top, bottom in zip(num, den, strict=True):
@@ -274,3 +275,17 @@ def _scale_to_integers(values: FloatArray) -> tuple[Any, int]:
     power = max((bottom.bit_length() - 1 for _, bottom in ratios), default=0)
     whole = np.array([top * ((1 << power) // bottom) for top, bottom in ratios], dtype=object)
     return whole.reshape(values.shape), power
+
+
+TARGET = Target(
+    arithmetic=Arithmetic(
+        program="SPECULA's IirFilter",
+        precision="single by default; double with precision 0",
+        sums="sum of the past inputs less the sum of the past outputs, per axis",
+        state="past measurements and past commands",
+        clipping="none: it assumes that its commands are applied",
+        limits="one transfer function per axis, of 40 states at most",
+    ),
+    file="filter file (.fits)",
+    write=export_iir,
+)

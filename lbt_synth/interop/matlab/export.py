@@ -18,6 +18,7 @@ from lbt_synth.interop.export_checks import (
     rehearsal_error,
     require_exportable,
 )
+from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.validation import FloatArray
 
@@ -107,3 +108,17 @@ def _mat_bytes(content: dict[str, Any]) -> bytes:
     savemat(buffer, content, format="5", oned_as="column")
     text = f"MATLAB 5.0 MAT-file, written by lbt_synth {lbt_synth.__version__}"
     return text.ljust(_TEXT_BYTES).encode("ascii") + bytes(buffer.getvalue()[_TEXT_BYTES:])
+
+
+TARGET = Target(
+    arithmetic=Arithmetic(
+        program="MATLAB and Simulink",
+        precision="double",
+        sums="matrix products, in an order of their library",
+        state="textbook: u(k) = C x(k) + D y(k); new_state: that of the gain file",
+        clipping="none: it assumes that its commands are applied",
+        limits="none",
+    ),
+    file="MATLAB file (.mat)",
+    write=export_mat,
+)

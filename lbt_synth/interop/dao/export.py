@@ -1,0 +1,215 @@
+"""Export a controller as the matrix that Durham's dao real-time computers load."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lbt_synth.design import Check, Design
+from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.interop.dao.inner_loop import InnerLoop
+from lbt_synth.interop.export_checks import (
+    Exported,
+    join_labels,
+    provenance_lines,
+    rehearsal_error,
+    require_exportable,
+)
+from lbt_synth.interop.iir.export import axis_polynomials, build_controller
+from lbt_synth.interop.target import Arithmetic, Target
+from lbt_synth.interop.written_loop import Rounding, prove_written
+from lbt_synth.linear import Controller
+from lbt_synth.storage.array_file import fits_bytes
+from lbt_synth.storage.atomic_files import require_ending, write_together
+from lbt_synth.storage.rows import json_record
+from lbt_synth.validation import FloatArray, integer
+
+_ROUNDOFF = 2.0**-24  # largest relative error of an operation in single precision
+_BESIDE = ".certificate.json"
+_SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
+
+
+def export_dao(
+    path: str | os.PathLike[str],
+    design: Design,
+    *,
+    order: int = 20,
+    modes: int | None = None,
+    gain_digest: str | None = None,
+) -> Exported:
+    """Write a controller as the matrix of a dao real-time computer, one column per mode.
+
+    The RTC computes ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)`` per mode
+    in single precision. Rows ``0 .. M`` of the matrix are ``b``, rows ``M+1 .. 2M`` are ``a``.
+    The loop is closed around the rounded coefficients before anything is written, at the sensor
+    gains of the design, and the rounding of the sums is bounded as noise.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write, ending in ``.npy`` or ``.fits``. The proof goes beside it, with the ending
+        ``.certificate.json``.
+    design : Design
+        Design whose modes decouple, with unit sensor and influence matrices.
+    order : int, optional
+        M of the RTC's configuration.
+    modes : int, optional
+        Columns of the matrix; by default those of the design. Further columns are zero: their
+        modes get no command.
+    gain_digest : str, optional
+        SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
+
+    Returns
+    -------
+    Exported
+        Matrix and certificate, the error in double and in single precision, and the checks.
+
+    Raises
+    ------
+    OutputError
+        If the ending is neither, or a file cannot be written.
+    ProblemError
+        If the design is not of such a loop, its modes are coupled, or the order is too low.
+    CertificateError
+        If the certificate that the design carries has a failed check.
+    NumericalError
+        If a check fails in the arithmetic of the RTC; ``residual`` holds its value.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, numpy as np, tempfile, pathlib
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder) / "slow.npy"
+    ...     _ = lbt.interop.export_dao(file, slow, order=1, modes=3)
+    ...     np.load(file).tolist()
+    [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
+    """
+    target = require_ending(path, "a matrix of dao", (".npy", ".fits"))
+    require_exportable(design)
+    own = _require_modal(design)
+    columns = own if modes is None else integer(modes, "modes", at_least=own)
+    lines = provenance_lines(design, gain_digest)
+    exact = direct_form_rows(design.controller, integer(order, "order", at_least=1))
+    rounded = exact.astype(np.float32)
+    checks = prove_written(design, *_as_computed(rounded, design.controller.dt_s))
+    _require_passed(checks)
+    matrix = np.zeros((len(rounded), columns), dtype=np.float32)
+    matrix[:, :own] = rounded
+    single = rehearsal_error(design, InnerLoop(rounded))
+    content = _matrix_bytes(matrix, design, lines, fits=target.suffix.lower() == ".fits")
+    certificate = {
+        "target": "dao",
+        "file": target.name,
+        "file_sha256": hashlib.sha256(content).hexdigest(),
+        "gain_sha256": gain_digest,
+        "order": order,
+        "modes": columns,
+        "sign": _SIGN,
+        "arithmetic": json_record(TARGET.arithmetic),
+        "checks": [json_record(check) for check in checks],
+    }
+    text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
+    beside = target.with_suffix(_BESIDE)
+    files = write_together({target: content, beside: text.encode()})
+    return Exported(files=files, error=single, error_single=single, checks=checks)
+
+
+def direct_form_rows(controller: Controller, order: int) -> FloatArray:
+    """Return the matrix (2 order + 1, modes) of a controller, before it is rounded."""
+    rows = np.zeros((2 * order + 1, len(controller.C)))
+    for mode, (num, den) in enumerate(axis_polynomials(controller)):
+        needed = len(den) - 1
+        if needed > order:
+            raise ProblemError(
+                f"order must be at least {needed}, that of the controller of mode {mode + 1}; got "
+                f"{order}. Raise it there and in the RTC's configuration, or design with fewer "
+                "states."
+            )
+        rows[: needed + 1, mode] = num[::-1] / den[-1]
+        rows[order + 1 : order + 1 + needed, mode] = -den[-2::-1] / den[-1]
+    return rows
+
+
+def _require_modal(design: Design) -> int:
+    """Return the number of modes of a design whose measurements and commands are its modes."""
+    hardware = design.hardware
+    if hardware is None:
+        raise ProblemError("a dao matrix needs the design of a loop; got a bare controller.")
+    identity = np.eye(hardware.modes)
+    for name in ("sensor", "influence"):
+        if not np.array_equal(getattr(hardware, name), identity):
+            raise ProblemError(
+                f"{name}_matrix must be the identity: the RTC reconstructs modes and projects them "
+                "on actuators itself. Design for the modes."
+            )
+    return hardware.modes
+
+
+def _as_computed(rounded: NDArray[np.float32], dt_s: float) -> tuple[Controller, Rounding]:
+    """Return the controller with the matrix's numbers, and what its arithmetic adds."""
+    rows = rounded.astype(np.float64)
+    order, modes = len(rows) // 2, rows.shape[1]
+    num = rows[order::-1].T
+    den = np.hstack([-rows[:order:-1].T, np.ones((modes, 1))])
+    sums = np.zeros_like(num)
+    sums[:, -1] = 1.0
+    written, entry = (build_controller(top, den, dt_s) for top in (num, sums))
+
+    def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+        """Bound the rounding of each product and of each partial sum, uniform in its interval."""
+        sizes = np.where(np.arange(len(rows))[:, None] <= order, measured, commands)
+        terms = np.abs(rows) * sizes
+        squares = terms**2 + np.cumsum(terms, axis=0) ** 2
+        return np.asarray(_ROUNDOFF**2 / 3 * np.sum(squares, axis=0))
+
+    return written, Rounding(entry=entry, variance=variance)
+
+
+def _require_passed(checks: tuple[Check, ...]) -> None:
+    """Refuse the export with the first check that fails."""
+    for check in checks:
+        if not check.passed:
+            raise NumericalError(
+                "the loop must keep what its design promises in single precision, in direct form; "
+                f"{check.name} is {check.value:.6g}, limit {check.limit:.6g}. Design with fewer "
+                "states or less accurate models, or use a target in double precision.",
+                status="arithmetic",
+                residual=check.value,
+            )
+
+
+def _matrix_bytes(
+    matrix: NDArray[np.float32], design: Design, lines: list[tuple[str, str]], *, fits: bool
+) -> bytes:
+    if fits:
+        cards: dict[str, Any] = {
+            "METHOD": (design.method, "synthesis"),
+            "ORDER": (len(matrix) // 2, "M: rows b_0..b_M, then a_1..a_M"),
+        }
+        return fits_bytes(cards, {"K_MAT": matrix}, comments=[*join_labels(lines), _SIGN])
+    buffer = io.BytesIO()
+    np.save(buffer, matrix, allow_pickle=False)
+    return buffer.getvalue()
+
+
+TARGET = Target(
+    arithmetic=Arithmetic(
+        program="Durham's dao real-time computers",
+        precision="single",
+        sums="per mode, product by product: b_0 y(k) .. b_M y(k-M), a_1 u(k-1) .. a_M u(k-M)",
+        state="past measurements and past applied commands",
+        clipping="at the voltage limit; the memory then holds the applied commands",
+        limits="one transfer function per mode, of order M at most",
+    ),
+    file="matrix of single precision (.npy, .fits) and its certificate (.json)",
+    write=export_dao,
+    beside=_BESIDE,
+    options=("order", "modes"),
+)

@@ -1,0 +1,140 @@
+"""Matrices of dao real-time computers, read back and run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from support.exports import relative
+
+import lbt_synth as lbt
+from lbt_synth.interop.dao.inner_loop import InnerLoop
+from lbt_synth.loop.simulation.run import step_loop
+
+
+@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
+def test_the_matrix_holds_the_controller(tmp_path, designs, name):
+    design = designs[name]
+    written = lbt.interop.export_dao(tmp_path / "K_mat.npy", design, modes=5)
+    matrix = np.load(written.files[0])
+    assert (matrix.dtype, matrix.shape) == (np.float32, (41, 5))
+    assert matrix.flags.c_contiguous
+    assert not matrix[:, 2:].any()
+    frequency = np.linspace(1, 399, 100)
+    z = np.exp(2j * np.pi * frequency * design.controller.dt_s)
+    powers = z[:, None] ** -np.arange(21)
+    expected = design.controller.to_statespace().frequency_response(frequency)
+    for mode in range(2):
+        found = (powers @ matrix[:21, mode]) / (1 - powers[:, 1:] @ matrix[21:, mode])
+        assert relative(found, expected[:, mode, mode]) < 1e-4
+    assert written.error == written.error_single < 1e-4
+
+
+def test_fits_and_npy_are_alike_and_the_certificate_names_the_file(tmp_path, designs):
+    digest = "ab" * 32
+    for ending in ("npy", "fits"):
+        target = tmp_path / f"{ending}.{ending}"
+        written = lbt.interop.export_dao(target, designs["kalman"], order=6, gain_digest=digest)
+        beside = json.loads((tmp_path / f"{ending}.certificate.json").read_text())
+        assert beside["file_sha256"] == hashlib.sha256(target.read_bytes()).hexdigest()
+        assert (beside["order"], beside["modes"], beside["gain_sha256"]) == (6, 2, digest)
+        assert [c["name"] for c in beside["checks"]] == [c.name for c in written.checks]
+        assert all(check["passed"] for check in beside["checks"])
+    with fits.open(tmp_path / "fits.fits", checksum=True) as units:
+        assert units["K_MAT"].data.dtype == ">f4"
+        assert np.array_equal(units["K_MAT"].data, np.load(tmp_path / "npy.npy"))
+
+
+def test_the_loop_runs_in_its_arithmetic(tmp_path, designs):
+    """The twin of the RTC leaves what the design leaves, on the same disturbance."""
+    design = designs["kalman"]
+    file = lbt.interop.export_dao(tmp_path / "k.npy", design).files[0]
+    rng = np.random.default_rng(3)
+    total = np.cumsum(rng.standard_normal((1, 1500, 2)), axis=1)
+    noise = 0.1 * rng.standard_normal((1, 1500, 2))
+    runs = (InnerLoop(np.load(file)), design.controller.start())
+    found, own = (step_loop(run, 0.7, design.hardware, total, noise)[0, :, :2] for run in runs)
+    assert np.std(found) == pytest.approx(np.std(own), rel=1e-4)
+    assert not np.array_equal(found, own)
+
+
+def test_a_design_that_single_precision_breaks_is_refused_with_the_number(tmp_path, loaded):
+    lines = lbt.models.spread_plant(loaded.plant, half_width_hz=1.0, lines=3)
+    with pytest.raises(lbt.errors.NumericalError, match="spectral radius at sensor gains") as seen:
+        lbt.interop.export_dao(tmp_path / "k.npy", lbt.kalman(lines))
+    assert seen.value.residual > 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_matrix_cannot_hold_is_refused(tmp_path, designs, loaded):
+    def refused(design, match, **options):
+        with pytest.raises(lbt.errors.ProblemError, match=match):
+            lbt.interop.export_dao(tmp_path / "k.npy", design, **options)
+
+    refused(designs["kalman"], "order must be at least 4", order=3)
+    refused(designs["kalman"], "modes must be at least 2", modes=1)
+    turned = replace(loaded.hardware, sensor_matrix=[[1, 0.1], [0, 1]])
+    refused(lbt.integrator(turned, gain=0.3), "sensor_matrix must be the identity")
+    bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
+    refused(bare, "needs the design of a loop")
+
+
+def random_design(rng):
+    """A Kalman filter or an integrator for one mode, a few lines and any frame rate."""
+    rate = float(rng.uniform(200, 2000))
+    if rng.uniform() < 0.1:
+        hardware = lbt.LoopHardware(frame_rate_hz=rate, modes=1)
+        return lbt.integrator(hardware, gain=float(rng.uniform(0.05, 0.9)))
+    air = lbt.models.ARModel(
+        coefficients=np.array([rng.uniform(0.9, 0.9999)]), driving_rms_nm=50.0, frame_rate_hz=rate
+    )
+    lines = [
+        lbt.Vibration(
+            frequency_hz=float(rng.uniform(2, 0.4 * rate)),
+            damping=float(10 ** rng.uniform(-3, -1)),
+            rms_nm=float(10 ** rng.uniform(1, 3)),
+            direction=(1.0,),
+        )
+        for _ in range(rng.integers(0, 4))
+    ]
+    noise = float(10 ** rng.uniform(0, 2))
+    return lbt.kalman(
+        lbt.tip_tilt_plant(
+            frame_rate_hz=rate, turbulence=air, noise_nm=noise, vibrations=lines or None, modes=1
+        )
+    )
+
+
+def written_radius(matrix, gain):
+    """Spectral radius of the loop of two frames, from the polynomial of the written numbers."""
+    order = len(matrix) // 2
+    own = np.concatenate([[1.0], -matrix[order + 1 :, 0].astype(float), [0.0, 0.0]])
+    own[2:] += gain * matrix[: order + 1, 0]
+    return np.max(np.abs(np.roots(own)))
+
+
+def count_written(folder, seed, count):
+    """Export random designs; each file that is written must be stable. Return how many were."""
+    rng, written = np.random.default_rng(seed), 0
+    for _ in range(count):
+        design = random_design(rng)
+        try:
+            lbt.interop.export_dao(folder / "k.npy", design, order=20)
+        except lbt.errors.NumericalError:
+            continue
+        written += 1
+        assert written_radius(np.load(folder / "k.npy"), 1.0) < 1
+    return written
+
+
+def test_no_file_is_written_that_is_unstable(tmp_path):
+    assert 0 < count_written(tmp_path, 4, 4)
+
+
+@pytest.mark.study
+def test_no_file_of_ten_thousand_is_unstable(tmp_path):
+    assert 5000 < count_written(tmp_path, 5, 10_000)

@@ -1,0 +1,96 @@
+"""The proof of a controller in the arithmetic of a target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.exports import lbt_designs
+
+import lbt_synth as lbt
+from lbt_synth.interop.written_loop import Rounding, prove_written
+
+
+def values(checks):
+    return {
+        check.name.partition(",")[0].partition(" at sensor gains")[0]: check for check in checks
+    }
+
+
+@pytest.mark.parametrize("name", ["kalman", "integrator"])
+def test_the_controller_itself_loses_nothing(name):
+    design = lbt_designs()[name]
+    checks = prove_written(design, design.controller)
+    assert all(check.passed for check in checks)
+    assert [c.value for c in checks[1:]] == pytest.approx([0] * len(checks[1:]), abs=1e-12)
+
+
+def test_an_unstable_loop_ends_the_proof():
+    design = lbt_designs()["integrator"]
+    louder = replace(design.controller, B=3 * design.controller.B, D=3 * design.controller.D)
+    (only,) = prove_written(design, louder)
+    assert not only.passed
+    assert only.value > 1
+
+
+@pytest.fixture(scope="module")
+def shaped():
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0, modes=1)
+    line = lbt.design.shaping.VibrationBand(low_hz=18, high_hz=22, rms_nm=100)
+    gains = {"sensor_gain": (0.5, 1.2), "scenarios": (1.0, 0.6)}
+    return lbt.robust(plant, bands=[line], functions=12, states=None, **gains)
+
+
+def test_a_shaped_design_keeps_its_demands(shaped):
+    checks = prove_written(shaped, shaped.controller)
+    assert all(check.passed for check in checks)
+    names = [check.name for check in checks]
+    assert names[:3] == [
+        "spectral radius at sensor gains 0.5 to 1.2",
+        "residual at sensor gain 1, loss",
+        "residual at sensor gain 0.6, loss",
+    ]
+    own = shaped.recertify().checks
+    assert {f"mode 1: {check.name}" for check in own} >= set(names[4:])
+    assert len(names) > 4
+
+
+def test_another_gain_costs_residual_and_demands(shaped):
+    louder = replace(shaped.controller, C=1.1 * shaped.controller.C, D=1.1 * shaped.controller.D)
+    failed = {check.name for check in prove_written(shaped, louder) if not check.passed}
+    assert "residual at sensor gain 1, loss" in failed
+    assert "mode 1: peak of the sensitivity" in failed
+
+
+def test_noise_in_the_sums_is_that_of_the_closed_form():
+    """An integrator ``u(k) = u(k-1) + g y(k) + e(k)``.
+
+    With ``phi_cor(k) = u(k-1)`` the noise obeys ``r(k) = r(k-1) - g r(k-2) - e(k-1)``; its
+    variance is summed from its impulse response.
+    """
+    g, hardware = 0.3, lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    design = lbt.integrator(hardware, gain=g)
+    entry = replace(design.controller, B=[[1.0]], D=[[0.0]])
+    size = 0.05
+    seen = []
+
+    def variance(measured, commands):
+        seen.append((measured, commands))
+        return np.array([size])
+
+    own = replace(design.controller, A=[[1.0]], B=[[g]], C=[[1.0]], D=[[0.0]])
+    checks = prove_written(design, own, Rounding(entry=entry, variance=variance))
+    impulse = [0.0, 1.0]
+    for _ in range(400):
+        impulse.append(impulse[-1] - g * impulse[-2])
+    air = lbt.models.ARModel(
+        coefficients=[0.99], driving_rms_nm=np.sqrt(1 - 0.99**2), frame_rate_hz=800
+    )
+    truth = lbt.Truth(turbulence=air, noise_nm=0.1)
+    left = lbt.residual_budget(lbt.close_loop(hardware, own), truth).rms_nm ** 2
+    expected = np.sqrt(1 + size * np.sum(np.square(impulse)) / left) - 1
+    found = values(checks[1:2])["residual at sensor gain 1"]
+    assert found.value == pytest.approx(expected, rel=1e-9)
+    assert seen[0][0] ** 2 == pytest.approx(left + 0.01, rel=1e-9)  # y is the residual and noise
