@@ -20,6 +20,7 @@ from lbt_synth.cli.argument_kinds import (
     add_switch,
     add_unit,
 )
+from lbt_synth.cli.record_arguments import add_missing_facts, add_prior_knowledge, add_repairs
 
 
 def init(parser: ArgumentParser) -> None:
@@ -92,7 +93,6 @@ def export(parser: ArgumentParser) -> None:
 
 def sigma(parser: ArgumentParser) -> None:
     """Plot singular values of one or several designs."""
-    add_unit(parser)
     _add_view(parser)
 
 
@@ -117,6 +117,7 @@ def step(parser: ArgumentParser) -> None:
 
 
 def _add_view(parser: ArgumentParser) -> None:
+    add_unit(parser)
     add_gains(parser, "+")
     text = "real sensor gain, as a factor on the one that each design assumes"
     add_option(parser, "--sensor-gain", float, text, 1.0)
@@ -230,10 +231,10 @@ def league(parser: ArgumentParser) -> None:
     add_option(parser, "--entries", str, "those that compete (default: all)", nargs="+")
     _add_engine(parser)
     add_switch(parser, "--pdf", "write the page as a PDF, too (league.pdf)")
-    _add_missing_facts(parser)
-    _add_repairs(parser)
+    add_missing_facts(parser)
+    add_repairs(parser)
     _add_acceptance(parser)
-    _add_prior_knowledge(parser)
+    add_prior_knowledge(parser)
 
 
 def _add_acceptance(parser: ArgumentParser) -> None:
@@ -265,9 +266,9 @@ def _add_series(parser: ArgumentParser) -> None:
         help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
         "and commands, or an open-loop series (identify: or a spectrum)",
     )
-    _add_missing_facts(parser)
-    _add_repairs(parser)
-    _add_prior_knowledge(parser)
+    add_missing_facts(parser)
+    add_repairs(parser)
+    add_prior_knowledge(parser)
     add_option(parser, "--wavelength-um", float, "of Strehl ratios (default: the file's, or 2.2)")
 
 
@@ -276,61 +277,6 @@ def _add_record(parser: ArgumentParser) -> None:
     _add_acceptance(parser)
     add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
     add_switch(parser, "--no-figure", "write no figure")
-
-
-def _add_missing_facts(parser: ArgumentParser) -> None:
-    from lbt_synth.storage.display_unit import UNITS
-
-    facts = parser.add_argument_group("what the file does not say")
-    add_option(facts, "--kind", ("closed-loop", "open-loop", "spectrum"))
-    add_option(facts, "--frame-rate-hz", float, "frame rate [Hz]")
-    add_option(facts, "--delay-frames", float, "total delay [frames]")
-    text = "of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too"
-    add_option(facts, "--unit", str, text)
-    add_option(facts, "--show-unit", UNITS, "what results are shown in (JSON and CSV stay in nm)")
-    add_option(facts, "--command-unit", str, "of the commands (default: --unit)")
-    add_option(facts, "--diameter-m", float, "telescope diameter [m], for angles")
-    add_option(facts, "--obstruction", float, "as a fraction of the diameter")
-    add_option(facts, "--averages", int, "periodograms that a spectrum is the mean of")
-    add_option(facts, "--commands", str, "another file, with the commands")
-    text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4"
-    add_option(facts, "--columns", str, text, nargs="+", metavar="ROLE=NAME")
-    add_option(facts, "--axes", int, "which of several columns or modes, from 0", nargs="+")
-
-
-def _add_repairs(parser: ArgumentParser) -> None:
-    text = "what the commands need, in this order, to be those that the mirror followed"
-    needs = parser.add_argument_group("what the commands need", text)
-    add_switch(needs, "--command-increments", "they are increments: add them up")
-    text = "frames by which they move to later frames, or to earlier ones below 0"
-    add_option(needs, "--command-shift-frames", int, text, 0)
-    text = "largest command that was applied [nm], of both axes or of each"
-    add_option(needs, "--command-limit-nm", float, text, nargs="+", metavar="NM")
-    add_switch(needs, "--swap-axes", "exchange those of the two axes")
-    add_option(needs, "--command-sign", int, "1 or -1, of both axes or of each", nargs="+")
-    text = "turn them, from the first axis to the second [deg]"
-    add_option(needs, "--command-rotation-deg", float, text, 0.0)
-    text = "matrix from them to the axes of the measurements, row after row"
-    add_option(needs, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
-    text = "factor, of both axes or of each; 1 says that they were recorded as large as applied"
-    add_option(needs, "--command-scale", float, text, nargs="+")
-
-
-def _add_prior_knowledge(parser: ArgumentParser) -> None:
-    known = parser.add_argument_group("what is known beforehand")
-    add_option(known, "--sensor-gain", float, "sensor gain, of both axes or of each", nargs="+")
-    text = "sensor gain where the data do not determine it"
-    add_option(known, "--assumed-gain", float, text, 1.0)
-    add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
-    add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
-    add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")
-    text = (
-        "NPY or CSV with one column per sensor and one row per frame of the record: what is "
-        "coherent with it is expected as a line"
-    )
-    add_option(known, "--accelerometers", str, text)
-    add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
-    add_option(known, "--most-lines", int, "most vibrations per axis", 20)
 
 
 def robustness(parser: ArgumentParser) -> None:

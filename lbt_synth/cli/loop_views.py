@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.cli.display import choose_design_unit
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
@@ -58,6 +59,7 @@ def show_view(
     """Print the margins of designs, and write their figure and their points, rows of a kind."""
     require_outputs(arguments.output, inputs=arguments.gains)
     designs, gain = load_designs(arguments.gains), arguments.sensor_gain
+    choose_design_unit(arguments, *designs.values())
     report = Report()
     with show_spinner("drawing", quiet=arguments.json):
         add_margins(report, designs, gain)

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lbt_synth.cli.display import choose_design_unit
-from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.loop_views import show_view
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
@@ -30,8 +28,6 @@ class SigmaPoint:
 
 def run(arguments: Namespace) -> Report:
     """Plot singular values of one or several designs, and print their margins."""
-    if arguments.unit is not None:
-        choose_design_unit(arguments, *load_designs(arguments.gains).values())
     return show_view(arguments, sigma_figure, _points, SigmaPoint)
 
 

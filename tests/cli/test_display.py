@@ -33,6 +33,8 @@ COMMANDS = {
     "limits": (CONFIG, "{}/k.fits", "-o", "{}/l.svg"),
     "robustness": (CONFIG,),
     "sigma": ("{}/k.fits", "-o", "{}/g.svg"),
+    "bode": ("{}/k.fits",),
+    "step": ("{}/k.fits", "-o", "{}/t.svg"),
     "identify": ("{}/n.fits", "-o", "{}/i.yaml"),
 }
 
