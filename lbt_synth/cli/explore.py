@@ -35,7 +35,7 @@ def run(arguments: Namespace) -> Report:
 
     from lbt_synth.report.explore.server import Site, serve  # bokeh's server, slow to import
 
-    site, told = Site(exploration=exploration, first=first, folder=folder), []
+    site, served = Site(exploration=exploration, first=first, folder=folder), []
 
     def announce(url: str) -> None:
         stream = sys.stderr if arguments.json else sys.stdout
@@ -47,7 +47,7 @@ def run(arguments: Namespace) -> Report:
                 file=stream,
                 flush=True,
             )
-        told.append(url)
+        served.append(url)
 
     serve(
         site,
@@ -56,6 +56,6 @@ def run(arguments: Namespace) -> Report:
         origins=arguments.origin,
         announce=announce,
     )
-    report = Report(data={"url": told[0]})
+    report = Report(data={"url": served[0]})
     report.note_files(site.saved)
     return report
