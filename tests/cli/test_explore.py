@@ -10,7 +10,7 @@ import sys
 from urllib.request import urlopen
 
 import pytest
-from support.commands import run
+from support.commands import hear_interruptions, run
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
@@ -62,14 +62,17 @@ def test_it_serves_until_it_is_interrupted(tmp_path):
     words = ["explore", str(LBT_YAML), "--port", "0", "-o", str(tmp_path), "--json"]
     command = [sys.executable, "-m", "lbt_synth.cli.main", *words]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, **pipes) as process:
+    with subprocess.Popen(command, preexec_fn=hear_interruptions, **pipes) as process:
         try:
             url = process.stderr.readline().split()[1]
             with urlopen(url) as page:
                 text = page.read().decode()
         finally:
             process.send_signal(signal.SIGINT)
-        out, error = process.communicate(timeout=20)
+        try:
+            out, error = process.communicate(timeout=20)
+        finally:
+            process.kill()  # else the test would wait for ever
     assert "<title>Explore lbt.yaml</title>" in text
     assert 'id="delay"' in text
     assert (process.returncode, error) == (0, "")

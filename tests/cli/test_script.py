@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from support.commands import hear_interruptions
 
 PRESS = "os.kill(os.getpid(), _signal.SIGINT)"
 AS_IT_LOADS = f"""
@@ -28,7 +29,13 @@ SCRIPT = "from lbt_synth.cli.script import entry_point; entry_point()"
 
 def python(code):
     code = f"import _signal, os, sys; sys.argv = ['lbt-synth', 'show', 'none.fits']\n{code}"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=hear_interruptions,
+    )
 
 
 def test_nothing_is_imported_before_interruptions_are_safe():

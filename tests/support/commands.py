@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import signal
+
 from lbt_synth.cli.main import main
+
+
+def hear_interruptions():
+    """Let a new process be interrupted where the tests run in a background that ignores it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def run(capsys, *arguments):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+from support.commands import hear_interruptions
 from support.configs import change_key
 
 FIVE_LINES = ((13.0, 40.0), (20.0, 80.0), (33.0, 20.0), (48.0, 10.0), (72.5, 8.0))  # Hz, mas
@@ -29,7 +30,9 @@ def served(config, *gains, folder):
     """Serve the page; yield its address, and end as Ctrl-C does."""
     words = ["explore", str(config), *map(str, gains), "--port", "0", "-o", str(folder)]
     command = [sys.executable, "-m", "lbt_synth.cli.main", *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, preexec_fn=hear_interruptions
+    ) as process:
         try:
             yield process.stdout.readline().split()[1]
         finally:
