@@ -63,7 +63,7 @@ def run(arguments: Namespace) -> Report:
         stable_single=math.isfinite(written.error_single),
     )
     report.data |= {"frame_cost": json_record(cost), **json_record(facts)}
-    report.tables.append(fact_table("Export", facts, *([cost] if arguments.target == "c" else [])))
+    report.tables.append(fact_table("Export", facts, *([cost] if target.costs_counted else [])))
     if written.checks:
         report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
     report.notes += _precision_notes(arguments, written)

@@ -45,6 +45,8 @@ class Target:
         Ending of the file that goes beside it, if there is one.
     options : tuple of str
         Options of ``write`` that the command line offers.
+    costs_counted : bool
+        Whether the counted cost of a frame is that of what is written.
     """
 
     arithmetic: Arithmetic
@@ -52,6 +54,7 @@ class Target:
     write: Callable[..., Exported]
     beside: str = ""
     options: tuple[str, ...] = ()
+    costs_counted: bool = False
 
 
 def target_names() -> tuple[str, ...]:

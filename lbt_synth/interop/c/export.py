@@ -265,4 +265,5 @@ TARGET = Target(
     write=export_c,
     beside=".h",
     options=("precision", "name"),
+    costs_counted=True,
 )

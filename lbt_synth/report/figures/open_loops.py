@@ -87,21 +87,29 @@ def axes_name(design: str, measurements: Sequence[int], *, alone: bool) -> str:
 
 def open_loops(designs: Mapping[str, Design], *, sensor_gain: float = 1.0) -> list[OpenLoop]:
     """Break the loop of each design; equal axes are one."""
-    found = []
-    for look, (design, loop) in enumerate(closed_loops(designs, sensor_gain).items()):
-        groups = broken_loops(loop) if loop.is_stable else (None,)
-        for number, broken in enumerate(groups):
-            alone, axes = len(groups) == 1, () if broken is None else broken.measurements
-            found.append(
-                OpenLoop(
-                    design=design,
-                    name=axes_name(design, axes, alone=alone),
-                    look=look,
-                    dash=look + number if number else None,
-                    broken=broken,
-                )
-            )
-    return found
+    loops = closed_loops(designs, sensor_gain)
+    return [
+        each
+        for look, (design, loop) in enumerate(loops.items())
+        for each in _break_loop(design, loop, look)
+    ]
+
+
+def _break_loop(design: str, loop: ClosedLoop, look: int) -> list[OpenLoop]:
+    """Break the loop of one design."""
+    groups = broken_loops(loop) if loop.is_stable else (None,)
+    return [
+        OpenLoop(
+            design=design,
+            name=axes_name(
+                design, () if broken is None else broken.measurements, alone=len(groups) == 1
+            ),
+            look=look,
+            dash=look + number if number else None,
+            broken=broken,
+        )
+        for number, broken in enumerate(groups)
+    ]
 
 
 def bode_figure(
@@ -206,10 +214,10 @@ def nyquist_figure(
     minus = _mark("critical point", [-1.0], [0.0], "cross")
     for name, loop in loops.items():
         marks, title = [unit, *minus], f"{name}: unstable"
-        found = open_loops({name: designs[name]}, sensor_gain=sensor_gain) if loop.is_stable else []
-        for each in found:
-            marks += _nyquist_marks(each, number=found.index(each), alone=len(found) == 1)
-        if found:
+        if loop.is_stable:
+            found = _break_loop(name, loop, look=0)
+            for number, each in enumerate(found):
+                marks += _nyquist_marks(each, number=number, alone=len(found) == 1)
             margins = loop_margins(loop)
             low, high = margins.disk_gain_low, min(margins.disk_gain_high, 1e3)
             for label, centre, radius, look in (
