@@ -28,6 +28,12 @@ def lock_file(handle: int) -> bool:
     return False
 
 
+def unlock_file(handle: int) -> None:
+    """Release a lock at once: a process that is being started holds a copy of each open file."""
+    if CAN_LOCK:
+        fcntl.flock(handle, fcntl.LOCK_UN)
+
+
 @contextlib.contextmanager
 def exclusive_lock(folder: Path, what: str) -> Iterator[None]:
     """Hold a lock on a directory."""
@@ -45,4 +51,5 @@ def exclusive_lock(folder: Path, what: str) -> Iterator[None]:
             )
         yield
     finally:
+        unlock_file(handle)
         os.close(handle)

@@ -7,6 +7,7 @@ import os
 import pytest
 
 from lbt_synth.errors import OutputError
+from lbt_synth.storage import file_locks
 from lbt_synth.storage.file_locks import exclusive_lock
 
 
@@ -43,3 +44,23 @@ def test_one_at_a_time(tmp_path):
             pass
     with exclusive_lock(tmp_path, "run"):
         pass
+
+
+def test_a_copy_of_the_open_file_keeps_no_lock(tmp_path, monkeypatch):
+    """A worker that another thread starts has one for a moment, between fork and exec."""
+    copies = []
+
+    def open_and_copy(path, flags):
+        handle = os.open(path, flags)
+        copies.append(os.dup(handle))
+        return handle
+
+    monkeypatch.setattr(file_locks, "open_regular", open_and_copy)
+    try:
+        for _ in range(2):
+            with exclusive_lock(tmp_path, "run"):
+                pass
+    finally:
+        for copy in copies:
+            os.close(copy)
+    assert len(copies) == 2
