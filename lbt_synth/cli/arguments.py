@@ -85,9 +85,9 @@ def export(parser: ArgumentParser) -> None:
     text = "c: prefix of the C names (default: the output's name without its ending)"
     add_option(parser, "--name", str, text)
     add_option(parser, "--order", int, "dao: M of the RTC's configuration (default 20)")
-    text = "dao: columns of the matrix (default: the modes of the design)"
+    text = "dao, pyrtc: modes of the RTC (default: those of the design)"
     add_option(parser, "--modes", int, text)
-    text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy"
+    text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy; pyrtc: folder"
     add_output(parser, text)
 
 

@@ -44,8 +44,10 @@ def run(arguments: Namespace) -> Report:
                 f"--{option} goes with --for {fitting}; got --for {arguments.target}."
             )
     output = Path(arguments.output)
-    beside = [output.parent / (output.stem + target.beside)] if target.beside else []
-    require_writable(output, *beside, inputs=[arguments.gain])
+    places = [output, *([output.parent / (output.stem + target.beside)] if target.beside else [])]
+    if target.contents and output.is_dir():
+        places = [output / name for name in target.contents]
+    require_writable(*places, inputs=[arguments.gain])
     design, digest = load_with_digest(arguments.gain)
     with show_spinner("exporting", quiet=arguments.json):
         written = target.write(output, design, gain_digest=digest, **options)

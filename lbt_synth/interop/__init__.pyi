@@ -5,7 +5,8 @@ from .dao.export import export_dao as export_dao
 from .export_checks import Exported as Exported
 from .iir.export import export_iir as export_iir
 from .matlab.export import export_mat as export_mat
-from .pyrtc import pyrtc_commands as pyrtc_commands
+from .pyrtc.export import export_pyrtc as export_pyrtc
+from .pyrtc.replay import pyrtc_commands as pyrtc_commands
 from .specula.calibration import Calibration as Calibration
 from .specula.calibration import calibrate as calibrate
 from .specula.end_to_end_run import EndToEndRun as EndToEndRun

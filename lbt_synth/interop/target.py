@@ -43,6 +43,8 @@ class Target:
         ``write(path, design, gain_digest=..., **options)``, which returns an :class:`Exported`.
     beside : str
         Ending of the file that goes beside it, if there is one.
+    contents : tuple of str
+        Names of the files, where the target writes a folder.
     options : tuple of str
         Options of ``write`` that the command line offers.
     costs_counted : bool
@@ -53,6 +55,7 @@ class Target:
     file: str
     write: Callable[..., Exported]
     beside: str = ""
+    contents: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
     costs_counted: bool = False
 
@@ -69,7 +72,7 @@ def target_names() -> tuple[str, ...]:
     --------
     >>> from lbt_synth.interop.target import target_names
     >>> target_names()
-    ('c', 'dao', 'iir', 'matlab')
+    ('c', 'dao', 'iir', 'matlab', 'pyrtc')
     """
     exports = Path(__file__).parent.glob("*/export.py")
     return tuple(sorted(path.parent.name for path in exports))

@@ -18,4 +18,4 @@ def test_a_target_says_how_it_computes(name):
 
 
 def test_each_folder_with_an_export_is_a_target():
-    assert target_names() == ("c", "dao", "iir", "matlab")
+    assert target_names() == ("c", "dao", "iir", "matlab", "pyrtc")

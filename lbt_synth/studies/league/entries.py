@@ -22,7 +22,7 @@ from lbt_synth.identification import (
     least_squares_predictor,
     spectral_design,
 )
-from lbt_synth.interop.pyrtc import pyrtc_commands, pyrtc_version
+from lbt_synth.interop.pyrtc.replay import pyrtc_commands, pyrtc_version
 from lbt_synth.methods.registry import method_named, plant_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models.loop_hardware import past_corrections

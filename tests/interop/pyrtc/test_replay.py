@@ -7,7 +7,8 @@ import pytest
 from scipy.signal import lfilter
 
 from lbt_synth.errors import MissingExtraError, ProblemError
-from lbt_synth.interop import pyrtc, pyrtc_commands
+from lbt_synth.interop import pyrtc_commands
+from lbt_synth.interop.pyrtc import replay as pyrtc
 
 WHITE = np.random.default_rng(0).standard_normal((3000, 2))
 SLOW = lfilter([1], [1, -0.9], WHITE, axis=0)

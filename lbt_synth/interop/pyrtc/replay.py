@@ -1,4 +1,4 @@
-"""The predictors of pyRTC on a recorded series; the only module that imports pyrtc."""
+"""The predictors of pyRTC on a recorded series."""
 
 from __future__ import annotations
 
@@ -67,10 +67,11 @@ def pyrtc_commands(
             'the predictors of pyRTC need pyrtcao; try: pip install "lbt-synth[pyrtc]".',
             extra="pyrtc",
         )
-    from pyrtc.predictive import make_predictor
+    from lbt_synth.interop.pyrtc import plugin
 
     try:
-        predictor = make_predictor({"type": kind, "horizon": frames_ahead}, past.shape[1])
+        options = {"type": kind, "horizon": frames_ahead}
+        predictor = plugin.register().make_predictor(options, past.shape[1])
         predictor.fit(past)
         predictor.reset()
         commands = np.zeros(now.shape)

@@ -1,0 +1,1 @@
+"""Our controllers as predictors of pyRTC, and its predictors on recorded series."""

@@ -1,0 +1,195 @@
+"""Export a controller as a configuration that pyRTC starts."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from lbt_synth.design import Check, Design
+from lbt_synth.errors import NumericalError, OutputError
+from lbt_synth.files import save_gain
+from lbt_synth.interop.export_checks import (
+    Exported,
+    join_labels,
+    provenance_lines,
+    rehearsal_error,
+    require_exportable,
+)
+from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
+from lbt_synth.interop.pyrtc.pol_filter import PolFilter, pol_filter
+from lbt_synth.interop.target import Arithmetic, Target
+from lbt_synth.interop.written_loop import prove_written
+from lbt_synth.storage.atomic_files import write_together
+from lbt_synth.storage.rows import json_record
+from lbt_synth.validation import FloatArray, integer
+
+_FIT_SECONDS = 20.0  # of pseudo-open-loop series that fit_predictor identifies
+_CONFIG, _GAIN, _RESPONSE = "config.yaml", "gain.fits", "interaction_matrix.npz"
+_CERTIFICATE = "certificate.json"
+_SYSTEM = """\
+{origin}
+#
+# wfs, slopes and wfc stand in for hardware, which a simulation drives. Replace them and
+# loop.im_file by those of your system. Residuals are in units of the commands, and the first modes
+# of the loop are those of the gain file.
+manager:
+  mode: soft-rtc
+wfs:
+  class_name: pyrtc.component.Component
+slopes:
+  class_name: lbt_synth.interop.pyrtc.plugin.SimulatedTelescope
+  signal_size: {size}
+wfc:
+  class_name: pyrtc.wavefront_corrector.WavefrontCorrector
+  name: simulated
+  num_actuators: {size}
+  num_modes: {size}
+loop:
+  class_name: lbt_synth.interop.pyrtc.plugin.Loop  # that of pyRTC; the name registers lbt_synth
+  functions: [predictive_integrator]
+  im_file: {response}
+  gain: 1.0  # a smaller one is another loop than the one that was designed
+  predictor:
+    type: lbt_synth
+    gain_file: {gain}
+    delay_frames: {delay}
+    fit_frames: {fit}
+    other_gain: 0.0  # of the integrator of all further modes
+"""
+
+
+def export_pyrtc(
+    path: str | os.PathLike[str],
+    design: Design,
+    *,
+    modes: int | None = None,
+    gain_digest: str | None = None,
+) -> Exported:
+    """Write a folder with a configuration that pyRTC starts, and all that it refers to.
+
+    The gain file goes into the folder; inside pyRTC it is certified again before it runs. pyRTC
+    computes signals and commands in single precision, and the predictor is a stable filter in
+    double precision. The loop is closed around that arithmetic before anything is written.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder to write; it is made if its parent is there.
+    design : Design
+        Design with as many measurements as commands.
+    modes : int, optional
+        Modes of the loop; by default those of the design. Further ones get no command.
+    gain_digest : str, optional
+        SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
+
+    Returns
+    -------
+    Exported
+        Configuration, gain file, interaction matrix and certificate, the error of the commands
+        in pyRTC's arithmetic, and the checks.
+
+    Raises
+    ------
+    OutputError
+        If the folder or a file cannot be written.
+    ProblemError
+        If the design is not of such a loop.
+    CertificateError
+        If the certificate that the design carries has a failed check.
+    NumericalError
+        If a check fails in the arithmetic of pyRTC; ``residual`` holds its value.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, tempfile, pathlib
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     written = lbt.interop.export_pyrtc(pathlib.Path(folder) / "slow", slow)
+    ...     sorted(file.name for file in written.files)
+    ['certificate.json', 'config.yaml', 'gain.fits', 'interaction_matrix.npz']
+    """
+    folder = Path(path)
+    require_exportable(design)
+    found = pol_filter(design)
+    own = len(found.response)
+    size = own if modes is None else integer(modes, "modes", at_least=own)
+    origin = "\n".join(f"# {line}" for line in join_labels(provenance_lines(design, gain_digest)))
+    checks = prove_written(design, *found.as_computed())
+    _require_passed(checks)
+    single = rehearsal_error(design, InnerLoop(design))
+    contents = {
+        _CONFIG: _write_system(found, origin, size).encode(),
+        _RESPONSE: _response_bytes(block_diag(found.response, np.eye(size - own))),
+    }
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the directory {folder}: {error.strerror}.", path=folder
+        ) from error
+    contents[_GAIN] = save_gain(folder / _GAIN, design).read_bytes()
+    certificate = {
+        "target": "pyrtc",
+        "gain_sha256": gain_digest,
+        "files_sha256": {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()},
+        "delay_frames": found.delay_frames,
+        "arithmetic": json_record(TARGET.arithmetic),
+        "checks": [json_record(check) for check in checks],
+    }
+    contents[_CERTIFICATE] = (json.dumps(certificate, indent=2, allow_nan=False) + "\n").encode()
+    files = write_together({folder / name: data for name, data in contents.items()})
+    return Exported(files=files, error=single, error_single=single, checks=checks)
+
+
+def _require_passed(checks: tuple[Check, ...]) -> None:
+    """Refuse the export with the first check that fails."""
+    for check in checks:
+        if not check.passed:
+            raise NumericalError(
+                "the loop must keep what its design promises in the arithmetic of pyRTC; "
+                f"{check.name} is {check.value:.6g}, limit {check.limit:.6g}.",
+                status="arithmetic",
+                residual=check.value,
+            )
+
+
+def _write_system(found: PolFilter, origin: str, size: int) -> str:
+    """Return the configuration of a system of that many modes."""
+    return _SYSTEM.format(
+        origin=origin,
+        size=size,
+        response=_RESPONSE,
+        gain=_GAIN,
+        delay=found.delay_frames,
+        fit=int(_FIT_SECONDS / found.system.dt_s),
+    )
+
+
+def _response_bytes(response: FloatArray) -> bytes:
+    """Write an interaction matrix as pyRTC does: the matrix, and a record of what it is."""
+    record = {"format": 2, "kind": "interaction_matrix", "image_axes": "yx"}
+    buffer = io.BytesIO()
+    np.savez(buffer, data=response, pyrtc_calibration=np.array(json.dumps(record)))
+    return buffer.getvalue()
+
+
+TARGET = Target(
+    arithmetic=Arithmetic(
+        program="pyRTC, its loop predictive_integrator",
+        precision="single for signals and commands, double in the controller",
+        sums="matrix products, in an order of their library",
+        state="of a stable filter, fed with the residual and the command sent delay_frames before",
+        clipping="predictor.command_limit in the controller; what the corrector clips is not seen",
+        limits="as many measurements as commands",
+    ),
+    file="folder with the configuration, the gain file and their certificate",
+    write=export_pyrtc,
+    contents=(_CONFIG, _GAIN, _RESPONSE, _CERTIFICATE),
+    options=("modes",),
+)

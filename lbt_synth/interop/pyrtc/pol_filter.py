@@ -1,0 +1,160 @@
+"""A controller as the stable filter that pyRTC feeds with its pseudo-open-loop series.
+
+pyRTC measures ``residual(k) = phase - c[0] u(k-1) - c[1] u(k-2) - ..``, in units of its commands,
+and gives the predictor ``residual(k) + u(k-d)``, with the command that it *sent* d frames before.
+The filter that returns the controller's commands is the controller in its own loop: what it knows
+of the phase does not depend on its past commands, so that nothing winds up. Where the mirror's
+answer c is not a delay of d frames, the filter corrects the series by the commands that it sent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.interop.written_loop import Rounding
+from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.loop import close_loop
+from lbt_synth.validation import FloatArray
+
+_ROUNDOFF = 2.0**-24  # largest relative error of an operation in single precision
+_LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single precision
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PolFilter:
+    """A controller in the units of pyRTC's commands.
+
+    Attributes
+    ----------
+    delay_frames : int
+        Frames after which pyRTC takes a command away.
+    response : (m, m) ndarray
+        From commands to measurements: its interaction matrix.
+    taps : (frames,) ndarray
+        What the last commands, u(k-1) first, are of the correction that measurement k sees.
+    system : StateSpace
+        From the phase and noise without a correction to the command u, (m,) each; stable.
+    """
+
+    delay_frames: int
+    response: FloatArray
+    taps: FloatArray
+    system: StateSpace
+
+    @property
+    def reconstructor(self) -> FloatArray:
+        """From measurements to residuals, (m, m), in the precision of pyRTC."""
+        return np.linalg.pinv(self.response).astype(np.float32).astype(np.float64)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the series of pyRTC needs no correction."""
+        return not np.any(self._tap_error())
+
+    def _tap_error(self) -> FloatArray:
+        """Return what pyRTC leaves of the last commands in its series, (frames,)."""
+        out = self.taps.copy()
+        out[self.delay_frames - 1] -= 1
+        return out
+
+    def start(self, limit: float = np.inf) -> RunningPolFilter:
+        """Return the filter with a memory of its own; it clips commands at the limit."""
+        return RunningPolFilter(system=self.system, tap_error=self._tap_error(), limit=limit)
+
+    def as_computed(self) -> tuple[Controller, Rounding]:
+        """Return the controller that pyRTC's loop computes, and what its arithmetic adds.
+
+        The states are those of the filter and the commands sent; noise enters the residual and
+        the command that is sent.
+        """
+        s, R, m, d = self.system, self.reconstructor, len(self.response), len(self.taps)
+        n = s.n_states
+        A = np.zeros((n + d * m, n + d * m))
+        A[: n + m, :n] = np.vstack([s.A, s.C])
+        A[n + m :, n:-m] = np.eye((d - 1) * m)
+        entry = np.zeros((len(A), 2 * m))
+        entry[: n + m, :m] = np.vstack([s.B, s.D])
+        entry[n : n + m, m:] = np.eye(m)
+        A[:, n:] += np.kron(self.taps, entry[:, :m])
+        C = np.zeros((m, len(A)))
+        C[:, n : n + m] = np.eye(m)  # the command sent, in the new state
+        whole = Controller(A=A, B=entry[:, :m] @ R, C=C, D=np.zeros((m, m)), dt_s=s.dt_s)
+
+        def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+            """Bound the rounding of the signal, of its product, of the sum and of the command."""
+            terms = np.abs(R) * measured
+            residual = np.sum(terms, axis=1)
+            squares = [
+                2 * np.sum(terms**2, axis=1)
+                + np.sum(np.cumsum(terms, axis=1) ** 2, axis=1)
+                + (residual + commands) ** 2,
+                commands**2,
+            ]
+            return np.asarray(_ROUNDOFF**2 / 3 * np.concatenate(squares))
+
+        return whole, Rounding(
+            entry=replace(whole, B=entry, D=np.zeros((m, 2 * m))), variance=variance
+        )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class RunningPolFilter:
+    """A filter with its state, and the commands that it sent, (frames, m), the last first."""
+
+    system: StateSpace
+    tap_error: FloatArray
+    limit: float
+    state: FloatArray = field(init=False)
+    sent: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self.state = np.zeros(self.system.n_states)
+        self.sent = np.zeros((len(self.tap_error), len(self.system.C)))
+
+    def step(self, pol: FloatArray, *, flat: bool = False) -> FloatArray:
+        """Take the series of pyRTC, (m,), return the command u that it sends, (m,).
+
+        Values that are not finite leave the state as it is, and repeat the last command. ``flat``
+        sends zeros.
+        """
+        s, u = self.system, self.sent[0]
+        if np.isfinite(pol).all():
+            seen = pol + self.tap_error @ self.sent
+            u = np.clip(s.C @ self.state + s.D @ seen, -self.limit, self.limit)
+            self.state = s.A @ self.state + s.B @ seen
+        sent = 0 * u if flat else u.astype(np.float32).astype(np.float64)
+        self.sent = np.vstack([sent, self.sent[:-1]])
+        return np.asarray(sent)
+
+
+def pol_filter(design: Design) -> PolFilter:
+    """Return the filter that gives a design's commands in pyRTC; refuse a loop it cannot hold."""
+    hardware = design.hardware
+    if hardware is None:
+        raise ProblemError("pyRTC needs the design of a loop; got a bare controller.")
+    response = hardware.sensor @ hardware.influence
+    q, m = response.shape
+    if q != m or np.linalg.cond(response) > _LARGEST_CONDITION:
+        raise ProblemError(
+            "pyRTC's predictors get one residual per command, so that the commands must show in "
+            f"as many measurements; got {q} measurements of {m} commands, with a condition number "
+            f"of {np.linalg.cond(response):.3g} (limit {_LARGEST_CONDITION:g}). Design for the "
+            "modes."
+        )
+    own = design.controller
+    own = replace(own, B=own.B @ response, D=own.D @ response)
+    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
+    whole = close_loop(modal, own).commanding()
+    delay = max(1, int(hardware.delay_frames + 0.5))
+    taps = np.zeros(max(delay, len(hardware.mirror_taps)))
+    taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
+    system = replace(whole, B=whole.B[:, m:], D=whole.D[:, m:])
+    return PolFilter(delay_frames=delay, response=response, taps=taps, system=system)

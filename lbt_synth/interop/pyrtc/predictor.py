@@ -1,0 +1,114 @@
+"""The controller of a gain file as a predictor of pyRTC."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import load_gain
+from lbt_synth.identification import design_from_record, loop_record
+from lbt_synth.interop.pyrtc.pol_filter import pol_filter
+from lbt_synth.methods.registry import method_of_design, record_methods
+from lbt_synth.validation import FloatArray, integer, matrix, number
+
+
+class GainFilePredictor:
+    """The controller of a gain file, which is certified again before it runs.
+
+    The first frames, which fill the loop's memory of commands, get the command 0. A residual that
+    is not finite leaves the filter as it is, and repeats the last command.
+
+    Parameters
+    ----------
+    num_modes : int
+        Modes of the loop; those of the gain file come first.
+    horizon : int
+        Frames from a command to the residual that shows it: ``delay_frames`` of the configuration.
+    gain_file : path-like
+        Gain file of the controller.
+    other_gain : float, optional
+        Gain of the integrator of all further modes.
+    command_limit : float, optional
+        Largest modulus of a command: the loop does not see what a corrector clips.
+    """
+
+    def __init__(
+        self,
+        num_modes: int,
+        horizon: int = 2,
+        *,
+        gain_file: str,
+        other_gain: float = 0.0,
+        command_limit: float | None = None,
+    ) -> None:
+        self.num_modes = integer(num_modes, "num_modes", at_least=1)
+        self.horizon = integer(horizon, "predictor.delay_frames", at_least=1)
+        self.fitted = False
+        self._other_gain = number(other_gain, "predictor.other_gain", at_least=0, at_most=1)
+        self._limit = np.inf
+        if command_limit is not None:
+            self._limit = number(command_limit, "predictor.command_limit", above=0)
+        self._gain_file = gain_file
+        self._take(load_gain(gain_file))
+
+    def _take(self, design: Design) -> None:
+        """Run another design, from a state of zero."""
+        found = pol_filter(design)
+        if found.delay_frames != self.horizon:
+            raise ProblemError(
+                f"predictor.delay_frames must be {found.delay_frames}, that of {self._gain_file}; "
+                f"got {self.horizon}. Design for the delay of this loop."
+            )
+        self._own = len(found.response)
+        if self._own > self.num_modes:
+            raise ProblemError(
+                f"the loop must control at least the {self._own} modes of {self._gain_file}; got "
+                f"{self.num_modes}. Lower loop.num_dropped_modes, or raise wfc.num_modes."
+            )
+        self._design, self._found, self._filter = design, found, found.start(self._limit)
+        self.reset()
+
+    def fit(self, pol_history: ArrayLike) -> GainFilePredictor:
+        """Identify the loop from its pseudo-open-loop series, and design for it again.
+
+        The method is that of the gain file, or the best one where that needs more than a record.
+        """
+        history = matrix(pol_history, "pol_history")[:, : self._own]
+        hardware = self._design.hardware
+        assert hardware is not None  # pol_filter refuses others
+        if not self._found.is_whole:
+            raise ProblemError(
+                "pyRTC's series is the phase for a mirror that settles at once and a delay of "
+                f"whole frames; that of {self._gain_file} is another. Try lbt-synth auto on a "
+                "record."
+            )
+        record = loop_record(
+            history, frame_rate_hz=hardware.frame_rate_hz, delay_frames=self.horizon, unit="nm"
+        )
+        method = method_of_design(self._design.method).name
+        known = method if method in record_methods() else None
+        self._take(design_from_record(record, method=known).design)
+        self.fitted = True
+        return self
+
+    def update(self, pol: ArrayLike) -> None:
+        """Take the pseudo-open-loop values of a frame, (modes,)."""
+        now = np.asarray(pol, dtype=np.float64).reshape(self.num_modes)
+        flat, own, rest = self._frames < self.horizon, slice(self._own), slice(self._own, None)
+        self._command[own] = self._filter.step(now[own], flat=flat)
+        if not flat and np.isfinite(now[rest]).all():
+            moved = self._command[rest] + self._other_gain * (now[rest] - self._command[rest])
+            self._command[rest] = np.clip(moved, -self._limit, self._limit)
+        self._frames += 1
+
+    def predict(self) -> FloatArray:
+        """Return the command with pyRTC's sign, the phase that it will cancel, (modes,)."""
+        return self._command.copy()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._filter.reset()
+        self._command: FloatArray = np.zeros(self.num_modes)
+        self._frames = 0

@@ -1,0 +1,109 @@
+"""The filter that gives a controller's commands from pyRTC's pseudo-open-loop series."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.exports import bare_design, lbt_designs
+from support.gain_file_edits import odd_plant
+
+import lbt_synth as lbt
+from lbt_synth.interop.pyrtc.pol_filter import pol_filter
+
+PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+
+
+def slow_mirror():
+    """A design for a mirror that moves for many frames."""
+    shell = lbt.models.PositionLoop.from_bandwidth(
+        natural_frequency_hz=50, damping=0.5, bandwidth_hz=150
+    )
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        modes=1,
+        turbulence=lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10, frame_rate_hz=800),
+        noise_nm=5.0,
+        mirror=shell,
+    )
+    return lbt.lqg(plant)
+
+
+DESIGNS = {
+    "kalman": lambda: lbt_designs()["kalman"],
+    "hinf": lambda: lbt_designs()["hinf"],
+    "integrator": lambda: lbt_designs()["integrator"],
+    "quick": lambda: lbt.integrator(replace(PATH, delay_frames=1.0), gain=0.4),
+    "odd": lambda: lbt.kalman(odd_plant()),
+    "slow": slow_mirror,
+}
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_what_pyrtc_computes_is_the_controller(name):
+    design = DESIGNS[name]()
+    found = pol_filter(design)
+    assert found.is_whole == (name not in ("odd", "slow"))
+    assert found.system.spectral_radius < 1
+    frequencies = np.array([0.5, 10.0, 20.0, 60.0, 399.0])
+    expected, written = (
+        c.to_statespace().frequency_response(frequencies)
+        for c in (design.controller, found.as_computed()[0])
+    )
+    # matrices that are not the identity are inverted in single precision
+    tolerance = 1e-6 if name == "odd" else 1e-12
+    assert np.max(np.abs(written - expected)) < tolerance * np.max(np.abs(expected))
+
+
+def test_a_controller_that_is_unstable_alone_becomes_a_stable_filter():
+    design = lbt_designs()["kalman"]
+    assert np.max(np.abs(np.linalg.eigvals(design.controller.A))) > 1.03
+    assert pol_filter(design).system.spectral_radius < 0.97
+
+
+def test_the_filter_of_an_integrator_in_closed_form():
+    """With u+ = u + g y and pol = y + u two frames ago: u(k) = u(k-1) + g (pol(k) - u(k-2))."""
+    running, u = pol_filter(lbt.integrator(PATH, gain=0.4)).start(), [0.0, 0.0]
+    for pol in np.random.default_rng(0).standard_normal(50):
+        u.append(u[-1] + 0.4 * (pol - u[-2]))
+        assert running.step(np.array([pol]))[0] == pytest.approx(u[-1], rel=1e-6)
+
+
+def test_the_noise_of_the_arithmetic_in_closed_form():
+    """Rounding enters the residual, and the command where it is sent."""
+    design = lbt.integrator(PATH, gain=0.4)
+    whole, rounding = pol_filter(design).as_computed()
+    entry = rounding.entry.to_statespace().frequency_response([30.0])[0, 0]
+    z = np.exp(2j * np.pi * 30.0 / 800)
+    own = 0.4 / (1 - 1 / z)
+    assert whole.to_statespace().frequency_response([30.0])[0, 0, 0] == pytest.approx(own)
+    # a command that is off by e is known to be: u = own (y + z^-2 e) + e
+    assert entry == pytest.approx([own, 1 + own / z**2])
+    ulp = 2.0**-24 / np.sqrt(3)
+    assert np.sqrt(rounding.variance(np.array([3.0]), np.array([4.0]))) == pytest.approx(
+        [ulp * np.sqrt(3 * 9 + 49), ulp * 4]
+    )
+
+
+BAD = [
+    (bare_design(lbt_designs()["kalman"].controller), lbt.errors.ProblemError, "bare controller"),
+    (
+        lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0], [0.5]]), gain=0.3),
+        lbt.errors.ProblemError,
+        "got 2 measurements of 1 commands",
+    ),
+    (
+        lbt.integrator(
+            lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0, 0.0], [0.0, 1e-5]]), gain=0.3
+        ),
+        lbt.errors.ProblemError,
+        r"a condition number of 1e\+05 \(limit 10000\)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("design", "error", "text"), BAD)
+def test_a_loop_that_pyrtc_cannot_hold_is_refused(design, error, text):
+    with pytest.raises(error, match=text):
+        pol_filter(design)

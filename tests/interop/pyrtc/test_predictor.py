@@ -1,0 +1,113 @@
+"""The predictor that pyRTC runs, without pyRTC."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.exports import lbt_designs
+from support.gain_file_edits import odd_plant
+
+import lbt_synth as lbt
+from lbt_synth.interop.pyrtc.pol_filter import pol_filter
+from lbt_synth.interop.pyrtc.predictor import GainFilePredictor
+
+LAZY = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5)
+
+
+@pytest.fixture(scope="module")
+def gains(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("gains")
+    for name in ("kalman", "integrator"):
+        lbt.save_gain(folder / f"{name}.fits", lbt_designs()[name])
+    lbt.save_gain(folder / "odd.fits", lbt.kalman(odd_plant()))
+    lbt.save_gain(folder / "lazy.fits", LAZY)
+    return folder
+
+
+def run(predictor, series):
+    out = []
+    for pol in series:
+        predictor.update(pol)
+        out.append(predictor.predict())
+    return np.array(out)
+
+
+def test_it_predicts_as_the_filter_after_the_frames_of_the_delay(gains):
+    series = np.random.default_rng(0).standard_normal((200, 2)).astype(np.float32)
+    predictor = GainFilePredictor(2, gain_file=gains / "kalman.fits")
+    for _ in range(2):  # reset brings back the start
+        running = pol_filter(lbt_designs()["kalman"]).start()
+        own = np.array([running.step(pol.astype(float)) for pol in series])
+        found = run(predictor, series)
+        assert np.array_equal(found[2:], own[2:])
+        assert not np.any(found[:2])
+        predictor.reset()
+
+
+def test_a_value_that_is_not_finite_repeats_the_last_command(gains):
+    series = np.random.default_rng(0).standard_normal((50, 2))
+    spoilt = np.insert(series, 20, [np.nan, 1.0], axis=0)
+    clean, other = (
+        run(GainFilePredictor(2, gain_file=gains / "kalman.fits"), s) for s in (series, spoilt)
+    )
+    assert np.array_equal(other[20], clean[19])
+    assert np.array_equal(np.delete(other, 20, axis=0), clean)
+
+
+def test_further_modes_have_an_integrator_and_all_are_clipped(gains):
+    predictor = GainFilePredictor(2, gain_file=gains / "lazy.fits", other_gain=0.25)
+    assert run(predictor, np.ones((4, 2)))[:, 1].tolist() == [0.0, 0.0, 0.25, 0.4375]
+    held = GainFilePredictor(2, gain_file=gains / "lazy.fits", command_limit=0.75)
+    assert run(held, np.ones((4, 2))).tolist() == [[0, 0], [0, 0], [0.75, 0], [0.75, 0]]
+
+
+BAD = [
+    ({"horizon": 3}, "predictor.delay_frames must be 2, that of"),
+    ({"num_modes": 1}, "must control at least the 2 modes of"),
+    ({"other_gain": 1.5}, "predictor.other_gain must be at most 1"),
+    ({"command_limit": 0}, "predictor.command_limit must be above 0"),
+]
+
+
+@pytest.mark.parametrize(("options", "text"), BAD)
+def test_what_does_not_fit_is_refused(gains, options, text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        GainFilePredictor(**{"num_modes": 2, "gain_file": gains / "integrator.fits", **options})
+
+
+def test_a_damaged_gain_file_is_one_sentence(gains, tmp_path):
+    content = bytearray((gains / "kalman.fits").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "bad.fits").write_bytes(content)
+    with pytest.raises(
+        lbt.errors.GainFileError, match=r"bad.fits is no gain file, or it is damaged"
+    ) as caught:
+        GainFilePredictor(2, gain_file=tmp_path / "bad.fits")
+    assert "\n" not in str(caught.value)
+
+
+def test_fit_identifies_the_series_and_designs_for_it(gains):
+    rng = np.random.default_rng(0)
+    turns = 2 * np.pi * 31.0 / 800 * np.arange(8000)
+    series = 100 * np.sin(turns)[:, None] + 5 * rng.standard_normal((8000, 1))
+    series += np.cumsum(rng.standard_normal((8000, 1)), axis=0)
+    predictor = GainFilePredictor(1, gain_file=gains / "lazy.fits")
+    before = run(predictor, series)
+    assert predictor.fit(series) is predictor
+    assert predictor.fitted
+    after = run(predictor, series)
+    left, gone = (np.std((series[2:] - found[:-2])[4000:]) for found in (before, after))
+    assert gone < 0.3 * left
+
+
+def test_a_delay_that_is_not_whole_is_not_fitted(gains):
+    predictor = GainFilePredictor(2, 3, gain_file=gains / "odd.fits")
+    with pytest.raises(lbt.errors.ProblemError, match="whole frames; that of"):
+        predictor.fit(np.zeros((10_000, 2)))
+
+
+def test_a_short_series_is_not_fitted(gains):
+    predictor = GainFilePredictor(1, gain_file=gains / "lazy.fits")
+    with pytest.raises(lbt.errors.ProblemError, match="8 s"):
+        predictor.fit(np.random.default_rng(0).standard_normal((500, 1)))
+    assert not predictor.fitted
