@@ -81,13 +81,17 @@ def export(parser: ArgumentParser) -> None:
         metavar="NAME",
     )
     types = ("double", "single")
-    add_option(parser, "--precision", types, "c: type of all numbers (default double)")
+    text = "c: plain assumes that commands are applied, estimator is given those that were"
+    add_option(parser, "--form", ("plain", "estimator"), f"{text} (default plain)")
+    text = "c: type of all numbers; iir: SPECULA's (default double)"
+    add_option(parser, "--precision", types, text)
     text = "c: prefix of the C names (default: the output's name without its ending)"
     add_option(parser, "--name", str, text)
     add_option(parser, "--order", int, "dao: M of the RTC's configuration (default 20)")
     text = "dao, pyrtc: modes of the RTC (default: those of the design)"
     add_option(parser, "--modes", int, text)
-    text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy; pyrtc: folder"
+    text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its certificate; "
+    text += "pyrtc: folder"
     add_output(parser, text)
 
 

@@ -11,12 +11,12 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.interop import Exported, frame_cost, target_named
-from lbt_synth.interop.target import target_names
+from lbt_synth.interop.target import CERTIFICATE, target_names
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
 
 _SINGLE_SUFFICES = 1e-3  # of the largest command
-_OPTIONS = ("precision", "name", "order", "modes")
+_OPTIONS = ("form", "precision", "name", "order", "modes")
 
 
 @table_row
@@ -44,14 +44,15 @@ def run(arguments: Namespace) -> Report:
                 f"--{option} goes with --for {fitting}; got --for {arguments.target}."
             )
     output = Path(arguments.output)
-    places = [output, *([output.parent / (output.stem + target.beside)] if target.beside else [])]
+    endings = () if target.contents else (target.beside, CERTIFICATE)
+    places = [output, *(output.parent / (output.stem + ending) for ending in endings if ending)]
     if target.contents and output.is_dir():
         places = [output / name for name in target.contents]
     require_writable(*places, inputs=[arguments.gain])
     design, digest = load_with_digest(arguments.gain)
     with show_spinner("exporting", quiet=arguments.json):
         written = target.write(output, design, gain_digest=digest, **options)
-    cost = frame_cost(design)
+    cost = written.cost or frame_cost(design)
     report = Report(
         data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
     )
@@ -65,7 +66,7 @@ def run(arguments: Namespace) -> Report:
         stable_single=math.isfinite(written.error_single),
     )
     report.data |= {"frame_cost": json_record(cost), **json_record(facts)}
-    report.tables.append(fact_table("Export", facts, *([cost] if target.costs_counted else [])))
+    report.tables.append(fact_table("Export", facts, *([cost] if written.cost else [])))
     if written.checks:
         report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
     report.notes += _precision_notes(arguments, written)

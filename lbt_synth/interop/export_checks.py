@@ -14,6 +14,7 @@ import numpy.typing as npt
 import lbt_synth
 from lbt_synth.design import Check, Design, certify_loop
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
+from lbt_synth.interop.arithmetic_cost import FrameCost
 from lbt_synth.linear import Controller
 from lbt_synth.linear.state_space import LinearSystem
 from lbt_synth.loop.simulation.run import SteppedController, step_loop
@@ -137,12 +138,15 @@ class Exported:
         The same in single precision; inf if the loop is then unstable.
     checks : tuple of Check
         The proof in the loop, with the numbers of the file.
+    cost : FrameCost or None
+        Arithmetic of a frame, if what is written is counted.
     """
 
     files: tuple[Path, ...]
     error: float
     error_single: float
     checks: tuple[Check, ...] = ()
+    cost: FrameCost | None = None
 
 
 def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:

@@ -16,6 +16,8 @@ from lbt_synth.storage.rows import column, table_row
 if TYPE_CHECKING:
     from lbt_synth.interop.export_checks import Exported
 
+CERTIFICATE = ".certificate.json"  # ending of the certificate beside what is written
+
 
 @table_row
 class Arithmetic:
@@ -42,13 +44,11 @@ class Target:
     write : callable
         ``write(path, design, gain_digest=..., **options)``, which returns an :class:`Exported`.
     beside : str
-        Ending of the file that goes beside it, if there is one.
+        Ending of the file that goes beside it, if there is one, other than the certificate.
     contents : tuple of str
         Names of the files, where the target writes a folder.
     options : tuple of str
         Options of ``write`` that the command line offers.
-    costs_counted : bool
-        Whether the counted cost of a frame is that of what is written.
     """
 
     arithmetic: Arithmetic
@@ -57,7 +57,6 @@ class Target:
     beside: str = ""
     contents: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
-    costs_counted: bool = False
 
 
 def target_names() -> tuple[str, ...]:

@@ -10,25 +10,28 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design, ShapedDesign
 from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.design.shaping.uncertainty import SensorGainRange
+from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
-from lbt_synth.loop.budget import ar_covariance, plant_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware, TipTiltPlant
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import BoolArray, FloatArray
 
+ROUNDOFF = {"double": 2.0**-53, "single": 2.0**-24}  # largest relative error of an operation
 _LOSS = 0.01  # of residual and of margins, relative
 _SCENARIOS = (1.0, 0.7, 0.5, 0.358)  # sensor gains, where a design names none
 _STEP = 1.01  # ratio of neighbouring sensor gains
 _WIDEST = 10.0  # factor on the sensor gain, to either side
 _POLE, _NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
+_ASKED = np.array([0.0031, 0.11, 0.37])  # parts of the frame rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,13 +41,78 @@ class Rounding:
     Attributes
     ----------
     entry : Controller
-        From the noise (m,) of the sums to the command; A and C are those of the controller.
+        From the noise (r,) of the sums to the command; A and C are those of the controller.
     variance : callable
-        From the rms of measurements and commands, (m,) each, to the variance of the noise, (m,).
+        From the rms of measurements and commands, (q,) and (m,), to the variance of the noise,
+        (r,).
+    signals : (s, n) ndarray, optional
+        Rows that read signals from the controller's state; their rms follow the measurements'.
     """
 
     entry: Controller
     variance: Callable[[FloatArray, FloatArray], FloatArray]
+    signals: FloatArray | None = None
+
+
+def matrix_rounding(
+    whole: FloatArray, entry: Controller, signals: FloatArray, roundoff: float
+) -> Rounding:
+    """Return the rounding of sums of products, row by row.
+
+    Parameters
+    ----------
+    whole : (r, c) ndarray
+        Coefficients; the terms of a row are added from left to right. The columns belong to the
+        signals, then to the measurements, then to the commands, as far as there are columns.
+    entry : Controller
+        From an error in each of the r sums to the command.
+    signals : (s, n) ndarray
+        Rows that read the signals from the controller's state.
+    roundoff : float
+        Largest relative error of an operation.
+
+    Returns
+    -------
+    Rounding
+        Each product and each partial sum with an error uniform in its interval.
+    """
+    count = len(signals)
+
+    def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+        q = measured.size - count
+        sizes = np.concatenate([measured[q:], measured[:q], commands])[: whole.shape[1]]
+        terms = np.abs(whole) * sizes
+        squares = terms**2 + np.cumsum(terms, axis=1) ** 2
+        return np.asarray(roundoff**2 / 3 * np.sum(squares, axis=1))
+
+    return Rounding(entry=entry, variance=variance, signals=signals)
+
+
+def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> None:
+    """Refuse an export with the first check that fails.
+
+    Parameters
+    ----------
+    checks : tuple of Check
+        Those of :func:`prove_written`.
+    arithmetic : str
+        That of the target, for the message.
+    hint : str
+        What to try instead.
+
+    Raises
+    ------
+    NumericalError
+        With the value of the check as its ``residual``.
+    """
+    for check in checks:
+        if not check.passed:
+            raise NumericalError(
+                f"the loop must keep what its design promises in {arithmetic}; {check.name} is "
+                f"{check.value:.6g}, limit {check.limit:.6g}. {hint}",
+                status="arithmetic",
+                residual=check.value,
+            )
 
 
 def prove_written(
@@ -59,7 +127,7 @@ def prove_written(
     written : Controller
         The controller with the numbers of the file.
     rounding : Rounding, optional
-        What the arithmetic adds; for a loop with as many modes as measurements and commands.
+        What the arithmetic adds.
 
     Returns
     -------
@@ -112,41 +180,83 @@ def _residual_check(
     assert hardware is not None
     n, m = hardware.modes, hardware.n_commands
     loops = [close_loop(hardware, c, sensor_gain=gain) for c in (design.controller, written)]
-    before, after = (_variances(design, loop, slice(n)) for loop in loops)
+    before = _variances(design, loops[0], slice(n))
     how = "Lyapunov equations, level sets"
-    if rounding is not None:
-        commands = np.sqrt(_variances(design, loops[1], slice(n, n + m)))
-        measured = np.sqrt(_variances(design, loops[1], slice(n + m, None)))
-        variance = rounding.variance(measured, commands)
-        after = after + _rounding_left(hardware, written, rounding.entry, variance, gain)
+    if rounding is None:
+        after = _variances(design, loops[1], slice(n))
+    else:
+        shown = _with_signals(loops[1], rounding.signals)
+        found = _variances(design, shown, slice(None))
+        sizes = np.sqrt(np.maximum(found, 0.0))  # below zero by rounding
+        variance = rounding.variance(sizes[n + m :], sizes[n : n + m])
+        after = found[:n] + _rounding_left(hardware, written, rounding.entry, variance, gain)
         how += "; rounding as white noise"
-    loss = float(np.max(np.sqrt(after / before))) - 1
+    with np.errstate(invalid="ignore"):  # not a number: no accuracy, and the check fails
+        loss = float(np.max(np.sqrt(after / before))) - 1
     return Check(f"residual at sensor gain {gain:g}, loss", loss, _LOSS, how)
 
 
+def _with_signals(loop: ClosedLoop, signals: FloatArray | None) -> ClosedLoop:
+    """Append signals of the controller, whose states come first, to the outputs of a loop."""
+    if signals is None:
+        return loop
+    s = loop.system
+    C, D = np.zeros((len(signals), s.n_states)), np.zeros((len(signals), s.D.shape[1]))
+    C[:, : signals.shape[1]] = signals
+    return replace(loop, system=replace(s, C=np.vstack([s.C, C]), D=np.vstack([s.D, D])))
+
+
 def _variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
-    """Variance of some outputs of the loop, one per mode, under what the design is for."""
-    n, s = loop.hardware.modes, loop.system
+    """Variance of some outputs of the loop, one each, under what the design is for."""
+    s, rate = loop.system, loop.hardware.frame_rate_hz
     seen = replace(loop, system=replace(s, C=s.C[rows], D=s.D[rows]))
+    n, q = loop.hardware.modes, loop.hardware.n_measurements
     if isinstance(design, ShapedDesign):
-        return np.array(
-            [
-                sum(
-                    leaf.measured_nm2(_mode_of(seen, mode))
-                    for leaf in leaves(spec.objective)
-                    if leaf.sensor_gain == loop.sensor_gain
-                )
-                for mode, spec in enumerate(design.specifications)
-            ]
-        )
-    if isinstance(design, EstimatorDesign) and isinstance(design.problem, TipTiltPlant):
-        return np.diag(plant_budget(seen, design.problem).total_nm2)
+        return _shaped_variances(design, seen)
     drive = np.sqrt(1 - _POLE**2)
-    rate = loop.hardware.frame_rate_hz
     slow = ARModel(coefficients=np.array([_POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
-    B, D = s.B[:, n:] * _NOISE, seen.system.D[:, n:] * _NOISE
-    noise = seen.system.C @ stationary_covariance(s.A, B @ B.T) @ seen.system.C.T + D @ D.T
-    return np.asarray(np.diag(ar_covariance(seen, slow, np.eye(n)) + noise))
+    sources, noise = [(slow, row) for row in np.eye(n)], _NOISE * np.eye(q)
+    if isinstance(design, EstimatorDesign) and isinstance(design.problem, TipTiltPlant):
+        plant = design.problem
+        sources = list(zip(plant.turbulence, np.eye(n), strict=True))
+        sources += [(v.ar_model(rate), np.asarray(v.direction)) for v in plant.vibrations]
+        noise = plant.D[:, -q:]
+    return _gaussian_variances(seen, sources, noise)
+
+
+def _gaussian_variances(
+    loop: ClosedLoop, sources: list[tuple[ARModel, FloatArray]], noise: FloatArray
+) -> FloatArray:
+    """Variance of each output under AR processes along directions, and noise of a factor."""
+    n, s = loop.hardware.modes, loop.system.balanced()
+    firsts = [np.outer(direction, np.eye(1, model.order)) for model, direction in sources]
+    shape = np.hstack(firsts)
+    air = block_diag(*(model.companion for model, _ in sources))
+    A = np.block([[s.A, s.B[:, :n] @ shape], [np.zeros((len(air), s.n_states)), air]])
+    newest = block_diag(*(m.driving_rms_nm * np.eye(m.order, 1) for m, _ in sources))
+    B = block_diag(s.B[:, n:] @ noise, newest)
+    C, through = np.hstack([s.C, s.D[:, :n] @ shape]), s.D[:, n:] @ noise
+    X = stationary_covariance(A, B @ B.T)
+    return np.asarray(np.sum((C @ X) * C, axis=1) + np.sum(through**2, axis=1))
+
+
+def _shaped_variances(design: ShapedDesign, loop: ClosedLoop) -> FloatArray:
+    """Variance of each output under the terms of a shaped design, mode by mode."""
+    found = np.zeros(len(loop.system.C))
+    for mode, spec in enumerate(design.specifications):
+        terms = [x for x in leaves(spec.objective) if x.sensor_gain == loop.sensor_gain]
+        for row in np.flatnonzero(_reached(loop, mode)):
+            one = _mode_of(loop, mode, slice(row, row + 1))
+            found[row] += sum(term.measured_nm2(one) for term in terms)
+    return found
+
+
+def _reached(loop: ClosedLoop, mode: int) -> BoolArray:
+    """Return which outputs respond to a mode, (outputs,); most belong to another one."""
+    response = loop.system.frequency_response(_ASKED * loop.hardware.frame_rate_hz)
+    n, sensor = loop.hardware.modes, loop.hardware.sensor
+    own = np.stack([response[:, :, mode], response[:, :, n:] @ sensor[:, mode]])
+    return np.asarray(np.any(own != 0, axis=(0, 1)))
 
 
 def _rounding_left(
@@ -166,12 +276,11 @@ def _rounding_left(
     return np.asarray(np.diag(C @ stationary_covariance(s.A, B @ B.T) @ C.T + D @ D.T))
 
 
-def _mode_of(loop: ClosedLoop, mode: int) -> SingleModeLoop:
-    """Take one mode of a loop, whose outputs may be any; noise enters as the mode's own sensor."""
+def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:
+    """Take outputs of a loop as those of one mode; noise enters as the mode's own sensor."""
     hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
     inputs = [s.B[:, mode], s.B[:, n:] @ hardware.sensor[:, mode]]
     direct = [s.D[:, mode], s.D[:, n:] @ hardware.sensor[:, mode]]
-    rows = slice(mode, None, n)  # the mode's residual, command and measurement
     system = replace(s, B=np.stack(inputs, axis=1), C=s.C[rows], D=np.stack(direct, axis=1)[rows])
     one = hardware.single_mode()
     own = replace(loop, system=system, hardware=one)
@@ -193,7 +302,7 @@ def _demand_checks(design: ShapedDesign, loop: ClosedLoop) -> list[Check]:
     ):
         if (id(spec), id(parameter)) not in found:
             found.add((id(spec), id(parameter)))
-            for check in spec.checks(_mode_of(modal, mode)):
+            for check in spec.checks(_mode_of(modal, mode, slice(mode, None, n))):
                 limit = check.limit + _LOSS * abs(check.limit)
                 name = f"mode {mode + 1}: {check.name}"
                 checks.append(replace(check, name=name, limit=limit))

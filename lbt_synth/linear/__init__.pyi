@@ -1,4 +1,7 @@
 from .estimation_problem import EstimationProblem as EstimationProblem
+from .estimator_form import EstimatorForm as EstimatorForm
+from .estimator_form import RunningEstimator as RunningEstimator
+from .estimator_form import estimator_form as estimator_form
 from .infeasibility_proof import Witness as Witness
 from .infeasibility_proof import infeasible_level as infeasible_level
 from .lyapunov import stationary_covariance as stationary_covariance

@@ -312,6 +312,9 @@ class Controller(LinearSystem):
         Feedthrough matrix.
     dt_s : float, optional
         Sampling period [s].
+    applied : (n, m) array_like, optional
+        How the last command enters the new state, where A has it as ``applied C``: what
+        :func:`estimator_form` takes out of A again.
 
     Raises
     ------
@@ -328,6 +331,14 @@ class Controller(LinearSystem):
     >>> [float(run.step([1.0])[0]) for _ in range(3)]
     [0.5, 1.0, 1.5]
     """
+
+    applied: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        LinearSystem.__post_init__(self)
+        if self.applied is not None:
+            rows, cols = (self.n_states, "to match A"), (len(self.C), "to match C")
+            set_fields(self, applied=matrix(self.applied, "applied", rows=rows, cols=cols))
 
     def to_statespace(self) -> StateSpace:
         """Return the same input-output map in the textbook (current-state) form."""
@@ -348,6 +359,8 @@ class Controller(LinearSystem):
 class RunningController:
     """A controller with its state: call ``step(y) -> u`` once per sample, or ``reset()``.
 
+    The plain form assumes that its commands are applied; :func:`estimator_form` does not.
+
     Examples
     --------
     >>> import lbt_synth as lbt
@@ -360,6 +373,7 @@ class RunningController:
 
     controller: Controller
     state: FloatArray = field(init=False)
+    form = "plain"
 
     def __post_init__(self) -> None:
         self.reset()

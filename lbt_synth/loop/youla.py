@@ -76,7 +76,8 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
     if stored:
         rows.append(C @ next_filter + D @ correction)
         entry[n : n + m] = C @ B + D
+    applied = entry @ (mirror.D * hardware.sensor @ hardware.influence)
+    applied[n + stored :] += np.kron(mirror.B[:, None], each)
     # the rows that read u(k-1) from the old state read u(k) from the new one
-    return Controller(
-        A=np.vstack([*rows, next_mirror]), B=entry, C=last, D=np.zeros((m, q)), dt_s=hardware.dt_s
-    )
+    whole, D = np.vstack([*rows, next_mirror]), np.zeros((m, q))
+    return Controller(A=whole, B=entry, C=last, D=D, dt_s=hardware.dt_s, applied=applied)

@@ -49,7 +49,8 @@ def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
     )
     data = json.loads(text)
     assert status == 0
-    assert data["files"] == [str(out), str(out.with_suffix(".h"))]
+    endings = (".c", ".h", ".certificate.json")
+    assert data["files"] == [str(out.with_suffix(ending)) for ending in endings]
     assert data["frame_cost"]["multiplications"] == 30
     assert data["gain_digest"] in out.read_text()
     Compiled(out, name="tip")
@@ -107,10 +108,11 @@ def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys, mon
 BAD = [
     (("KALMAN", "--for", "matlab", "-o", "k.mat", "--name", "x"), 2, "--name goes with --for c"),
     (
-        ("KALMAN", "--for", "iir", "-o", "k.fits", "--precision", "single"),
+        ("KALMAN", "--for", "matlab", "-o", "k.mat", "--precision", "single"),
         2,
-        "--precision goes with",
+        "--precision goes with --for c or iir",
     ),
+    (("KALMAN", "--for", "iir", "-o", "k.fits", "--form", "plain"), 2, "--form goes with --for c"),
     (("KALMAN", "--for", "c", "-o", "k.c", "--precision", "half"), 2, "invalid choice"),
     (("KALMAN", "--for", "c", "-o", "k.c", "--name", "2x"), 2, "prefix of the C names"),
     (("KALMAN", "--for", "c", "-o", "kal man.c"), 2, "must end in .c"),

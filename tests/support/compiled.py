@@ -61,8 +61,10 @@ class Compiled:
     def reset(self):
         self._call("reset", self.state)
 
-    def step(self, y):
+    def step(self, y, *applied):
+        """The estimator form is given the applied commands, too."""
         measured = np.array(y, dtype=self.real)
         assert measured.shape == (self.inputs,)
-        self.held = self._call("step", self.state, measured, self.u)
+        given = [np.array(values, dtype=self.real) for values in applied]
+        self.held = self._call("step", self.state, measured, *given, self.u)
         return self.u.astype(np.float64)

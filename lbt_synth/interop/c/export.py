@@ -15,18 +15,20 @@ import numpy as np
 from lbt_synth.design import Design
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.interop.arithmetic_cost import frame_cost, has_straight_line_form
+from lbt_synth.interop.c.arithmetic import SourceTerms, prove_source
+from lbt_synth.interop.c.reading import read_source
+from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
     FRAMES,
     Exported,
-    WrittenTerms,
     provenance_lines,
     rehearsal_error,
     require_exportable,
 )
 from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.linear import Controller
-from lbt_synth.storage.atomic_files import write_together
-from lbt_synth.validation import choice
+from lbt_synth.interop.written_loop import ROUNDOFF, require_proved
+from lbt_synth.linear import Controller, estimator_form
+from lbt_synth.validation import FloatArray, choice
 
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
@@ -38,6 +40,7 @@ def export_c(
     path: str | os.PathLike[str],
     design: Design,
     *,
+    form: str = "plain",
     precision: str = "double",
     name: str | None = None,
     gain_digest: str | None = None,
@@ -48,8 +51,11 @@ def export_c(
     in. ``<name>_reset(&state)`` sets the state to zero; ``<name>_step(&state, y, u)`` computes
     ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``, in the same number of operations
     each frame, and returns 0. If a measurement is not finite it returns 1: u is the last command
-    again, and the state stays. Coefficients are exact (hexadecimal). Units are those of the
-    design: nm rms of wavefront for a loop whose sensor and influence matrices are the identity.
+    again, and the state stays. In estimator form ``<name>_step(&state, y, applied, u)`` takes the
+    commands that were applied in the last frame, too, and is stable by itself: nothing winds up
+    where commands are clipped or the loop is open. Coefficients are exact (hexadecimal). Units are
+    those of the design: nm rms of wavefront for a loop whose sensor and influence matrices are the
+    identity.
 
     Parameters
     ----------
@@ -57,6 +63,9 @@ def export_c(
         Source file to write, ending in ``.c``; the header, ending in ``.h``, goes beside it.
     design : Design
         The design.
+    form : {"plain", "estimator"}, optional
+        Whether the controller assumes that its commands were applied, or is given those that
+        were (:func:`~lbt_synth.linear.estimator_form`).
     precision : {"double", "single"}, optional
         Type of all numbers, ``double`` or ``float``. Coefficients are rounded to it.
     name : str, optional
@@ -67,8 +76,8 @@ def export_c(
     Returns
     -------
     Exported
-        Source and header, and the error of the chosen precision and of single: terms are
-        added in the order of the source, by a processor that rounds each of them.
+        Source, header and certificate, and the error of the chosen precision and of single:
+        terms are added in the order of the source, by a processor that rounds each of them.
 
     Raises
     ------
@@ -79,8 +88,8 @@ def export_c(
     CertificateError
         If the certificate that the design carries has a failed check.
     NumericalError
-        If the loop is unstable with the rounded coefficients, or the commands of a frame
-        overflow.
+        If the loop is unstable with the rounded coefficients, the commands of a frame overflow,
+        a check of the loop fails in the arithmetic of the source, or there is no estimator form.
 
     Examples
     --------
@@ -89,7 +98,7 @@ def export_c(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     written = lbt.interop.export_c(pathlib.Path(folder) / "slow.c", slow)
     ...     [file.name for file in written.files]
-    ['slow.c', 'slow.h']
+    ['slow.c', 'slow.h', 'slow.certificate.json']
     """
     target = Path(path)
     if not _SOURCE.fullmatch(target.name):
@@ -101,12 +110,16 @@ def export_c(
     header = target.with_suffix(".h")
     choice(precision, "precision", ("double", "single"))
     prefix = require_identifier(target.stem if name is None else name)
+    choice(form, "form", ("plain", "estimator"))
     single = precision == "single"
     require_exportable(design)
-    controller = _round_to_single(design.controller) if single else design.controller
-    require_exportable(design, controller)
+    written, applied = _form_of(design, form)
+    if single:
+        written = _round_to_single(written)
+    if not applied:
+        require_exportable(design, written)
     error_double, error_single = (
-        rehearsal_error(design, WrittenTerms(design.controller, dtype))
+        rehearsal_error(design, SourceTerms(written, applied, dtype))
         for dtype in (np.float64, np.float32)
     )
     error = error_single if single else error_double
@@ -121,13 +134,44 @@ def export_c(
     lines = provenance_lines(design, gain_digest)
     if single:  # in double precision the figure would depend on this machine's matrix products
         lines.append(("precision", f"single: commands within {error:.1e} of the largest one"))
-    source_text, header_text = render_code(
-        prefix, header.name, controller, lines, single=single, gain_digest=gain_digest
+    texts = render_code(
+        prefix,
+        header.name,
+        written,
+        lines,
+        applied=applied,
+        single=single,
+        gain_digest=gain_digest,
     )
-    written = write_together(
-        {target: source_text.encode("ascii"), header: header_text.encode("ascii")}
+    checks = prove_source(design, *read_source(*texts), ROUNDOFF[precision])
+    require_proved(checks, f"{precision} precision", "Try double precision.")
+    source, declarations = (text.encode("ascii") for text in texts)
+    files = write_certified(
+        {target: source, header: declarations},
+        target="c",
+        arithmetic=TARGET.arithmetic,
+        checks=checks,
+        gain_digest=gain_digest,
+        form=form,
+        precision=precision,
     )
-    return Exported(files=written, error=error, error_single=error_single)
+    cost = frame_cost(written)
+    return Exported(files=files, error=error, error_single=error_single, checks=checks, cost=cost)
+
+
+def _form_of(design: Design, form: str) -> tuple[Controller, int]:
+    """Return what is written, and its number of inputs that are applied commands, the last ones."""
+    if form == "plain":
+        return design.controller, 0
+    if design.hardware is None:
+        raise ProblemError(
+            "the estimator form needs the design of a loop: a bare filter has no commands to be "
+            "applied. Export it with form plain."
+        )
+    own = estimator_form(design)
+    inputs, m = np.hstack([own.B, own.applied]), len(own.C)
+    D = np.zeros((m, inputs.shape[1]))
+    return Controller(A=own.A, B=inputs, C=own.C, D=D, dt_s=own.dt_s), m
 
 
 def require_identifier(name: str) -> str:
@@ -166,10 +210,14 @@ def render_code(
     controller: Controller,
     provenance: Sequence[tuple[str, str]],
     *,
+    applied: int,
     single: bool,
     gain_digest: str | None,
 ) -> tuple[str, str]:
-    """Return the source and the header; ``provenance`` begins the comment of both."""
+    """Return the source and the header; ``provenance`` begins the comment of both.
+
+    The last ``applied`` inputs of the controller are the commands that were applied.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     def constant(value: float) -> str:
@@ -187,16 +235,18 @@ def render_code(
         "p": prefix,
         "P": prefix.upper(),
         "n": controller.n_states,
-        "q": controller.B.shape[1],
+        "q": controller.B.shape[1] - applied,
         "m": len(controller.C),
+        "applied": applied,
         "type": "float" if single else "double",
         "largest": "FLT_MAX" if single else "DBL_MAX",
         "controller": controller,
+        "matrices": _split_inputs(controller, applied),
         "provenance": provenance,
         "cost": frame_cost(controller),
         "header_name": header_name,
         "gain_digest": gain_digest,
-        "straight_line": _write_out(prefix, controller, zero=constant(0.0))
+        "straight_line": _write_out(prefix, controller, applied, zero=constant(0.0))
         if has_straight_line_form(controller)
         else None,
     }
@@ -206,9 +256,16 @@ def render_code(
     return source, header
 
 
-def _write_out(prefix: str, controller: Controller, *, zero: str) -> dict[str, Any]:
+def _split_inputs(controller: Controller, applied: int) -> dict[str, FloatArray]:
+    """Return A, B, C and D by name, and L, the columns of the applied commands."""
+    q = controller.B.shape[1] - applied
+    B, L = np.hsplit(controller.B, [q])
+    return {"A": controller.A, "B": B, "L": L, "C": controller.C, "D": controller.D[:, :q]}
+
+
+def _write_out(prefix: str, controller: Controller, applied: int, *, zero: str) -> dict[str, Any]:
     """Return one frame with each non-zero term written out; factors of 1 and -1 are signs."""
-    n = controller.n_states
+    n, q = controller.n_states, controller.B.shape[1] - applied
     coefficients: list[tuple[str, float]] = []
     sums: dict[str, str] = {}
     # a command is computed from the new state n0, n1, ...
@@ -220,6 +277,8 @@ def _write_out(prefix: str, controller: Controller, *, zero: str) -> dict[str, A
                 name, place = f"{state}{j}", f"{on_state}[{i}][{j}]"
                 if j >= n:
                     name, place = f"y{j - n}", f"{on_y}[{i}][{j - n}]"
+                if j >= n + q:
+                    name, place = f"a{j - n - q}", f"L[{i}][{j - n - q}]"
                 factor = ""
                 if abs(row[j]) != 1:
                     factor = f"c[{len(coefficients)}] * "
@@ -227,11 +286,11 @@ def _write_out(prefix: str, controller: Controller, *, zero: str) -> dict[str, A
                 terms.append(("-" if row[j] == -1 else "+", factor + name))
             start = f"    const {prefix}_real {result}{i} ="
             sums[f"{result}{i}"] = _wrap(terms or [("+", zero)], len(start))
+    used = np.flatnonzero(np.vstack([controller.B, controller.D]).any(axis=0)).tolist()
     return {
         "states": np.flatnonzero(controller.A.any(axis=0)).tolist(),
-        "measurements": np.flatnonzero(
-            np.vstack([controller.B, controller.D]).any(axis=0)
-        ).tolist(),
+        "measurements": [i for i in used if i < q],
+        "applied": [i - q for i in used if i >= q],
         "coefficients": coefficients,
         "sums": sums,
     }
@@ -258,12 +317,11 @@ TARGET = Target(
         precision="double or single",
         sums="each row of [A, B] and of [C, D] from left to right",
         state="new state: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)",
-        clipping="none: it assumes that its commands are applied",
+        clipping="yours: the estimator form takes the applied commands, the plain form none",
         limits="none",
     ),
     file="source and header (.c, .h)",
     write=export_c,
     beside=".h",
-    options=("precision", "name"),
-    costs_counted=True,
+    options=("form", "precision", "name"),
 )

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
 import os
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lbt_synth.design import Check, Design
-from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop.dao.inner_loop import InnerLoop
+from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
@@ -21,17 +20,17 @@ from lbt_synth.interop.export_checks import (
     rehearsal_error,
     require_exportable,
 )
-from lbt_synth.interop.iir.export import axis_polynomials, build_controller
+from lbt_synth.interop.iir.export import axis_polynomials
+from lbt_synth.interop.iir.realisation import build_controller
 from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.interop.written_loop import Rounding, prove_written
+from lbt_synth.interop.written_loop import Rounding, prove_written, require_proved
 from lbt_synth.linear import Controller
 from lbt_synth.storage.array_file import fits_bytes
-from lbt_synth.storage.atomic_files import require_ending, write_together
-from lbt_synth.storage.rows import json_record
+from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.validation import FloatArray, integer
 
 _ROUNDOFF = 2.0**-24  # largest relative error of an operation in single precision
-_BESIDE = ".certificate.json"
+_HINT = "Design with fewer states or less accurate models, or use a target in double precision."
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
 
 
@@ -99,25 +98,21 @@ def export_dao(
     exact = direct_form_rows(design.controller, integer(order, "order", at_least=1))
     rounded = exact.astype(np.float32)
     checks = prove_written(design, *_as_computed(rounded, design.controller.dt_s))
-    _require_passed(checks)
+    require_proved(checks, "single precision, in direct form", _HINT)
     matrix = np.zeros((len(rounded), columns), dtype=np.float32)
     matrix[:, :own] = rounded
     single = rehearsal_error(design, InnerLoop(rounded))
     content = _matrix_bytes(matrix, design, lines, fits=target.suffix.lower() == ".fits")
-    certificate = {
-        "target": "dao",
-        "file": target.name,
-        "file_sha256": hashlib.sha256(content).hexdigest(),
-        "gain_sha256": gain_digest,
-        "order": order,
-        "modes": columns,
-        "sign": _SIGN,
-        "arithmetic": json_record(TARGET.arithmetic),
-        "checks": [json_record(check) for check in checks],
-    }
-    text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
-    beside = target.with_suffix(_BESIDE)
-    files = write_together({target: content, beside: text.encode()})
+    files = write_certified(
+        {target: content},
+        target="dao",
+        arithmetic=TARGET.arithmetic,
+        checks=checks,
+        gain_digest=gain_digest,
+        order=order,
+        modes=columns,
+        sign=_SIGN,
+    )
     return Exported(files=files, error=single, error_single=single, checks=checks)
 
 
@@ -172,19 +167,6 @@ def _as_computed(rounded: NDArray[np.float32], dt_s: float) -> tuple[Controller,
     return written, Rounding(entry=entry, variance=variance)
 
 
-def _require_passed(checks: tuple[Check, ...]) -> None:
-    """Refuse the export with the first check that fails."""
-    for check in checks:
-        if not check.passed:
-            raise NumericalError(
-                "the loop must keep what its design promises in single precision, in direct form; "
-                f"{check.name} is {check.value:.6g}, limit {check.limit:.6g}. Design with fewer "
-                "states or less accurate models, or use a target in double precision.",
-                status="arithmetic",
-                residual=check.value,
-            )
-
-
 def _matrix_bytes(
     matrix: NDArray[np.float32], design: Design, lines: list[tuple[str, str]], *, fits: bool
 ) -> bytes:
@@ -210,6 +192,5 @@ TARGET = Target(
     ),
     file="matrix of single precision (.npy, .fits) and its certificate (.json)",
     write=export_dao,
-    beside=_BESIDE,
     options=("order", "modes"),
 )

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import os
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from lbt_synth.design import Design, certify_loop
+from lbt_synth.design import Check, Design, certify_loop
 from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
@@ -18,13 +19,17 @@ from lbt_synth.interop.export_checks import (
     rehearsal_error,
     require_exportable,
 )
+from lbt_synth.interop.iir.realisation import build_controller
 from lbt_synth.interop.target import Arithmetic, Target
+from lbt_synth.interop.written_loop import ROUNDOFF, Rounding, prove_written, require_proved
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.storage.array_file import fits_bytes
-from lbt_synth.storage.atomic_files import require_ending, write_atomically
-from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, number
+from lbt_synth.storage.atomic_files import require_ending
+from lbt_synth.validation import BoolArray, FloatArray, choice, frozen_copy, number
 
 _LAYOUT_VERSION = 1  # of SPECULA's IirFilterData
+_SWITCH = {"double": 0, "single": 1}  # SPECULA's own ``precision``
+_HINT = "Use the gain file itself, which SPECULA's SsrFilter loads, or a design of fewer states."
 
 
 class DirectForm:
@@ -57,6 +62,7 @@ def export_iir(
     path: str | os.PathLike[str],
     design: Design,
     *,
+    precision: str = "double",
     tolerance: float = 1e-6,
     gain_digest: str | None = None,
 ) -> Exported:
@@ -72,6 +78,9 @@ def export_iir(
         File to write, ending in ``.fits``.
     design : Design
         Design with as many commands as measurements, whose axes decouple.
+    precision : {"double", "single"}, optional
+        In which SPECULA shall run it: what the loop is proved in. The file is the same but for
+        a card that states it.
     tolerance : float, optional
         Largest error in double precision that is accepted: difference of the commands over the
         largest command, over 2000 frames.
@@ -81,7 +90,7 @@ def export_iir(
     Returns
     -------
     Exported
-        The file, and its error in double and in single precision.
+        The file, its certificate, its error in double and in single precision, and the checks.
 
     Raises
     ------
@@ -90,7 +99,8 @@ def export_iir(
     ProblemError
         If sizes differ or axes are coupled.
     NumericalError
-        If the error in double precision is above the tolerance; ``residual`` holds it.
+        If the error in double precision is above the tolerance, or a check fails in the
+        precision; ``residual`` holds the value.
     CertificateError
         If the certificate that the design carries has a failed check.
 
@@ -104,6 +114,7 @@ def export_iir(
     """
     target = require_ending(path, "an IIR filter file", (".fits",))
     tolerance = number(tolerance, "tolerance", above=0)
+    choice(precision, "precision", tuple(_SWITCH))
     require_exportable(design)
     lines = provenance_lines(design, gain_digest)
     num, den = _align(axis_polynomials(design.controller))
@@ -112,8 +123,7 @@ def export_iir(
         raise NumericalError(
             f"the transfer function must give the commands of the controller to {tolerance:.3g} of "
             f"the largest one; got {error:.3g}: its coefficients in double precision do not hold "
-            "the poles. Use the gain file itself, which SPECULA's SsrFilter loads, or a design of "
-            "fewer states.",
+            f"the poles. {_HINT}",
             status="transfer function",
             residual=error,
         )
@@ -122,10 +132,49 @@ def export_iir(
         "VERSION": (_LAYOUT_VERSION, "layout of the HDUs"),
         "METHOD": (design.method, "synthesis"),
         "ERROR64": (error, "commands in double precision, relative"),
+        "PRECISN": (_SWITCH[precision], "of SPECULA, for which the loop was proved"),
+        "FORM": ("plain", "assumes that its commands are applied"),
     }
     arrays = {"ORDNUM": count, "ORDDEN": count, "NUM": num, "DEN": den}
-    written = write_atomically(target, fits_bytes(cards, arrays, comments=join_labels(lines)))
-    return Exported(files=(written,), error=error, error_single=single)
+    data = fits_bytes(cards, arrays, comments=join_labels(lines))
+    checks = _prove(design, data, precision)
+    require_proved(checks, f"{precision} precision, as a transfer function", _HINT)
+    files = write_certified(
+        {target: data},
+        target="iir",
+        arithmetic=TARGET.arithmetic,
+        checks=checks,
+        gain_digest=gain_digest,
+        precision=precision,
+        specula_precision=_SWITCH[precision],
+    )
+    return Exported(files=files, error=error, error_single=single, checks=checks)
+
+
+def _prove(design: Design, data: bytes, precision: str) -> tuple[Check, ...]:
+    """Check the loop around the transfer functions that a file holds, rounded to a precision."""
+    if design.hardware is None:
+        return ()
+    from astropy.io import fits
+
+    with fits.open(io.BytesIO(data)) as units, np.errstate(over="ignore"):
+        kind = np.float32 if precision == "single" else np.float64
+        num, den = (np.asarray(units[name].data, kind).astype(float) for name in ("NUM", "DEN"))
+    sums = np.zeros_like(num)
+    sums[:, -1] = 1.0
+    written, entry = (build_controller(top, den, design.controller.dt_s) for top in (num, sums))
+
+    def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+        """Bound the rounding of sums in any order, of their difference and of the quotient."""
+        terms = np.stack([np.abs(num) * measured[:, None], np.abs(den) * commands[:, None]])
+        whole = np.sum(terms, axis=2)
+        count = num.shape[1]
+        squares = np.sum(terms**2, axis=2) + count * whole**2
+        return np.asarray(
+            ROUNDOFF[precision] ** 2 / 3 * (np.sum(squares, axis=0) + 2 * commands**2)
+        )
+
+    return prove_written(design, written, Rounding(entry=entry, variance=variance))
 
 
 def _align(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
@@ -145,28 +194,6 @@ def _rehearse(design: Design, num: FloatArray, den: FloatArray, dtype: Any) -> f
         if not certify_loop(design.hardware, written).passed:
             return float("inf")
     return rehearsal_error(design, DirectForm(num, den, dtype))
-
-
-def build_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controller:
-    """Build the controller of these coefficients; the last state of each axis is its command."""
-    axes = []
-    for top, bottom in zip(num, den, strict=True):
-        n = len(bottom) - 1
-        shift, feed = np.eye(n, k=1), top[-1] / bottom[-1]
-        A, B = np.zeros((n + 1, n + 1)), np.zeros((n + 1, 1))
-        A[:n, :n] = shift
-        A[:n, 0] -= bottom[-2::-1] / bottom[-1]
-        B[:n, 0] = top[-2::-1] / bottom[-1] - feed * bottom[-2::-1] / bottom[-1]
-        A[n, :1], B[n] = 1.0 if n else 0.0, feed
-        axes.append((A, B))
-    m, size = len(axes), len(axes[0][0])
-    return Controller(
-        A=block_diag(*(A for A, _ in axes)),
-        B=block_diag(*(B for _, B in axes)),
-        C=frozen_copy(np.kron(np.eye(m), np.eye(size)[-1:])),
-        D=np.zeros((m, m)),
-        dt_s=dt_s,
-    )
 
 
 _COUPLED = 1e-9  # of the largest balanced entry; less is what a solver leaves of a zero
@@ -283,9 +310,10 @@ TARGET = Target(
         precision="single by default; double with precision 0",
         sums="sum of the past inputs less the sum of the past outputs, per axis",
         state="past measurements and past commands",
-        clipping="none: it assumes that its commands are applied",
+        clipping="none: plain form, it assumes that its commands are applied",
         limits="one transfer function per axis, of 40 states at most",
     ),
     file="filter file (.fits)",
     write=export_iir,
+    options=("precision",),
 )

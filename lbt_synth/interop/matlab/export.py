@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 import lbt_synth
-from lbt_synth.design import Design
+from lbt_synth.design import Check, Design
+from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
     Exported,
     MatrixForm,
@@ -19,7 +21,14 @@ from lbt_synth.interop.export_checks import (
     require_exportable,
 )
 from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.storage.atomic_files import require_ending, write_atomically
+from lbt_synth.interop.written_loop import (
+    ROUNDOFF,
+    matrix_rounding,
+    prove_written,
+    require_proved,
+)
+from lbt_synth.linear import Controller
+from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.validation import FloatArray
 
 _TEXT_BYTES = 116  # of the header of a version 5 file; scipy writes the date there
@@ -63,7 +72,7 @@ def export_mat(
     Returns
     -------
     Exported
-        The file, and the error of the textbook form.
+        The file, its certificate, the error of the textbook form, and the checks of its loop.
 
     Raises
     ------
@@ -71,6 +80,8 @@ def export_mat(
         If the ending is not ``.mat``, or the file cannot be written.
     CertificateError
         If the certificate that the design carries has a failed check.
+    NumericalError
+        If a check fails with the numbers of the file; ``residual`` holds its value.
 
     Examples
     --------
@@ -96,8 +107,38 @@ def export_mat(
         content["delay_frames"] = design.hardware.delay_frames
     error = rehearsal_error(design, _Textbook(textbook, np.float64))
     single = rehearsal_error(design, MatrixForm(design.controller, np.float32))
-    written = write_atomically(target, _mat_bytes(content))
-    return Exported(files=(written,), error=error, error_single=single)
+    data = _mat_bytes(content)
+    checks = _prove(design, data)
+    require_proved(checks, "double precision, in textbook form", "Design with fewer states.")
+    files = write_certified(
+        {target: data},
+        target="matlab",
+        arithmetic=TARGET.arithmetic,
+        checks=checks,
+        gain_digest=gain_digest,
+    )
+    return Exported(files=files, error=error, error_single=single, checks=checks)
+
+
+def _prove(design: Design, data: bytes) -> tuple[Check, ...]:
+    """Check the loop around the textbook form that a file holds; its products round as sums."""
+    if design.hardware is None:
+        return ()
+    from scipy.io import loadmat
+
+    buffer: Any = io.BytesIO(data)  # as for savemat
+    form = loadmat(buffer)["textbook"][0, 0]
+    whole = np.block([[form["A"], form["B"]], [form["C"], form["D"]]])
+    n, m = design.controller.n_states, len(design.controller.C)
+    # with the command as further states, the sums of a frame are the new state
+    state = np.hstack([whole[:, :n], np.zeros((n + m, m))])
+    rows, none = np.eye(n + m), np.zeros((m, whole.shape[1] - n))
+    dt_s = design.controller.dt_s
+    written = Controller(A=state, B=whole[:, n:], C=rows[n:], D=none, dt_s=dt_s)
+    entry = replace(written, B=rows, D=np.zeros((m, n + m)))
+    return prove_written(
+        design, written, matrix_rounding(whole, entry, rows[:n], ROUNDOFF["double"])
+    )
 
 
 def _mat_bytes(content: dict[str, Any]) -> bytes:
@@ -116,7 +157,7 @@ TARGET = Target(
         precision="double",
         sums="matrix products, in an order of their library",
         state="textbook: u(k) = C x(k) + D y(k); new_state: that of the gain file",
-        clipping="none: it assumes that its commands are applied",
+        clipping="none: plain form, it assumes that its commands are applied",
         limits="none",
     ),
     file="MATLAB file (.mat)",

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import Controller, RunningController
+from lbt_synth.linear import Controller, EstimatorForm, RunningController, RunningEstimator
 from lbt_synth.linear.block_filtering import filter_series as filter_series
 from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.loop.closed_loop import close_loop
@@ -16,7 +16,7 @@ from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.summaries import Summarised
-from lbt_synth.validation import FloatArray, frozen_copy, integer
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _SETTLED = 1e-4  # decay of the slowest mode after which a loop has settled
 _MOST_SETTLING = 200_000  # frames
@@ -46,7 +46,7 @@ class Simulation(Summarised):
     total_nm, residual_nm : (cases, frames, n) ndarray
         Phase before and after the correction [nm].
     commands : (cases, frames, m) ndarray
-        Commands u(k).
+        Commands u(k), as the mirror applied them.
     measurements : (cases, frames, q) ndarray
         Measurements y(k).
     frame_rate_hz : float
@@ -77,7 +77,7 @@ class Simulation(Summarised):
 
 
 def simulate(
-    controller: Controller | HasController | SteppedController,
+    controller: Controller | EstimatorForm | HasController | SteppedController,
     truth: Truth,
     *,
     hardware: LoopHardware,
@@ -85,6 +85,7 @@ def simulate(
     cases: int = 1,
     seed: int = 0,
     settle_frames: int | None = None,
+    stroke: float | None = None,
 ) -> Simulation:
     """Close the loop in the time domain.
 
@@ -95,8 +96,10 @@ def simulate(
 
     Parameters
     ----------
-    controller : Controller, Design or object with ``step(y)`` and ``reset()``
-        The controller; a :class:`Controller` runs at the speed of matrix products.
+    controller : Controller, Design, EstimatorForm or object with ``step(y)`` and ``reset()``
+        The controller; a :class:`Controller` runs at the speed of matrix products where the
+        stroke is not limited. The form of :func:`~lbt_synth.linear.estimator_form` is given the
+        commands that were applied.
     truth : Truth
         Disturbances, noise and sensor gain.
     hardware : LoopHardware
@@ -110,6 +113,8 @@ def simulate(
     settle_frames : int, optional
         Frames run before and dropped; by default until the slowest mode of the
         loop has decayed to 1e-4 (1000 frames for a stepped controller).
+    stroke : float, optional
+        Largest modulus of a command that the mirror applies; without a limit by default.
 
     Returns
     -------
@@ -142,6 +147,9 @@ def simulate(
     frames = integer(frames, "frames", at_least=1)
     cases = integer(cases, "cases", at_least=1)
     seed = integer(seed, "seed", at_least=0)
+    limit = np.inf if stroke is None else number(stroke, "stroke", above=0)
+    if isinstance(controller, EstimatorForm):
+        controller = controller.start()
     if isinstance(controller, SteppedController):
         default = _DEFAULT_SETTLING
     else:
@@ -163,10 +171,11 @@ def simulate(
     size = {"frames": settle + frames, "cases": cases}
     total = draw_disturbance(truth, hardware, rng=disturbance_rng, zero_frame=settle, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
-    if isinstance(controller, Controller):
+    if isinstance(controller, Controller) and stroke is None:
         outputs = filter_series(loop.system, np.concatenate([total, noise], axis=2))
     else:
-        outputs = step_loop(controller, truth.sensor_gain, hardware, total, noise)
+        own = controller.start() if isinstance(controller, Controller) else controller
+        outputs = step_loop(own, truth.sensor_gain, hardware, total, noise, stroke=limit)
     n, m = hardware.modes, hardware.n_commands
     kept = outputs[:, settle:]
     return Simulation(
@@ -187,10 +196,21 @@ def settling_frames(radius: float) -> int:
 
 
 def step_controller(
-    controller: SteppedController | RunningController, y: FloatArray, size: int, *, frame: int
+    controller: SteppedController | RunningController | RunningEstimator,
+    y: FloatArray,
+    size: int,
+    *,
+    frame: int,
+    applied: FloatArray | None = None,
 ) -> FloatArray:
-    """Give a controller its measurements, and return its commands if they are finite."""
-    u = np.asarray(controller.step(y), dtype=np.float64)
+    """Give a controller its measurements, and return its commands if they are finite.
+
+    An estimator form is given the commands that were applied in the last frame, too.
+    """
+    if isinstance(controller, RunningEstimator):
+        u = controller.step(y, applied)
+    else:
+        u = np.asarray(controller.step(y), dtype=np.float64)
     finite = bool(np.all(np.isfinite(u)))
     if u.shape != (size,) or not finite:
         kind = "" if finite else " with values that are not finite"
@@ -202,13 +222,17 @@ def step_controller(
 
 
 def step_loop(
-    controller: SteppedController | RunningController,
+    controller: SteppedController | RunningController | RunningEstimator,
     sensor_gain: float,
     hardware: LoopHardware,
     total: FloatArray,
     noise: FloatArray,
+    *,
+    stroke: float = np.inf,
 ) -> FloatArray:
     """Run the loop one frame at a time, as written in :class:`LoopHardware`.
+
+    The mirror clips commands at the stroke, which then are those applied.
 
     Return ``phi_res, u, y`` side by side, (cases, frames, n + m + q).
     """
@@ -222,7 +246,8 @@ def step_loop(
         commands = np.zeros((len(taps), m))  # u(k), u(k-1), ...
         for k in range(frames):
             y = sensor_gain * hardware.sensor @ residual + noise[case, k]
-            u = step_controller(controller, y, m, frame=k)
+            u = step_controller(controller, y, m, frame=k, applied=commands[0])
+            u = np.clip(u, -stroke, stroke)
             commands = np.vstack([u, commands[:-1]])
             residual = total[case, k] - hardware.influence @ (taps @ commands)
             out[case, k] = np.concatenate([residual, u, y])

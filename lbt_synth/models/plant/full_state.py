@@ -43,9 +43,10 @@ class FullStatePlant(EstimationProblem):
         """
         gain = self._checked_gain(gain_predictor)
         to_command = self.hardware.projector @ self.L
-        A = self.A - gain @ self.C + (self.B_known - gain @ self.D_known) @ to_command
+        applied = self.B_known - gain @ self.D_known
+        A = self.A - gain @ self.C + applied @ to_command
         D = np.zeros((to_command.shape[0], gain.shape[1]))
-        return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s)
+        return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
         """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -98,6 +99,18 @@ def test_single_precision_may_break_a_loop(tmp_path, loaded):
     written = lbt.interop.export_iir(tmp_path / "k.fits", prior)
     assert written.error < 1e-6
     assert written.error_single > 1e-2
+
+
+def test_the_loop_is_proved_in_the_precision_that_runs_it(tmp_path, loaded, designs):
+    written = lbt.interop.export_iir(tmp_path / "k.fits", designs["kalman"], precision="single")
+    losses = [check.value for check in written.checks if check.name.startswith("residual")]
+    assert 1e-9 < max(losses) < 1e-4
+    beside = json.loads(written.files[1].read_text())
+    assert (beside["precision"], beside["specula_precision"]) == ("single", 1)
+    prior = lbt.kalman(lbt.models.spread_plant(loaded.plant, half_width_hz=1.0, lines=3))
+    with pytest.raises(lbt.errors.NumericalError, match="in single precision, as a transfer"):
+        lbt.interop.export_iir(tmp_path / "no.fits", prior, precision="single")
+    assert not list(tmp_path.glob("no*"))
 
 
 def test_axes_that_do_not_decouple(tmp_path, loaded):

@@ -26,6 +26,8 @@ def test_matlab_round_trip(tmp_path, designs, name):
     assert "ss(textbook.A, textbook.B, textbook.C, textbook.D, dt_s)" in data["convention"]
     assert "cd" * 32 in data["provenance"]
     assert written.error < 1e-13
+    assert all(check.passed for check in written.checks)
+    assert len(written.checks) > 2
     run, x = design.controller.start(), np.zeros(len(A))
     series = np.random.default_rng(6).standard_normal((300, 2))
     expected = np.array([run.step(y) for y in series])

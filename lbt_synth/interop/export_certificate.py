@@ -1,0 +1,60 @@
+"""The certificate that goes beside every exported file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lbt_synth.design import Check
+from lbt_synth.interop.target import CERTIFICATE, Arithmetic
+from lbt_synth.storage.atomic_files import write_together
+from lbt_synth.storage.rows import json_record
+
+
+def write_certified(
+    files: dict[Path, bytes],
+    *,
+    target: str,
+    arithmetic: Arithmetic,
+    checks: Sequence[Check],
+    gain_digest: str | None,
+    **facts: Any,
+) -> tuple[Path, ...]:
+    """Write files and their certificate, all or none.
+
+    Parameters
+    ----------
+    files : dict of Path to bytes
+        What is written. The certificate has the name of the first one.
+    target, arithmetic : str, Arithmetic
+        Name of the target, and how it computes.
+    checks : sequence of Check
+        What was proved in that arithmetic.
+    gain_digest : str or None
+        SHA-256 of the gain file.
+    **facts
+        What else the file depends on, such as its precision.
+
+    Returns
+    -------
+    tuple of Path
+        The files, and the certificate.
+    """
+    digests = {path.name: hashlib.sha256(data).hexdigest() for path, data in files.items()}
+    first, *others = files
+    certificate: dict[str, Any] = {
+        "target": target,
+        "file": first.name,
+        "file_sha256": digests[first.name],
+        **({"others_sha256": {o.name: digests[o.name] for o in others}} if others else {}),
+        "gain_sha256": gain_digest,
+        **facts,
+        "arithmetic": json_record(arithmetic),
+        "checks": [json_record(check) for check in checks],
+    }
+    text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
+    written = (*files.items(), (first.with_suffix(CERTIFICATE), text.encode()))
+    return write_together(dict(written))

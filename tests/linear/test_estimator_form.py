@@ -1,0 +1,132 @@
+"""Controllers as estimators that are given the applied commands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.exports import lbt_config, lbt_designs
+
+import lbt_synth as lbt
+from lbt_synth.linear import estimator_form
+
+PATH = lbt.LoopHardware(frame_rate_hz=800)
+
+
+def law(**changes):
+    return lbt.integrator(PATH, gain=0.3, law=lbt.design.IntegratorLaw(**changes))
+
+
+def shaped(delay):
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=delay)
+    spec = lbt.design.shaping.Specification(
+        objective=lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0)
+    )
+    return lbt.design.shape(path, spec, functions=8, states=None)
+
+
+DESIGNS = {
+    "kalman": lambda: lbt_designs()["kalman"],
+    "hinf": lambda: lbt_designs()["hinf"],
+    "integrator": lambda: lbt_designs()["integrator"],
+    "turned": lambda: lbt_designs()["turned"],  # coordinates that say nothing of the command
+    "leak": lambda: law(leak=0.98),
+    "zero": lambda: law(zero_hz=20.0),
+    "two": lambda: law(integrators=2, zero_hz=20.0),
+    "fast": lambda: shaped(1),  # a command that acts on the next measurement
+    "late": lambda: shaped(2.4),
+}
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_it_is_the_same_controller_where_its_commands_are_applied(name):
+    controller = DESIGNS[name]().controller
+    form = estimator_form(controller)
+    assert form.spectral_radius < 1
+    plain, given, own = controller.start(), form.start(), form.start()
+    assert (plain.form, given.form) == ("plain", "estimator")
+    last = np.zeros(len(controller.C))
+    for y in np.random.default_rng(0).standard_normal((30, controller.B.shape[1])):
+        u, last, alone = plain.step(y), given.step(y, last), own.step(y)
+        size = np.max(np.abs(u))
+        assert np.allclose(last, u, rtol=0, atol=1e-10 * size)
+        assert np.array_equal(alone, last)
+
+
+@pytest.mark.parametrize("name", ["kalman", "hinf", "fast", "late"])
+def test_an_estimator_does_not_see_whether_its_commands_are_applied(name):
+    """Measurements of a loop whose mirror does anything: the estimate is that of another one."""
+    design = DESIGNS[name]()
+    hardware, form = design.hardware, estimator_form(design)
+    rng = np.random.default_rng(1)
+    total = np.cumsum(rng.standard_normal((60, hardware.modes)), axis=0)
+    found = []
+    for mirror in (0.0, 1.0):
+        run, residual = form.start(), np.zeros(hardware.modes)
+        past = np.zeros((len(hardware.mirror_taps), hardware.n_commands))
+        for phase in total:
+            u = run.step(hardware.sensor @ residual, past[0])
+            past = np.vstack([mirror * rng.standard_normal(u.shape), past[:-1]])
+            residual = phase - hardware.influence @ (hardware.mirror_taps @ past)
+        found.append(u)
+    assert np.allclose(*found, rtol=0, atol=1e-9 * np.max(np.abs(found)))
+
+
+def test_what_is_left_of_a_conditioned_controller_are_its_zeros():
+    form = estimator_form(law(zero_hz=20.0))
+    assert form.spectral_radius == pytest.approx(np.exp(-2 * np.pi * 20 / 800), rel=1e-12)
+    pure = estimator_form(law())
+    assert not pure.A.any()
+    assert np.array_equal(pure.applied, np.eye(2))  # u(k) = u_applied(k-1) + g y(k)
+
+
+def test_a_controller_without_such_a_form_is_refused():
+    late = lbt.Controller(A=[[0, 0], [1, 1.0]], B=[[1], [0]], C=[[0, 1]], D=[[0]])
+    with pytest.raises(lbt.errors.NumericalError, match="a measurement for each command"):
+        estimator_form(late)
+    # z (z - 2) / (z - 1)^2
+    outside = lbt.Controller(A=[[2, -1], [1, 0]], B=[[1], [0]], C=[[1, -2.0]], D=[[0]])
+    with pytest.raises(lbt.errors.NumericalError, match="a zero of modulus 2") as refused:
+        estimator_form(outside)
+    assert refused.value.residual == pytest.approx(2)
+    with pytest.raises(lbt.errors.DimensionError, match="applied must have"):
+        lbt.Controller(A=[[0.5]], B=[[1]], C=[[1]], D=[[0]], applied=np.ones((2, 1)))
+
+
+def test_inputs_that_are_not_finite_leave_the_state():
+    run = estimator_form(law()).start()
+    run.step([1.0, 2.0], [0.0, 0.0])
+    state = run.state.copy()
+    for y, applied in (([np.nan, 0], [0, 0]), ([0, 0], [np.inf, 0])):
+        with pytest.raises(lbt.errors.NonFiniteError, match="Hold the last command"):
+            run.step(y, applied)
+        assert np.array_equal(run.state, state)
+    with pytest.raises(lbt.errors.DimensionError, match="applied must have shape"):
+        run.step([1.0, 2.0], [0.0])
+
+
+def test_a_mirror_that_stops_short_winds_up_the_plain_form_alone():
+    config, rms = lbt_config(), {}
+    for name in ("kalman", "integrator"):
+        controller = lbt_designs()[name].controller
+        for form in (controller, estimator_form(controller)):
+            run = lbt.simulate(
+                form,
+                config.truth,
+                hardware=config.hardware,
+                frames=1200,
+                seed=3,
+                settle_frames=0,
+                stroke=1200.0,
+            )
+            assert np.max(np.abs(run.commands)) == 1200
+            rms[name, type(form).__name__] = run.rms_nm[0]
+    assert rms["kalman", "Controller"] > 2 * rms["kalman", "EstimatorForm"]
+    assert rms["integrator", "Controller"] > 1.3 * rms["integrator", "EstimatorForm"]
+    free = lbt.simulate(
+        controller, config.truth, hardware=config.hardware, frames=50, stroke=1e9, settle_frames=0
+    )
+    own = lbt.simulate(
+        controller, config.truth, hardware=config.hardware, frames=50, settle_frames=0
+    )
+    assert np.allclose(free.commands, own.commands, rtol=1e-9)
