@@ -25,7 +25,11 @@ CASES = {
     "export mat": ("gain.fits", ("gain.fits", "--for", "matlab", "-o", "OUT.mat")),
     "export iir": ("gain.fits", ("gain.fits", "--for", "iir", "-o", "OUT.fits")),
     "export c": ("gain.fits", ("gain.fits", "--for", "c", "-o", "OUT.c")),
-    "export pyrtc": ("gain.fits", ("gain.fits", "--for", "pyrtc", "-o", "."), "certificate.json"),
+    "export pyrtc": (
+        "gain.fits",
+        ("gain.fits", "--for", "pyrtc", "-o", "."),
+        "config.certificate.json",
+    ),
     "export c header": ("gain.fits", ("gain.fits", "--for", "c", "-o", "other.c"), "other.h"),
     "sigma": ("gain.fits", ("gain.fits", "-o", "OUT.png")),
     "bode": ("gain.fits", ("gain.fits", "-o", "OUT.png")),

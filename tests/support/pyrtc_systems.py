@@ -13,7 +13,7 @@ import yaml
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 
 _NUMBERS = itertools.count()
-_LONGEST_S = 60
+_LONGEST_S = 120
 
 
 @contextmanager
@@ -22,47 +22,104 @@ def running(folder, *, predictor=None, training=None, own_process=False):
 
     Another predictor takes the place of ours; a training series is what it is fitted to.
     """
-    import pyshmem
-    from pyrtc.manager import RTCManager
-
     conf = yaml.safe_load((folder / "config.yaml").read_text())
-    signal_name, wfc_name = streams = [
-        f"lbt_{os.getpid()}_{next(_NUMBERS)}_{kind}" for kind in ("signal", "wfc")
-    ]
-    conf["slopes"] |= {"output_streams": {"signal": signal_name}}
-    conf["slopes"] |= {"input_streams": {"wfc": wfc_name}}
-    conf["wfc"] |= {"output_streams": {"wfc": wfc_name}}
-    conf["loop"] |= {
-        "input_streams": {"signal": signal_name},
-        "output_streams": {"wfc": wfc_name},
-    }
     conf["loop"]["predictor"] = conf["loop"]["predictor"] if predictor is None else predictor
     if own_process:
         conf["manager"]["component_modes"] = {"loop": "hard-rtc"}
-    path = folder / f"{signal_name}.yaml"
+    with built(folder, conf) as manager:
+        if training is not None:
+            manager.get_component("loop").fit_predictor(training)
+        manager.start()
+        yield manager.get_component("slopes"), manager.get_component("loop")
+
+
+@contextmanager
+def synthetic(folder):
+    """Yield the manager of a folder's loop on pyRTC's own sensor: images, slopes, a calibration.
+
+    The sensor runs at its own pace and sees no disturbance yet; the loop is calibrated.
+    """
+    conf = yaml.safe_load((folder / "config.yaml").read_text())
+    modes = conf["wfc"]["num_modes"]
+    grid = {"sub_ap_spacing": 8, "sub_ap_offset_x": 0, "sub_ap_offset_y": 0}
+    conf["wfs"] = {
+        "class_name": "SyntheticSHWFS",
+        "functions": ["expose"],
+        "name": "sensor",
+        "width": 32,
+        "height": 32,
+        "dark_count": 10,
+        "num_modes": modes,
+        "frame_rate_hz": 200.0,
+        "read_noise": 1.0,
+        **grid,
+    }
+    conf["slopes"] = {"type": "SHWFS", "signal_type": "slopes", "functions": ["compute_signal"]}
+    conf["slopes"] |= grid
+    del conf["loop"]["im_file"]
+    conf["loop"] |= {"poke_amp": 0.2, "num_iters_im": 4}
+    with built(folder, conf) as manager:
+        sensor = manager.get_component("wfs")
+        amplitudes, sensor.modal_amplitudes = sensor.modal_amplitudes, 0 * sensor.modal_amplitudes
+        for part in ("wfc", "wfs", "slopes"):
+            manager.start_component(part)
+        manager.get_component("loop").compute_im()
+        sensor.modal_amplitudes = amplitudes
+        yield manager
+
+
+@contextmanager
+def built(folder, conf):
+    """Build a system under stream names of its own, and clear it away."""
+    import pyshmem
+    from pyrtc.manager import RTCManager
+
+    prefix = f"lbt_{os.getpid()}_{next(_NUMBERS)}_"
+    simulated = "signal_size" in conf["slopes"]
+    roles = {
+        "wfs": ("wfc", "wfs_raw wfs"),
+        "slopes": ("wfc" if simulated else "wfs", "signal signal_2d"),
+        "loop": ("signal", "wfc"),
+        "wfc": ("", "wfc wfc_2d"),
+    }
+    for section, words in roles.items():
+        for kind, names in zip(("input_streams", "output_streams"), words, strict=True):
+            conf[section][kind] = {name: prefix + name for name in names.split()}
+    path = folder / f"{prefix}.yaml"
     path.write_text(yaml.safe_dump(conf))
     before = signal.signal(signal.SIGALRM, _give_up)
     signal.alarm(_LONGEST_S)
     manager = RTCManager.from_config_file(path)
     try:
         manager.build()
-        if training is not None:
-            manager.get_component("loop").fit_predictor(training)
-        manager.start()
-        yield manager.get_component("slopes"), manager.get_component("loop")
+        yield manager
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
         children = [getattr(runtime, "launcher", None) for runtime in manager.runtimes.values()]
         processes = [child.process for child in children if child is not None]
-        manager.close()
-        for process in processes:
-            process.kill()
-            process.wait()
-            process.stdin.close()
-            process.stdout.close()
-        for name in streams:
-            pyshmem.unlink_quiet(name)
+        try:
+            manager.close()
+        finally:
+            for process in processes:
+                process.kill()
+                process.wait()
+                process.stdin.close()
+                process.stdout.close()
+            for name in ("wfs_raw", "wfs", "signal", "signal_2d", "wfc", "wfc_2d"):
+                pyshmem.unlink_quiet(prefix + name)
+
+
+def modal_residuals(manager, frames):
+    """Residuals of the next frames in units of the commands, (frames, modes)."""
+    loop, series = manager.get_component("loop"), []
+    stream = loop.signal_shm
+    seen = stream.count
+    for _ in range(frames):
+        found = stream.read_after_publication(seen, timeout=10)
+        seen = found.count
+        series.append(np.array(found.payload))
+    return loop.modal_residuals(series)
 
 
 def _give_up(*_):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -11,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.design import Check, Design
-from lbt_synth.errors import NumericalError, OutputError
+from lbt_synth.design import Design
+from lbt_synth.errors import OutputError
 from lbt_synth.files import save_gain
+from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
@@ -23,15 +23,13 @@ from lbt_synth.interop.export_checks import (
 )
 from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
 from lbt_synth.interop.pyrtc.pol_filter import PolFilter, pol_filter
-from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.interop.written_loop import prove_written
-from lbt_synth.storage.atomic_files import write_together
-from lbt_synth.storage.rows import json_record
+from lbt_synth.interop.target import CERTIFICATE, Arithmetic, Target
+from lbt_synth.interop.written_loop import prove_written, require_proved
 from lbt_synth.validation import FloatArray, integer
 
 _FIT_SECONDS = 20.0  # of pseudo-open-loop series that fit_predictor identifies
 _CONFIG, _GAIN, _RESPONSE = "config.yaml", "gain.fits", "interaction_matrix.npz"
-_CERTIFICATE = "certificate.json"
+_HINT = "Design with less accurate models, or for lower sensor gains."
 _SYSTEM = """\
 {origin}
 #
@@ -112,7 +110,7 @@ def export_pyrtc(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     written = lbt.interop.export_pyrtc(pathlib.Path(folder) / "slow", slow)
     ...     sorted(file.name for file in written.files)
-    ['certificate.json', 'config.yaml', 'gain.fits', 'interaction_matrix.npz']
+    ['config.certificate.json', 'config.yaml', 'gain.fits', 'interaction_matrix.npz']
     """
     folder = Path(path)
     require_exportable(design)
@@ -121,42 +119,29 @@ def export_pyrtc(
     size = own if modes is None else integer(modes, "modes", at_least=own)
     origin = "\n".join(f"# {line}" for line in join_labels(provenance_lines(design, gain_digest)))
     checks = prove_written(design, *found.as_computed())
-    _require_passed(checks)
+    require_proved(checks, "the arithmetic of pyRTC", _HINT)
     single = rehearsal_error(design, InnerLoop(design))
-    contents = {
-        _CONFIG: _write_system(found, origin, size).encode(),
-        _RESPONSE: _response_bytes(block_diag(found.response, np.eye(size - own))),
-    }
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(
             f"cannot make the directory {folder}: {error.strerror}.", path=folder
         ) from error
-    contents[_GAIN] = save_gain(folder / _GAIN, design).read_bytes()
-    certificate = {
-        "target": "pyrtc",
-        "gain_sha256": gain_digest,
-        "files_sha256": {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()},
-        "delay_frames": found.delay_frames,
-        "arithmetic": json_record(TARGET.arithmetic),
-        "checks": [json_record(check) for check in checks],
+    contents = {
+        _CONFIG: _write_system(found, origin, size).encode(),
+        _RESPONSE: _response_bytes(block_diag(found.response, np.eye(size - own))),
+        _GAIN: save_gain(folder / _GAIN, design).read_bytes(),
     }
-    contents[_CERTIFICATE] = (json.dumps(certificate, indent=2, allow_nan=False) + "\n").encode()
-    files = write_together({folder / name: data for name, data in contents.items()})
+    files = write_certified(
+        {folder / name: content for name, content in contents.items()},
+        target="pyrtc",
+        arithmetic=TARGET.arithmetic,
+        checks=checks,
+        gain_digest=gain_digest,
+        delay_frames=found.delay_frames,
+        modes=size,
+    )
     return Exported(files=files, error=single, error_single=single, checks=checks)
-
-
-def _require_passed(checks: tuple[Check, ...]) -> None:
-    """Refuse the export with the first check that fails."""
-    for check in checks:
-        if not check.passed:
-            raise NumericalError(
-                "the loop must keep what its design promises in the arithmetic of pyRTC; "
-                f"{check.name} is {check.value:.6g}, limit {check.limit:.6g}.",
-                status="arithmetic",
-                residual=check.value,
-            )
 
 
 def _write_system(found: PolFilter, origin: str, size: int) -> str:
@@ -190,6 +175,6 @@ TARGET = Target(
     ),
     file="folder with the configuration, the gain file and their certificate",
     write=export_pyrtc,
-    contents=(_CONFIG, _GAIN, _RESPONSE, _CERTIFICATE),
+    contents=(_CONFIG, _GAIN, _RESPONSE, str(Path(_CONFIG).with_suffix(CERTIFICATE))),
     options=("modes",),
 )

@@ -15,12 +15,11 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.interop.written_loop import Rounding
+from lbt_synth.interop.written_loop import ROUNDOFF, Rounding
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
 from lbt_synth.validation import FloatArray
 
-_ROUNDOFF = 2.0**-24  # largest relative error of an operation in single precision
 _LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single precision
 
 
@@ -94,7 +93,7 @@ class PolFilter:
                 + (residual + commands) ** 2,
                 commands**2,
             ]
-            return np.asarray(_ROUNDOFF**2 / 3 * np.concatenate(squares))
+            return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate(squares))
 
         return whole, Rounding(
             entry=replace(whole, B=entry, D=np.zeros((m, 2 * m))), variance=variance

@@ -6,12 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import design_from_record, loop_record
 from lbt_synth.interop.pyrtc.pol_filter import pol_filter
 from lbt_synth.methods.registry import method_of_design, record_methods
-from lbt_synth.validation import FloatArray, integer, matrix, number
+from lbt_synth.validation import FloatArray, integer, number
+
+_FITTED_NM = 100.0  # rms of a series that is identified
 
 
 class GainFilePredictor:
@@ -51,7 +53,11 @@ class GainFilePredictor:
         if command_limit is not None:
             self._limit = number(command_limit, "predictor.command_limit", above=0)
         self._gain_file = gain_file
-        self._take(load_gain(gain_file))
+        try:
+            design = load_gain(gain_file)
+        except GainFileError as error:
+            raise error from None  # in the log of pyRTC one sentence, without how it was found
+        self._take(design)
 
     def _take(self, design: Design) -> None:
         """Run another design, from a state of zero."""
@@ -75,7 +81,7 @@ class GainFilePredictor:
 
         The method is that of the gain file, or the best one where that needs more than a record.
         """
-        history = matrix(pol_history, "pol_history")[:, : self._own]
+        history = np.asarray(pol_history, dtype=np.float64)[:, : self._own]
         hardware = self._design.hardware
         assert hardware is not None  # pol_filter refuses others
         if not self._found.is_whole:
@@ -84,8 +90,13 @@ class GainFilePredictor:
                 f"whole frames; that of {self._gain_file} is another. Try lbt-synth auto on a "
                 "record."
             )
+        # in any unit: a controller does not depend on it
+        size = float(np.std(history[np.isfinite(history)])) or 1.0
         record = loop_record(
-            history, frame_rate_hz=hardware.frame_rate_hz, delay_frames=self.horizon, unit="nm"
+            history * (_FITTED_NM / size),
+            frame_rate_hz=hardware.frame_rate_hz,
+            delay_frames=self.horizon,
+            unit="nm",
         )
         method = method_of_design(self._design.method).name
         known = method if method in record_methods() else None

@@ -14,7 +14,7 @@ from support.gain_file_edits import odd_plant
 import lbt_synth as lbt
 from lbt_synth.interop.pyrtc import export as pyrtc_export
 
-NAMES = ["certificate.json", "config.yaml", "gain.fits", "interaction_matrix.npz"]
+NAMES = ["config.certificate.json", "config.yaml", "gain.fits", "interaction_matrix.npz"]
 
 
 def read(folder):
@@ -43,11 +43,11 @@ def test_the_folder_holds_all_that_it_refers_to(tmp_path):
 
 def test_the_certificate_has_digests_and_checks(tmp_path):
     written = lbt.interop.export_pyrtc(tmp_path, lbt_designs()["hinf"], gain_digest="b" * 64)
-    found = json.loads((tmp_path / "certificate.json").read_text())
+    found = json.loads((tmp_path / "config.certificate.json").read_text())
     assert found["gain_sha256"] == "b" * 64
     assert [check["passed"] for check in found["checks"]] == [True] * len(written.checks)
     assert found["arithmetic"]["precision"].startswith("single for signals")
-    for name, digest in found["files_sha256"].items():
+    for name, digest in {found["file"]: found["file_sha256"], **found["others_sha256"]}.items():
         assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == digest
 
 

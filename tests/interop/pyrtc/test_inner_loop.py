@@ -46,6 +46,22 @@ def test_a_clipped_command_winds_nothing_up():
     assert np.max(np.abs(alone.state)) > 1e8
 
 
+def test_a_loop_that_was_open_closes_as_if_it_had_not_been():
+    """The mirror is flattened while the loop does not run."""
+    design, frames = lbt_designs()["kalman"], 2500
+    total, noise = series(design, frames)
+    whole = step_loop(InnerLoop(design), 1.0, design.hardware, total, noise)[0, :, :2]
+    loop, commands, residual = InnerLoop(design), np.zeros((2, 2)), np.zeros(2)
+    for k in range(frames):
+        closed = not 500 <= k < 800
+        commands = np.vstack(
+            [loop.step(residual + noise[0, k]) if closed else np.zeros(2), commands[:1]]
+        )
+        residual = total[0, k] - commands[1]
+        if k > 1500:
+            assert np.max(np.abs(residual - whole[k])) < 0.5
+
+
 def test_reset_forgets():
     loop = InnerLoop(lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5))
     assert [loop.step([2.0])[0] for _ in range(2)] == [1.0, 2.0]

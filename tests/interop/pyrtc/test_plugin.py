@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from support.exports import lbt_config, lbt_designs, relative
 from support.gain_file_edits import odd_plant
-from support.pyrtc_systems import drawn, pol_series, residual_rms, running
+from support.pyrtc_systems import (
+    drawn,
+    modal_residuals,
+    pol_series,
+    residual_rms,
+    running,
+    synthetic,
+)
 
 import lbt_synth as lbt
 from lbt_synth.interop.pyrtc import plugin
@@ -16,12 +23,12 @@ from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
 from lbt_synth.loop.simulation.run import step_loop
 
 QUIET = 5  # frames without a signal, until the loop runs
-SETTLE = 1000
+SETTLE = 500
 
 
 @cache
 def given():
-    return drawn(lbt_config().truth, lbt_config().hardware, frames=3000, seed=2, quiet=QUIET)
+    return drawn(lbt_config().truth, lbt_config().hardware, frames=2000, seed=2, quiet=QUIET)
 
 
 def export(folder, name="kalman", **options):
@@ -81,11 +88,37 @@ def test_the_residual_is_below_those_of_its_own_predictors(tmp_path):
 
 
 @pytest.mark.e2e
-def test_a_loop_that_does_not_run_is_an_error_of_the_telescope(tmp_path, monkeypatch):
+def test_it_closes_on_the_sensor_of_pyrtc(tmp_path):
+    """Its images, its slopes and its calibration, at its own pace."""
+    pytest.importorskip("pyrtc")
+    slow = lbt.models.ARModel(
+        coefficients=[1.99, -0.9905], driving_rms_nm=0.002, frame_rate_hz=200.0
+    )
+    plant = lbt.tip_tilt_plant(frame_rate_hz=200, turbulence=slow, noise_nm=0.01, delay_frames=1)
+    lbt.interop.export_pyrtc(tmp_path, lbt.kalman(plant), modes=6)
+    config = tmp_path / "config.yaml"
+    config.write_text(config.read_text().replace("other_gain: 0.0", "other_gain: 0.3"))
+    with synthetic(tmp_path) as manager:
+        open_loop = np.std(modal_residuals(manager, 200), axis=0)
+        manager.start_component("loop")
+        modal_residuals(manager, 100)  # until it has settled
+        closed = np.std(modal_residuals(manager, 200), axis=0)
+    assert np.all(closed < 0.5 * open_loop)
+    assert np.all(closed[:2] < 0.2 * open_loop[:2])
+
+
+@pytest.mark.e2e
+def test_a_spoilt_frame_repeats_the_command_and_a_loop_that_stops_is_an_error(
+    tmp_path, monkeypatch
+):
     pytest.importorskip("pyrtc")
     monkeypatch.setattr(plugin, "_ANSWER_SECONDS", 0.1)
     export(tmp_path)
     with running(tmp_path) as (telescope, loop):
+        for k in range(10):
+            last = telescope.step([float(k), 1.0])
+        assert np.any(last)
+        assert np.array_equal(telescope.step([np.nan, 1.0]), last)
         loop.stop()
         telescope.step(np.zeros(2))  # the frame that it waits for
         with pytest.raises(lbt.errors.ProblemError, match="must answer within 0.1 s"):
