@@ -105,6 +105,16 @@ def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys, mon
     assert "note:" not in run(capsys, *arguments)[1]
 
 
+def test_export_pyrtc_at_the_terminal(tmp_path, capsys, gains):
+    arguments = ("export", gains["kalman"], "--for", "pyrtc", "-o", f"{tmp_path}/k/")
+    for _ in range(2):  # into a new folder, and over its files
+        status, text, _ = run(capsys, *arguments)
+        assert status == 0
+        assert text.count("written: ") == 4
+    found = json.loads(run(capsys, *arguments, "--json")[1])
+    assert {check["passed"] for check in found["checks"]} == {True}
+
+
 BAD = [
     (("KALMAN", "--for", "matlab", "-o", "k.mat", "--name", "x"), 2, "--name goes with --for c"),
     (
@@ -121,6 +131,9 @@ BAD = [
     (("KALMAN", "--for", "iir", "-o", "k.mat"), 2, "must end in .fits"),
     (("KALMAN", "--for", "iir", "-o", "KALMAN"), 2, "must not replace the input"),
     (("KALMAN", "--for", "c", "-o", "none/k.c"), 2, "no directory none"),
+    (("KALMAN", "--for", "pyrtc", "-o", "none/k"), 2, "no directory none"),
+    (("KALMAN", "--for", "pyrtc", "-o", "DAMAGED.fits"), 2, "cannot make the directory"),
+    (("KALMAN", "--for", "pyrtc", "-o", "k", "--order", "3"), 2, "--order goes with --for dao"),
     (("KALMAN", "--for", "pdf", "-o", "k.pdf"), 2, "invalid choice"),
     (("KALMAN", "-o", "k.c"), 2, "required"),
     (("none.fits", "--for", "c", "-o", "k.c"), 2, "cannot read none.fits"),
