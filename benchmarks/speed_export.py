@@ -24,7 +24,13 @@ FRAMES, REPEATS = 20_000, 15
 DRIVER = """
 #define _POSIX_C_SOURCE 199309L
 #include <time.h>
-typedef void step_type(void *, const REAL *, REAL *);
+#ifdef ESTIMATOR
+typedef int step_type(void *, const REAL *, const REAL *, REAL *);
+#define STEP step(state, y, u, u)
+#else
+typedef int step_type(void *, const REAL *, REAL *);
+#define STEP step(state, y, u)
+#endif
 typedef void gemv_type(const char *, const int *, const int *, const REAL *, const REAL *,
                        const int *, const REAL *, const int *, const REAL *, REAL *, const int *);
 static double now(void)
@@ -40,12 +46,12 @@ double time_step(step_type *step, REAL *state, int n, REAL *y, REAL *u, int fram
     for (k = 0; k < frames; k++) {
         if (k % 64 == 0) for (i = 0; i < n; i++) state[i] = (REAL)1;
         y[0] = (REAL)(k % 7 - 3);
-        step(state, y, u);
+        STEP;
     }
     return (now() - start) / frames;
 }
 double time_gemv(gemv_type *gemv, const REAL *matrix, int rows, int cols, REAL *x, REAL *out,
-                 int n, int frames)
+                 int n, int q, int frames)
 {
     const double start = now();
     const REAL one = 1, zero = 0;
@@ -56,6 +62,7 @@ double time_gemv(gemv_type *gemv, const REAL *matrix, int rows, int cols, REAL *
         x[n] = (REAL)(k % 7 - 3);
         gemv("N", &rows, &cols, &one, matrix, &rows, x, &stride, &zero, out, &stride);
         for (i = 0; i < n; i++) x[i] = out[i];
+        for (i = n + q; i < cols; i++) x[i] = out[i - q];
     }
     return (now() - start) / frames;
 }
@@ -72,15 +79,23 @@ def blas(name: str) -> ctypes.c_void_p:
     return ctypes.c_void_p(pointer(capsule, get_name(capsule)))
 
 
-def frame(design: lbt.Design, *, single: bool) -> Row:
+def frame(design: lbt.Design, *, single: bool, form: str = "plain") -> Row:
     """Median seconds a frame of both, in turn."""
     k = design.controller
     n, q, m = k.n_states, k.B.shape[1], len(k.C)
+    inputs = k
+    if form == "estimator":
+        own = lbt.linear.estimator_form(k)
+        both = np.hstack([own.B, own.applied])
+        D = np.zeros((m, both.shape[1]))
+        inputs = lbt.Controller(A=own.A, B=both, C=own.C, D=D)
     real, dtype = ("float", np.float32) if single else ("double", np.float64)
     with tempfile.TemporaryDirectory() as folder:
         at = Path(folder)
-        lbt.interop.export_c(at / "ctl.c", design, precision="single" if single else "double")
-        (at / "driver.c").write_text(f"#define REAL {real}\n{DRIVER}")
+        precision = "single" if single else "double"
+        lbt.interop.export_c(at / "ctl.c", design, precision=precision, form=form)
+        defined = "#define ESTIMATOR\n" if form == "estimator" else ""
+        (at / "driver.c").write_text(f"#define REAL {real}\n{defined}{DRIVER}")
         subprocess.run(
             ["cc", "-std=c99", "-O2", "-shared", "-fPIC", "ctl.c", "driver.c", "-o", "ctl.so"],
             cwd=at,
@@ -93,16 +108,22 @@ def frame(design: lbt.Design, *, single: bool) -> Row:
         made = np.array(values, dtype=dtype, order="F")
         return made, ctypes.c_void_p(made.ctypes.data)
 
-    textbook = k.to_statespace()  # one product gives the next state and the command
+    textbook = inputs.to_statespace()  # one product gives the next state and the command
     whole = np.block([[textbook.A, textbook.B], [textbook.C, textbook.D]])
     state, y, u, x, out, matrix = map(
-        array, (np.zeros(n + m), np.zeros(q), np.zeros(m), np.zeros(n + q), np.zeros(n + m), whole)
+        array,
+        (
+            *(np.zeros(size) for size in (n + m, q, m, whole.shape[1], n + m)),
+            whole,
+        ),
     )
     gemv = blas("sgemv" if single else "dgemv")
     mine, theirs = [], []
     for _ in range(REPEATS):
+        x[0][n + q :] = u[0][:] = 0.0
         mine.append(library.time_step(library.ctl_step, state[1], n, y[1], u[1], FRAMES))
-        theirs.append(library.time_gemv(gemv, matrix[1], n + m, n + q, x[1], out[1], n, FRAMES))
+        size = n + m, whole.shape[1]
+        theirs.append(library.time_gemv(gemv, matrix[1], *size, x[1], out[1], n, q, FRAMES))
     scale = np.max(np.abs(out[0][n:]))  # both end in the same frame of the same input
     assert np.max(np.abs(u[0] - out[0][n:])) < (1e-4 if single else 1e-11) * scale
     return {
@@ -138,7 +159,27 @@ def compiled_frames() -> dict[str, Row]:
             size = f"{design.controller.n_states} states, {'single' if single else 'double'}"
             rows[f"{name} ({size})"] = frame(design, single=single)
     rows["Kalman (10 states, double)"]["bar"] = 1
+    for name, design in (("Kalman", twelve_states()), ("no zeros", turned(twelve_states()))):
+        for single in (False, True):
+            size = f"estimator form, 12 states, {'single' if single else 'double'}"
+            rows[f"{name} ({size})"] = {
+                **frame(design, single=single, form="estimator"),
+                "bar": 1 / 1.3,
+            }
     return rows
+
+
+def twelve_states() -> lbt.Design:
+    """A Kalman filter of two axes with turbulence of the second order and a line."""
+    config = lbt.load_config(ROOT / "examples" / "lbt_robust.yaml")
+    lines = [
+        lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=d)
+        for d in ((1, 0), (0, 1))
+    ]
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800, turbulence=config.plant.turbulence, noise_nm=15.5, vibrations=lines
+    )
+    return lbt.kalman(plant)
 
 
 REALTIME = (

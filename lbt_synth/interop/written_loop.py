@@ -189,8 +189,9 @@ def _residual_check(
         found = _variances(design, shown, slice(None))
         sizes = np.sqrt(np.maximum(found, 0.0))  # below zero by rounding
         variance = rounding.variance(sizes[n + m :], sizes[n : n + m])
-        after = found[:n] + _rounding_left(hardware, written, rounding.entry, variance, gain)
-        how += "; rounding as white noise"
+        left = _rounding_left(hardware, written, rounding.entry, variance, gain)
+        after = found[:n] + left
+        how += f"; rounding at most {np.sqrt(np.max(left / before)):.1e} of it"
     with np.errstate(invalid="ignore"):  # not a number: no accuracy, and the check fails
         loss = float(np.max(np.sqrt(after / before))) - 1
     return Check(f"residual at sensor gain {gain:g}, loss", loss, _LOSS, how)

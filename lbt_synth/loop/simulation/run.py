@@ -247,8 +247,8 @@ def step_loop(
         for k in range(frames):
             y = sensor_gain * hardware.sensor @ residual + noise[case, k]
             u = step_controller(controller, y, m, frame=k, applied=commands[0])
-            u = np.clip(u, -stroke, stroke)
-            commands = np.vstack([u, commands[:-1]])
+            commands[1:] = commands[:-1]
+            commands[0] = u if stroke == np.inf else np.clip(u, -stroke, stroke)
             residual = total[case, k] - hardware.influence @ (taps @ commands)
-            out[case, k] = np.concatenate([residual, u, y])
+            out[case, k] = np.concatenate([residual, commands[0], y])
     return out
