@@ -11,10 +11,12 @@ from fractions import Fraction
 
 import numpy as np
 from astropy.io import fits
+from ruamel.yaml import YAML
 from scipy.io import loadmat
 from support.compiled import Compiled
 
 import lbt_synth as lbt
+from lbt_synth.interop.pyrtc.predictor import GainFilePredictor
 
 FRAMES = 1000
 SINGLE = {"single": np.float32, "double": np.float64}
@@ -223,9 +225,37 @@ def is_schur(polynomial):
     return True
 
 
-WITHOUT_ORACLE = {"cacao", "pyrtc"}  # judged by the tests of their own inner loops
-ORACLES = {"c": judge_c, "dao": judge_dao, "iir": judge_iir, "matlab": judge_matlab}
-ENDINGS = {"c": "k.c", "dao": "k.npy", "iir": "k.fits", "matlab": "k.mat"}
+def judge_pyrtc(files, design, options):
+    """Close the loop around the matrices of the gain file, and run the predictor as pyRTC does."""
+    predictor = YAML(typ="safe").load(files[0])["loop"]["predictor"]
+    gain_file, delay = files[0].with_name(predictor["gain_file"]), predictor["delay_frames"]
+    with fits.open(gain_file) as units:
+        A, B, C, D = (units[name].data.astype(float) for name in "ABCD")
+
+    def step(x, y, last):
+        x = A @ x + B @ y
+        return x, C @ x + D @ y
+
+    running = GainFilePredictor(len(C), delay, gain_file=gain_file)
+    sent = [np.zeros(len(C), dtype=np.float32)] * delay  # with pyRTC's sign
+
+    def run(y, last):
+        running.update(y.astype(np.float32) - sent[0])
+        sent[:] = [*sent[1:], (-running.predict()).astype(np.float32)]
+        return -sent[-1].astype(float)
+
+    return bool(Loop(design.hardware, len(A), step).radius() < 1 and decays(design.hardware, run))
+
+
+WITHOUT_ORACLE = {"cacao"}  # judged by the tests of its own inner loop
+ORACLES = {
+    "c": judge_c,
+    "dao": judge_dao,
+    "iir": judge_iir,
+    "matlab": judge_matlab,
+    "pyrtc": judge_pyrtc,
+}
+ENDINGS = {"c": "k.c", "dao": "k.npy", "iir": "k.fits", "matlab": "k.mat", "pyrtc": "k"}
 
 
 def judge(folder, seed):
