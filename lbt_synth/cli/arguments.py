@@ -90,6 +90,10 @@ def export(parser: ArgumentParser) -> None:
     add_option(parser, "--order", int, "dao: M of the RTC's configuration (default 20)")
     text = "dao, pyrtc: modes of the RTC (default: those of the design)"
     add_option(parser, "--modes", int, text)
+    text = "cacao: frames of history (default: as many as the loss needs)"
+    add_option(parser, "--steps", int, text)
+    text = "cacao: relative loss of residual that chooses them (default 0.01, the most)"
+    add_option(parser, "--loss", float, text)
     text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its certificate; "
     text += "pyrtc: folder"
     add_output(parser, text)

@@ -16,7 +16,7 @@ from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
 
 _SINGLE_SUFFICES = 1e-3  # of the largest command
-_OPTIONS = ("form", "precision", "name", "order", "modes")
+_OPTIONS = ("form", "precision", "name", "order", "modes", "steps", "loss")
 
 
 @table_row

@@ -1,6 +1,7 @@
 from .arithmetic_cost import FrameCost as FrameCost
 from .arithmetic_cost import frame_cost as frame_cost
 from .c.export import export_c as export_c
+from .cacao.export import export_cacao as export_cacao
 from .dao.export import export_dao as export_dao
 from .export_checks import Exported as Exported
 from .iir.export import export_iir as export_iir

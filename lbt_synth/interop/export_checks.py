@@ -47,6 +47,21 @@ def require_exportable(design: Design, written: Controller | None = None) -> Non
         )
 
 
+def require_modal(design: Design, file: str) -> int:
+    """Return the number of modes of a design whose measurements and commands are its modes."""
+    hardware = design.hardware
+    if hardware is None:
+        raise ProblemError(f"{file} needs the design of a loop; got a bare controller.")
+    identity = np.eye(hardware.modes)
+    for name in ("sensor", "influence"):
+        if not np.array_equal(getattr(hardware, name), identity):
+            raise ProblemError(
+                f"{name}_matrix must be the identity: the RTC reconstructs modes and projects them "
+                "on actuators itself. Design for the modes."
+            )
+    return hardware.modes
+
+
 class MatrixForm:
     """A controller in new-state form, stepped in a given precision."""
 

@@ -137,7 +137,7 @@ def prove_written(
     """
     hardware = design.hardware
     assert hardware is not None  # the callers refuse a design without a loop
-    low, high = _gain_interval(design, hardware)
+    low, high = proved_gains(design, hardware)
     count = 2 + int(np.log(high / low) / np.log(_STEP))
     gains = np.append(np.geomspace(low, high, count), 1.0)
     radius = float(np.max(radii_by_gain(hardware, written)(gains)))
@@ -155,7 +155,7 @@ def prove_written(
     return tuple(checks)
 
 
-def _gain_interval(design: Design, hardware: LoopHardware) -> tuple[float, float]:
+def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
     """Return the sensor gains that are demanded, or 1 % less than the design holds."""
     if isinstance(design, ShapedDesign):
         demands = [d for spec in design.specifications for d in spec.demands]
@@ -180,13 +180,13 @@ def _residual_check(
     assert hardware is not None
     n, m = hardware.modes, hardware.n_commands
     loops = [close_loop(hardware, c, sensor_gain=gain) for c in (design.controller, written)]
-    before = _variances(design, loops[0], slice(n))
+    before = mode_variances(design, loops[0], slice(n))
     how = "Lyapunov equations, level sets"
     if rounding is None:
-        after = _variances(design, loops[1], slice(n))
+        after = mode_variances(design, loops[1], slice(n))
     else:
         shown = _with_signals(loops[1], rounding.signals)
-        found = _variances(design, shown, slice(None))
+        found = mode_variances(design, shown, slice(None))
         sizes = np.sqrt(np.maximum(found, 0.0))  # below zero by rounding
         variance = rounding.variance(sizes[n + m :], sizes[n : n + m])
         left = _rounding_left(hardware, written, rounding.entry, variance, gain)
@@ -207,7 +207,7 @@ def _with_signals(loop: ClosedLoop, signals: FloatArray | None) -> ClosedLoop:
     return replace(loop, system=replace(s, C=np.vstack([s.C, C]), D=np.vstack([s.D, D])))
 
 
-def _variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
+def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     """Variance of some outputs of the loop, one each, under what the design is for."""
     s, rate = loop.system, loop.hardware.frame_rate_hz
     seen = replace(loop, system=replace(s, C=s.C[rows], D=s.D[rows]))

@@ -22,7 +22,7 @@ def test_a_target_says_how_it_computes(name):
 
 
 def test_each_folder_with_an_export_is_a_target_and_has_an_oracle():
-    assert {"c", "dao", "iir", "matlab", "pyrtc"} <= set(target_names())
+    assert {"c", "cacao", "dao", "iir", "matlab", "pyrtc"} <= set(target_names())
     assert set(target_names()) <= set(ORACLES) | WITHOUT_ORACLE
     assert not set(ORACLES) & WITHOUT_ORACLE
 

@@ -19,6 +19,7 @@ from lbt_synth.interop.export_checks import (
     provenance_lines,
     rehearsal_error,
     require_exportable,
+    require_modal,
 )
 from lbt_synth.interop.iir.export import axis_polynomials
 from lbt_synth.interop.iir.realisation import build_controller
@@ -92,7 +93,7 @@ def export_dao(
     """
     target = require_ending(path, "a matrix of dao", (".npy", ".fits"))
     require_exportable(design)
-    own = _require_modal(design)
+    own = require_modal(design, "a dao matrix")
     columns = own if modes is None else integer(modes, "modes", at_least=own)
     lines = provenance_lines(design, gain_digest)
     exact = direct_form_rows(design.controller, integer(order, "order", at_least=1))
@@ -130,21 +131,6 @@ def direct_form_rows(controller: Controller, order: int) -> FloatArray:
         rows[: needed + 1, mode] = num[::-1] / den[-1]
         rows[order + 1 : order + 1 + needed, mode] = -den[-2::-1] / den[-1]
     return rows
-
-
-def _require_modal(design: Design) -> int:
-    """Return the number of modes of a design whose measurements and commands are its modes."""
-    hardware = design.hardware
-    if hardware is None:
-        raise ProblemError("a dao matrix needs the design of a loop; got a bare controller.")
-    identity = np.eye(hardware.modes)
-    for name in ("sensor", "influence"):
-        if not np.array_equal(getattr(hardware, name), identity):
-            raise ProblemError(
-                f"{name}_matrix must be the identity: the RTC reconstructs modes and projects them "
-                "on actuators itself. Design for the modes."
-            )
-    return hardware.modes
 
 
 def _as_computed(rounded: NDArray[np.float32], dt_s: float) -> tuple[Controller, Rounding]:

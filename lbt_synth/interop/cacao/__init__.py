@@ -1,0 +1,1 @@
+"""Export of a controller as the predictive filter of cacao."""
