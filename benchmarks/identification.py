@@ -2,6 +2,8 @@
 
     python benchmarks/identification.py [--records 200] [--jobs 2] [--seconds 60]
     python benchmarks/identification.py --errors    only how honest the standard errors are
+    python benchmarks/identification.py --errors --colour 0.3 ...    with first-order noise
+    python benchmarks/identification.py --errors --close ...         with pairs of close lines
     python benchmarks/identification.py --drifts    sinusoids and narrow resonances that drift
     python benchmarks/identification.py --times
 
@@ -18,8 +20,9 @@ from __future__ import annotations
 import argparse
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -47,9 +50,19 @@ class Case:
 
 
 def case(
-    seed: int, frames: int, *, rate: float = RATE, drift: lbt.models.ARModel | None = None
+    seed: int,
+    frames: int,
+    *,
+    rate: float = RATE,
+    drift: lbt.models.ARModel | None = None,
+    colour: float = 0.0,
+    close: bool = False,
 ) -> Case:
-    """Draw a loop, perhaps with a drift on top of its turbulence, and run it."""
+    """Draw a loop, perhaps with a drift on top of its turbulence, and run it.
+
+    ``colour`` is the correlation of the noise of neighbouring frames; ``close`` puts a second line
+    within 4 half widths of each.
+    """
     rng = np.random.default_rng([seed, 1])
     path = lbt.LoopHardware(frame_rate_hz=rate, delay_frames=2, modes=1)
     noise = float(np.exp(rng.uniform(np.log(2), np.log(30))))
@@ -79,11 +92,29 @@ def case(
         )
         for _ in range(int(rng.integers(0, 6)))
     )
+    if close:
+        lines += tuple(
+            replace(
+                line,
+                frequency_hz=line.frequency_hz * (1 + rng.uniform(1, 4) * line.damping),
+                rms_nm=line.rms_nm * rng.uniform(0.3, 1),
+            )
+            for line in lines
+        )
     total = turbulence if drift is None else lbt.models.SumSpectrum(parts=[turbulence, drift])
     truth = lbt.Truth(turbulence=total, vibrations=lines, noise_nm=noise, sensor_gain=sensor_gain)
     ran = lbt.integrator(path, gain=float(rng.uniform(0.2, 0.6)))
+    seen = truth
+    if colour:  # to the loop, noise is a part of the phase that it cannot remove
+        own = lbt.models.ARModel(
+            coefficients=[colour],
+            driving_rms_nm=noise / sensor_gain * np.sqrt(1 - colour**2),
+            frame_rate_hz=rate,
+        )
+        whole = lbt.models.SumSpectrum(parts=[total, own])
+        seen = replace(truth, turbulence=whole, noise_nm=1e-3 * noise)
     run = lbt.simulate(
-        ran.controller, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000
+        ran.controller, seen, hardware=path, frames=frames, seed=seed, settle_frames=2000
     )
     record = lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=rate, delay_frames=2, unit="nm"
@@ -214,10 +245,32 @@ def coverage(results: list[dict]) -> None:
             )
 
 
-def only_errors(seed: int, frames: int) -> dict:
+def only_errors(seed: int, frames: int, **options: Any) -> dict:
     """Return the deviations of one record."""
-    it = case(seed, frames)
-    return {"errors": deviations(it, lbt.identify(it.record).axes[0])}
+    it = case(seed, frames, **options)
+    begin = time.process_time()
+    model = lbt.identify(it.record)
+    return {
+        "seed": seed,
+        "errors": deviations(it, model.axes[0]),
+        "seconds": time.process_time() - begin,
+        "coloured": model.axes[0].noise_correlation != 0,
+        "warned": any("warning" in note for note in model.notes),
+    }
+
+
+def show_errors(results: list[dict]) -> None:
+    """Print the coverage, large deviations, and how many records have a warning."""
+    coverage(results)
+    for r in results:
+        far = {name: np.round(v, 1) for name, v in r["errors"].items() if np.any(np.abs(v) > 4)}
+        if far:
+            print(f"  record {r['seed']}{', warned' * r['warned']}: {far}")
+    print(
+        f"coloured noise in {sum(r['coloured'] for r in results)}, a warning in "
+        f"{sum(r['warned'] for r in results)} of {len(results)} records; median time "
+        f"{np.median([r['seconds'] for r in results]):.2f} s"
+    )
 
 
 def studied(seed: int, frames: int) -> dict:
@@ -444,12 +497,17 @@ def main() -> None:
     parser.add_argument("--drifts", action="store_true", help="only sinusoids that drift")
     parser.add_argument("--times", action="store_true", help="only the time of two axes")
     parser.add_argument("--errors", action="store_true", help="only the standard errors")
+    parser.add_argument("--colour", type=float, default=0.0, help="of the noise, with --errors")
+    parser.add_argument("--close", action="store_true", help="pairs of lines, with --errors")
     asked = parser.parse_args()
     if asked.times or asked.drifts:
         times() if asked.times else drifts()
         return
-    study, show = (only_errors, coverage) if asked.errors else (studied, table)
-    one = partial(study, frames=int(asked.seconds * RATE))
+    study, show, options = studied, table, {}
+    if asked.errors:
+        study, show = only_errors, show_errors
+        options = {"colour": asked.colour, "close": asked.close}
+    one = partial(study, frames=int(asked.seconds * RATE), **options)
     with ProcessPoolExecutor(asked.jobs) as pool:
         seeds = range(asked.first, asked.first + asked.records)
         show(list(pool.map(one, seeds)))

@@ -306,7 +306,8 @@ def _whiteness_note(axis: IdentifiedAxis) -> str:
 def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
     turbulence, whiteness = axis.turbulence, axis.whiteness
     tests = ("deviation", "p_value", "correlation_p_value", "white")
-    own = ("noise_nm", "noise_error_nm", "sensor_gain", "sensor_gain_error", "sensor_gain_note")
+    noise = ("noise_nm", "noise_error_nm", "noise_correlation", "noise_correlation_error")
+    own = (*noise, "sensor_gain", "sensor_gain_error", "sensor_gain_note")
     return {
         "turbulence": asdict(axis.turbulence_fit)
         | {"coefficients": turbulence.coefficients, "driving_rms_nm": turbulence.driving_rms_nm},

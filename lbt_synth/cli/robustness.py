@@ -22,8 +22,9 @@ from lbt_synth.loop import Imaging, stable_sensor_gains
 from lbt_synth.report.designs.assessment import require_compatible
 from lbt_synth.report.designs.report import refine_values
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, percent_column, row_table, table_row
-from lbt_synth.studies import RobustnessMap, robustness_map
+from lbt_synth.studies import GuaranteedResidual, RobustnessMap, guaranteed_residual, robustness_map
 from lbt_synth.studies.robustness import default_methods
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
@@ -106,9 +107,14 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     report = Report(data={"maps": {}})
     for name, found in maps.items():
         intervals = _stable_gains(designs[name], found, assumed[name])
-        report.data["maps"][name] = asdict(found) | {"stable_sensor_gains": intervals}
+        worst = _guarantee(designs[name], found, assumed[name], config)
+        report.data["maps"][name] = asdict(found) | {
+            "stable_sensor_gains": intervals,
+            "guaranteed": asdict(worst),
+        }
         report.tables.append(row_table(_map_title(name, found, config.imaging), _map_lines(found)))
         report.notes += _map_notes(name, designs[name], config, found, intervals)
+        report.notes.append(f"{name}: {_guarantee_text(worst, found)}")
     write_outputs(
         report,
         arguments.output,
@@ -208,6 +214,33 @@ def _map_lines(found: RobustnessMap) -> list[MapLine]:
                 )
             )
     return lines
+
+
+def _guarantee(
+    design: Design, found: RobustnessMap, assumed: float, config: Config
+) -> GuaranteedResidual:
+    """Bound the residual over the frequencies and sensor gains of a map, at the design's delay."""
+    assert design.hardware is not None  # _assumed_gain has refused the others
+    errors, gains = found.errors_hz, found.sensor_gains / assumed
+    return guaranteed_residual(
+        design.hardware,
+        design,
+        config.truth,
+        error_hz=(float(errors.min()), float(errors.max())),
+        sensor_gains=(float(gains.min()), float(gains.max())),
+    )
+
+
+def _guarantee_text(worst: GuaranteedResidual, found: RobustnessMap) -> str:
+    """Return what holds between the points of a map."""
+    low, high = found.sensor_gains.min(), found.sensor_gains.max()
+    box = (
+        f"each vibration anywhere in its errors and the sensor gain of each axis anywhere from "
+        f"{low:.4g} to {high:.4g}"
+    )
+    if np.isfinite(worst.upper_nm):
+        return f"at most {nm_text(worst.upper_nm, '.4g')} are left with {box}: guaranteed"
+    return f"nothing is guaranteed with {box}: not all of these loops are stable"
 
 
 def _map_notes(

@@ -8,6 +8,3 @@ They can be compared with the least residual that any linear controller leaves.
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-# A function that shares its module's name hides the module, whichever is imported first.
-from lbt_synth.loop.strehl import strehl as strehl  # noqa: E402

@@ -207,6 +207,55 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     assert_whole(tmp_path / "out", lbt.studies.load_study(path), lbt.studies.evaluate_samples)
 
 
+@pytest.fixture
+def certificate(tmp_path):
+    """The file of a certificate that is its own authority, and that of its key."""
+    files = [tmp_path / name for name in ("certificate.pem", "key.pem")]
+    options = [
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "1",
+        "-subj",
+        "/CN=127.0.0.1",
+    ]
+    made = ["openssl", *options, "-out", files[0], "-keyout", files[1]]
+    subprocess.run(made, check=True, capture_output=True)
+    return files
+
+
+@pytest.mark.e2e
+def test_an_encrypted_scheduler(tmp_path, capsys, certificate, monkeypatch):
+    from distributed import LocalCluster
+    from distributed.security import Security
+
+    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 5)
+    own, key = map(str, certificate)
+    sides = {
+        f"tls_{side}_{what}": name
+        for side in ("scheduler", "worker", "client")
+        for what, name in (("cert", own), ("key", key))
+    }
+    security = Security(tls_ca_file=own, require_encryption=True, **sides)
+    path = study_file(tmp_path, samples="8", parameters=PARAMETERS)
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, security=security, dashboard_address=":0"
+    ) as encrypted:
+        address = encrypted.scheduler_address
+        assert address.startswith("tls://")
+        arguments = ("study", path, "-o", tmp_path / "out", "--dask", address)
+        status, _, error = run(capsys, *arguments)  # without the certificate
+        assert status == 2
+        assert error.count("\n") == 1
+        assert not (tmp_path / "out").exists()
+        status, _, error = run(capsys, *arguments, "--dask-tls", own, own, key)
+        assert status == 0, error
+    assert_whole(tmp_path / "out", lbt.studies.load_study(path), lbt.studies.evaluate_samples)
+
+
 @pytest.mark.e2e
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""])
 def test_no_scheduler(tmp_path, capsys, address, monkeypatch):

@@ -27,7 +27,7 @@ def choices(schema):
     """What a part of the schema may be, references and alternatives followed."""
     if "$ref" in schema:
         return choices(SCHEMA["$defs"][schema["$ref"].rpartition("/")[2]])
-    parts = [*schema.get("oneOf", []), *schema.get("anyOf", [])]
+    parts = [part for word in ("oneOf", "anyOf", "allOf") for part in schema.get(word, [])]
     return [found for part in parts for found in choices(part)] if parts else [schema]
 
 

@@ -8,6 +8,3 @@ Their loop is closed exactly, and in long simulations.
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-# A function that shares its module's name hides the module, whichever is imported first.
-from lbt_synth.design.modal.reconstructor import reconstructor as reconstructor  # noqa: E402

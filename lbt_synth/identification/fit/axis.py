@@ -19,13 +19,12 @@ from lbt_synth.identification.fit.periodogram import (
     loop_periodogram,
 )
 from lbt_synth.identification.fit.physical_parameters import (
-    WIDE_DAMPING,
     describe_axis,
     hold_gain,
     parameter_covariance,
     standard_errors,
 )
-from lbt_synth.identification.fit.whittle import FittedModel
+from lbt_synth.identification.fit.whittle import WIDE_DAMPING, FittedModel
 from lbt_synth.identification.stretches import StretchesLike, checked_stretches
 from lbt_synth.validation import FloatArray, number, real_array, require_instance
 
@@ -54,8 +53,9 @@ def identify_axis(
     The pseudo-open-loop measurement ``y(k) + g c(k)``, with c(k) the correction that y(k)
     contains and g the sensor gain, is g times the phase plus the noise. Its spectrum is the sum
     of turbulence (a second-order process, with the roll-off of tilt if the data ask for it),
-    resonances and white noise. The Whittle likelihood chooses all parameters, the sensor gain
-    among them, and a penalised criterion the number of resonances.
+    resonances and noise: white, or a first-order process where the data ask for it. The Whittle
+    likelihood chooses all parameters, the sensor gain among them, and a penalised criterion the
+    number of resonances.
 
     Parameters
     ----------

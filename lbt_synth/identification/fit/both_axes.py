@@ -272,6 +272,13 @@ def _find_doubts(
                 "the rest of the model suffers"
             )
     for i, axis in enumerate(axes):
+        if axis.noise_correlation:
+            yield (
+                f"the noise of axis {i} is not white: neighbouring frames have a correlation of "
+                f"{axis.noise_correlation:.3f} +- {axis.noise_correlation_error:.3f}, which the "
+                "model and its errors hold. Designs take white noise of the same rms"
+            )
+    for i, axis in enumerate(axes):
         test = axis.whiteness
         if test.p_value < _NOT_WHITE or test.correlation_p_value < _NOT_WHITE:
             yield (

@@ -29,6 +29,7 @@ LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
+COLOUR_PRICE = 9.0  # the same of noise that is not white
 _SPLIT = 9.0  # the same of the second of two lines that lie in each other's skirts
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
@@ -38,6 +39,7 @@ _POWERS = (0.0, float(np.log(4)), float(-np.log(4)))
 # Priors: mean and standard deviation. What the data leave open stays where it makes sense.
 _FIXED, _NONE = (0.0, 0.0), (0.0, np.inf)
 _GAIN_PRIOR = (np.log(0.7), 1.0)
+_COLOUR_PRIOR = (0.0, 1.0)
 STARTING_CORNER_HZ, _CORNER_WIDTH = 50.0, 2.0
 _SLOWEST = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
@@ -63,6 +65,7 @@ class Search:
     lowest_line_hz: float = LOWEST_LINE_HZ  # below, a component belongs to the turbulence
     most_lines: int = MOST_LINES
     announced: Sequence[tuple[float, float]] = ()  # (frequency, error) of known lines [Hz]
+    colour: float = 0.0  # of the noise, where a fit begins; 0 for white noise
 
     def __post_init__(self) -> None:
         nyquist = self.data.frame_rate_hz / 2
@@ -97,7 +100,8 @@ class Search:
         """Return the priors of a fit."""
         gain = _GAIN_PRIOR if self.finds_gain else _FIXED
         corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
-        rows = [gain, _NONE, corner if spectrum.rolls_off else _FIXED]
+        colour = _COLOUR_PRIOR if spectrum.colour else _FIXED
+        rows = [gain, _NONE, colour, corner if spectrum.rolls_off else _FIXED]
         for c in spectrum.components:
             frequency, damping = (self.log_angle(1.0), _SLOWEST), _DAMPING_PRIORS[c.kind]
             if c.kind == "line":
@@ -160,12 +164,16 @@ def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel
     return min(settled, key=lambda model: cost(search, model), default=None)
 
 
-def drop_roll_off(search: Search, model: FittedModel) -> FittedModel:
-    """Return the model without the roll-off of its turbulence, if that adds too little."""
+def simplify(search: Search, model: FittedModel) -> FittedModel:
+    """Return the model without roll-off or colour, where that adds too little."""
     if model.spectrum.rolls_off:
         less = fit(search, replace(model.spectrum, log_corner=float(np.log(2 * NO_CORNER))))
         if less is not None and less.contrast - model.contrast < search.price / PARAMETERS:
-            return less
+            model = less
+    if model.spectrum.colour:
+        less = fit(search, replace(model.spectrum, colour=0.0))
+        if less is not None and less.contrast - model.contrast < COLOUR_PRICE:
+            model = less
     return model
 
 

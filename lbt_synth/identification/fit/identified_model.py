@@ -182,6 +182,9 @@ class IdentifiedAxis(Summarised):
     noise_nm, noise_error_nm : float
         Measurement noise per frame on y, at least a hundredth of the innovations' deviation, and
         its standard error [nm].
+    noise_correlation, noise_correlation_error : float
+        Correlation of the noise of neighbouring frames, of a first-order process, and its standard
+        error; 0 where the data do not ask for it. A plant takes white noise of the same rms.
     sensor_gain : float
         Sensor gain: found, given or assumed.
     sensor_gain_error : float or None
@@ -208,6 +211,8 @@ class IdentifiedAxis(Summarised):
     parts: tuple[IdentifiedLine, ...]
     noise_nm: float
     noise_error_nm: float
+    noise_correlation: float
+    noise_correlation_error: float
     sensor_gain: float
     sensor_gain_error: float | None
     sensor_gain_note: str

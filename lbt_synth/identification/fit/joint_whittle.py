@@ -31,7 +31,7 @@ from lbt_synth.identification.fit.whittle import (
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
-_FIRST = 3  # place of the first component in a packed spectrum
+_FIRST = 4  # place of the first component in a packed spectrum
 _DIFFERENCE = 1e-4  # of a logarithm
 
 Parts = tuple[Component | None, Component | None]

@@ -94,5 +94,12 @@ def _background(
         ("turbulence, damping", slow.damping, ".3g", slow.damping_error, ""),
         ("turbulence, roll-off", slow.corner_hz, ".3g", slow.corner_error_hz, "Hz"),
         ("noise per frame", axis.noise_nm, ".3f", axis.noise_error_nm, "nm"),
+        (
+            "noise, correlation",
+            axis.noise_correlation or None,
+            ".3f",
+            axis.noise_correlation_error,
+            "",
+        ),
         ("sensor gain", axis.sensor_gain, ".4f", axis.sensor_gain_error, ""),
     )

@@ -22,6 +22,7 @@ from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import (
     NO_CORNER,
+    WIDE_DAMPING,
     FittedModel,
     Kind,
     SpectrumModel,
@@ -43,6 +44,7 @@ _MOST_ROUNDS = 12
 _HALF = float(np.log(0.5))
 _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
+_COLOUR = 0.3  # of the noise, where a fit begins
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +59,32 @@ class Candidate:
 
 def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
     """Find the model of one axis."""
-    return fitting.add_evidence(search, find_components(search, start))
+    model = find_components(search, start)
+    if start is None and _may_be_coloured(search, model):
+        trials = [model, find_components(replace(search, colour=_COLOUR), None)]
+        model = min(trials, key=lambda trial: _cost_of_noise(search, trial))
+    return fitting.add_evidence(search, model)
+
+
+def _may_be_coloured(search: Search, model: FittedModel) -> bool:
+    """Whether noise that is not white may be what wide components, or a wrong gain, explain."""
+    spectrum = model.spectrum
+    narrow = [c for c in spectrum.lines if c.damping_ratio <= WIDE_DAMPING]
+    if len(narrow) < len(spectrum.components) - 1:
+        return True
+    near = fitting.fit(search, replace(spectrum, colour=_COLOUR))
+    return near is not None and model.contrast - near.contrast > fitting.COLOUR_PRICE
+
+
+def _cost_of_noise(search: Search, model: FittedModel) -> float:
+    """Return the cost of a model in which a colour of the noise competes with wide resonances.
+
+    A wide resonance fits most spectra that fall, and counts twice.
+    """
+    spectrum = model.spectrum
+    wide = sum(c.damping_ratio > WIDE_DAMPING for c in spectrum.lines)
+    coloured = fitting.COLOUR_PRICE * bool(spectrum.colour)
+    return fitting.cost(search, model) + search.price * wide + coloured
 
 
 def gain_ambiguity(search: Search, best: FittedModel) -> float:
@@ -71,7 +98,8 @@ def gain_ambiguity(search: Search, best: FittedModel) -> float:
         if abs(float(np.log(trial)) - gain) < _SAME_GAIN:
             continue
         try:
-            other = find_components(replace(search, gain=trial), None, rounds=_FEW_ROUNDS)
+            begin = replace(search, gain=trial, colour=best.spectrum.colour)
+            other = find_components(begin, None, rounds=_FEW_ROUNDS)
         except NumericalError:
             continue
         made = fitting.fit(search, other.spectrum)
@@ -97,7 +125,7 @@ def find_components(
         if better is None:
             break
         model = better
-    return _restore_turbulence(search, fitting.prune(search, fitting.drop_roll_off(search, model)))
+    return _restore_turbulence(search, fitting.prune(search, fitting.simplify(search, model)))
 
 
 def _improve(search: Search, model: FittedModel) -> FittedModel | None:
@@ -168,7 +196,11 @@ def _fit_background(search: Search, gain: float) -> FittedModel | None:
     slow = max(float(trapezoid(d, f)) - white, 0.1 * white)
     known = replace(search, gain=gain)
     ground = SpectrumModel(
-        float(np.log(gain)), float(np.log(white)), known.log_angle(fitting.STARTING_CORNER_HZ), ()
+        float(np.log(gain)),
+        float(np.log(white)),
+        search.colour,
+        known.log_angle(fitting.STARTING_CORNER_HZ),
+        (),
     )
     starts = [
         ground.add(known.component("turbulence", hz, ratio, slow))

@@ -17,6 +17,7 @@ from lbt_synth.identification.fit.identified_model import (
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import (
     GAIN,
+    WIDE_DAMPING,
     FittedModel,
     Priors,
     SpectrumModel,
@@ -30,11 +31,10 @@ from lbt_synth.models.resonance_spectrum import coefficients
 from lbt_synth.validation import FloatArray, frozen_copy
 
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
-WIDE_DAMPING = 0.1
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 _DIFFERENCE = 1e-4  # of a logarithm
 _LAGS = 100
-_TURBULENCE = slice(2, 6)  # places of roll-off and turbulence in a packed vector
+_TURBULENCE = slice(3, 7)  # places of roll-off and turbulence in a packed vector
 _LOWEST = 3  # bins in which the ends of the taper show
 
 
@@ -99,6 +99,8 @@ def describe_axis(
         parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
+        noise_correlation=spectrum.noise_correlation,
+        noise_correlation_error=(1 - spectrum.noise_correlation**2) * errors.colour,
         sensor_gain=gain,
         sensor_gain_error=None if gain_error is None else gain * gain_error,
         sensor_gain_note=note,

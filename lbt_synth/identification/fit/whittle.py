@@ -28,6 +28,7 @@ from lbt_synth.models.resonance_spectrum import log_density, log_roll_off
 from lbt_synth.validation import FloatArray, IntArray
 
 GAIN = 0  # place of the sensor gain in a packed vector
+WIDE_DAMPING = 0.1  # damping ratio of a resonance that is no line
 NO_CORNER = 50.0  # angle per frame; a corner above it is none
 _TILT_ORDER = 5 / 6  # of its roll-off: tilt falls with f^(-17/3), a second-order process with f^-4
 _LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
@@ -100,6 +101,7 @@ class SpectrumModel:
 
     log_gain: float  # of the sensor
     log_noise: float  # of its variance
+    colour: float  # of the noise: arctanh of the correlation of neighbours; 0 if it is white
     log_corner: float  # of the roll-off of the turbulence, an angle per frame
     components: tuple[Component, ...]
     roll_off_order: float = _TILT_ORDER  # 1 for a process of finite order
@@ -107,19 +109,26 @@ class SpectrumModel:
     def pack(self) -> FloatArray:
         """Return all parameters as a vector (p,)."""
         rows = ((c.log_frequency, c.damping, c.log_power) for c in self.components)
-        return np.array([self.log_gain, self.log_noise, self.log_corner, *chain(*rows)])
+        return np.array(
+            [self.log_gain, self.log_noise, self.colour, self.log_corner, *chain(*rows)]
+        )
 
     def unpack(self, vector: FloatArray) -> SpectrumModel:
         """Return the model with the numbers of a vector (p,)."""
-        gain, noise, corner, *rest = vector.tolist()
+        gain, noise, colour, corner, *rest = vector.tolist()
         rows = zip(self.components, rest[::3], rest[1::3], rest[2::3], strict=True)
         each = (Component(c.kind, f, damping, power, c.announced) for c, f, damping, power in rows)
-        return SpectrumModel(gain, noise, corner, tuple(each), self.roll_off_order)
+        return SpectrumModel(gain, noise, colour, corner, tuple(each), self.roll_off_order)
 
     @property
     def gain(self) -> float:
         """The sensor gain."""
         return float(np.exp(self.log_gain))
+
+    @property
+    def noise_correlation(self) -> float:
+        """Correlation of the noise of neighbouring frames."""
+        return float(np.tanh(self.colour))
 
     @property
     def lines(self) -> tuple[Component, ...]:
@@ -207,13 +216,14 @@ def densities(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the densities of noise and components, (1 + c, f), with log derivatives.
 
-    The derivatives by frequency and damping are (c, 2, f), those of the turbulence by its corner
-    (f,).
+    The derivatives by frequency and damping are (c, 2, f), those of the noise by its colour and of
+    the turbulence by its corner (2, f).
     """
     s, white = data.half_angle_square, 2 / data.frame_rate_hz
     count = len(spectrum.components)
     density, slopes = np.empty((1 + count, s.size)), np.empty((count, 2, s.size))
-    density[0] = white * np.exp(spectrum.log_noise)
+    shape, by_colour = _log_colour(spectrum.colour, s)
+    density[0] = white * np.exp(spectrum.log_noise + shape)
     fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
     for c, own, slope in zip(spectrum.components, density[1:], slopes, strict=True):
         value, slope[0], slope[1] = log_density(c.frequency, c.damping_ratio, s)
@@ -223,7 +233,14 @@ def densities(
             _smear(data, c, value, slope)
         slope[1] *= c.damping_slope
         np.exp(value + (c.log_power + np.log(white)), out=own)
-    return density, slopes, by_corner
+    return density, slopes, np.array([by_colour, by_corner])
+
+
+def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the spectrum of first-order noise over that of white noise, and its slope, (f,)."""
+    a = np.tanh(colour)
+    below = (1 - a) ** 2 + a * s
+    return np.log1p(-(a**2)) - np.log(below), -2 * a + (1 - a**2) * (2 * (1 - a) - s) / below
 
 
 def _smear(data: LoopPeriodogram, line: Component, value: FloatArray, slope: FloatArray) -> None:
@@ -256,14 +273,15 @@ def contrast(data: LoopPeriodogram, spectrum: SpectrumModel) -> float:
 
 
 def log_slopes(
-    each: FloatArray, slopes: FloatArray, by_corner: FloatArray, model: FloatArray
+    each: FloatArray, slopes: FloatArray, by_shape: FloatArray, model: FloatArray
 ) -> FloatArray:
     """Return the slopes of a spectrum, by all parameters, over a density (f,), (p, f).
 
     The first three arguments are those of :func:`densities`. The gain changes the data, not the
     spectrum.
     """
-    rows = [np.zeros_like(model), each[0] / model, by_corner * each[1] / model]
+    noise = each[0] / model
+    rows = [np.zeros_like(model), noise, by_shape[0] * noise, by_shape[1] * each[1] / model]
     for own, (by_frequency, by_damping) in zip(each[1:], slopes, strict=True):
         share = own / model
         rows += [by_frequency * share, by_damping * share, share]
@@ -275,10 +293,10 @@ def derivatives(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return L without the priors, its gradient (p,) and its information matrix (p, p)."""
     count, gain = data.count, spectrum.gain
-    each, slopes, by_corner = densities(data, spectrum)
+    each, slopes, by_shape = densities(data, spectrum)
     model = each.sum(axis=0)
     ratio = data.power(gain) / model
-    rows = log_slopes(each, slopes, by_corner, model)
+    rows = log_slopes(each, slopes, by_shape, model)
     weighted = rows * count
     gradient = weighted @ (1 - ratio)
     information = weighted @ rows.T

@@ -38,6 +38,7 @@ def test_closed_loop_gives_lines_noise_and_sensor_gain() -> None:
     assert found.sensor_gain == pytest.approx(0.6, abs=4 * found.sensor_gain_error)
     assert found.sensor_gain_error < 0.03
     assert found.whiteness.white
+    assert found.noise_correlation == 0
     assert found.turbulence.rms_nm == pytest.approx(300, abs=5 * found.turbulence_fit.rms_error_nm)
     assert found.turbulence_fit.rms_nm == pytest.approx(found.turbulence.rms_nm, rel=1e-9)
     # the model stands for the spectrum of the phase
@@ -61,6 +62,28 @@ def test_standard_errors_are_honest() -> None:
     for name, values in deviations.items():
         # chi-squared of 12 values: 2.2 to 32 with a probability of 0.998
         assert 2.2 < np.sum(np.square(values)) < 32, name
+
+
+@pytest.mark.parametrize("colour", [0.1, 0.6])
+def test_noise_that_is_not_white_leaves_the_gain(colour: float) -> None:
+    """As white noise it moved the gain by 10 and by 25 of its standard errors."""
+    own = lbt.models.ARModel(
+        coefficients=[colour], driving_rms_nm=10 * np.sqrt(1 - colour**2), frame_rate_hz=RATE
+    )
+    y, c = integrator_loop(
+        lines=((31.0, 0.004, 30.0),),
+        noise=1e-3,
+        turbulence=lbt.models.SumSpectrum(parts=[slow(), own]),
+        frames=20_000,
+        seed=1,
+    )
+    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    assert found.sensor_gain_error is not None
+    assert found.sensor_gain == pytest.approx(0.6, abs=3 * found.sensor_gain_error)
+    assert found.sensor_gain_error < 0.04
+    assert found.noise_correlation == pytest.approx(colour, abs=3 * found.noise_correlation_error)
+    assert found.noise_nm == pytest.approx(6, abs=3 * found.noise_error_nm)
+    assert len(found.lines) == len(found.parts) == 1
 
 
 @given(scale=st.sampled_from([1e-3, 0.02, 50.0]))

@@ -19,7 +19,7 @@ def test_a_line_that_leaves_the_band_is_dropped() -> None:
     search = Search(data=data, gain=1.0)
     slow = search.component("turbulence", 1.0, 0.5, 0.1)
     line = search.component("line", 100.0, 0.01, 1e-4)
-    start = SpectrumModel(0.0, 0.0, search.log_angle(50.0), (slow, line))
+    start = SpectrumModel(0.0, 0.0, 0.0, search.log_angle(50.0), (slow, line))
     inside = fit(search, start)
     assert inside is not None
     assert len(inside.spectrum.components) == 2

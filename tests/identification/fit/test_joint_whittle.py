@@ -26,7 +26,7 @@ LINE = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=50, direction=(0.8, -
 
 def spectrum(*parts: Component) -> SpectrumModel:
     turbulence = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(280.0**2))
-    return SpectrumModel(0.0, np.log(40), np.log(30 * W), (turbulence, *parts))
+    return SpectrumModel(0.0, np.log(40), 0.0, np.log(30 * W), (turbulence, *parts))
 
 
 def line(frequency: float, ratio: float, rms: float) -> Component:

@@ -1,0 +1,128 @@
+"""The guarantee over line frequencies and sensor gains, against points drawn from its box."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+
+RATE = 500.0
+TURNED = np.array([[0.9, -0.3], [0.2, 1.1]])  # of the mirror, which couples the axes
+AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=RATE)
+
+
+def setting(*, coupled: bool, sinusoids: bool):
+    """A loop designed for a mirror that mixes its axes or not, and its truth."""
+    lines = [(22.0, 60.0, (0.8, 0.6)), (61.0, 25.0, (0.0, 1.0))]
+    model = [
+        lbt.Vibration(frequency_hz=f, damping=0.02, rms_nm=rms, direction=d) for f, rms, d in lines
+    ]
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE, turbulence=AIR, vibrations=model, noise_nm=8.0, modes=2
+    )
+    hardware = lbt.LoopHardware(
+        frame_rate_hz=RATE, influence_matrix=TURNED if coupled else None, modes=2
+    )
+    true = [
+        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=d)
+        for f, rms, d in lines
+    ]
+    truth = lbt.Truth(
+        turbulence=AIR,
+        vibrations=tuple(true if sinusoids else model),
+        noise_nm=8.0,
+        frequency_errors_hz=(1.5, 4.0),
+    )
+    # coupled axes run an integrator that knows nothing of the mixture
+    path = replace(hardware, influence_matrix=np.eye(2))
+    design = lbt.integrator(path, gain=0.3) if coupled else lbt.kalman(plant)
+    return hardware, design.controller, truth
+
+
+def left_nm(hardware, controller, truth, gains, errors):
+    """The residual at one point of the box."""
+    lines = tuple(
+        replace(line, frequency_hz=line.frequency_hz + error)
+        for line, error in zip(truth.vibrations, errors, strict=True)
+    )
+    path = replace(hardware, sensor_matrix=np.diag(gains))
+    loop = lbt.close_loop(path, controller)
+    return lbt.residual_budget(loop, replace(truth, vibrations=lines)).rms_nm
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("sinusoids", [False, True])
+def test_no_point_of_the_box_leaves_more(coupled: bool, sinusoids: bool) -> None:
+    hardware, controller, truth = setting(coupled=coupled, sinusoids=sinusoids)
+    found = lbt.studies.guaranteed_residual(
+        hardware, controller, truth, error_hz=2.0, sensor_gains=(0.7, 1.25), tolerance=0.05
+    )
+    rng = np.random.default_rng(0)
+    ends = np.array([[g, h] for g in (0.7, 1.25) for h in (0.7, 1.25)])
+    drawn = np.vstack([ends, rng.uniform(0.7, 1.25, (4, 2))])
+    sizes = np.array([0.75, 2.0])  # the lines' shares of the error
+    most = max(
+        left_nm(hardware, controller, truth, gains, part * sizes)
+        for gains in drawn
+        for part in (np.array([1, 1]), np.array([-1, 1]), rng.uniform(-1, 1, 2))
+    )
+    assert most <= found.upper_nm <= found.value_nm * 1.051
+    assert most > (0.9 if sinusoids else 0.6) * found.value_nm
+    assert all(0.7 <= gain <= 1.25 for gain in found.sensor_gains)
+
+
+def test_it_is_attained_by_sinusoids_of_one_axis() -> None:
+    hardware, controller, truth = setting(coupled=False, sinusoids=True)
+    lines = tuple(replace(line, direction=(0.0, 1.0)) for line in truth.vibrations)
+    truth = replace(truth, vibrations=lines)
+    found = lbt.studies.guaranteed_residual(
+        hardware, controller, truth, error_hz=2.0, sensor_gains=(0.8, 1.2), tolerance=0.01
+    )
+    path = replace(hardware, sensor_matrix=np.diag(found.sensor_gains))
+    response = lbt.close_loop(path, controller).sensitivity
+    places = []  # where each line is worst, on a grid
+    for line, size in zip(lines, (0.75, 2.0), strict=True):
+        grid = line.frequency_hz + np.linspace(-size, size, 401)
+        size_of = np.linalg.norm(response(grid) @ np.array(line.direction), axis=1)
+        places.append(grid[np.argmax(size_of)] - line.frequency_hz)
+    at = left_nm(hardware, controller, truth, found.sensor_gains, places)
+    assert at == pytest.approx(found.value_nm, rel=1e-5)
+    assert found.upper_nm == pytest.approx(at, rel=0.011)
+
+
+def test_without_errors_it_is_the_residual() -> None:
+    hardware, controller, truth = setting(coupled=True, sinusoids=True)
+    found = lbt.studies.guaranteed_residual(hardware, controller, truth)
+    assert found.upper_nm == pytest.approx(
+        left_nm(hardware, controller, truth, (1, 1), (0, 0)), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("gains", [(0.5, 2.4), (1.1, 3.5), (2.6, 2.7)])
+def test_nothing_is_guaranteed_where_a_loop_is_unstable(gains: tuple[float, float]) -> None:
+    hardware, controller, truth = setting(coupled=False, sinusoids=True)
+    assert lbt.loop.stable_sensor_gains(hardware, controller)[1] < 2.4
+    found = lbt.studies.guaranteed_residual(hardware, controller, truth, sensor_gains=gains)
+    assert np.isinf(found.upper_nm)
+    path = replace(hardware, sensor_matrix=np.diag(found.sensor_gains))
+    assert not lbt.close_loop(path, controller).is_stable
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sensor_gains": (1.2, 0.8)}, "sensor_gains must be"),
+        ({"sensor_gains": (0.0, 1.0)}, "sensor_gains must be above 0"),
+        ({"error_hz": (2.0, 1.0)}, "error_hz must be"),
+        ({"error_hz": -1.0}, "error_hz must be at least 0"),
+        ({"error_hz": 60.0}, "between 0 and 250 Hz"),
+        ({"tolerance": 0.0}, "tolerance must be"),
+    ],
+)
+def test_what_is_refused(options, message) -> None:
+    hardware, controller, truth = setting(coupled=False, sinusoids=True)
+    with pytest.raises(lbt.errors.ProblemError, match=message):
+        lbt.studies.guaranteed_residual(hardware, controller, truth, **options)
