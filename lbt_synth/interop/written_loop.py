@@ -43,14 +43,14 @@ class Rounding:
     entry : Controller
         From the noise (r,) of the sums to the command; A and C are those of the controller.
     variance : callable
-        From the rms of measurements and commands, (q,) and (m,), to the variance of the noise,
-        (r,).
+        From the sensor gain and the rms of measurements and commands, (q,) and (m,), to the
+        variance of the noise, (r,).
     signals : (s, n) ndarray, optional
         Rows that read signals from the controller's state; their rms follow the measurements'.
     """
 
     entry: Controller
-    variance: Callable[[FloatArray, FloatArray], FloatArray]
+    variance: Callable[[float, FloatArray, FloatArray], FloatArray]
     signals: FloatArray | None = None
 
 
@@ -78,7 +78,7 @@ def matrix_rounding(
     """
     count = len(signals)
 
-    def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+    def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         q = measured.size - count
         sizes = np.concatenate([measured[q:], measured[:q], commands])[: whole.shape[1]]
         terms = np.abs(whole) * sizes
@@ -188,7 +188,7 @@ def _residual_check(
         shown = _with_signals(loops[1], rounding.signals)
         found = mode_variances(design, shown, slice(None))
         sizes = np.sqrt(np.maximum(found, 0.0))  # below zero by rounding
-        variance = rounding.variance(sizes[n + m :], sizes[n : n + m])
+        variance = rounding.variance(gain, sizes[n + m :], sizes[n : n + m])
         left = _rounding_left(hardware, written, rounding.entry, variance, gain)
         after = found[:n] + left
         how += f"; rounding at most {np.sqrt(np.max(left / before)):.1e} of it"

@@ -34,15 +34,6 @@ def test_an_unstable_loop_ends_the_proof():
     assert only.value > 1
 
 
-@pytest.fixture(scope="module")
-def shaped():
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0, modes=1)
-    line = lbt.design.shaping.VibrationBand(low_hz=18, high_hz=22, rms_nm=100)
-    gains = {"sensor_gain": (0.5, 1.2), "scenarios": (1.0, 0.6)}
-    return lbt.robust(plant, bands=[line], functions=12, states=None, **gains)
-
-
 def test_a_shaped_design_keeps_its_demands(shaped):
     checks = prove_written(shaped, shaped.controller)
     assert all(check.passed for check in checks)
@@ -76,7 +67,8 @@ def test_noise_in_the_sums_is_that_of_the_closed_form():
     size = 0.05
     seen = []
 
-    def variance(measured, commands):
+    def variance(sensor_gain, measured, commands):
+        assert sensor_gain in (1.0, 0.7, 0.5, 0.358)
         seen.append((measured, commands))
         return np.array([size])
 

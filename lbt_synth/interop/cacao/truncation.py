@@ -100,7 +100,7 @@ def written_filter(taps: FloatArray, hardware: LoopHardware) -> tuple[Controller
     entry = replace(written, B=np.hstack([command, written.B]), D=np.zeros((m, 2 * m)))
     sizes = np.abs(np.hstack([*taps]))
 
-    def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+    def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         terms = sizes * np.tile(measured + commands, steps)
         largest = np.sum(terms, axis=1)
         sums = np.sum(terms**2, axis=1) + largest**2 * terms.shape[1]

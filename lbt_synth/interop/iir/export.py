@@ -164,7 +164,7 @@ def _prove(design: Design, data: bytes, precision: str) -> tuple[Check, ...]:
     sums[:, -1] = 1.0
     written, entry = (build_controller(top, den, design.controller.dt_s) for top in (num, sums))
 
-    def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+    def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         """Bound the rounding of sums in any order, of their difference and of the quotient."""
         terms = np.stack([np.abs(num) * measured[:, None], np.abs(den) * commands[:, None]])
         whole = np.sum(terms, axis=2)

@@ -83,7 +83,7 @@ class PolFilter:
         C[:, n : n + m] = np.eye(m)  # the command sent, in the new state
         whole = Controller(A=A, B=entry[:, :m] @ R, C=C, D=np.zeros((m, m)), dt_s=s.dt_s)
 
-        def variance(measured: FloatArray, commands: FloatArray) -> FloatArray:
+        def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
             """Bound the rounding of the signal, of its product, of the sum and of the command."""
             terms = np.abs(R) * measured
             residual = np.sum(terms, axis=1)

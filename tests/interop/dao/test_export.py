@@ -13,6 +13,7 @@ from support.exports import relative
 
 import lbt_synth as lbt
 from lbt_synth.interop.dao.inner_loop import InnerLoop
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.simulation.run import step_loop
 
 
@@ -68,6 +69,47 @@ def test_a_design_that_single_precision_breaks_is_refused_with_the_number(tmp_pa
         lbt.interop.export_dao(tmp_path / "k.npy", lbt.kalman(lines))
     assert seen.value.residual > 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("order", [20, 15])
+def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, shaped, order):
+    """In the arithmetic of the computer the loop leaves what the design leaves in double."""
+    written = lbt.interop.export_dao(tmp_path / "k.npy", shaped, order=order)
+    matrix = np.load(written.files[0])
+    assert matrix.shape == (2 * order + 1, 1)
+    assert max(written_radius(matrix, gain) for gain in np.geomspace(0.5, 1.2, 40)) < 1
+    beside = json.loads((tmp_path / "k.certificate.json").read_text())
+    assert beside["coefficients"].startswith("made again for single precision")
+    air, line, *_ = shaped.specifications[0].objective.terms
+    vibration = lbt.models.SinusoidalVibration(
+        frequency_hz=20.0, rms_nm=line.rms_nm, direction=(1.0,)
+    )
+    truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, vibrations=[vibration])
+    rng, size = np.random.default_rng(1), {"frames": 6000, "cases": 1}
+    total = draw_disturbance(truth, shaped.hardware, rng=rng, **size)
+    noise = draw_noise(truth, shaped.hardware, rng=rng, **size)
+    runs = (InnerLoop(matrix), shaped.controller.start())
+    found, own = (step_loop(run, 1.0, shaped.hardware, total, noise)[0, 1000:, 0] for run in runs)
+    assert np.std(found) == pytest.approx(np.std(own), rel=0.03)
+    assert np.std(found) < 0.3 * np.std(total)
+
+
+def test_coefficients_of_the_gain_file_are_kept_where_they_pass(tmp_path, designs):
+    lbt.interop.export_dao(tmp_path / "k.npy", designs["kalman"])
+    beside = json.loads((tmp_path / "k.certificate.json").read_text())
+    assert beside["coefficients"] == "of the gain file, rounded"
+
+
+@pytest.mark.study
+def test_the_robust_example_runs_in_single_precision(tmp_path):
+    """Twelve states per axis, whose own coefficients reach a spectral radius of 1.126."""
+    design = lbt.robust(lbt.load_config("examples/lbt_robust.yaml"))
+    written = lbt.interop.export_dao(tmp_path / "k.npy", design)
+    losses = [check.value for check in written.checks if "residual" in check.name]
+    assert len(losses) == 4
+    assert max(losses) < 0.01
+    matrix = np.load(written.files[0])
+    assert max(written_radius(matrix, gain) for gain in np.geomspace(0.25, 1.3, 400)) < 1
 
 
 def test_what_the_matrix_cannot_hold_is_refused(tmp_path, designs, loaded):
