@@ -125,7 +125,7 @@ def test_rounding_is_bounded_by_a_loop_in_that_arithmetic(path):
         for run in (AppliedFilter(matrix), written.start())
     )
     rms = np.sqrt(np.mean(double**2, axis=0))
-    bound = np.sqrt(np.sum(rounding.variance(rms[2:], rms[1:2])))
+    bound = np.sqrt(np.sum(rounding.variance(1.0, rms[2:], rms[1:2])))
     assert 0 < np.std(single[:, 0] - double[:, 0]) < 3 * bound
 
 
