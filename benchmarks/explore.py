@@ -7,7 +7,8 @@ from the repository::
 
 The loop has two axes and five lines on each. First the processor time of each step of a move; then
 each slider goes over its range in steps, and the time counts from the event of the slider to the
-paint of the curves that follow from it, and of all.
+frame after the paint of the curves that follow from it, and of all: the Strehl curve and the table
+come last.
 """
 
 import os
@@ -76,7 +77,7 @@ if __name__ == "__main__":
     methods = sys.argv[1:] or ["kalman", "hinf"]
     with tempfile.TemporaryDirectory() as folder:
         config = write_config(Path(folder), five_lines())
-        browser = chromium(Path(folder) / "profile", "localhost")
+        browser = chromium(Path(folder) / "profile", "localhost", requests=False)
         with served(config, folder=folder) as address:
             browser.set_window_size(1400, 1000)
             browser.get(address)

@@ -297,8 +297,9 @@ def suggest_part(value: object, kind: type[Any]) -> str:
     for name in _PARTS:
         part = getattr(value, name, None)
         if isinstance(part, kind):
-            designer = ", or its method design" if callable(getattr(value, "design", None)) else ""
-            return f" Try its {name}{designer}."
+            own = type(value).__name__.lower()
+            designer = f", or {own}.design(...)" if callable(getattr(value, "design", None)) else ""
+            return f" Try {own}.{name}{designer}."
         if getattr(part, "__annotations__", {}).get("return") in makers:
-            return f" Try its {name}()."
+            return f" Try {type(value).__name__.lower()}.{name}()."
     return ""

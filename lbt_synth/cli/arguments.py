@@ -144,6 +144,7 @@ def report(parser: ArgumentParser) -> None:
 
 def explore(parser: ArgumentParser) -> None:
     """Open a page of sliders in the browser, to see designs while the loop and the sky change."""
+    add_unit(parser)
     add_config(parser)
     add_gains(parser, text="gain files to show beside the design of the sliders")
     text = "name or address to serve at (default localhost: this machine only; others can write "
@@ -199,6 +200,7 @@ def end_to_end_table(parser: ArgumentParser) -> None:
 
 
 def _add_simulator(parser: ArgumentParser) -> None:
+    add_unit(parser)
     add_config(parser)
     add_option(parser, "--pixels", int, "pixels across the pupil, even")
     add_option(parser, "--frames", int, "frames of an exposure")
@@ -347,6 +349,7 @@ def mirror(parser: ArgumentParser) -> None:
 
 def modal(parser: ArgumentParser) -> None:
     """Compare integrators, optimised gains and Kalman filters for all modes of the mirror."""
+    add_unit(parser)
     add_config(parser)
     add_option(parser, "--modes", int, "number of modes, at least 2 (default: mirror.modes)")
     add_outputs(parser)

@@ -12,7 +12,7 @@ from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import nm_per_mas
-from lbt_synth.storage.display_unit import UNITS, DisplayUnit, show_in
+from lbt_synth.storage.display_unit import LENGTHS, UNITS, DisplayUnit, show_in
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 
@@ -23,7 +23,8 @@ def choose_unit(
     """Show wavefronts in the unit that was asked for; an angle needs the telescope's diameter."""
     asked = getattr(arguments, "show_unit", None) or arguments.unit
     name = (asked if asked in UNITS else None) or configured or "nm"
-    if name == "nm":
+    if name in LENGTHS:
+        show_in(DisplayUnit(name=name, nm=LENGTHS[name]))
         return
     if diameter_m is None:
         raise ProblemError(
@@ -38,6 +39,16 @@ def choose_unit(
 def choose_config_unit(arguments: Namespace, config: Config) -> None:
     """Show wavefronts in the unit that was asked for, or in that of a configuration."""
     choose_unit(arguments, config.imaging.diameter_m, config.settings.units)
+
+
+def choose_wavefront_unit(arguments: Namespace) -> None:
+    """Show wavefronts of all modes in the unit that was asked for, which cannot be an angle."""
+    if arguments.unit not in (None, *LENGTHS):
+        raise ProblemError(
+            f"--unit {arguments.unit} is an angle of tip and tilt, and this command shows other "
+            f"modes, too. Try {' or '.join(LENGTHS)}."
+        )
+    choose_unit(arguments)
 
 
 def choose_design_unit(arguments: Namespace, *designs: Design) -> None:

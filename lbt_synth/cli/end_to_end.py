@@ -8,6 +8,7 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
+from lbt_synth.cli.display import choose_wavefront_unit
 from lbt_synth.cli.loop_inputs import given_options
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.output_files import make_directory
@@ -56,6 +57,7 @@ def run(arguments: Namespace) -> Report:
     """Close the loop of a gain file end to end, and write a figure, telemetry and a summary."""
     outputs = [Path(arguments.output) / name for name in _FILES]
     refuse_replacing(outputs, [arguments.config, arguments.gain])
+    choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
     design = load_gain(arguments.gain)
     setup.controller(design)  # refuses a filter of another loop before any work

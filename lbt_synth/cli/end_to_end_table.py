@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
+from lbt_synth.cli.display import choose_wavefront_unit
 from lbt_synth.cli.end_to_end import calibrate_setup, load_setup
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
@@ -32,6 +33,7 @@ def run(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     written = [folder / name for number in arguments.tables for name in _FILES[number]]
     refuse_replacing(written, [arguments.config, *arguments.gains])
+    choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
     designs = load_designs(arguments.gains)
     if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:

@@ -7,6 +7,7 @@ import sys
 from argparse import Namespace
 from pathlib import Path
 
+from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.config import load_config
@@ -30,6 +31,7 @@ def run(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     require_writable(folder / "explored-1.yaml")
     config = load_config(arguments.config)
+    choose_config_unit(arguments, config)
     exploration = explore(config, load_designs(arguments.gains))
     first = whole_view(exploration, quick_view(exploration, first_wish()))
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth import models
+from lbt_synth.cli.display import choose_wavefront_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
@@ -17,7 +18,8 @@ from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
 from lbt_synth.errors import ConfigError
 from lbt_synth.report.figures import modal_figure
-from lbt_synth.storage.rows import column, nm_column, table_row
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import column, nm_column, row_table, table_row
 from lbt_synth.validation import FloatArray, integer
 
 _MOST_MODES = 20_000
@@ -26,6 +28,14 @@ _MIRROR_NOTE = (
     "their estimates as if it were there at once (lbt-synth mirror, design lqg: tip and tilt "
     "without this lag)."
 )
+
+
+@table_row
+class ControllerRow:
+    """What a controller leaves of all modes."""
+
+    controller: str = column("controller")
+    residual_nm: float = nm_column("residual", format=".1f")
 
 
 @table_row
@@ -45,6 +55,7 @@ class OrderRow:
 def run(arguments: Namespace) -> Report:
     """Compare integrators, optimised gains and Kalman filters, mode by mode."""
     require_outputs(arguments.output, inputs=[arguments.config])
+    choose_wavefront_unit(arguments)
     config = load_config(arguments.config)
     count = _mode_count(arguments.modes, config)
     atmosphere = config.require_atmosphere(
@@ -62,12 +73,9 @@ def run(arguments: Namespace) -> Report:
     report = Report(
         data={"modes": count, "uniform_gain": uniform, "residual_nm": whole, "turbulence_nm": alone}
     )
-    report.add_table(
-        "All modes",
-        ("controller", "residual [nm]"),
-        [("none, turbulence alone", f"{alone:.1f}")]
-        + [(name, f"{rms:.1f}") for name, rms in whole.items()],
-    )
+    left = {"none, turbulence alone": alone, **whole}
+    totals = [ControllerRow(controller=name, residual_nm=rms) for name, rms in left.items()]
+    report.tables.append(row_table("All modes", totals))
     report.add_rows("rows", "By radial order, residuals over its modes", rows)
     report.notes += [
         "turbulence: AR1 models, von Karman variances, poles by radial order.",
@@ -139,12 +147,13 @@ def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
             )
     pyramid, one = settings.sensor.pyramid, float(config.noise_nm)
     if pyramid is None:
-        return np.full(count, one), f"noise: {one:.6g} nm on every mode (assumed)."
+        return np.full(count, one), f"noise: {nm_text(one, '.6g')} on every mode (assumed)."
     modulation = pyramid.modulation_lambda_over_d
     noise = models.pyramid_modal_noise_nm(one, modes=count, modulation_lambda_over_d=modulation)
     return noise, (
-        f"noise: {one:.6g} nm on tip and tilt, less on modes of higher order, down to "
-        f"{noise[-1]:.6g} nm (assumed, of a pyramid with a modulation of {modulation:g} lambda/D)."
+        f"noise: {nm_text(one, '.6g')} on tip and tilt, less on modes of higher order, down to "
+        f"{nm_text(noise[-1], '.6g')} (assumed, of a pyramid with a modulation of {modulation:g} "
+        "lambda/D)."
     )
 
 

@@ -362,8 +362,8 @@ class FileSection(Section):
     """A whole configuration file; an identified system knows no telescope and no atmosphere."""
 
     version: int = Field(ge=1, le=1, description="version of the layout: 1")
-    units: Literal["nm", "mas", "urad"] | None = Field(
-        default=None, description="what commands show wavefronts in: nm (default), mas or urad"
+    units: Literal["nm", "um", "mas", "urad"] | None = Field(
+        default=None, description="what commands show wavefronts in: nm (default), um, mas or urad"
     )
     telescope: TelescopeSection | None = Field(default=None, description="the pupil")
     atmosphere: AtmosphereSection | None = Field(default=None, description="the turbulence")

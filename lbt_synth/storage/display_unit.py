@@ -13,7 +13,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-UNITS = ("nm", "mas", "urad")
+LENGTHS = {"nm": 1.0, "um": 1000.0}  # of wavefront, in nm
+UNITS = (*LENGTHS, "mas", "urad")
 _NM = re.compile(r"\Anm(?=\Z|[ ²^/])")
 
 

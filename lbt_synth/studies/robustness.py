@@ -348,23 +348,17 @@ def _shift_vibrations(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
     nyquist = hardware.frame_rate_hz / 2
-    places = [
-        [line.frequency_hz for line in stationary_vibrations(each.vibrations)]
-        for each in (truth.with_frequency_error(float(error)) for error in errors_hz)
-    ]
     moved = []
-    for vibration, frequencies in zip(
-        stationary_vibrations(truth.vibrations),
-        np.reshape(places, (errors_hz.size, -1)).T,
-        strict=True,
-    ):
+    for vibration in stationary_vibrations(truth.vibrations):
         checked_direction(vibration, hardware)
-        wrong = ~(frequencies < nyquist)
+        place_hz = vibration.frequency_hz
+        frequencies = place_hz + truth.frequency_shift_hz(place_hz, 1.0) * errors_hz
+        wrong = ~((frequencies > 0) & (frequencies < nyquist))
         if np.any(wrong):
             raise ProblemError(
                 f"errors_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
-                f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
-                f"{vibration.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
+                f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at {place_hz:.6g} Hz to "
+                f"{frequencies[wrong][0]:.6g} Hz."
             )
         moved.append(
             EnsembleVibration(

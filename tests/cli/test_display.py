@@ -86,3 +86,13 @@ def test_an_angle_needs_a_diameter(capsys, tmp_path):
     lbt.save_gain(tmp_path / "bare.fits", lbt.kalman(plant))
     assert main(["show", str(tmp_path / "bare.fits"), "--unit", "mas"]) == 2
     assert "telescope's diameter, which is not known here" in capsys.readouterr().err
+
+
+def test_modes_beside_tilt_have_lengths_only(capsys, tmp_path):
+    words = ["modal", CONFIG, "--modes", "6", "-o", str(tmp_path / "m.svg")]
+    assert main([*words, "--unit", "um"]) == 0
+    out = capsys.readouterr().out
+    assert "residual [um]" in out
+    assert re.findall(r".*\bnm\b.*", out) == []
+    assert main([*words, "--unit", "mas"]) == 2
+    assert "--unit mas is an angle of tip and tilt" in capsys.readouterr().err

@@ -30,8 +30,11 @@ function* walk(node) {
 """
 
 
-def chromium(profile, *hosts):
-    """Start headless Chromium, to which no names are known but those of hosts."""
+def chromium(profile, *hosts, requests=True):
+    """Start headless Chromium, to which no names are known but those of hosts.
+
+    It lists the requests of its pages, which takes time from whatever is measured.
+    """
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -39,7 +42,8 @@ def chromium(profile, *hosts):
     rules = ", ".join(["MAP * ~NOTFOUND", *(f"EXCLUDE {host}" for host in hosts)])
     for option in (*OPTIONS, f"--host-resolver-rules={rules}", f"--user-data-dir={profile}"):
         options.add_argument(option)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    logs = {"browser": "ALL"} | ({"performance": "ALL"} if requests else {})
+    options.set_capability("goog:loggingPrefs", logs)
     service = webdriver.ChromeService(executable_path="/usr/bin/chromedriver")
     return webdriver.Chrome(options=options, service=service)
 

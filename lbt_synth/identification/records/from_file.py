@@ -132,7 +132,7 @@ def load_record(
                 )
             if averages is not None:
                 raise ProblemError("averages are only for a spectrum; this file is telemetry.")
-            return record_from_telemetry(load_telemetry(source), modes=axes, **given)
+            return record_from_telemetry(load_telemetry(source), axes=axes, **given)
         contents = read_contents(source)
         if commands is not None:
             other = Path(commands)
@@ -165,7 +165,7 @@ _CONDITION = 1e8
 def record_from_telemetry(
     telemetry: Telemetry,
     *,
-    modes: Sequence[int] | None = None,
+    axes: Sequence[int] | None = None,
     frame_rate_hz: float | None = None,
     delay_frames: float | None = None,
     mirror: PositionLoop | None = None,
@@ -184,7 +184,7 @@ def record_from_telemetry(
     ----------
     telemetry : Telemetry
         What the loop recorded.
-    modes : sequence of int, optional
+    axes : sequence of int, optional
         Tip and tilt among the modes, from 0; all, where there are one or two.
     frame_rate_hz : float, optional
         Frame rate [Hz]; refused where it is not that of the telemetry.
@@ -231,7 +231,7 @@ def record_from_telemetry(
     """
     require_instance(telemetry, Telemetry)
     n = telemetry.modes
-    chosen = choose_axes(modes, "modes", n, "modes")
+    chosen = choose_axes(axes, "axes", n, "modes")
     facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
     columns = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in _MATRICES}

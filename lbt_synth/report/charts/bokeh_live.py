@@ -47,7 +47,7 @@ def _styles_of(panel: Panel) -> object:
         (c.name, c.look, c.line, c.marker, c.filled, c.size, c.width, c.dash, c.hover)
         for c in panel.select(Curve)
     ]
-    rules = [(rule.name, rule.axis, rule.dash) for rule in panel.select(Rule)]
+    rules = {(rule.name, rule.axis, rule.dash) for rule in panel.select(Rule)}
     return panel.x.text, panel.y.text, curves, rules
 
 

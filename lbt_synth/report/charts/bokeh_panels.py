@@ -10,7 +10,6 @@ import numpy as np
 from lbt_synth.report.charts import scales
 from lbt_synth.report.charts.description import (
     Area,
-    Axis,
     Bars,
     Curve,
     Flags,
@@ -56,7 +55,9 @@ def panel_figure(
     from bokeh.models import (
         BoxZoomTool,
         ColumnDataSource,
+        FixedTicker,
         PanTool,
+        PlainText,
         Range1d,
         ResetTool,
         WheelZoomTool,
@@ -84,6 +85,10 @@ def panel_figure(
     figure.toolbar.update(logo=None, active_drag=zoom, active_scroll=None)
     figure.grid.grid_line_color = "#e0e0e0"
     figure.outline_line_color = None
+    for axis, shown in ((figure.xaxis[0], panel.x), (figure.yaxis[0], panel.y)):
+        axis.update(axis_label=PlainText(text=shown.text), **_AXIS)
+        if shown.log:
+            axis.ticker = FixedTicker()
     set_scales(figure, panel)
     own = {} if sources is None else sources
     own |= {key: ColumnDataSource(columns) for key, columns in panel_columns(panel).items()}
@@ -92,9 +97,13 @@ def panel_figure(
         for i, group in enumerate(_curve_groups(panel))
         for j, curve in enumerate(group)
     }
-    for i, rule in enumerate(panel.select(Rule)):
-        points[id(rule)] = {rule.axis: rule.axis, "source": own[f"rule-{i}"]}
+    grouped = set()
+    for i, rules in enumerate(_rule_groups(panel)):
+        points[id(rules[0])] = {rules[0].axis: "at", "source": own[f"rules-{i}"]}
+        grouped |= {id(rule) for rule in rules[1:]}  # drawn with the first
     for mark in panel.marks:
+        if id(mark) in grouped:
+            continue
         models = _draw(figure, panel, mark, points.get(id(mark), {}))
         if mark.name and models:
             named.setdefault(mark.name, []).extend(model.id for model in models)
@@ -107,21 +116,28 @@ def panel_figure(
 
 
 def set_scales(figure: Any, panel: Panel) -> None:
-    """Give the axes of a figure the scales and ticks of a panel."""
+    """Give the axes of a figure the ends and ticks of the scales of a panel."""
     axes = ((figure.xaxis[0], figure.x_range), (figure.yaxis[0], figure.y_range))
     for (axis, shown), own, ends in zip(
         axes, (panel.x, panel.y), scales.scale_ends(panel), strict=True
     ):
         if (shown.start, shown.end) != ends:
             shown.update(start=ends[0], end=ends[1])
-        _style_axis(axis, own, ends)
+        if own.log:
+            ticks = scales.log_ticks(*ends)
+            powers = range(*(int(np.floor(np.log10(end))) + i for i, end in enumerate(ends)))
+            # finer ones for readers who zoom in
+            fine = [f * 10.0**n for n in powers for f in range(1, 10)]
+            minor = [t for t in fine if t not in ticks]
+            axis.ticker.update(ticks=ticks, minor_ticks=minor)
+            axis.major_label_overrides = dict(zip(ticks, scales.log_tick_texts(ticks), strict=True))
 
 
 def panel_columns(panel: Panel) -> dict[str, dict[str, FloatArray]]:
-    """Return the columns of what a panel draws: one source per group of curves, one per rule.
+    """Return the columns of what a panel draws: one source per group of curves or of rules.
 
     Curves of the same abscissae are a group: x, the ordinate of each, and the height ``at`` which
-    their values are shown.
+    their values are shown. Rules that look alike are a group, and stand ``at`` their places.
     """
     columns: dict[str, dict[str, FloatArray]] = {}
     for i, group in enumerate(_curve_groups(panel)):
@@ -135,9 +151,17 @@ def panel_columns(panel: Panel) -> dict[str, dict[str, FloatArray]]:
         if group[0].hover:
             at = _mean_height(np.array(heights), log=panel.y.log)
             columns[f"curves-{i}"]["at"] = at
-    for i, rule in enumerate(panel.select(Rule)):
-        columns[f"rule-{i}"] = {rule.axis: np.array([rule.at])}
+    for i, rules in enumerate(_rule_groups(panel)):
+        columns[f"rules-{i}"] = {"at": np.array([rule.at for rule in rules])}
     return columns
+
+
+def _rule_groups(panel: Panel) -> list[list[Rule]]:
+    """Return the rules of a panel, those that look alike together."""
+    groups: dict[object, list[Rule]] = {}
+    for rule in panel.select(Rule):
+        groups.setdefault((rule.name, rule.axis, rule.dash), []).append(rule)
+    return list(groups.values())
 
 
 def _curve_groups(panel: Panel) -> list[list[Curve]]:
@@ -156,19 +180,6 @@ def _height(panel: Panel) -> int:
     if panel.select(Map):
         return _MAP_HEIGHT
     return _HEIGHT if panel.height_in is None else int(60 + 115 * panel.height_in)
-
-
-def _style_axis(axis: Any, own: Axis, ends: tuple[float, float]) -> None:
-    from bokeh.models import FixedTicker, PlainText
-
-    axis.update(axis_label=PlainText(text=own.text), **_AXIS)
-    if own.log:
-        ticks = scales.log_ticks(*ends)
-        powers = range(*(int(np.floor(np.log10(end))) + i for i, end in enumerate(ends)))
-        # finer ones for readers who zoom in
-        fine = [f * 10.0**n for n in powers for f in range(1, 10)]
-        axis.ticker = FixedTicker(ticks=ticks, minor_ticks=[t for t in fine if t not in ticks])
-        axis.major_label_overrides = dict(zip(ticks, scales.log_tick_texts(ticks), strict=True))
 
 
 def _draw(figure: Any, panel: Panel, mark: Mark, points: dict[str, Any]) -> list[Any]:

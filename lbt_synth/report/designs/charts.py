@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.loop import close_loop
 from lbt_synth.report.charts.description import Axis, Chart, Curve, Panel, Rule
 from lbt_synth.report.charts.scales import count_columns
 from lbt_synth.report.designs.report import DesignReport
@@ -19,6 +20,7 @@ from lbt_synth.report.figures.loop import (
     stable_curve,
     vibration_rules,
 )
+from lbt_synth.report.figures.open_loops import bode_panels, break_loop
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, map_panels, strehl_panel
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
 from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
@@ -51,7 +53,27 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
                 noise=_largest_text(report, "noise_transfer"),
             )
         )
+        charts.append(_bode_chart(report))
     return charts
+
+
+def _bode_chart(report: DesignReport) -> Chart:
+    """Gain and phase of the loops, with their margins marked."""
+    hardware, gain = report.config.hardware, report.config.truth.sensor_gain
+    loops = [
+        each
+        for look, one in enumerate(report.assessments)
+        for each in break_loop(
+            one.name, close_loop(hardware, one.design.controller, sensor_gain=gain), look
+        )
+    ]
+    margins = [f"{each.name} {each.margins}" for each in loops]
+    return chart(
+        "bode",
+        bode_panels(loops),
+        gain=number_text(report.real_gain),
+        margins=listing_text(margins),
+    )
 
 
 def _largest_text(report: DesignReport, name: str) -> str:

@@ -197,10 +197,11 @@ def frequency_errors(config: Config) -> FloatArray:
     lines = [line.frequency_hz for line in stationary_vibrations(config.truth.vibrations)]
     if not lines:
         return frozen_copy([0.0])
-    nyquist_hz, shift = config.hardware.frame_rate_hz / 2, config.truth.frequency_shift_hz
-    fine = refine_values([*config.errors_hz, 0.0]).tolist()
-    kept = [e for e in fine if all(0 < f + shift(f, e) < nyquist_hz for f in lines)]
-    return frozen_copy(kept)
+    fine = refine_values([*config.errors_hz, 0.0])
+    shifts = [config.truth.frequency_shift_hz(line, 1.0) for line in lines]
+    places = np.array(lines) + fine[:, None] * shifts
+    nyquist_hz = config.hardware.frame_rate_hz / 2
+    return frozen_copy(fine[np.all((places > 0) & (places < nyquist_hz), axis=1)])
 
 
 def refine_values(values: Sequence[float]) -> FloatArray:

@@ -17,6 +17,7 @@ from lbt_synth.report.explore.knobs import Knob, list_knobs
 from lbt_synth.report.explore.panels import Shown
 from lbt_synth.report.explore.wish import Wish, fulfil
 from lbt_synth.report.number_text import fixed_text, number_text
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import compare_in_truth
 
 
@@ -103,7 +104,7 @@ def whole_view(exploration: Exploration, view: View) -> View:
 def describe_moves(exploration: Exploration, wish: Wish) -> str:
     """Return the sliders that a wish moved, as people read them; empty without any."""
     return ", ".join(
-        f"{knob.label} {number_text(value)} {knob.unit}".rstrip()
+        f"{knob.label} {number_text(value * knob.shown[1])} {knob.shown[0]}".rstrip()
         for knob, value in wish.move(exploration.knobs).items()
     )
 
@@ -120,7 +121,7 @@ def judge(view: View) -> str:
     )
     margins = loop_margins(loop)
     parts = [
-        f"{view.name} leaves {fixed_text(own.residual_nm, 1)} nm rms, Strehl ratio "
+        f"{view.name} leaves {nm_text(own.residual_nm, '.1f', unit='nm rms')}, Strehl ratio "
         f"{fixed_text(100 * own.strehl, 1)} %"
     ]
     if found.limit is not None:
@@ -132,7 +133,7 @@ def judge(view: View) -> str:
     if better:
         best = min(better, key=lambda row: row.residual_nm)
         sentences.append(
-            f"the {design_title(best.method)} leaves {fixed_text(best.residual_nm, 1)} nm here"
+            f"the {design_title(best.method)} leaves {nm_text(best.residual_nm, '.1f')} here"
         )
     sentences.append(
         f"Margins: modulus {number_text(margins.modulus, 3)}, phase "

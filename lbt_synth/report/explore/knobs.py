@@ -16,6 +16,7 @@ from lbt_synth.methods.registry import all_methods
 from lbt_synth.report.designs.report import frequency_errors
 from lbt_synth.report.explore import edits
 from lbt_synth.report.explore.edits import Content
+from lbt_synth.storage.display_unit import shown_unit
 
 Edit: TypeAlias = Callable[[Config, Content, float], None]
 SHIFT = "shift"  # key of the knob that moves the true lines
@@ -39,6 +40,11 @@ class Knob:
     )
     option: str = ""  # The option of the method that it is, or
     edit: Edit | None = None  # what puts its value into a configuration
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """The unit that people see, and the factor to it."""
+        return shown_unit(self.unit)
 
 
 def list_knobs(config: Config) -> tuple[Knob, ...]:

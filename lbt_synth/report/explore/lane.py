@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextvars import copy_context
 from threading import Condition, Thread
 
 
 class Lane:
     """Runs one piece of work after another in a thread; newer work replaces what still waits.
 
-    The thread ends with the program, even in the middle of its work.
+    The thread shows wavefronts in the unit of its maker, and ends with the program, even in the
+    middle of its work.
     """
 
     def __init__(self) -> None:
         self._waiting: Callable[[], None] | None = None
         self._open, self._changed = True, Condition()
-        self._thread = Thread(target=self._run, daemon=True)
+        self._thread = Thread(target=copy_context().run, args=(self._run,), daemon=True)
         self._thread.start()
 
     def submit(self, work: Callable[[], None]) -> None:

@@ -20,7 +20,7 @@
   }
   function tell(knob) {
     const value = knob.id in moved ? moved[knob.id] : Number(knob.dataset.value);
-    const text = `${Number(value.toPrecision(4))} ${knob.dataset.unit}`.trim();
+    const text = `${Number((value * knob.dataset.factor).toPrecision(4))} ${knob.dataset.unit}`.trim();
     const output = knob.parentElement.querySelector("output");
     output.textContent = text;
     output.classList.toggle("moved", knob.id in moved);
@@ -132,6 +132,12 @@
   }
   start();
 
+  // at each paint Bokeh writes the same style sheets, and the browser computes them again
+  function keepStyles() {
+    const sheet = Bokeh.require("core/dom").InlineStyleSheet.prototype, write = sheet._update;
+    sheet._update = function (css) { if (this.el.textContent !== css) write.call(this, css); };
+  }
+
   const began = Date.now();
   const waiting = setInterval(() => {
     const page = window.Bokeh && Bokeh.documents[0];
@@ -142,6 +148,7 @@
     }
     clearInterval(waiting);
     fail("");
+    keepStyles();
     for (const [name, take] of [["answer", hear], ["verdict", judge], ["saved", list]]) {
       const read = () => { if (exchange[name]) take(JSON.parse(exchange[name])); };
       exchange.properties[name].change.connect(read);

@@ -91,12 +91,12 @@ def open_loops(designs: Mapping[str, Design], *, sensor_gain: float = 1.0) -> li
     return [
         each
         for look, (design, loop) in enumerate(loops.items())
-        for each in _break_loop(design, loop, look)
+        for each in break_loop(design, loop, look)
     ]
 
 
-def _break_loop(design: str, loop: ClosedLoop, look: int) -> list[OpenLoop]:
-    """Break the loop of one design."""
+def break_loop(design: str, loop: ClosedLoop, look: int) -> list[OpenLoop]:
+    """Break the loop of one design; equal axes are one."""
     groups = broken_loops(loop) if loop.is_stable else (None,)
     return [
         OpenLoop(
@@ -145,12 +145,17 @@ def bode_figure(
     >>> len(lbt.report.figures.bode_figure({"slow": slow}).axes)
     2
     """
+    return draw_figure(bode_panels(open_loops(designs, sensor_gain=sensor_gain)), axes=axes)
+
+
+def bode_panels(loops: Sequence[OpenLoop]) -> tuple[Panel, Panel]:
+    """Return the panels of gain and phase of broken loops, with their margins."""
     gains: list[Mark] = [Rule(name="", at=0.0, axis="y", dash=1)]
     phases: list[Mark] = []
     gain_marks: list[Mark] = []
     phase_marks: list[Mark] = []
     lowest, highest = -180.0, -90.0
-    for each in open_loops(designs, sensor_gain=sensor_gain):
+    for each in loops:
         found = each.broken
         if found is None:
             gains.append(each.curve(np.zeros(0), np.zeros(0)))
@@ -166,11 +171,10 @@ def bode_figure(
             phase_marks += _mark("phase margin", [frequency_hz] * 2, ends, "circle")
     phases += [Rule(name="", at=at, axis="y", dash=1) for at in _critical_phases(lowest, highest)]
     y, below = Axis(label="loop gain", unit="dB"), Axis(label="phase", unit="deg")
-    panels = (
+    return (
         Panel(x=FREQUENCY, y=y, marks=(*gains, *gain_marks)),
         Panel(x=FREQUENCY, y=below, marks=(*phases, *phase_marks)),
     )
-    return draw_figure(panels, axes=axes)
 
 
 def nyquist_figure(
@@ -215,7 +219,7 @@ def nyquist_figure(
     for name, loop in loops.items():
         marks, title = [unit, *minus], f"{name}: unstable"
         if loop.is_stable:
-            found = _break_loop(name, loop, look=0)
+            found = break_loop(name, loop, look=0)
             for number, each in enumerate(found):
                 marks += _nyquist_marks(each, number=number, alone=len(found) == 1)
             margins = loop_margins(loop)

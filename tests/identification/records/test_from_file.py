@@ -477,20 +477,20 @@ def test_modes_of_many():
     y, u = rng.standard_normal((2, 60, 5))
     many = telemetry(measurements=y, commands=u, diameter_m=8.0, name="night")
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"there are 5 modes; say which are tip and tilt: modes="
+        lbt.errors.ProblemError, match=r"there are 5 modes; say which are tip and tilt: axes="
     ):
         lbt.identification.record_from_telemetry(many)
-    seen = lbt.identification.record_from_telemetry(many, modes=(1, 0))
+    seen = lbt.identification.record_from_telemetry(many, axes=(1, 0))
     assert np.array_equal(seen.measurements, y[:, [1, 0]])
     assert np.array_equal(seen.commands, u[:, [1, 0]])
     assert "axes are modes 1, 0 of 5" in seen.health.notes
     assert (seen.diameter_m, seen.source) == (8.0, "night")
-    assert lbt.identification.record_from_telemetry(many, modes=[3]).axes == 1
+    assert lbt.identification.record_from_telemetry(many, axes=[3]).axes == 1
     for bad in ((0, 0), (5,), (0, 1, 2), ()):
         with pytest.raises(
-            lbt.errors.ProblemError, match="modes must be one or two different numbers below 5"
+            lbt.errors.ProblemError, match="axes must be one or two different numbers below 5"
         ):
-            lbt.identification.record_from_telemetry(many, modes=bad)
+            lbt.identification.record_from_telemetry(many, axes=bad)
 
 
 def test_slopes_with_their_modes_and_without():
@@ -507,7 +507,7 @@ def test_slopes_with_their_modes_and_without():
             reconstructor=R,
             commands=phase,
         ),
-        modes=(0, 1),
+        axes=(0, 1),
     )
     assert np.allclose(seen.measurements, phase[:, :2])
     # a reconstructor of another gain is taken out
@@ -519,14 +519,14 @@ def test_slopes_with_their_modes_and_without():
             reconstructor=R / 2,
             commands=phase,
         ),
-        modes=(0, 1),
+        axes=(0, 1),
     )
     assert np.allclose(half.measurements, phase[:, :2])
     with pytest.raises(
         lbt.errors.ProblemError, match=r"slopes without modal coefficients.*slopes @ R.T"
     ):
         lbt.identification.record_from_telemetry(
-            telemetry(measurements=slopes, interaction_matrix=S, commands=phase), modes=(0, 1)
+            telemetry(measurements=slopes, interaction_matrix=S, commands=phase), axes=(0, 1)
         )
     with pytest.raises(lbt.errors.ProblemError, match="slopes without modal coefficients"):
         lbt.identification.record_from_telemetry(

@@ -30,7 +30,7 @@ def test_new_numbers_go_to_the_same_figure():
     live.show(panel([3.0, 4.0, 5.0, 6.0], at=3.0))
     assert figure_of(live) is figure
     np.testing.assert_array_equal(line.data["y0"], [3.0, 4.0, 5.0, 6.0])
-    np.testing.assert_array_equal(rule.data["x"], [3.0])
+    np.testing.assert_array_equal(rule.data["at"], [3.0])
 
 
 def test_what_is_the_same_is_not_sent():

@@ -12,6 +12,7 @@ from support.design_reports import SMALL, words_of
 from support.pages import Reader
 
 import lbt_synth as lbt
+from lbt_synth.report.charts.description import Curve
 from lbt_synth.report.designs.page import design_page
 from lbt_synth.report.designs.verdict import verdict
 from lbt_synth.report.number_text import fixed_text
@@ -41,6 +42,15 @@ def test_an_unstable_loop_is_named_loudly(report, text):
     assert text.count("wild: unstable") > 5
 
 
+def test_the_loop_gain_has_the_margins_of_the_table(report):
+    (found,) = [each for each in design_page(report).charts if each.key == "bode"]
+    for one in report.stable:
+        assert f"{one.name} {one.margins.phase_deg:.1f}° at" in found.alt
+    marked = {curve.name for curve in found.panels[1].select(Curve)}
+    assert "phase margin" in marked
+    assert "wild unstable" in found.alt
+
+
 def test_a_limit_of_nothing_is_no_limit(config, designs):
     still = lbt.Truth(turbulence=None, noise_nm=config.truth.noise_nm)
     report = lbt.report.design_report(replace(config, truth=still), {"slow": designs["slow"]})
@@ -55,6 +65,7 @@ def test_the_page_is_complete(text, report, config):
     for word in (
         "Summary",
         "Rejection and noise",
+        "Loop gain and margins",
         "Strehl ratio over the frequency error",
         "Poles",
         "Step response",

@@ -12,6 +12,7 @@ from lbt_synth.report.explore.exploration import (
     whole_view,
 )
 from lbt_synth.report.explore.wish import Wish
+from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
 
 
 @pytest.fixture(scope="module")
@@ -66,3 +67,11 @@ def test_moves_in_words(exploration):
     wish = Wish(method="hinf", values={"delay": 2.5, "hinf-gamma_ratio": 1.3, "robust-band": 1.0})
     assert describe_moves(exploration, wish) == "total delay 2.5 frames, gamma ratio 1.3"
     assert describe_moves(exploration, first_wish()) == ""
+
+
+def test_wavefronts_in_another_unit(exploration):
+    view = quick_view(exploration, Wish(method="kalman", values={"noise": 20.0}))
+    with own_display_unit():
+        show_in(DisplayUnit(name="mas", nm=10.0))
+        assert describe_moves(exploration, view.wish) == "measurement noise 2 mas"
+        assert " mas rms, Strehl ratio" in judge(view)

@@ -3,6 +3,7 @@
 from threading import Event
 
 from lbt_synth.report.explore.lane import Lane
+from lbt_synth.storage.display_unit import DisplayUnit, nm_text, own_display_unit, show_in
 
 
 def test_newer_work_replaces_what_waits():
@@ -35,3 +36,14 @@ def test_a_closed_lane_drops_what_waits():
     lane._thread.join(10)
     assert not lane._thread.is_alive()
     assert began.is_set()
+
+
+def test_work_is_shown_in_the_unit_of_the_page():
+    shown, ended = [], Event()
+    with own_display_unit():
+        show_in(DisplayUnit(name="mas", nm=10.0))
+        lane = Lane()
+    lane.submit(lambda: (shown.append(nm_text(20.0)), ended.set()))
+    assert ended.wait(10)
+    assert shown == ["2 mas"]
+    lane.close()
