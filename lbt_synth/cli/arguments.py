@@ -81,8 +81,7 @@ def export(parser: ArgumentParser) -> None:
         metavar="NAME",
     )
     types = ("double", "single")
-    text = "c: plain assumes that commands are applied, estimator is given those that were"
-    add_option(parser, "--form", ("plain", "estimator"), f"{text} (default plain)")
+    _add_form(parser, "c")
     text = "c: type of all numbers; iir: SPECULA's (default double)"
     add_option(parser, "--precision", types, text)
     text = "c: prefix of the C names (default: the output's name without its ending)"
@@ -97,6 +96,11 @@ def export(parser: ArgumentParser) -> None:
     text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its certificate; "
     text += "pyrtc: folder"
     add_output(parser, text)
+
+
+def _add_form(parser: ArgumentParser, whose: str) -> None:
+    text = "plain assumes that commands are applied, estimator is given those that were"
+    add_option(parser, "--form", ("plain", "estimator"), f"{whose}: {text} (default plain)")
 
 
 def sigma(parser: ArgumentParser) -> None:
@@ -166,6 +170,8 @@ def simulate(parser: ArgumentParser) -> None:
     add_option(parser, "--cases", int, "independent runs")
     add_option(parser, "--seed", int, "seed of the random series")
     add_option(parser, "--sensor-gain", float, "real sensor gain")
+    add_option(parser, "--stroke", float, "largest command that the mirror applies [nm]")
+    _add_form(parser, "of the controller")
     add_output(parser, FIGURE, required=False)
     text = "write the series of the first run (.fits, .npz or .aot.fits)"
     add_option(parser, "--telemetry", str, text, metavar="FILE")

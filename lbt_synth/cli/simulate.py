@@ -20,6 +20,7 @@ from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
+from lbt_synth.linear import estimator_form
 from lbt_synth.loop import (
     ClosedLoop,
     Imaging,
@@ -76,11 +77,12 @@ def run(arguments: Namespace) -> Report:
     settle = max(settings.settle_frames, settling_frames(loop.spectral_radius))
     with show_spinner("closing the loop", quiet=arguments.json):
         simulation = simulate(
-            design.controller,
+            estimator_form(design) if arguments.form == "estimator" else design.controller,
             truth,
             hardware=config.hardware,
             **sizes | given_options(arguments, *sizes),
             settle_frames=settle,
+            stroke=arguments.stroke,
         )
         strehls = simulation.strehl(config.imaging)
     report = _describe_simulation(
@@ -92,6 +94,13 @@ def run(arguments: Namespace) -> Report:
     )
     report.data["sensor_gain"] = config.sensor_gain * truth.sensor_gain
     report.notes += _simulation_notes(config, design, strehls, settle, drifts=truth.drifts)
+    if arguments.stroke is not None:
+        clipped = np.mean(np.any(np.abs(simulation.commands) >= arguments.stroke, axis=2))
+        report.data["clipped"] = float(clipped)
+        report.notes.append(
+            f"note: the mirror clipped the commands of {clipped:.2%} of the frames; the exact "
+            "answer has no limit of the stroke."
+        )
     if arguments.output is not None:
         title = f"{design.method}: the first second above, mean spectrum of all runs below"
         figure = simulation_figure(simulation, title=title)

@@ -129,8 +129,8 @@ def estimator_form(controller: Controller | HasController) -> EstimatorForm:
     Raises
     ------
     NumericalError
-        If the controller is no estimator and has a zero outside the unit circle, or fewer
-        measurements than commands; ``residual`` is the modulus of the zero.
+        If the controller is no estimator and has a zero that is not inside the unit circle;
+        ``residual`` is its modulus.
 
     Examples
     --------
@@ -161,9 +161,9 @@ def estimator_form(controller: Controller | HasController) -> EstimatorForm:
     )
     if not form.spectral_radius < _STABLE:
         raise NumericalError(
-            "an estimator form must be stable; this controller has a zero of modulus "
-            f"{form.spectral_radius:.6g}, which it would keep as a pole. Use the plain form, and "
-            "reset it where its commands were not applied.",
+            "an estimator form must be stable; that of this controller would keep a pole of "
+            f"modulus {form.spectral_radius:.6g}, a zero of the controller. Use the plain form, "
+            "and reset it where its commands were not applied.",
             residual=form.spectral_radius,
         )
     return form
@@ -185,12 +185,4 @@ def _with_command_state(controller: Controller) -> Controller:
 def _conditioning_gain(controller: Controller) -> FloatArray:
     """Return L (n, m) of the conditioning technique."""
     A, B, C = controller.A, controller.B, controller.C
-    moves = C @ B
-    if np.linalg.matrix_rank(moves) < len(moves):
-        raise NumericalError(
-            "an estimator form needs a measurement for each command, which moves it at once; this "
-            "controller has commands that none moves. Use the plain form, and reset it where its "
-            "commands were not applied.",
-            residual=float("inf"),
-        )
-    return np.asarray(A @ B @ np.linalg.pinv(moves))
+    return np.asarray(A @ B @ np.linalg.pinv(C @ B))

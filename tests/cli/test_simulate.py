@@ -31,6 +31,19 @@ def test_simulate(tmp_path, capsys, gains):
     assert dim["strehl_exact"] < data["strehl_exact"]
 
 
+def test_a_mirror_of_little_stroke(capsys, gains):
+    arguments = ("simulate", CONFIG, gains["kalman"], "--frames", 500, "--cases", 1)
+    free = json.loads(run(capsys, *arguments, "--json")[1])
+    left = {}
+    for form in ("plain", "estimator"):
+        limited = (*arguments, "--stroke", 1200, "--form", form)
+        data = json.loads(run(capsys, *limited, "--json")[1])
+        left[form] = data["residual_nm"][0], data["clipped"]
+    assert left["plain"] > left["estimator"] > (free["residual_nm"][0], 0)
+    assert left["plain"][1] > left["estimator"][1] > 0
+    assert "note: the mirror clipped the commands of" in run(capsys, *limited)[1]
+
+
 def test_an_unstable_loop_has_status_1(capsys, gains):
     status, out, error = run(
         capsys, "simulate", CONFIG, gains["hinf"], "--sensor-gain", 0.3, "--json"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import astuple
+from fractions import Fraction
 
 import pytest
-from support.written_files import ORACLES, WITHOUT_ORACLE, judge
+from support.written_files import ENDINGS, ORACLES, WITHOUT_ORACLE, is_schur, judge
 
 import lbt_synth as lbt
 from lbt_synth.interop import export_checks
@@ -25,6 +26,25 @@ def test_each_folder_with_an_export_is_a_target_and_has_an_oracle():
     assert {"c", "cacao", "dao", "iir", "matlab", "pyrtc"} <= set(target_names())
     assert set(target_names()) <= set(ORACLES) | WITHOUT_ORACLE
     assert not set(ORACLES) & WITHOUT_ORACLE
+
+
+def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
+    """Files of an integrator, judged in the loop of one that is too slow for it."""
+    quick = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.9)
+    late = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=3), gain=0.1)
+    options = {"precision": "double", "form": "plain"}
+    for name, oracle in ORACLES.items():
+        files = lbt.interop.target_named(name).write(tmp_path / ENDINGS[name], quick).files
+        assert oracle(files, quick, options)
+        assert not oracle(files, late, options)
+
+
+def test_polynomials_are_judged_exactly():
+    near = Fraction(2**60 - 1, 2**60)
+    assert is_schur([Fraction(1), -near])
+    assert not is_schur([Fraction(1), Fraction(-1)])
+    assert is_schur([Fraction(1), -2 * near, near**2, Fraction(0)])
+    assert not is_schur([Fraction(1), -2 * near, 1 + Fraction(1, 2**100)])
 
 
 def written_stable(folder, monkeypatch, seeds):
