@@ -89,6 +89,8 @@ def export(parser: ArgumentParser) -> None:
     add_option(parser, "--order", int, "dao: M of the RTC's configuration (default 20)")
     text = "dao, pyrtc: modes of the RTC (default: those of the design)"
     add_option(parser, "--modes", int, text)
+    text = "dao: gain of an integrator for each further mode (default: no command)"
+    add_option(parser, "--other-gain", float, text)
     text = "cacao: frames of history (default: as many as the loss needs)"
     add_option(parser, "--steps", int, text)
     text = "cacao: relative loss of residual that chooses them (default 0.01, the most)"

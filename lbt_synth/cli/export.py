@@ -16,7 +16,7 @@ from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
 
 _SINGLE_SUFFICES = 1e-3  # of the largest command
-_OPTIONS = ("form", "precision", "name", "order", "modes", "steps", "loss")
+_OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
 
 
 @table_row
@@ -40,8 +40,9 @@ def run(arguments: Namespace) -> Report:
     for option in options:
         if option not in target.options:
             fitting = " or ".join(n for n in target_names() if option in target_named(n).options)
+            given = option.replace("_", "-")
             raise ProblemError(
-                f"--{option} goes with --for {fitting}; got --for {arguments.target}."
+                f"--{given} goes with --for {fitting}; got --for {arguments.target}."
             )
     output = Path(arguments.output)
     endings = () if target.contents else (target.beside, CERTIFICATE)

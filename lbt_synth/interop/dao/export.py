@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import io
 import os
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lbt_synth.design import Design, ShapedDesign
+from lbt_synth.design import Check, Design, ShapedDesign
+from lbt_synth.design.modal import MixedController, ModalFilters
+from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.dao.inner_loop import InnerLoop
 from lbt_synth.interop.dao.lattice_rounding import round_together
 from lbt_synth.interop.dao.mode_loop import ROUNDING, DirectFormLoop, shaped_mode_loop
+from lbt_synth.interop.dao.modes import ModeDesign, mode_designs
 from lbt_synth.interop.dao.refit import refit
 from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
@@ -29,9 +33,10 @@ from lbt_synth.interop.iir.realisation import build_controller
 from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.interop.written_loop import Rounding, prove_written, require_proved
 from lbt_synth.linear import Controller
+from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.atomic_files import require_ending
-from lbt_synth.validation import FloatArray, integer
+from lbt_synth.validation import FloatArray, integer, number
 
 _HINT = "Design with fewer states or less accurate models, or use a target in double precision."
 _OWN = "of the gain file, rounded"
@@ -41,10 +46,12 @@ _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's
 
 def export_dao(
     path: str | os.PathLike[str],
-    design: Design,
+    design: Design | MixedController | ModalFilters,
     *,
     order: int = 20,
     modes: int | None = None,
+    other_gain: float | None = None,
+    hardware: LoopHardware | None = None,
     gain_digest: str | None = None,
 ) -> Exported:
     """Write a controller as the matrix of a dao real-time computer, one column per mode.
@@ -60,13 +67,18 @@ def export_dao(
     path : path-like
         File to write, ending in ``.npy`` or ``.fits``. The proof goes beside it, with the ending
         ``.certificate.json``.
-    design : Design
-        Design whose modes decouple, with unit sensor and influence matrices.
+    design : Design, MixedController or ModalFilters
+        Design whose modes decouple, with unit sensor and influence matrices; or a design with
+        integrators for the other modes; or a filter for each mode.
     order : int, optional
         M of the RTC's configuration.
     modes : int, optional
-        Columns of the matrix; by default those of the design. Further columns are zero: their
-        modes get no command.
+        Columns of the matrix; by default those of the design. Further columns are zero, and their
+        modes get no command, without ``other_gain``.
+    other_gain : float, optional
+        Gain of an integrator for each further mode.
+    hardware : LoopHardware, optional
+        Loop of the integrators, where no filter says which.
     gain_digest : str, optional
         SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
 
@@ -97,22 +109,23 @@ def export_dao(
     [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
     """
     target = require_ending(path, "a matrix of dao", (".npy", ".fits"))
-    require_exportable(design)
-    own = require_modal(design, "a dao matrix")
+    if other_gain is not None:
+        design = _with_integrators(design, modes, other_gain)
+    parts, own = _parts(design, hardware)
     columns = own if modes is None else integer(modes, "modes", at_least=own)
-    lines = provenance_lines(design, gain_digest)
-    exact = direct_form_rows(design.controller, integer(order, "order", at_least=1))
-    rounded = exact.astype(np.float32)
-    checks = prove_written(design, *_as_computed(rounded, design))
-    made_again = not all(check.passed for check in checks) and _can_make_again(design, exact)
-    if isinstance(design, ShapedDesign) and made_again:
-        rounded = _made_again(design, exact)
-        checks = prove_written(design, *_as_computed(rounded, design))
-    require_proved(checks, "single precision, in direct form", _HINT)
-    matrix = np.zeros((len(rounded), columns), dtype=np.float32)
-    matrix[:, :own] = rounded
-    single = rehearsal_error(design, InnerLoop(rounded))
-    content = _matrix_bytes(matrix, design, lines, fits=target.suffix.lower() == ".fits")
+    order = integer(order, "order", at_least=1)
+    matrix = np.zeros((2 * order + 1, columns), dtype=np.float32)
+    checks: list[Check] = []
+    again, error = False, 0.0
+    for part in parts:
+        proved = _proved_columns(part.design, order)
+        matrix[:, part.modes] = proved.columns
+        again |= proved.made_again
+        error = max(error, rehearsal_error(part.design, InnerLoop(proved.columns)))
+        checks += (replace(check, name=_of_modes(check.name, part, own)) for check in proved.checks)
+    first = parts[0].design
+    lines = provenance_lines(first, gain_digest)
+    content = _matrix_bytes(matrix, first, lines, fits=target.suffix.lower() == ".fits")
     files = write_certified(
         {target: content},
         target="dao",
@@ -122,9 +135,66 @@ def export_dao(
         order=order,
         modes=columns,
         sign=_SIGN,
-        coefficients=_AGAIN if made_again else _OWN,
+        coefficients=_AGAIN if again else _OWN,
     )
-    return Exported(files=files, error=single, error_single=single, checks=checks)
+    return Exported(files=files, error=error, error_single=error, checks=tuple(checks))
+
+
+class _Proved(NamedTuple):
+    """Columns (2 M + 1, n) of a design, and what was checked of them."""
+
+    columns: NDArray[np.float32]
+    checks: tuple[Check, ...]
+    made_again: bool
+
+
+def _parts(
+    design: Design | MixedController | ModalFilters, hardware: LoopHardware | None
+) -> tuple[list[ModeDesign], int]:
+    """Return the designs of all modes, and the number of modes."""
+    if isinstance(design, MixedController | ModalFilters):
+        parts, own = mode_designs(design, hardware), design.n_modes
+        if not parts:
+            raise ProblemError("at least one mode must have a gain above 0; all are 0.")
+        for part in parts:
+            require_exportable(part.design)
+        if isinstance(design, MixedController) and isinstance(design.filter, Design):
+            require_modal(design.filter, "a dao matrix")
+        return parts, own
+    require_exportable(design)
+    own = require_modal(design, "a dao matrix")
+    return [ModeDesign(design, tuple(range(own)))], own
+
+
+def _with_integrators(
+    design: Design | MixedController | ModalFilters, modes: int | None, gain: float
+) -> MixedController:
+    """Return a design with integrators for all further modes."""
+    if not isinstance(design, Design):
+        raise ProblemError("other_gain goes with a design; a controller of all modes has gains.")
+    own = require_modal(design, "a dao matrix")
+    if modes is None:
+        raise ProblemError("other_gain needs modes, the number of modes of the RTC; got none.")
+    gains = np.full(integer(modes, "modes", at_least=own), number(gain, "other_gain", above=0))
+    return MixedController(filter=design, gains=gains, filtered=range(own))
+
+
+def _of_modes(name: str, part: ModeDesign, own: int) -> str:
+    """Name the modes of a check, where they are not all of them."""
+    return name if len(part.modes) == own else f"{name} ({name_modes(np.array(part.modes))})"
+
+
+def _proved_columns(design: Design, order: int) -> _Proved:
+    """Return the columns of a design, proved in the arithmetic of the RTC."""
+    exact = direct_form_rows(design.controller, order)
+    rounded = exact.astype(np.float32)
+    checks = prove_written(design, *_as_computed(rounded, design))
+    made_again = not all(check.passed for check in checks) and _can_make_again(design, exact)
+    if isinstance(design, ShapedDesign) and made_again:
+        rounded = _made_again(design, exact)
+        checks = prove_written(design, *_as_computed(rounded, design))
+    require_proved(checks, "single precision, in direct form", _HINT)
+    return _Proved(rounded, checks, made_again)
 
 
 def direct_form_rows(controller: Controller, order: int) -> FloatArray:
@@ -228,5 +298,5 @@ TARGET = Target(
     ),
     file="matrix of single precision (.npy, .fits) and its certificate (.json)",
     write=export_dao,
-    options=("order", "modes"),
+    options=("order", "modes", "other_gain"),
 )
