@@ -14,6 +14,7 @@ from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 
 _NUMBERS = itertools.count()
 _LONGEST_S = 120
+SENSOR_HZ = 100.0  # of pyRTC's own sensor
 
 
 @contextmanager
@@ -50,14 +51,14 @@ def synthetic(folder):
         "height": 32,
         "dark_count": 10,
         "num_modes": modes,
-        "frame_rate_hz": 200.0,
+        "frame_rate_hz": SENSOR_HZ,
         "read_noise": 1.0,
         **grid,
     }
     conf["slopes"] = {"type": "SHWFS", "signal_type": "slopes", "functions": ["compute_signal"]}
     conf["slopes"] |= grid
     del conf["loop"]["im_file"]
-    conf["loop"] |= {"poke_amp": 0.2, "num_iters_im": 4}
+    conf["loop"] |= {"poke_amp": 0.2, "num_iters_im": 4, "im_settle_frames": 3}
     with built(folder, conf) as manager:
         sensor = manager.get_component("wfs")
         amplitudes, sensor.modal_amplitudes = sensor.modal_amplitudes, 0 * sensor.modal_amplitudes

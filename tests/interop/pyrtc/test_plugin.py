@@ -9,6 +9,7 @@ import pytest
 from support.exports import lbt_config, lbt_designs, relative
 from support.gain_file_edits import odd_plant
 from support.pyrtc_systems import (
+    SENSOR_HZ,
     drawn,
     modal_residuals,
     pol_series,
@@ -91,20 +92,16 @@ def test_the_residual_is_below_those_of_its_own_predictors(tmp_path):
 def test_it_closes_on_the_sensor_of_pyrtc(tmp_path):
     """Its images, its slopes and its calibration, at its own pace."""
     pytest.importorskip("pyrtc")
-    slow = lbt.models.ARModel(
-        coefficients=[1.99, -0.9905], driving_rms_nm=0.002, frame_rate_hz=200.0
-    )
-    plant = lbt.tip_tilt_plant(frame_rate_hz=200, turbulence=slow, noise_nm=0.01, delay_frames=1)
-    lbt.interop.export_pyrtc(tmp_path, lbt.kalman(plant), modes=6)
+    path = lbt.LoopHardware(frame_rate_hz=SENSOR_HZ, delay_frames=1)
+    lbt.interop.export_pyrtc(tmp_path, lbt.integrator(path, gain=0.4), modes=6)
     config = tmp_path / "config.yaml"
-    config.write_text(config.read_text().replace("other_gain: 0.0", "other_gain: 0.3"))
+    config.write_text(config.read_text().replace("other_gain: 0.0", "other_gain: 0.5"))
     with synthetic(tmp_path) as manager:
-        open_loop = np.std(modal_residuals(manager, 200), axis=0)
+        open_loop = np.std(modal_residuals(manager, 120), axis=0)
         manager.start_component("loop")
-        modal_residuals(manager, 100)  # until it has settled
-        closed = np.std(modal_residuals(manager, 200), axis=0)
-    assert np.all(closed < 0.5 * open_loop)
-    assert np.all(closed[:2] < 0.2 * open_loop[:2])
+        modal_residuals(manager, 50)  # until it has settled
+        closed = np.std(modal_residuals(manager, 120), axis=0)
+    assert np.all(closed < 0.6 * open_loop)  # about 0.2, if no frame is late
 
 
 @pytest.mark.e2e
