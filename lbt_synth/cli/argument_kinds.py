@@ -42,7 +42,8 @@ def add_gain(parser: ArgumentParser) -> None:
 
 def add_gains(parser: ArgumentParser, nargs: str = "*", text: str = GAIN_FILE) -> None:
     """Add gain files."""
-    parser.add_argument("gains", nargs=nargs, metavar="gain", help=text)
+    # without a default, argparse calls them required
+    parser.add_argument("gains", nargs=nargs, metavar="gain", help=text, default=[])
 
 
 def add_output(parser: ArgumentParser, text: str, *, required: bool = True) -> None:

@@ -20,7 +20,10 @@ def run(arguments: Namespace) -> Report:
         ) from error
     parser = build_parser(*COMMANDS)
     for action in _takes_files(parser):
-        action.complete = shtab.FILE  # type: ignore[attr-defined]
+        if action.dest == "topic":  # of help
+            action.choices = list(COMMANDS)
+        else:
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
     text = shtab.complete(parser, shell=arguments.shell)
     return Report(data={"shell": arguments.shell, "script": text}, opening=text.splitlines())
 

@@ -40,6 +40,7 @@ def test_a_shell_takes_its_script(tmp_path, capsys, shell):
         (("design", "a.yaml", "--method", "kal"), "kalman"),
         (("show", "ga"), "gain.fits"),
         (("init", "--telescope", "ke"), "keck"),
+        (("help", "robu"), "robustness"),
     ],
 )
 def test_bash_completes(tmp_path, capsys, words, expected):

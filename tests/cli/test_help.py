@@ -30,3 +30,8 @@ def test_a_mistyped_command_is_suggested(capsys):
         status, out, error = run(capsys, *words)
         assert (status, out, error.count("\n")) == (2, "", 1)
         assert "did you mean design?" in error
+
+
+def test_what_can_be_left_out_is_not_called_required(capsys):
+    status, _, error = run(capsys, "robustness")
+    assert (status, "required: config (see" in error) == (2, True)

@@ -7,7 +7,6 @@ A description knows no drawing library. ``matplotlib_charts`` draws it for files
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, TypeVar
 
@@ -275,16 +274,6 @@ def require_key(key: str) -> str:
             f"got {key!r}."
         )
     return key
-
-
-def legend_entries(panels: Sequence[Panel]) -> dict[str, Mark]:
-    """Return the entries of a legend, each name with the first mark that has it."""
-    found: dict[str, Mark] = {}
-    for panel in panels:
-        for mark in panel.marks:
-            if mark.name:
-                found.setdefault(mark.name, mark)
-    return found
 
 
 def _take_columns(mark: Mark, *names: str) -> None:

@@ -24,7 +24,6 @@ from lbt_synth.report.charts.description import (
     Panel,
     Rule,
     Span,
-    legend_entries,
 )
 from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
 from lbt_synth.report.figures.style import house_style
@@ -147,7 +146,7 @@ def _new_places(panels: Sequence[Panel], columns: int, title: str) -> tuple[Figu
 
 def _draw_legend(owner: Figure | Axes, panels: Sequence[Panel], **options: Any) -> None:
     """Give a figure or axes the legend of panels, if anything in them has a name."""
-    entries = legend_entries(panels)
+    entries = scales.legend_entries(panels)
     if not entries:
         return
     # a leading underscore would leave a name out

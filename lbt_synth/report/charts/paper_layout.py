@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lbt_synth.report.charts.description import Bars, Map, Panel, legend_entries
-from lbt_synth.report.charts.scales import scale_ends, shorten
+from lbt_synth.report.charts.description import Bars, Map, Panel
+from lbt_synth.report.charts.scales import legend_entries, scale_ends, shorten
 
 WIDTH_IN = 7.0
 LETTER_IN = 0.068  # width of a letter at 8 points, generously

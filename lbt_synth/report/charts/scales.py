@@ -8,7 +8,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from lbt_synth.report.charts.description import Area, Axis, Bars, Curve, Map, Panel, Rule
+from lbt_synth.report.charts.description import (
+    Area,
+    Axis,
+    Bars,
+    Curve,
+    Map,
+    Mark,
+    Panel,
+    Rule,
+    Span,
+)
 from lbt_synth.validation import BoolArray, FloatArray
 
 STREHL_LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
@@ -51,6 +61,35 @@ def scale_ends(panel: Panel) -> tuple[tuple[float, float], tuple[float, float]]:
         return x, (len(panel.categories) - 0.4, -0.6)
     y_room = 0.0 if tight else _ROOM
     return x, _axis_ends(panel.y, y_values, y_room, [(c.y, c.marker is not None) for c in curves])
+
+
+def legend_entries(panels: Sequence[Panel]) -> dict[str, Mark]:
+    """Return the entries of a legend, each name with the first mark that has it and is seen."""
+    found: dict[str, Mark] = {}
+    for panel in panels:
+        ends = scale_ends(panel)
+        for mark in panel.marks:
+            if mark.name and _is_seen(mark, *ends):
+                found.setdefault(mark.name, mark)
+    return found
+
+
+def _is_seen(mark: Mark, x: tuple[float, float], y: tuple[float, float]) -> bool:
+    """Whether a mark reaches into the scales; a curve without points is in the legend only."""
+    match mark:
+        case Rule():
+            return _overlap([mark.at], x if mark.axis == "x" else y)
+        case Span():
+            return _overlap([mark.low, mark.high], x if mark.axis == "x" else y)
+        case Curve() if mark.x.size:
+            return _overlap(mark.x, x) and _overlap(mark.y, y)
+    return True
+
+
+def _overlap(values: FloatArray | list[float], ends: tuple[float, float]) -> bool:
+    """Whether the range of values and a scale have something in common."""
+    known = np.asarray(values)[np.isfinite(values)]
+    return bool(known.size and known.max() >= min(ends) and known.min() <= max(ends))
 
 
 def _axis_ends(

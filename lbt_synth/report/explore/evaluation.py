@@ -19,7 +19,7 @@ from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, 
 from lbt_synth.studies import robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_POINTS, _NEAR_A_LINE = 300, 16  # frequencies of a curve: in all, and on each side of a line
+_POINTS, _NEAR_A_LINE = 240, 28  # frequencies of a curve: in all, and on each side of a line
 _SHIFTS = 15
 _SEGMENT = 2048  # frames of a segment of the spectrum
 

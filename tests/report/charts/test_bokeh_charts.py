@@ -11,8 +11,9 @@ from support.browser import DESK, PHONE, WALK, chain, drawn_plots, opened, toolt
 from support.pages import every_mark
 
 from lbt_synth.report.charts.bokeh_charts import embed_charts
-from lbt_synth.report.charts.description import Axis, Chart, Curve, Panel, legend_entries
+from lbt_synth.report.charts.description import Axis, Chart, Curve, Panel
 from lbt_synth.report.charts.matplotlib_charts import draw_figure
+from lbt_synth.report.charts.scales import legend_entries
 
 
 def test_the_data_of_charts_are_those_given():

@@ -7,9 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lbt_synth.report.charts.description import Area, Axis, Curve, Panel
+from lbt_synth.report.charts.description import (
+    Area,
+    Axis,
+    Curve,
+    Panel,
+    Rule,
+    Span,
+)
 from lbt_synth.report.charts.scales import (
     keep_apart,
+    legend_entries,
     log_tick_texts,
     log_ticks,
     scale_ends,
@@ -92,3 +100,22 @@ def test_labels_do_not_overlap(wanted):
 def test_of_labels_that_cover_each_other_the_first_stays():
     boxes = [(0, 0, 2, 1), (1, 0, 3, 1), (2.5, 0, 4, 1), (0, 2, 2, 3)]
     assert keep_apart(boxes) == [True, False, True, True]
+
+
+def test_a_legend_names_what_is_seen():
+    x = np.array([1.0, 3.0])
+    marks = (
+        Curve(name="curve", x=x, y=x),
+        Curve(name="far above", x=x, y=x + 50),
+        Curve(name="unstable", x=np.zeros(0), y=np.zeros(0)),
+        Rule(name="line", at=2.0),
+        Rule(name="line beyond", at=20.0),
+        Rule(name="level", at=9.0, axis="y"),
+        Span(name="band at the edge", low=2.9, high=40.0),
+        Span(name="band beyond", low=30.0, high=40.0),
+    )
+    panel = Panel(x=Axis(label="x"), y=Axis(label="y", low=0.0, high=10.0), marks=marks)
+    seen = ["curve", "unstable", "line", "level", "band at the edge"]
+    assert list(legend_entries([panel])) == seen
+    beside = Panel(x=Axis(label="x", high=50.0), y=panel.y, marks=marks)
+    assert set(legend_entries([panel, beside])) == {*seen, "line beyond", "band beyond"}
