@@ -179,7 +179,7 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
         contrast,
         min(starts, key=contrast),
         method="Nelder-Mead",
-        options={"xatol": 1e-8, "fatol": 1e-13},
+        options={"xatol": 1e-8, "fatol": 1e-13, "maxiter": 2000, "maxfev": 2000},
     )
     if not fit.success:
         raise NumericalError(
