@@ -92,6 +92,19 @@ def panel_figure(
     set_scales(figure, panel)
     own = {} if sources is None else sources
     own |= {key: ColumnDataSource(columns) for key, columns in panel_columns(panel).items()}
+    _draw_marks(figure, panel, own, named)
+    if panel.categories:
+        names = {i: scales.shorten(name, 24) for i, name in enumerate(panel.categories)}
+        figure.yaxis[0].update(ticker=list(names), major_label_overrides=names, axis_label=None)
+        figure.ygrid.grid_line_color = None
+    _hover_curves(figure, panel, own)
+    return figure
+
+
+def _draw_marks(
+    figure: Any, panel: Panel, own: dict[str, Any], named: dict[str, list[str]]
+) -> None:
+    """Draw the marks of a panel; curves and rules that look alike share a source."""
     points = {
         id(curve): {"x": "x", "y": f"y{j}", "source": own[f"curves-{i}"]}
         for i, group in enumerate(_curve_groups(panel))
@@ -107,12 +120,6 @@ def panel_figure(
         models = _draw(figure, panel, mark, points.get(id(mark), {}))
         if mark.name and models:
             named.setdefault(mark.name, []).extend(model.id for model in models)
-    if panel.categories:
-        names = {i: scales.shorten(name, 24) for i, name in enumerate(panel.categories)}
-        figure.yaxis[0].update(ticker=list(names), major_label_overrides=names, axis_label=None)
-        figure.ygrid.grid_line_color = None
-    _hover_curves(figure, panel, own)
-    return figure
 
 
 def set_scales(figure: Any, panel: Panel) -> None:
