@@ -65,21 +65,8 @@ def verify(parser: ArgumentParser) -> None:
 
 def export(parser: ArgumentParser) -> None:
     """Write the controller of a gain file for a real-time computer or another program."""
-    from lbt_synth.interop.target import target_names
-
     add_gain(parser)
-    text = "the program that loads the file; without NAME, list what each computes, and end"
-    add_option(
-        parser,
-        "--for",
-        target_names(),
-        text,
-        action=TargetChoice,
-        nargs="?",
-        required=True,
-        dest="target",
-        metavar="NAME",
-    )
+    _add_target(parser)
     types = ("double", "single")
     _add_form(parser, "c")
     text = "c: type of all numbers; iir: SPECULA's (default double)"
@@ -103,6 +90,39 @@ def export(parser: ArgumentParser) -> None:
 def _add_form(parser: ArgumentParser, whose: str) -> None:
     text = "plain assumes that commands are applied, estimator is given those that were"
     add_option(parser, "--form", ("plain", "estimator"), f"{whose}: {text} (default plain)")
+
+
+def rehearse(parser: ArgumentParser) -> None:
+    """Run a gain file in the arithmetic of another program, in the loop, on a record."""
+    add_gain(parser)
+    _add_target(parser)
+    text = "what a loop recorded (default: a disturbance drawn from the file's own truth)"
+    add_option(parser, "--record", str, text, metavar="FILE", dest="file")
+    add_missing_facts(parser)
+    add_repairs(parser)
+    add_option(parser, "--sensor-gain", float, "sensor gain of the record", 1.0)
+    add_option(parser, "--stroke", float, "largest command that the mirror applies [nm]")
+    add_option(parser, "--frames", int, "frames to draw where there is no record (default 8000)")
+    add_option(parser, "--seed", int, "seed of what is drawn", 1)
+    add_option(parser, "--wavelength-um", float, "of Strehl ratios (default: the file's, or 2.2)")
+    add_output(parser, FIGURE, required=False)
+
+
+def _add_target(parser: ArgumentParser) -> None:
+    from lbt_synth.interop.target import target_names
+
+    text = "the program that loads the file; without NAME, list what each computes, and end"
+    add_option(
+        parser,
+        "--for",
+        target_names(),
+        text,
+        action=TargetChoice,
+        nargs="?",
+        required=True,
+        dest="target",
+        metavar="NAME",
+    )
 
 
 def sigma(parser: ArgumentParser) -> None:

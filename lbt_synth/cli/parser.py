@@ -17,7 +17,8 @@ COMMANDS = {
     add_arguments.__name__.replace("_", "-"): add_arguments
     for add_arguments in (
         *(arguments.init, arguments.schema),
-        *(arguments.design, arguments.show, arguments.verify, arguments.export),
+        *(arguments.design, arguments.show, arguments.verify),
+        *(arguments.export, arguments.rehearse),
         *(arguments.sigma, arguments.bode, arguments.nyquist, arguments.nichols, arguments.step),
         *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
         *(arguments.diagnose, arguments.league),

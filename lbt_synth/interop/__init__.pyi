@@ -8,6 +8,8 @@ from .iir.export import export_iir as export_iir
 from .matlab.export import export_mat as export_mat
 from .pyrtc.export import export_pyrtc as export_pyrtc
 from .pyrtc.replay import pyrtc_commands as pyrtc_commands
+from .rehearsal import Rehearsal as Rehearsal
+from .rehearsal import rehearse as rehearse
 from .specula.calibration import Calibration as Calibration
 from .specula.calibration import calibrate as calibrate
 from .specula.end_to_end_run import EndToEndRun as EndToEndRun

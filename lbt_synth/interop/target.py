@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 from lbt_synth.storage.rows import column, table_row
 
 if TYPE_CHECKING:
+    from lbt_synth.design import Design
     from lbt_synth.interop.export_checks import Exported
+    from lbt_synth.loop.simulation.run import SteppedController
 
 CERTIFICATE = ".certificate.json"  # ending of the certificate beside what is written
 
@@ -49,6 +51,9 @@ class Target:
         Names of the files, where the target writes a folder.
     options : tuple of str
         Options of ``write`` that the command line offers.
+    runner : callable, optional
+        ``runner(design, limit)``, which returns the controller of a design stepped in the
+        arithmetic of the target. One that knows its limit clips its commands itself.
     """
 
     arithmetic: Arithmetic
@@ -57,6 +62,7 @@ class Target:
     beside: str = ""
     contents: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
+    runner: Callable[[Design, float], SteppedController] | None = None
 
 
 def target_names() -> tuple[str, ...]:

@@ -31,6 +31,11 @@ CASES = {
         "config.certificate.json",
     ),
     "export c header": ("gain.fits", ("gain.fits", "--for", "c", "-o", "other.c"), "other.h"),
+    "rehearse": ("gain.fits", ("gain.fits", "--for", "dao", "-o", "OUT.png")),
+    "rehearse record": (
+        "series.fits",
+        ("gain.fits", "--for", "dao", "--record", "series.fits", "-o", "OUT.pdf"),
+    ),
     "sigma": ("gain.fits", ("gain.fits", "-o", "OUT.png")),
     "bode": ("gain.fits", ("gain.fits", "-o", "OUT.png")),
     "nyquist": ("gain.fits", ("gain.fits", "-o", "a.csv", "-o", "OUT.png")),

@@ -153,6 +153,7 @@ SAID = {  # what each command does with files that are there, its status, and a 
     "show": (("GAIN",), 0, "| quantity"),
     "verify": (("GAIN",), 0, "spectral radius"),
     "export": (("GAIN", "--for", "c", "-o", "OUT.c"), 0, "written: OUT.c"),
+    "rehearse": (("GAIN", "--for", "dao"), 2, "Give --record"),
     "sigma": (("GAIN", "-o", "OUT.png"), 0, "written: OUT.png"),
     "bode": (("GAIN", "-o", "OUT.csv"), 0, "written: OUT.csv"),
     "nyquist": (("GAIN",), 0, "modulus margin"),

@@ -6,6 +6,7 @@ from dataclasses import astuple
 from fractions import Fraction
 
 import pytest
+from support.plants import ROOT
 from support.written_files import ENDINGS, ORACLES, WITHOUT_ORACLE, is_schur, judge
 
 import lbt_synth as lbt
@@ -20,6 +21,13 @@ def test_a_target_says_how_it_computes(name):
     target = lbt.interop.target_named(name)
     assert all(text and text.isascii() for text in astuple(target.arithmetic))
     assert target.write.__name__.startswith("export_")
+
+
+def test_the_page_has_the_table_of_the_targets():
+    page = (ROOT / "docs" / "real_time_computer.md").read_text()
+    for name in target_names():
+        words = astuple(lbt.interop.target_named(name).arithmetic)
+        assert f"* - `{name}`\n" + "".join(f"  - {text}\n" for text in words) in page
 
 
 def test_each_folder_with_an_export_is_a_target_and_has_an_oracle():

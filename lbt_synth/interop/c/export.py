@@ -324,4 +324,5 @@ TARGET = Target(
     write=export_c,
     beside=".h",
     options=("form", "precision", "name"),
+    runner=lambda design, _: SourceTerms(design.controller, 0, np.float64),
 )

@@ -26,6 +26,8 @@ class AppliedFilter:
         A row per mode of the command.
     delay_frames : float, optional
         Total delay of the loop; the latency of cacao's index arithmetic is one frame more.
+    limit : float, optional
+        Largest modulus of a command that is applied; the history holds the applied commands.
 
     Raises
     ------
@@ -42,7 +44,7 @@ class AppliedFilter:
     [1.0, 0.0, 1.0, 0.0]
     """
 
-    def __init__(self, matrix: ArrayLike, delay_frames: float = 2.0) -> None:
+    def __init__(self, matrix: ArrayLike, delay_frames: float = 2.0, limit: float = np.inf) -> None:
         self._matrix = np.atleast_2d(np.asarray(matrix, dtype=np.float32))
         modes, columns = self._matrix.shape
         if columns % modes or not columns:
@@ -51,7 +53,7 @@ class AppliedFilter:
                 f"{self._matrix.shape}."
             )
         latency = np.float32(1 + number(delay_frames, "delay_frames", at_least=1))
-        self._whole = int(latency)
+        self._whole, self._limit = int(latency), np.float32(limit)
         self._older = np.float32(latency - self._whole)  # weight of the older of two frames
         self.reset()
 
@@ -69,7 +71,7 @@ class AppliedFilter:
         self._history[1:] = self._history[:-1].copy()
         self._history[0] = np.asarray(y, dtype=np.float32) - past
         products = self._matrix * self._history.ravel()
-        u = np.add.accumulate(products, axis=1)[:, -1]
+        u = np.clip(np.add.accumulate(products, axis=1)[:, -1], -self._limit, self._limit)
         self._applied[1:] = self._applied[:-1].copy()
         self._applied[0] = u
         return 0.0 - u.astype(np.float64)

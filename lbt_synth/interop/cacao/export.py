@@ -28,6 +28,7 @@ from lbt_synth.interop.export_checks import (
 )
 from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.interop.written_loop import prove_written, require_proved
+from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.validation import integer, number
 
@@ -95,14 +96,8 @@ def export_cacao(
     """
     target = require_ending(path, "a predictive filter", (".fits",))
     require_exportable(design)
-    modes = require_modal(design, "a predictive filter")
-    hardware = design.hardware
-    assert hardware is not None  # require_modal refuses a design without a loop
-    if hardware.mirror is not None or hardware.delay_frames > LONGEST_DELAY:
-        raise ProblemError(
-            "the mirror must settle at once, with a total delay of at most "
-            f"{LONGEST_DELAY} frames: cacao's history knows a delay alone. Use another target."
-        )
+    hardware = _require_loop(design)
+    modes = hardware.modes
     limit = number(loss, "loss", above=0, at_most=_MOST_LOSS)
     found = predictive_filter(design)
     if steps is None:
@@ -145,6 +140,19 @@ def export_cacao(
     return Exported(files=files, error=error, error_single=error, checks=checks)
 
 
+def _require_loop(design: Design) -> LoopHardware:
+    """Return the loop of a design; refuse one that cacao's history does not know."""
+    require_modal(design, "a predictive filter")
+    hardware = design.hardware
+    assert hardware is not None  # require_modal refuses a design without a loop
+    if hardware.mirror is not None or hardware.delay_frames > LONGEST_DELAY:
+        raise ProblemError(
+            "the mirror must settle at once, with a total delay of at most "
+            f"{LONGEST_DELAY} frames: cacao's history knows a delay alone. Use another target."
+        )
+    return hardware
+
+
 def filter_matrix(taps: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return the matrix (m, steps * m) of taps (steps, m, m), the newest frame first."""
     return np.ascontiguousarray(-np.hstack([*taps]), dtype=np.float32)
@@ -171,6 +179,14 @@ def _matrix_bytes(
     return buffer.getvalue()
 
 
+def _start(design: Design, limit: float) -> AppliedFilter:
+    """Return the filter with as many steps as its residual needs."""
+    _require_loop(design)
+    found = predictive_filter(design)
+    taps = found.taps(found.fewest_steps(_MOST_LOSS))
+    return AppliedFilter(filter_matrix(taps), found.loop.hardware.delay_frames, limit)
+
+
 TARGET = Target(
     arithmetic=Arithmetic(
         program="cacao's applyPF, behind its modalfilter",
@@ -183,4 +199,5 @@ TARGET = Target(
     file="matrix of single precision (.fits) and its certificate",
     write=export_cacao,
     options=("steps", "loss"),
+    runner=_start,
 )

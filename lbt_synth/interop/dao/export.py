@@ -41,6 +41,7 @@ from lbt_synth.validation import FloatArray, integer, number
 _HINT = "Design with fewer states or less accurate models, or use a target in double precision."
 _OWN = "of the gain file, rounded"
 _AGAIN = "made again for single precision; the loop keeps what the gain file promises"
+_ORDER = 20  # M, where a configuration gives none
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
 
 
@@ -48,7 +49,7 @@ def export_dao(
     path: str | os.PathLike[str],
     design: Design | MixedController | ModalFilters,
     *,
-    order: int = 20,
+    order: int = _ORDER,
     modes: int | None = None,
     other_gain: float | None = None,
     hardware: LoopHardware | None = None,
@@ -287,6 +288,12 @@ def _matrix_bytes(
     return buffer.getvalue()
 
 
+def _start(design: Design, limit: float) -> InnerLoop:
+    """Return the RTC's inner loop with the matrix that would be written."""
+    require_modal(design, "a dao matrix")
+    return InnerLoop(_proved_columns(design, _ORDER).columns, limit=limit)
+
+
 TARGET = Target(
     arithmetic=Arithmetic(
         program="Durham's dao real-time computers",
@@ -299,4 +306,5 @@ TARGET = Target(
     file="matrix of single precision (.npy, .fits) and its certificate (.json)",
     write=export_dao,
     options=("order", "modes", "other_gain"),
+    runner=_start,
 )

@@ -316,4 +316,5 @@ TARGET = Target(
     file="filter file (.fits)",
     write=export_iir,
     options=("precision",),
+    runner=lambda design, _: DirectForm(*_align(axis_polynomials(design.controller))),
 )

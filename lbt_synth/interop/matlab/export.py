@@ -162,4 +162,5 @@ TARGET = Target(
     ),
     file="MATLAB file (.mat)",
     write=export_mat,
+    runner=lambda design, _: _Textbook(design.controller.to_statespace(), np.float64),
 )

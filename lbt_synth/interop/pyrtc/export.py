@@ -177,4 +177,5 @@ TARGET = Target(
     write=export_pyrtc,
     contents=(_CONFIG, _GAIN, _RESPONSE, str(Path(_CONFIG).with_suffix(CERTIFICATE))),
     options=("modes",),
+    runner=InnerLoop,
 )

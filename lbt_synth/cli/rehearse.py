@@ -1,0 +1,186 @@
+"""The command rehearse: a gain file in the arithmetic of a target, in the loop, on data."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lbt_synth.cli.display import choose_config_unit, choose_unit
+from lbt_synth.cli.loop_records import load_series, record_imaging
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.output_files import require_figure
+from lbt_synth.cli.progress import show_spinner
+from lbt_synth.config.load import config_from_text
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.files import load_gain
+from lbt_synth.identification import LoopRecord, require_length
+from lbt_synth.interop import rehearse
+from lbt_synth.loop import Imaging, Simulation, series_strehl
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.report.figures import simulation_figure
+from lbt_synth.report.figures.style import save_figure
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.validation import FloatArray
+
+_FRAMES = 8000  # of a drawn disturbance
+_FEWEST = 256  # of a record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Series:
+    """What the loops run on."""
+
+    source: str
+    total_nm: FloatArray
+    noise: FloatArray | None
+    hardware: LoopHardware
+    imaging: Imaging
+    sensor_gain: float
+    ran: tuple[FloatArray, FloatArray] | None = None  # residual and commands of the record
+
+
+@table_row
+class RehearsedRow:
+    """One loop on the series."""
+
+    name: str = column("loop")
+    first_nm: float = nm_column("first axis", unit="nm rms")
+    second_nm: float | None = nm_column("second axis", unit="nm rms")
+    residual_nm: float = nm_column("residual", unit="nm rms")
+    strehl: float | None = percent_column("Strehl")
+    largest_command_nm: float = nm_column("largest command")
+    clipped_frames: int | None = column("clipped frames")
+
+
+@table_row
+class RehearsalFacts:
+    """How far the target is from the design."""
+
+    difference_rms_nm: float = column("difference of the commands", unit="nm rms")
+    difference_largest_nm: float = column("  largest", unit="nm")
+    spectral_radius: float = column("spectral radius of the design's loop")
+    frames: int = column("frames compared")
+    settle_frames: int = column("frames before, in which the loops settle")
+
+
+def run(arguments: Namespace) -> Report:
+    """Run the loop in the arithmetic of a target, beside the design and what ran."""
+    given = [path for path in (arguments.gain, arguments.file) if path is not None]
+    if arguments.output is not None:
+        require_figure(arguments.output, inputs=given)
+    design = load_gain(arguments.gain)
+    with show_spinner("rehearsing", quiet=arguments.json):
+        series = _drawn(arguments, design) if arguments.file is None else _recorded(arguments)
+        found = rehearse(
+            design,
+            arguments.target,
+            series.total_nm,
+            hardware=series.hardware,
+            noise=series.noise,
+            sensor_gain=series.sensor_gain,
+            stroke=arguments.stroke,
+        )
+    imaging = series.imaging
+    loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
+    rows = [
+        _describe(name, one.residual_nm, one.commands, imaging, one.clipped_frames)
+        for name, one in loops.items()
+    ]
+    if series.ran is not None:
+        residual, commands = (part[found.settle_frames :] for part in series.ran)
+        rows.append(_describe("what ran", residual, commands, imaging, None))
+    report = Report(data={"gain": arguments.gain, "target": arguments.target})
+    what = f"Rehearsal for {arguments.target} on {series.source}; {imaging.label}"
+    report.add_rows("loops", what, rows)
+    facts = RehearsalFacts(
+        difference_rms_nm=float(np.sqrt(np.mean(np.sum(found.differences**2, axis=1)))),
+        difference_largest_nm=float(np.max(np.abs(found.differences))),
+        spectral_radius=found.spectral_radius,
+        frames=len(found.differences),
+        settle_frames=found.settle_frames,
+    )
+    report.add_facts("The target beside the design", facts)
+    if series.noise is None:
+        report.notes.append("note: residuals hold the noise of the measurements.")
+    if design.hardware is not None:
+        report.notes += [
+            f"note: {text}" for text in loop_differences(design.hardware, series.hardware)
+        ]
+    if arguments.output is not None:
+        drawn = Simulation(
+            total_nm=series.total_nm[None, found.settle_frames :],
+            residual_nm=found.target.residual_nm[None],
+            commands=found.target.commands[None],
+            measurements=np.zeros((1, len(found.differences), series.hardware.n_measurements)),
+            frame_rate_hz=series.hardware.frame_rate_hz,
+            seed=0,
+        )
+        figure = simulation_figure(drawn, title=f"{design.method} in {arguments.target}")
+        report.note_written(save_figure(figure, arguments.output))
+    return report
+
+
+def _describe(
+    name: str, residual: FloatArray, commands: FloatArray, imaging: Imaging, clipped: int | None
+) -> RehearsedRow:
+    axes = np.sqrt(np.mean(residual**2, axis=0)).tolist()
+    return RehearsedRow(
+        name=name,
+        first_nm=axes[0],
+        second_nm=axes[1] if len(axes) == 2 else None,
+        residual_nm=float(np.linalg.norm(axes)),
+        strehl=series_strehl(residual, imaging) if len(axes) <= 2 else None,
+        largest_command_nm=float(np.max(np.abs(commands))),
+        clipped_frames=clipped,
+    )
+
+
+def _recorded(arguments: Namespace) -> _Series:
+    """Return the pseudo-open-loop series of a record, in its longest stretch of usable frames."""
+    record = load_series(arguments)
+    if not isinstance(record, LoopRecord):
+        raise ProblemError("a rehearsal runs on recorded series; got a spectrum.")
+    record = record.bridged()
+    require_length(record, frames=_FEWEST, seconds=0)
+    choose_unit(arguments, record.diameter_m)
+    gain = arguments.sensor_gain
+    start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
+    commands = record.commands
+    ran = None
+    if commands is not None:
+        ran = (record.measurements[start:stop] / gain, commands[start:stop])
+    return _Series(
+        source=f"{stop - start} frames of {Path(arguments.file).name}",
+        total_nm=record.pseudo_open_loop(gain)[start:stop],
+        noise=None,
+        hardware=record.hardware,
+        imaging=record_imaging(arguments, record),
+        sensor_gain=gain,
+        ran=ran,
+    )
+
+
+def _drawn(arguments: Namespace, design: Design) -> _Series:
+    """Return a disturbance drawn from the truth that the gain file was made with."""
+    if not design.configuration:
+        raise ProblemError(
+            "the gain file holds no configuration to draw a disturbance from. Give --record."
+        )
+    config = config_from_text(design.configuration, Path(arguments.gain))
+    choose_config_unit(arguments, config)
+    truth, rng = config.truth, np.random.default_rng(arguments.seed)
+    frames = arguments.frames or _FRAMES
+    return _Series(
+        source=f"{frames} frames of its own truth",
+        total_nm=draw_disturbance(truth, config.hardware, frames=frames, cases=1, rng=rng)[0],
+        noise=draw_noise(truth, config.hardware, frames=frames, cases=1, rng=rng)[0],
+        hardware=config.hardware,
+        imaging=config.imaging,
+        sensor_gain=truth.sensor_gain,
+    )

@@ -1,0 +1,166 @@
+"""A controller in the arithmetic of a target, in the loop, beside itself in double precision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.design import Design
+from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.interop.target import target_named, target_names
+from lbt_synth.loop import close_loop
+from lbt_synth.loop.simulation.run import settling_frames, step_loop
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, float_array, frozen_copy, number
+
+_MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RehearsedLoop:
+    """Series of one of the loops, after both have settled.
+
+    Attributes
+    ----------
+    residual_nm : (frames, n) ndarray
+        Residual, less noise that was given apart [nm].
+    commands : (frames, m) ndarray
+        Commands that the mirror got.
+    clipped_frames : int
+        Frames in which a command reached the limit.
+    """
+
+    residual_nm: FloatArray
+    commands: FloatArray
+    clipped_frames: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rehearsal:
+    """A target and the design itself on the same series.
+
+    Attributes
+    ----------
+    target, design : RehearsedLoop
+        In the arithmetic of the target, and in double precision.
+    settle_frames : int
+        Frames at the beginning that are left out.
+    spectral_radius : float
+        Of the design's loop.
+    """
+
+    target: RehearsedLoop
+    design: RehearsedLoop
+    settle_frames: int
+    spectral_radius: float
+
+    @property
+    def differences(self) -> FloatArray:
+        """Commands of the target less those of the design, (frames, m)."""
+        return np.asarray(self.target.commands - self.design.commands)
+
+
+def rehearse(
+    design: Design,
+    target: str,
+    total_nm: ArrayLike,
+    *,
+    hardware: LoopHardware | None = None,
+    noise: ArrayLike | None = None,
+    sensor_gain: float = 1.0,
+    stroke: float | None = None,
+) -> Rehearsal:
+    """Run a loop frame by frame in the arithmetic of a target, and in double precision.
+
+    Parameters
+    ----------
+    design : Design
+        The design.
+    target : str
+        Name of a target that has a ``runner``.
+    total_nm : (frames, n) array_like
+        Phase of each frame; or the pseudo-open-loop series of a record, whose noise is then part
+        of the residual [nm].
+    hardware : LoopHardware, optional
+        The loop; by default that of the design.
+    noise : (frames, q) array_like, optional
+        Noise of the measurements; none by default.
+    sensor_gain : float, optional
+        Real sensor gain relative to the sensor matrix.
+    stroke : float, optional
+        Largest modulus of a command that the mirror applies; without a limit by default.
+
+    Returns
+    -------
+    Rehearsal
+        Both loops, on the frames after they have settled.
+
+    Raises
+    ------
+    ProblemError
+        If the target cannot be rehearsed, cannot hold the design, or sizes clash.
+    UnstableLoopError
+        If the loop of the design is unstable.
+    NumericalError
+        If the loop grows beyond all numbers in the arithmetic of the target.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, numpy as np
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5)
+    >>> phase = 100 * np.sin(np.arange(2000.0)[:, None] / 50)
+    >>> run = lbt.interop.rehearse(slow, "dao", phase)
+    >>> bool(0 < np.max(np.abs(run.differences)) < 1e-3)
+    True
+    """
+    runner = target_named(target).runner
+    if runner is None:
+        able = ", ".join(name for name in target_names() if target_named(name).runner)
+        raise ProblemError(f"{target} cannot be rehearsed: take one of {able}.")
+    path = design.hardware if hardware is None else hardware
+    if path is None:
+        raise ProblemError("a rehearsal needs the design of a loop; got a bare controller.")
+    total = float_array(total_nm, "total_nm")
+    seen = (
+        np.zeros((len(total), path.n_measurements))
+        if noise is None
+        else float_array(noise, "noise")
+    )
+    if total.ndim != 2 or total.shape[1] != path.modes or len(seen) != len(total):
+        raise DimensionError(
+            f"total_nm must be (frames, {path.modes}), with as many frames of noise; got "
+            f"{total.shape} and {seen.shape}."
+        )
+    gain = number(sensor_gain, "sensor_gain", above=0)
+    limit = np.inf if stroke is None else number(stroke, "stroke", above=0)
+    loop = close_loop(path, design.controller, sensor_gain=gain)
+    loop.require_stable()
+    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * len(total)))
+    runs = []
+    for controller in (runner(design, limit), design.controller.start()):
+        try:
+            with np.errstate(all="ignore"):  # what overflows is found to be infinite
+                out = step_loop(controller, gain, path, total[None], seen[None], stroke=limit)
+        except ProblemError as error:
+            raise NumericalError(
+                f"in the arithmetic of {target} the loop grows beyond all numbers: {error}",
+                status="arithmetic",
+            ) from error
+        n, m = path.modes, path.n_commands
+        out = out[0, settle:]
+        commands = frozen_copy(out[:, n : n + m])
+        runs.append(
+            RehearsedLoop(
+                residual_nm=frozen_copy(out[:, :n]),
+                commands=commands,
+                clipped_frames=int(np.sum(np.any(np.abs(commands) >= limit, axis=1))),
+            )
+        )
+    return Rehearsal(
+        target=runs[0],
+        design=runs[1],
+        settle_frames=settle,
+        spectral_radius=loop.spectral_radius,
+    )

@@ -1,0 +1,74 @@
+"""The command rehearse."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.commands import run
+from support.plants import LBT_YAML
+
+import lbt_synth as lbt
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A gain file with its configuration, one without, and a record of a loop at gain 0.7."""
+    folder = tmp_path_factory.mktemp("files")
+    config = lbt.load_config(LBT_YAML)
+    slow = lbt.integrator(config.hardware, gain=0.3)
+    lbt.save_gain(folder / "bare.fits", slow)
+    lbt.save_gain(folder / "gain.fits", config.design("kalman"))
+    air = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=800)
+    truth = lbt.Truth(turbulence=air, noise_nm=5.0, sensor_gain=0.7)
+    night = lbt.simulate(slow, truth, hardware=config.hardware, frames=2400)
+    series = lbt.files.telemetry_from_simulation(night, config.hardware, imaging=config.imaging)
+    lbt.files.save_telemetry(folder / "night.fits", series)
+    return folder, night
+
+
+def test_a_record_is_rehearsed_beside_what_ran(capsys, files):
+    folder, night = files
+    words = ("rehearse", folder / "bare.fits", "--for", "dao", "--record", folder / "night.fits")
+    status, text, error = run(capsys, *words, "--sensor-gain", 0.7, "--json")
+    assert (status, error) == (0, ""), error
+    data = json.loads(text)
+    target, design, ran = data["loops"]
+    # the same controller on its own series: what it was, but for the start
+    assert design["residual_nm"] == pytest.approx(ran["residual_nm"], rel=1e-3)
+    assert target["residual_nm"] == pytest.approx(ran["residual_nm"], rel=1e-3)
+    assert ran["clipped_frames"] is None
+    frames = data["frames"]
+    commands = night.commands[0][-frames:]
+    assert ran["largest_command_nm"] == pytest.approx(np.max(np.abs(commands)))
+    assert 0 < data["difference_rms_nm"] < data["difference_largest_nm"] < 0.01
+
+
+def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files):
+    gain, figure = files[0] / "gain.fits", tmp_path / "a.png"
+    words = ("rehearse", gain, "--for", "dao", "--frames", 1500, "--stroke", 900)
+    status, text, error = run(capsys, *words, "--unit", "mas", "-o", figure)
+    assert (status, error) == (0, "")
+    assert "1500 frames of its own truth; Strehl ratio at 2.2 um" in text
+    assert "residual [mas rms]" in text
+    assert "what ran" not in text
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    data = json.loads(run(capsys, *words, "--json")[1])
+    assert data["loops"][0]["largest_command_nm"] == 900
+    assert data["loops"][0]["clipped_frames"] > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("bare.fits", "--for", "dao"), "holds no configuration to draw"),
+        (("gain.fits", "--for", "dao", "--record", "none.fits"), "none.fits"),
+        (("gain.fits", "--for", "doa"), "invalid choice"),
+    ],
+)
+def test_what_is_missing_is_said(capsys, monkeypatch, files, words, message):
+    monkeypatch.chdir(files[0])
+    status, _, error = run(capsys, "rehearse", *words)
+    assert status == 2
+    assert message in error
