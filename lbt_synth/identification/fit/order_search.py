@@ -195,13 +195,8 @@ def _fit_background(search: Search, gain: float) -> FittedModel | None:
     white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
     slow = max(float(trapezoid(d, f)) - white, 0.1 * white)
     known = replace(search, gain=gain)
-    ground = SpectrumModel(
-        float(np.log(gain)),
-        float(np.log(white)),
-        search.colour,
-        known.log_angle(fitting.STARTING_CORNER_HZ),
-        (),
-    )
+    corner = known.log_angle(fitting.STARTING_CORNER_HZ)
+    ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), search.colour, corner, ())
     starts = [
         ground.add(known.component("turbulence", hz, ratio, slow))
         for hz, ratio in _STARTING_TURBULENCE

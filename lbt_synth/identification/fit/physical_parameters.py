@@ -93,14 +93,15 @@ def describe_axis(
     process = _turbulence_process(nearest_process(search, spectrum), rate)
     innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
     noise = max(float(np.exp(spectrum.log_noise / 2)), _LEAST_NOISE * innovation)
+    correlation = float(np.tanh(spectrum.colour))
     return IdentifiedAxis(
         turbulence=process,
         turbulence_fit=_describe_turbulence(spectrum, errors, covariance, process),
         parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
-        noise_correlation=spectrum.noise_correlation,
-        noise_correlation_error=(1 - spectrum.noise_correlation**2) * errors.colour,
+        noise_correlation=correlation,
+        noise_correlation_error=(1 - correlation**2) * errors.colour,
         sensor_gain=gain,
         sensor_gain_error=None if gain_error is None else gain * gain_error,
         sensor_gain_note=note,

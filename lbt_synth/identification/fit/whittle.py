@@ -109,9 +109,8 @@ class SpectrumModel:
     def pack(self) -> FloatArray:
         """Return all parameters as a vector (p,)."""
         rows = ((c.log_frequency, c.damping, c.log_power) for c in self.components)
-        return np.array(
-            [self.log_gain, self.log_noise, self.colour, self.log_corner, *chain(*rows)]
-        )
+        first = [self.log_gain, self.log_noise, self.colour, self.log_corner]
+        return np.array([*first, *chain(*rows)])
 
     def unpack(self, vector: FloatArray) -> SpectrumModel:
         """Return the model with the numbers of a vector (p,)."""
@@ -124,11 +123,6 @@ class SpectrumModel:
     def gain(self) -> float:
         """The sensor gain."""
         return float(np.exp(self.log_gain))
-
-    @property
-    def noise_correlation(self) -> float:
-        """Correlation of the noise of neighbouring frames."""
-        return float(np.tanh(self.colour))
 
     @property
     def lines(self) -> tuple[Component, ...]:
