@@ -20,7 +20,14 @@ from lbt_synth.cli.argument_kinds import (
     add_switch,
     add_unit,
 )
-from lbt_synth.cli.record_arguments import add_missing_facts, add_prior_knowledge, add_repairs
+from lbt_synth.cli.record_arguments import (
+    add_acceptance,
+    add_missing_facts,
+    add_prior_knowledge,
+    add_record,
+    add_repairs,
+    add_series,
+)
 
 
 def init(parser: ArgumentParser) -> None:
@@ -240,7 +247,7 @@ def _add_simulator(parser: ArgumentParser) -> None:
 
 def identify(parser: ArgumentParser) -> None:
     """Identify turbulence, vibrations, noise and sensor gain from a record."""
-    _add_record(parser)
+    add_record(parser)
     add_output(parser, "configuration to write (.yaml)")
 
 
@@ -248,7 +255,7 @@ def auto(parser: ArgumentParser) -> None:
     """Go from a record to a gain file: identify, design, certify, test on unseen data."""
     from lbt_synth.methods.registry import default_method, record_methods
 
-    _add_record(parser)
+    add_record(parser)
     text = (
         f"default: {default_method()}, unless another of the quick ones leaves clearly less of the "
         "frames after its training"
@@ -271,13 +278,8 @@ def league(parser: ArgumentParser) -> None:
     add_switch(parser, "--pdf", "write the page as a PDF, too (league.pdf)")
     add_missing_facts(parser)
     add_repairs(parser)
-    _add_acceptance(parser)
+    add_acceptance(parser)
     add_prior_knowledge(parser)
-
-
-def _add_acceptance(parser: ArgumentParser) -> None:
-    text = "go on although the commands do not reach the measurements as given"
-    add_switch(parser, "--accept-record", text)
 
 
 def _add_engine(parser: ArgumentParser) -> None:
@@ -292,29 +294,10 @@ def _add_engine(parser: ArgumentParser) -> None:
 
 def diagnose(parser: ArgumentParser) -> None:
     """Say what ran in a record, what is wrong, what it costs, and what to change first."""
-    _add_series(parser)
+    add_series(parser)
     parser.add_argument("gain", nargs="?", help=f"{GAIN_FILE} to try on the record")
     add_output(parser, "page to write, one file that opens offline (.html)", required=False)
     add_option(parser, "--pdf", str, "write the same as a PDF, too (.pdf)", metavar="FILE")
-
-
-def _add_series(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "file",
-        help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
-        "and commands, or an open-loop series (identify: or a spectrum)",
-    )
-    add_missing_facts(parser)
-    add_repairs(parser)
-    add_prior_knowledge(parser)
-    add_option(parser, "--wavelength-um", float, "of Strehl ratios (default: the file's, or 2.2)")
-
-
-def _add_record(parser: ArgumentParser) -> None:
-    _add_series(parser)
-    _add_acceptance(parser)
-    add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
-    add_switch(parser, "--no-figure", "write no figure")
 
 
 def robustness(parser: ArgumentParser) -> None:

@@ -62,3 +62,30 @@ def add_prior_knowledge(parser: ArgumentParser) -> None:
     add_option(known, "--accelerometers", str, text)
     add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
     add_option(known, "--most-lines", int, "most vibrations per axis", 20)
+
+
+def add_acceptance(parser: ArgumentParser) -> None:
+    """Add the way past a record that is refused."""
+    text = "go on although the commands do not reach the measurements as given"
+    add_switch(parser, "--accept-record", text)
+
+
+def add_series(parser: ArgumentParser) -> None:
+    """Add a record, or a series, and all that it may not say."""
+    parser.add_argument(
+        "file",
+        help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
+        "and commands, or an open-loop series (identify: or a spectrum)",
+    )
+    add_missing_facts(parser)
+    add_repairs(parser)
+    add_prior_knowledge(parser)
+    add_option(parser, "--wavelength-um", float, "of Strehl ratios (default: the file's, or 2.2)")
+
+
+def add_record(parser: ArgumentParser) -> None:
+    """Add a record that is fitted, and its figure."""
+    add_series(parser)
+    add_acceptance(parser)
+    add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
+    add_switch(parser, "--no-figure", "write no figure")
