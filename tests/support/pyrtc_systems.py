@@ -13,7 +13,7 @@ import yaml
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 
 _NUMBERS = itertools.count()
-_LONGEST_S = 120
+_LONGEST_S = 300
 SENSOR_HZ = 100.0  # of pyRTC's own sensor
 
 
