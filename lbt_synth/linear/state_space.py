@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import matrix_balance, schur
+from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.batched import solve_stack
+from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
 from lbt_synth.validation import (
@@ -272,14 +273,13 @@ def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
 def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     """Transfer matrices at points z, by one Schur form and one substitution per point.
 
-    ``A = U T U*`` is unitary, so nothing is lost when A is defective, as it is with
-    every delay. The smaller of inputs and outputs is carried through the substitution.
-    The system should be balanced. The result is not finite at a pole.
+    U is unitary, so nothing is lost when A is defective, as with every delay. The smaller of inputs
+    and outputs is carried through. The system should be balanced; at a pole nothing is finite.
     """
     if len(system.C) > system.B.shape[1]:
         dual = StateSpace(A=system.A.T, B=system.C.T, C=system.B.T, D=system.D.T)
         return np.swapaxes(schur_response(dual, z), 1, 2)
-    T, U = schur(system.A.astype(np.complex128), output="complex")
+    T, U = complex_schur(system.A)
     rows, B = system.C @ U, U.conj().T @ system.B
     p, n = rows.shape
     out = np.empty((z.size, p, B.shape[1]), dtype=np.complex128)
