@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 from lbt_synth.design import Check, Design, ShapedDesign
 from lbt_synth.design.modal import MixedController, ModalFilters
 from lbt_synth.design.modal.reconstructor import name_modes
+from lbt_synth.design.shaping.specification import to_metadata
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.dao.inner_loop import InnerLoop
 from lbt_synth.interop.dao.lattice_rounding import round_together
-from lbt_synth.interop.dao.mode_loop import ROUNDING, DirectFormLoop, shaped_mode_loop
+from lbt_synth.interop.dao.mode_loop import DirectFormLoop, shaped_mode_loop
 from lbt_synth.interop.dao.modes import ModeDesign, mode_designs
 from lbt_synth.interop.dao.refit import refit
 from lbt_synth.interop.export_certificate import write_certified
@@ -31,7 +33,7 @@ from lbt_synth.interop.export_checks import (
 from lbt_synth.interop.iir.export import axis_polynomials
 from lbt_synth.interop.iir.realisation import build_controller
 from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.interop.written_loop import Rounding, prove_written, require_proved
+from lbt_synth.interop.written_loop import ROUNDOFF, Rounding, prove_written, require_proved
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import fits_bytes
@@ -189,11 +191,12 @@ def _proved_columns(design: Design, order: int) -> _Proved:
     """Return the columns of a design, proved in the arithmetic of the RTC."""
     exact = direct_form_rows(design.controller, order)
     rounded = exact.astype(np.float32)
-    checks = prove_written(design, *_as_computed(rounded, design))
-    made_again = not all(check.passed for check in checks) and _can_make_again(design, exact)
-    if isinstance(design, ShapedDesign) and made_again:
+    loops = _mode_loops(design, order)
+    checks = prove_written(design, *_as_computed(rounded, design, loops))
+    made_again = not all(check.passed for check in checks) and _can_make_again(loops, exact)
+    if made_again:
         rounded = _made_again(design, exact)
-        checks = prove_written(design, *_as_computed(rounded, design))
+        checks = prove_written(design, *_as_computed(rounded, design, loops))
     require_proved(checks, "single precision, in direct form", _HINT)
     return _Proved(rounded, checks, made_again)
 
@@ -214,7 +217,9 @@ def direct_form_rows(controller: Controller, order: int) -> FloatArray:
     return rows
 
 
-def _as_computed(rounded: NDArray[np.float32], design: Design) -> tuple[Controller, Rounding]:
+def _as_computed(
+    rounded: NDArray[np.float32], design: Design, loops: list[DirectFormLoop]
+) -> tuple[Controller, Rounding]:
     """Return the controller with the matrix's numbers, and what its arithmetic adds."""
     rows, dt_s = rounded.astype(np.float64), design.controller.dt_s
     order, modes = len(rows) // 2, rows.shape[1]
@@ -226,52 +231,52 @@ def _as_computed(rounded: NDArray[np.float32], design: Design) -> tuple[Controll
 
     def variance(sensor_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         """Add up the rounding of each product and of each partial sum."""
-        if isinstance(design, ShapedDesign):
-            return np.array(
-                [
-                    loop.sums_nm2(rows[:, mode], sensor_gain)
-                    for mode, loop in enumerate(_mode_loops(design, order))
-                ]
-            )
+        if loops:
+            columns = zip(loops, rows.T, strict=True)
+            return np.array([loop.sums_nm2(column, sensor_gain) for loop, column in columns])
         sizes = np.where(np.arange(len(rows))[:, None] <= order, measured, commands)
         terms = np.abs(rows) * sizes  # a bound: their signs and correlations are not used
         squares = terms**2 + np.cumsum(terms, axis=0) ** 2
-        return np.asarray(ROUNDING * np.sum(squares, axis=0))
+        return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.sum(squares, axis=0))
 
     return written, Rounding(entry=entry, variance=variance)
 
 
-def _mode_loops(design: ShapedDesign, order: int) -> list[DirectFormLoop]:
+def _mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
+    """Return the loop of each mode of a shaped design, made once for equal ones; none of others."""
+    if not isinstance(design, ShapedDesign):
+        return []
     assert design.hardware is not None  # a shaped design is of a loop
-    return [shaped_mode_loop(design.hardware, spec, order) for spec in design.specifications]
+    keys = [json.dumps(to_metadata(spec)) for spec in design.specifications]
+    found = {
+        key: shaped_mode_loop(design.hardware, spec, order)
+        for key, spec in dict(zip(keys, design.specifications, strict=True)).items()
+    }
+    return [found[key] for key in keys]
 
 
-def _can_make_again(design: Design, exact: FloatArray) -> bool:
+def _can_make_again(loops: list[DirectFormLoop], exact: FloatArray) -> bool:
     """Whether the controller of each mode is a starting point: a shaped one, of an even order."""
     odd = (len(exact) // 2) % 2
     unused = exact[[len(exact) // 2, -1]]
-    return isinstance(design, ShapedDesign) and exact[0].all() and not (odd and unused.any())
+    return bool(loops) and bool(exact[0].all()) and not (odd and unused.any())
 
 
-def _made_again(design: ShapedDesign, exact: FloatArray) -> NDArray[np.float32]:
+def _made_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
     """Return the matrix of controllers made for this arithmetic; equal modes are made once."""
     order = len(exact) // 2
     used = np.arange(len(exact))
     if order % 2:  # the search takes coefficients in pairs
         used = np.delete(used, [order, 2 * order])
-    found: dict[tuple[int, int], NDArray[np.float32]] = {}
-    keys = [
-        (id(spec), id(parameter))
-        for spec, parameter in zip(design.specifications, design.parameters, strict=True)
-    ]
-    for mode, (key, loop) in enumerate(
-        zip(keys, _mode_loops(design, order - order % 2), strict=True)
-    ):
+    rounded = np.zeros(exact.shape, dtype=np.float32)
+    found: dict[tuple[int, bytes], NDArray[np.float32]] = {}
+    for mode, loop in enumerate(_mode_loops(design, order - order % 2)):
+        key = id(loop), exact[:, mode].tobytes()
         if key not in found:
             best = refit(loop, exact[used, mode])
-            found[key] = np.zeros(len(exact), dtype=np.float32)
-            found[key][used] = round_together(best, loop.slopes(best))
-    return np.stack([found[key] for key in keys], axis=1)
+            found[key] = round_together(best, loop.slopes(best))
+        rounded[used, mode] = found[key]
+    return rounded
 
 
 def _matrix_bytes(

@@ -10,13 +10,14 @@ from lbt_synth.design.shaping.channel import Channel, laguerre_basis
 from lbt_synth.design.shaping.objectives import ResidualVariance, VibrationBand, leaves
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.design.shaping.uncertainty import SensorGainRange
+from lbt_synth.interop.written_loop import ROUNDOFF
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
-# Mean square of the relative error of an operation in single precision. The error is uniform
-# within half a step, and a step is 2^-24 to 2^-23 of the number: of normal numbers of any size the
-# mean square is at most 0.544 of what it would be if all steps were the widest, of a sinusoid 0.66.
-ROUNDING = 2 / 3 * 2.0**-48 / 3
+# Mean square of the relative error of an operation. The error is uniform within half a step, and a
+# step is 2^-24 to 2^-23 of the number: of normal numbers of any size the mean square is at most
+# 0.544 of what it would be if all steps were the widest, of a sinusoid 0.66.
+ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

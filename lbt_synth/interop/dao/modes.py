@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from lbt_synth.design import Design, IntegratorLaw, integrator, kalman
 from lbt_synth.design.modal import MixedController, ModalFilters
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.models import LoopHardware, Vibration, tip_tilt_plant
+from lbt_synth.models import LoopHardware, tip_tilt_plant
 from lbt_synth.validation import require_instance
 
 _SAME = 1e-6  # relative difference of a filter designed alone from that of the batch
@@ -58,15 +59,7 @@ def _filter_designs(filters: ModalFilters, modes: tuple[int, ...]) -> list[ModeD
     """Design each filter alone; it is that of the batch, and has a certificate of its own."""
     found = []
     for index, mode in enumerate(modes):
-        lines = [
-            Vibration(
-                frequency_hz=line.frequency_hz,
-                damping=line.damping,
-                rms_nm=line.rms_nm,
-                direction=(1.0,),
-            )
-            for line in filters.vibrations[index]
-        ]
+        lines = [replace(line, direction=(1.0,)) for line in filters.vibrations[index]]
         design = kalman(
             tip_tilt_plant(
                 frame_rate_hz=filters.turbulence.frame_rate_hz,
