@@ -4,6 +4,7 @@ From the repository::
 
     python benchmarks/export_targets.py              # the proof: loss, or the limit that refuses
     python benchmarks/export_targets.py frames       # a million frames in closed loop
+    python benchmarks/export_targets.py frames cacao # of one target
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth as lbt
+from lbt_synth.interop import Exported
 from lbt_synth.interop.dao.inner_loop import InnerLoop
 from lbt_synth.interop.iir.export import DirectForm
 from lbt_synth.interop.target import target_named, target_names
@@ -27,7 +29,6 @@ from lbt_synth.linear.block_filtering import filter_series
 Array = npt.NDArray[Any]
 LOOPS, FRAMES, SETTLE, RATE_HZ = 200, 5000, 2000, 800.0
 TURBULENCE_NM, VIBRATION_NM, NOISE_NM, POLE = 592.0, 797.0, 15.5, 0.9886
-ENDINGS = {"c": "k.c", "iir": "k.fits", "matlab": "k.mat", "dao": "k.npy", "pyrtc": "k"}
 CASES: dict[str, tuple[str, dict[str, str]]] = {
     "C, double": ("c", {}),
     "C, single": ("c", {"precision": "single"}),
@@ -36,6 +37,7 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
     "transfer functions, single": ("iir", {"precision": "single"}),
     "MATLAB": ("matlab", {}),
     "dao": ("dao", {}),
+    "cacao": ("cacao", {}),
 }
 DRIVER = """
 #include "k.h"
@@ -69,10 +71,15 @@ def designs() -> dict[str, lbt.Design]:
     return made | {"robust": other.design("robust")}
 
 
+def export(design: lbt.Design, target: str, options: dict[str, str], folder: Path) -> Exported:
+    """Export a design."""
+    return target_named(target).write(target_named(target).path_in(folder), design, **options)
+
+
 def worst_loss(design: lbt.Design, target: str, options: dict[str, str], folder: Path) -> str:
     """Export a design; return the largest loss of its residual, or what refuses it."""
     try:
-        written = target_named(target).write(folder / ENDINGS[target], design, **options)
+        written = export(design, target, options, folder)
     except lbt.errors.LbtSynthError as error:
         found = str(error).partition("; ")[2] or str(error)
         return "refused: " + found.partition(", limit")[0].partition(". ")[0]
@@ -134,10 +141,9 @@ def run_steps(step: Any, gain: float, phase: Array, noise: Array) -> Array:
     return out
 
 
-def run_target(
-    target: str, options: dict[str, str], files: tuple[Path, ...], *series: Any
-) -> Array:
+def run_target(target: str, options: dict[str, str], written: Exported, *series: Any) -> Array:
     """Run what was written in the arithmetic of its target."""
+    files = written.files
     if target == "c":
         return run_c(files, *series)
     if target == "matlab":
@@ -160,12 +166,20 @@ def run_target(
         kind = np.float32 if options.get("precision") == "single" else np.float64
         filters = DirectForm(num, den, kind)
         return run_steps(lambda y: filters.step(y.ravel()).reshape(y.shape), *series)
+    if target == "cacao":
+        twins = [written.start(np.inf) for _ in range(LOOPS)]
+        return run_steps(lambda y: np.array(list(map(step_twin, twins, y))), *series)
     rows = np.tile(np.load(files[0]), (1, LOOPS))
     loop = InnerLoop(rows, np.zeros((1, rows.shape[1])))
     return run_steps(lambda y: loop.step(y.ravel()).reshape(y.shape), *series)
 
 
-def million(folder: Path) -> None:
+def step_twin(twin: Any, y: Array) -> Array:
+    """Take y(k) of one loop, return u(k)."""
+    return np.asarray(twin.step(y))
+
+
+def million(folder: Path, targets: list[str]) -> None:
     """Print the arithmetic's noise in a million frames, beside its bound."""
     made = designs()
     phase, noise = disturbance(np.random.default_rng(0))
@@ -176,8 +190,10 @@ def million(folder: Path) -> None:
     print("|---|---|---:|---:|---:|---:|")
     for name, design in made.items():
         for case, (target, options) in CASES.items():
+            if targets and target not in targets:
+                continue
             try:
-                written = target_named(target).write(folder / ENDINGS[target], design, **options)
+                written = export(design, target, options, folder)
             except lbt.errors.LbtSynthError:
                 continue
             bounds = [c for c in written.checks if c.name.startswith("residual")]
@@ -186,7 +202,7 @@ def million(folder: Path) -> None:
                 loop = lbt.close_loop(design.hardware, design.controller, sensor_gain=gain)
                 own = filter_series(loop.system, np.concatenate([phase, noise], axis=2))
                 own = own[:, SETTLE:, :2]
-                found = run_target(target, options, written.files, gain, phase, noise)[:, SETTLE:]
+                found = run_target(target, options, written, gain, phase, noise)[:, SETTLE:]
                 size = np.sqrt(np.mean(own**2))
                 apart = np.sqrt(np.mean((found - own) ** 2)) / size
                 loss = np.sqrt(np.mean(found**2)) / size - 1
@@ -199,4 +215,7 @@ def million(folder: Path) -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
-        (million if sys.argv[1:] == ["frames"] else proof)(Path(place))
+        if sys.argv[1:2] == ["frames"]:
+            million(Path(place), sys.argv[2:])
+        else:
+            proof(Path(place))

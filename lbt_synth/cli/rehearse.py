@@ -64,7 +64,6 @@ class RehearsalFacts:
 
     difference_rms_nm: float = column("difference of the commands", unit="nm rms")
     difference_largest_nm: float = column("  largest", unit="nm")
-    spectral_radius: float = column("spectral radius of the design's loop")
     frames: int = column("frames compared")
     settle_frames: int = column("frames before, in which the loops settle")
 
@@ -101,11 +100,11 @@ def run(arguments: Namespace) -> Report:
     facts = RehearsalFacts(
         difference_rms_nm=float(np.sqrt(np.mean(np.sum(found.differences**2, axis=1)))),
         difference_largest_nm=float(np.max(np.abs(found.differences))),
-        spectral_radius=found.spectral_radius,
         frames=len(found.differences),
         settle_frames=found.settle_frames,
     )
     report.add_facts("The target beside the design", facts)
+    report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
     if series.noise is None:
         report.notes.append("note: residuals hold the noise of the measurements.")
     if design.hardware is not None:

@@ -127,15 +127,15 @@ def shape(
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
     for spec in specifications:
         spec.require_fitting(hardware)
-    solved: dict[int, tuple[ModeSolution, ModeSolution]] = {}  # equal modes share a specification
+    solved: dict[str, tuple[ModeSolution, ModeSolution]] = {}  # equal modes are solved once
     for spec in specifications:
-        if id(spec) not in solved:
+        if spec.key not in solved:
             basis = laguerre_basis(size, common, dt_s=single.dt_s)
             chosen = long = solve_mode(spec, Channel(hardware=single, basis=basis))
             if order is not None and order < size:
                 chosen = reduce_poles(spec, long, order, tolerance)
-            solved[id(spec)] = long, chosen
-    longs, modes = zip(*(solved[id(spec)] for spec in specifications), strict=True)
+            solved[spec.key] = long, chosen
+    longs, modes = zip(*(solved[spec.key] for spec in specifications), strict=True)
     parameters = tuple(mode.parameter for mode in modes)
     status, rounds = modes[0].sequence.status, max(long.sequence.programmes for long in longs)
     design = ShapedDesign(
@@ -200,6 +200,17 @@ class ShapedDesign(Design):
         return max(loop.controller.n_states for loop in self._loops)
 
     @property
+    def first_equal_modes(self) -> list[int]:
+        """First mode of the same specification, parameter and objective, for each mode."""
+        keys = [
+            (spec.key, *(getattr(parameter, name).tobytes() for name in "ABCD"), claimed)
+            for spec, parameter, claimed in zip(
+                self.specifications, self.parameters, self.objective_nm, strict=True
+            )
+        ]
+        return [keys.index(key) for key in keys]
+
+    @property
     def _loops(self) -> list[SingleModeLoop]:
         return [mode_loop(self.loop_hardware, parameter) for parameter in self.parameters]
 
@@ -236,16 +247,16 @@ class ShapedDesign(Design):
 
     def recertify(self) -> Certificate:
         """Compute the certificate again from the matrices."""
-        hardware, checks = self.loop_hardware, []
         claims = list(zip(self.specifications, self.parameters, self.objective_nm, strict=True))
-        found: dict[tuple[int, int, float], list[Check]] = {}  # equal modes are checked once
-        for mode, (spec, parameter, claimed) in enumerate(claims):
-            kind = id(spec), id(parameter), claimed
-            if kind not in found:
-                found[kind] = _mode_checks(hardware, spec, parameter, claimed)
+        found = {
+            first: _mode_checks(self.loop_hardware, *claims[first])
+            for first in set(self.first_equal_modes)
+        }
+        checks: list[Check] = []
+        for mode, first in enumerate(self.first_equal_modes):
             prefix = f"mode {mode + 1}: " if len(claims) > 1 else ""
-            checks += [replace(c, name=prefix + c.name) for c in found[kind]]
-        checks.append(certify_loop(hardware, self.controller))
+            checks += [replace(c, name=prefix + c.name) for c in found[first]]
+        checks.append(certify_loop(self.loop_hardware, self.controller))
         if checks[-1].passed:
             checks.append(self._decoupling_check())
         return replace(UNCERTIFIED, checks=tuple(checks))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -151,6 +151,9 @@ class Exported:
         on white noise elsewhere.
     error_single : float
         The same in single precision; inf if the loop is then unstable.
+    start : callable
+        ``start(limit)``, which returns what was written, stepped in the arithmetic of the target.
+        One that knows its limit clips its commands itself.
     checks : tuple of Check
         The proof in the loop, with the numbers of the file.
     cost : FrameCost or None
@@ -160,6 +163,7 @@ class Exported:
     files: tuple[Path, ...]
     error: float
     error_single: float
+    start: Callable[[float], SteppedController]
     checks: tuple[Check, ...] = ()
     cost: FrameCost | None = None
 

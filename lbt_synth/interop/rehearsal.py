@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design
+from lbt_synth.design import Check, Design
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.interop.target import target_named, target_names
+from lbt_synth.interop.export_checks import Exported
+from lbt_synth.interop.target import target_named
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.simulation.run import settling_frames, step_loop
 from lbt_synth.models import LoopHardware
@@ -47,14 +50,14 @@ class Rehearsal:
         In the arithmetic of the target, and in double precision.
     settle_frames : int
         Frames at the beginning that are left out.
-    spectral_radius : float
-        Of the design's loop.
+    checks : tuple of Check
+        The proof of what the target runs, as in its certificate.
     """
 
     target: RehearsedLoop
     design: RehearsedLoop
     settle_frames: int
-    spectral_radius: float
+    checks: tuple[Check, ...]
 
     @property
     def differences(self) -> FloatArray:
@@ -72,14 +75,16 @@ def rehearse(
     sensor_gain: float = 1.0,
     stroke: float | None = None,
 ) -> Rehearsal:
-    """Run a loop frame by frame in the arithmetic of a target, and in double precision.
+    """Run what is exported to a target in its arithmetic, and the design in double precision.
+
+    Both loops run frame by frame, on the same series.
 
     Parameters
     ----------
     design : Design
         The design.
     target : str
-        Name of a target that has a ``runner``.
+        Name of a target, whose export has its usual options.
     total_nm : (frames, n) array_like
         Phase of each frame; or the pseudo-open-loop series of a record, whose noise is then part
         of the residual [nm].
@@ -100,11 +105,13 @@ def rehearse(
     Raises
     ------
     ProblemError
-        If the target cannot be rehearsed, cannot hold the design, or sizes clash.
+        If the target cannot hold the design, or sizes clash.
+    CertificateError
+        If the certificate that the design carries has a failed check.
     UnstableLoopError
         If the loop of the design is unstable.
     NumericalError
-        If the loop grows beyond all numbers in the arithmetic of the target.
+        If the export is refused, or the loop grows beyond all numbers in its arithmetic.
 
     Examples
     --------
@@ -115,10 +122,6 @@ def rehearse(
     >>> bool(0 < np.max(np.abs(run.differences)) < 1e-3)
     True
     """
-    runner = target_named(target).runner
-    if runner is None:
-        able = ", ".join(name for name in target_names() if target_named(name).runner)
-        raise ProblemError(f"{target} cannot be rehearsed: take one of {able}.")
     path = design.hardware if hardware is None else hardware
     if path is None:
         raise ProblemError("a rehearsal needs the design of a loop; got a bare controller.")
@@ -138,8 +141,9 @@ def rehearse(
     loop = close_loop(path, design.controller, sensor_gain=gain)
     loop.require_stable()
     settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * len(total)))
+    exported = _exported(design, target)
     runs = []
-    for controller in (runner(design, limit), design.controller.start()):
+    for controller in (exported.start(limit), design.controller.start()):
         try:
             with np.errstate(all="ignore"):  # what overflows is found to be infinite
                 out = step_loop(controller, gain, path, total[None], seen[None], stroke=limit)
@@ -162,5 +166,12 @@ def rehearse(
         target=runs[0],
         design=runs[1],
         settle_frames=settle,
-        spectral_radius=loop.spectral_radius,
+        checks=exported.checks,
     )
+
+
+def _exported(design: Design, target: str) -> Exported:
+    """Export a design, and keep what was proved of it rather than the files."""
+    writer = target_named(target)
+    with TemporaryDirectory() as folder:
+        return writer.write(writer.path_in(Path(folder)), design)

@@ -8,15 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lbt_synth.storage.rows import column, table_row
 
 if TYPE_CHECKING:
-    from lbt_synth.design import Design
     from lbt_synth.interop.export_checks import Exported
-    from lbt_synth.loop.simulation.run import SteppedController
 
 CERTIFICATE = ".certificate.json"  # ending of the certificate beside what is written
 
@@ -45,24 +44,26 @@ class Target:
         What is written, in words.
     write : callable
         ``write(path, design, gain_digest=..., **options)``, which returns an :class:`Exported`.
-    beside : str
-        Ending of the file that goes beside it, if there is one, other than the certificate.
+    endings : tuple of str
+        Ending of the file, and of what goes beside it other than the certificate.
     contents : tuple of str
         Names of the files, where the target writes a folder.
-    options : tuple of str
-        Options of ``write`` that the command line offers.
-    runner : callable, optional
-        ``runner(design, limit)``, which returns the controller of a design stepped in the
-        arithmetic of the target. One that knows its limit clips its commands itself.
     """
 
     arithmetic: Arithmetic
     file: str
     write: Callable[..., Exported]
-    beside: str = ""
+    endings: tuple[str, ...] = ()
     contents: tuple[str, ...] = ()
-    options: tuple[str, ...] = ()
-    runner: Callable[[Design, float], SteppedController] | None = None
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of the arguments of ``write``."""
+        return tuple(signature(self.write).parameters)
+
+    def path_in(self, folder: Path, stem: str = "k") -> Path:
+        """Return a path in a folder that ``write`` takes."""
+        return folder / "".join([stem, *self.endings[:1]])
 
 
 def target_names() -> tuple[str, ...]:

@@ -297,14 +297,10 @@ def _demand_checks(design: ShapedDesign, loop: ClosedLoop) -> list[Check]:
     to_modes[n : 2 * n, n : n + m] = hardware.influence
     to_modes[2 * n :, n + m :] = np.linalg.pinv(hardware.sensor)
     modal = replace(loop, system=replace(s, C=to_modes @ s.C, D=to_modes @ s.D))
-    checks, found = [], set()
-    for mode, (spec, parameter) in enumerate(
-        zip(design.specifications, design.parameters, strict=True)
-    ):
-        if (id(spec), id(parameter)) not in found:
-            found.add((id(spec), id(parameter)))
-            for check in spec.checks(_mode_of(modal, mode, slice(mode, None, n))):
-                limit = check.limit + _LOSS * abs(check.limit)
-                name = f"mode {mode + 1}: {check.name}"
-                checks.append(replace(check, name=name, limit=limit))
+    checks = []
+    for mode in sorted(set(design.first_equal_modes)):
+        own = _mode_of(modal, mode, slice(mode, None, n))
+        for check in design.specifications[mode].checks(own):
+            limit = check.limit + _LOSS * abs(check.limit)
+            checks.append(replace(check, name=f"mode {mode + 1}: {check.name}", limit=limit))
     return checks

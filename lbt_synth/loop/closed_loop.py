@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
@@ -171,12 +173,20 @@ def close_loop(
 def radii_by_gain(
     hardware: LoopHardware, controller: Controller | HasController
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
+    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,).
+
+    The eigenvalues are those of the parts whose states act on one another; equal parts count once.
+    """
     A0, A1, *_ = _checked_loop_matrices(hardware, as_controller(controller))
+    links = csr_matrix((A0 != 0) | (A1 != 0))
+    count, label = connected_components(links, connection="strong")
+    parts = (np.ix_(label == part, label == part) for part in range(count))
+    different = {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}
 
     def radii(sensor_gains: FloatArray) -> FloatArray:
-        loops = A0 + np.asarray(sensor_gains)[:, None, None] * A1
-        return np.asarray(np.max(np.abs(np.linalg.eigvals(loops)), axis=1))
+        gains = np.asarray(sensor_gains)[:, None, None]
+        eigenvalues = [np.linalg.eigvals(A + gains * B) for A, B in different.values()]
+        return np.asarray(np.max(np.abs(np.concatenate(eigenvalues, axis=1)), axis=1))
 
     return radii
 

@@ -86,3 +86,15 @@ def test_noise_in_the_sums_is_that_of_the_closed_form():
     found = values(checks[1:2])["residual at sensor gain 1"]
     assert found.value == pytest.approx(expected, rel=1e-9)
     assert seen[0][0] ** 2 == pytest.approx(left + 0.01, rel=1e-9)  # y is the residual and noise
+
+
+def test_demands_of_equal_modes_are_checked_once(tmp_path, shaped):
+    """In a gain file they are equal by value only."""
+    path = lbt.LoopHardware(frame_rate_hz=800)
+    both = lbt.design.shape(path, shaped.specifications[0], functions=16, states=None)
+    assert both.first_equal_modes == [0, 0]
+    loaded = lbt.load_gain(lbt.save_gain(tmp_path / "both.fits", both))
+    for design in (both, loaded):
+        names = [check.name for check in prove_written(design, design.controller)]
+        assert any(name.startswith("mode 1: ") for name in names)
+        assert not any(name.startswith("mode 2: ") for name in names)

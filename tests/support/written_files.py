@@ -277,14 +277,6 @@ ORACLES = {
     "pyrtc": judge_pyrtc,
     "cacao": judge_cacao,
 }
-ENDINGS = {
-    "c": "k.c",
-    "cacao": "p.fits",
-    "dao": "k.npy",
-    "iir": "k.fits",
-    "matlab": "k.mat",
-    "pyrtc": "k",
-}
 
 
 def judge(folder, seed):
@@ -301,9 +293,9 @@ def judge(folder, seed):
     verdicts = {}
     for name, oracle in ORACLES.items():
         options = random_options(name, rng)
-        place = folder / ENDINGS[name]
+        target = lbt.interop.target_named(name)
         try:
-            written = lbt.interop.target_named(name).write(place, design, **options)
+            written = target.write(target.path_in(folder), design, **options)
         except (lbt.errors.NumericalError, lbt.errors.ProblemError):
             verdicts[name] = None
             continue

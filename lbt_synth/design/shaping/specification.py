@@ -5,6 +5,7 @@ A gain file holds it as plain metadata.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias, get_args
 
@@ -89,6 +90,11 @@ class Specification:
     @property
     def _parts(self) -> tuple[object, ...]:
         return (*leaves(self.objective), *self.demands)
+
+    @property
+    def key(self) -> str:
+        """Text that equal specifications share."""
+        return json.dumps(to_metadata(self))
 
     @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:

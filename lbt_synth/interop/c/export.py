@@ -155,8 +155,14 @@ def export_c(
         form=form,
         precision=precision,
     )
-    cost = frame_cost(written)
-    return Exported(files=files, error=error, error_single=error_single, checks=checks, cost=cost)
+    return Exported(
+        files=files,
+        error=error,
+        error_single=error_single,
+        start=lambda _: SourceTerms(written, applied, np.float32 if single else np.float64),
+        checks=checks,
+        cost=frame_cost(written),
+    )
 
 
 def _form_of(design: Design, form: str) -> tuple[Controller, int]:
@@ -322,7 +328,5 @@ TARGET = Target(
     ),
     file="source and header (.c, .h)",
     write=export_c,
-    beside=".h",
-    options=("form", "precision", "name"),
-    runner=lambda design, _: SourceTerms(design.controller, 0, np.float64),
+    endings=(".c", ".h"),
 )

@@ -137,7 +137,13 @@ def export_cacao(
         latency_frames=hardware.delay_frames + 1,
         sign=_SIGN,
     )
-    return Exported(files=files, error=error, error_single=error, checks=checks)
+    return Exported(
+        files=files,
+        error=error,
+        error_single=error,
+        start=lambda limit: AppliedFilter(matrix, hardware.delay_frames, limit),
+        checks=checks,
+    )
 
 
 def _require_loop(design: Design) -> LoopHardware:
@@ -179,14 +185,6 @@ def _matrix_bytes(
     return buffer.getvalue()
 
 
-def _start(design: Design, limit: float) -> AppliedFilter:
-    """Return the filter with as many steps as its residual needs."""
-    _require_loop(design)
-    found = predictive_filter(design)
-    taps = found.taps(found.fewest_steps(_MOST_LOSS))
-    return AppliedFilter(filter_matrix(taps), found.loop.hardware.delay_frames, limit)
-
-
 TARGET = Target(
     arithmetic=Arithmetic(
         program="cacao's applyPF, behind its modalfilter",
@@ -198,6 +196,5 @@ TARGET = Target(
     ),
     file="matrix of single precision (.fits) and its certificate",
     write=export_cacao,
-    options=("steps", "loss"),
-    runner=_start,
+    endings=(".fits",),
 )

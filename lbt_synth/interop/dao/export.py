@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from lbt_synth.design import Check, Design, ShapedDesign
 from lbt_synth.design.modal import MixedController, ModalFilters
 from lbt_synth.design.modal.reconstructor import name_modes
-from lbt_synth.design.shaping.specification import to_metadata
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.dao.inner_loop import InnerLoop
 from lbt_synth.interop.dao.lattice_rounding import round_together
@@ -43,7 +41,6 @@ from lbt_synth.validation import FloatArray, integer, number
 _HINT = "Design with fewer states or less accurate models, or use a target in double precision."
 _OWN = "of the gain file, rounded"
 _AGAIN = "made again for single precision; the loop keeps what the gain file promises"
-_ORDER = 20  # M, where a configuration gives none
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
 
 
@@ -51,7 +48,7 @@ def export_dao(
     path: str | os.PathLike[str],
     design: Design | MixedController | ModalFilters,
     *,
-    order: int = _ORDER,
+    order: int = 20,
     modes: int | None = None,
     other_gain: float | None = None,
     hardware: LoopHardware | None = None,
@@ -74,7 +71,7 @@ def export_dao(
         Design whose modes decouple, with unit sensor and influence matrices; or a design with
         integrators for the other modes; or a filter for each mode.
     order : int, optional
-        M of the RTC's configuration.
+        M of the RTC's configuration; its own default is 20.
     modes : int, optional
         Columns of the matrix; by default those of the design. Further columns are zero, and their
         modes get no command, without ``other_gain``.
@@ -140,7 +137,13 @@ def export_dao(
         sign=_SIGN,
         coefficients=_AGAIN if again else _OWN,
     )
-    return Exported(files=files, error=error, error_single=error, checks=tuple(checks))
+    return Exported(
+        files=files,
+        error=error,
+        error_single=error,
+        start=lambda limit: InnerLoop(matrix[:, :own], limit=limit),
+        checks=tuple(checks),
+    )
 
 
 class _Proved(NamedTuple):
@@ -247,12 +250,11 @@ def _mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
     if not isinstance(design, ShapedDesign):
         return []
     assert design.hardware is not None  # a shaped design is of a loop
-    keys = [json.dumps(to_metadata(spec)) for spec in design.specifications]
     found = {
-        key: shaped_mode_loop(design.hardware, spec, order)
-        for key, spec in dict(zip(keys, design.specifications, strict=True)).items()
+        mode: shaped_mode_loop(design.hardware, design.specifications[mode], order)
+        for mode in set(design.first_equal_modes)
     }
-    return [found[key] for key in keys]
+    return [found[mode] for mode in design.first_equal_modes]
 
 
 def _can_make_again(loops: list[DirectFormLoop], exact: FloatArray) -> bool:
@@ -293,12 +295,6 @@ def _matrix_bytes(
     return buffer.getvalue()
 
 
-def _start(design: Design, limit: float) -> InnerLoop:
-    """Return the RTC's inner loop with the matrix that would be written."""
-    require_modal(design, "a dao matrix")
-    return InnerLoop(_proved_columns(design, _ORDER).columns, limit=limit)
-
-
 TARGET = Target(
     arithmetic=Arithmetic(
         program="Durham's dao real-time computers",
@@ -310,6 +306,5 @@ TARGET = Target(
     ),
     file="matrix of single precision (.npy, .fits) and its certificate (.json)",
     write=export_dao,
-    options=("order", "modes", "other_gain"),
-    runner=_start,
+    endings=(".npy",),
 )

@@ -124,10 +124,11 @@ def _search(
             latest[key] = _rows(loop, targets, x, weights)
         return latest[key]
 
+    count = rows(theta)[0].size
+
     def errors(x: FloatArray) -> FloatArray:
-        found = rows(x)[0]
         stable = loop.radius(_coefficients(loop, x), gains) < loop_limit
-        return found if stable else np.full_like(found, 1e3)
+        return rows(x)[0] if stable else np.full(count, 1e3)
 
     def slopes(x: FloatArray) -> FloatArray:
         return rows(x)[1]

@@ -29,6 +29,7 @@ from lbt_synth.validation import BoolArray, FloatArray, choice, frozen_copy, num
 
 _LAYOUT_VERSION = 1  # of SPECULA's IirFilterData
 _SWITCH = {"double": 0, "single": 1}  # SPECULA's own ``precision``
+_KINDS: dict[str, Any] = {"double": np.float64, "single": np.float32}
 _HINT = "Use the gain file itself, which SPECULA's SsrFilter loads, or a design of fewer states."
 
 
@@ -148,7 +149,13 @@ def export_iir(
         precision=precision,
         specula_precision=_SWITCH[precision],
     )
-    return Exported(files=files, error=error, error_single=single, checks=checks)
+    return Exported(
+        files=files,
+        error=error,
+        error_single=single,
+        start=lambda _: DirectForm(num, den, _KINDS[precision]),
+        checks=checks,
+    )
 
 
 def _prove(design: Design, data: bytes, precision: str) -> tuple[Check, ...]:
@@ -158,8 +165,8 @@ def _prove(design: Design, data: bytes, precision: str) -> tuple[Check, ...]:
     from astropy.io import fits
 
     with fits.open(io.BytesIO(data)) as units, np.errstate(over="ignore"):
-        kind = np.float32 if precision == "single" else np.float64
-        num, den = (np.asarray(units[name].data, kind).astype(float) for name in ("NUM", "DEN"))
+        rounded = (np.asarray(units[n].data, _KINDS[precision]) for n in ("NUM", "DEN"))
+        num, den = (part.astype(float) for part in rounded)
     sums = np.zeros_like(num)
     sums[:, -1] = 1.0
     written, entry = (build_controller(top, den, design.controller.dt_s) for top in (num, sums))
@@ -315,6 +322,5 @@ TARGET = Target(
     ),
     file="filter file (.fits)",
     write=export_iir,
-    options=("precision",),
-    runner=lambda design, _: DirectForm(*_align(axis_polynomials(design.controller))),
+    endings=(".fits",),
 )

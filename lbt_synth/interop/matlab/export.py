@@ -117,7 +117,13 @@ def export_mat(
         checks=checks,
         gain_digest=gain_digest,
     )
-    return Exported(files=files, error=error, error_single=single, checks=checks)
+    return Exported(
+        files=files,
+        error=error,
+        error_single=single,
+        start=lambda _: _Textbook(textbook, np.float64),
+        checks=checks,
+    )
 
 
 def _prove(design: Design, data: bytes) -> tuple[Check, ...]:
@@ -162,5 +168,5 @@ TARGET = Target(
     ),
     file="MATLAB file (.mat)",
     write=export_mat,
-    runner=lambda design, _: _Textbook(design.controller.to_statespace(), np.float64),
+    endings=(".mat",),
 )

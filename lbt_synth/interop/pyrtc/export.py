@@ -141,7 +141,13 @@ def export_pyrtc(
         delay_frames=found.delay_frames,
         modes=size,
     )
-    return Exported(files=files, error=single, error_single=single, checks=checks)
+    return Exported(
+        files=files,
+        error=single,
+        error_single=single,
+        start=lambda limit: InnerLoop(design, limit),
+        checks=checks,
+    )
 
 
 def _write_system(found: PolFilter, origin: str, size: int) -> str:
@@ -176,6 +182,4 @@ TARGET = Target(
     file="folder with the configuration, the gain file and their certificate",
     write=export_pyrtc,
     contents=(_CONFIG, _GAIN, _RESPONSE, str(Path(_CONFIG).with_suffix(CERTIFICATE))),
-    options=("modes",),
-    runner=InnerLoop,
 )

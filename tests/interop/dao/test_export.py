@@ -125,58 +125,9 @@ def test_what_the_matrix_cannot_hold_is_refused(tmp_path, designs, loaded):
     refused(bare, "needs the design of a loop")
 
 
-def random_design(rng):
-    """A Kalman filter or an integrator for one mode, a few lines and any frame rate."""
-    rate = float(rng.uniform(200, 2000))
-    if rng.uniform() < 0.1:
-        hardware = lbt.LoopHardware(frame_rate_hz=rate, modes=1)
-        return lbt.integrator(hardware, gain=float(rng.uniform(0.05, 0.9)))
-    air = lbt.models.ARModel(
-        coefficients=np.array([rng.uniform(0.9, 0.9999)]), driving_rms_nm=50.0, frame_rate_hz=rate
-    )
-    lines = [
-        lbt.Vibration(
-            frequency_hz=float(rng.uniform(2, 0.4 * rate)),
-            damping=float(10 ** rng.uniform(-3, -1)),
-            rms_nm=float(10 ** rng.uniform(1, 3)),
-            direction=(1.0,),
-        )
-        for _ in range(rng.integers(0, 4))
-    ]
-    noise = float(10 ** rng.uniform(0, 2))
-    return lbt.kalman(
-        lbt.tip_tilt_plant(
-            frame_rate_hz=rate, turbulence=air, noise_nm=noise, vibrations=lines or None, modes=1
-        )
-    )
-
-
 def written_radius(matrix, gain):
     """Spectral radius of the loop of two frames, from the polynomial of the written numbers."""
     order = len(matrix) // 2
     own = np.concatenate([[1.0], -matrix[order + 1 :, 0].astype(float), [0.0, 0.0]])
     own[2:] += gain * matrix[: order + 1, 0]
     return np.max(np.abs(np.roots(own)))
-
-
-def count_written(folder, seed, count):
-    """Export random designs; each file that is written must be stable. Return how many were."""
-    rng, written = np.random.default_rng(seed), 0
-    for _ in range(count):
-        design = random_design(rng)
-        try:
-            lbt.interop.export_dao(folder / "k.npy", design, order=20)
-        except lbt.errors.NumericalError:
-            continue
-        written += 1
-        assert written_radius(np.load(folder / "k.npy"), 1.0) < 1
-    return written
-
-
-def test_no_file_is_written_that_is_unstable(tmp_path):
-    assert 0 < count_written(tmp_path, 4, 4)
-
-
-@pytest.mark.study
-def test_no_file_of_ten_thousand_is_unstable(tmp_path):
-    assert 5000 < count_written(tmp_path, 5, 10_000)
