@@ -11,7 +11,9 @@ from . import report as report
 from . import studies as studies
 from .config import load_config as load_config
 from .design import Design as Design
+from .design import h2_controller as h2_controller
 from .design import hinf as hinf
+from .design import hinf_controller as hinf_controller
 from .design import integrator as integrator
 from .design import kalman as kalman
 from .design import lqg as lqg

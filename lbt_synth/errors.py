@@ -82,9 +82,12 @@ class DetectabilityError(ProblemError):
     ----------
     eigenvalue : complex or None
         The offending eigenvalue of the state matrix.
+    eigenvector : (n,) ndarray or None
+        Moduli of its eigenvector's entries, one per state, where it was computed.
     """
 
     eigenvalue: complex | None = None
+    eigenvector: Any = None
 
 
 class RecordError(ProblemError):

@@ -63,8 +63,8 @@ def listed(stub):
     }
 
 
-def test_the_face_has_at_most_forty_names():
-    assert len([name for name in dir(lbt) if not name.startswith("_")]) <= 40
+def test_the_face_has_at_most_forty_four_names():
+    assert len([name for name in dir(lbt) if not name.startswith("_")]) <= 44
     assert listed(Path(lbt.__file__).with_suffix(".pyi")) == set(lbt.__all__)
     for name in lbt.__all__:
         thing = getattr(lbt, name)

@@ -34,6 +34,10 @@ INFEASIBLE_TOLERANCE = 1e-9
 VARIANCE_TOLERANCE = 1e-6
 LEVEL_SETS = "level sets on the symplectic pencil"
 _GRID = 513  # frequencies from 0 to the Nyquist frequency
+_ONE_NORM = "relative, 1-norm"
+_TWO_EQUATIONS = "relative, two Lyapunov equations"
+_VARIANCE = (_ONE_NORM, _TWO_EQUATIONS)  # the checks of a variance
+_NOTHING = 1e-14  # part of a system's size that counts as rounding
 _TINY = 1e-300  # keeps a quotient finite where the denominator is zero
 
 
@@ -187,14 +191,19 @@ def certify_filter(
 
 
 def certify_error(
-    error: StateSpace, *, stability: str = "spectral radius of the filter"
+    error: StateSpace, *, stability: str = "spectral radius of the filter", white: bool = True
 ) -> Certificate:
     """Certify a system from disturbance to estimation error.
 
     The checks are stability, the variance by a Lyapunov equation and its adjoint, and the norm by
-    level sets and on a frequency grid. ``stability`` names the first check.
+    level sets and on a frequency grid. ``stability`` names the first check. Without ``white`` the
+    disturbance is no white noise, and the variance means nothing.
     """
-    return _examine_error(error, stability)[0]
+    certificate, norm, _ = _examine_error(error, stability)
+    if white or norm is None:
+        return certificate
+    kept = tuple(check for check in certificate.checks if check.computed_by not in _VARIANCE)
+    return replace(certificate, checks=kept, rms_per_output=frozen_copy(np.empty(0)))
 
 
 def _examine_error(
@@ -207,18 +216,16 @@ def _examine_error(
         return Certificate(checks=(stable,), gamma=np.inf, rms_per_output=infinite), None, None
     drive = error.B @ error.B.T
     P = stationary_covariance(error.A, drive)
-    variances = np.diag(error.C @ P @ error.C.T)
+    variances = np.diag(error.C @ P @ error.C.T + error.D @ error.D.T)
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     highest = float(np.max(largest_singular_values(error, grid)))
     residual = lyapunov_residual(error.A, drive, P)
-    above = highest / max(norm.upper, _TINY) - 1
+    above = (highest - _rounding(error)) / max(norm.upper, _TINY) - 1
     how = f"{_GRID} frequencies against level sets"
     checks = (
         stable,
-        Check(
-            "residual of the Lyapunov equation", residual, RESIDUAL_TOLERANCE, "relative, 1-norm"
-        ),
+        Check("residual of the Lyapunov equation", residual, RESIDUAL_TOLERANCE, _ONE_NORM),
         _adjoint_variance_check(error, float(variances.sum())),
         Check("singular values above the norm", above, NORM_TOLERANCE, how),
     )
@@ -226,14 +233,20 @@ def _examine_error(
     return Certificate(checks=checks, gamma=norm.value, rms_per_output=rms), norm, P
 
 
+def _rounding(error: StateSpace) -> float:
+    """Size of an error that is nothing but rounding."""
+    through = np.linalg.norm(error.B) * np.linalg.norm(error.C) + np.linalg.norm(error.D)
+    return max(float(_NOTHING * through), _TINY)
+
+
 def _adjoint_variance_check(error: StateSpace, variance: float) -> Check:
     """Compare the variance with that of the adjoint equation, which sums it in another order."""
     weight = stationary_covariance(error.A.T, error.C.T @ error.C)
-    adjoint = float(np.trace(error.B.T @ weight @ error.B))
-    size = max(abs(variance), abs(adjoint))
+    adjoint = float(np.trace(error.B.T @ weight @ error.B + error.D.T @ error.D))
+    size = max(abs(variance), abs(adjoint), _rounding(error) ** 2)
     apart = abs(variance - adjoint) / size if size > 0 else 0.0
-    how = "relative, two Lyapunov equations"
-    return Check("variance, against its adjoint equation", apart, VARIANCE_TOLERANCE, how)
+    name = "variance, against its adjoint equation"
+    return Check(name, apart, VARIANCE_TOLERANCE, _TWO_EQUATIONS)
 
 
 def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:

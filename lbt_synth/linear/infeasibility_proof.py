@@ -104,7 +104,7 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
 
 def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Basis T with ``covariance = T T'``, and its left inverse; null directions are dropped."""
-    spread = np.sqrt(np.diag(covariance))
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     spread = np.where(spread > 0, spread, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
     kept = values > _RANK_TOLERANCE * values[-1]

@@ -16,6 +16,7 @@ from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.batched import solve_stack
+from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
@@ -121,7 +122,7 @@ class StateSpace(LinearSystem):
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:
-        """Take a StateSpace, a discrete ``control.StateSpace``, or a tuple (A, B, C, D).
+        """Take a discrete system of python-control or scipy, or a tuple (A, B, C, D).
 
         Anything else, and a system in continuous time, raises a ProblemError.
 
@@ -133,22 +134,13 @@ class StateSpace(LinearSystem):
         """
         if isinstance(system, StateSpace):
             return system
-        if isinstance(system, tuple | list) and len(system) == 4:
-            A, B, C, D = system
-            return cls(A=A, B=B, C=C, D=D)
-        if all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt")):
-            if system.dt == 0:
-                raise ProblemError(
-                    "the system must be in discrete time; got a continuous one (dt = 0). "
-                    "Try control.sample_system(system, dt)."
-                )
-            unspecified = system.dt is None or system.dt is True
-            dt_s = 1.0 if unspecified else float(system.dt)
-            return cls(A=system.A, B=system.B, C=system.C, D=system.D, dt_s=dt_s)
-        raise ProblemError(
-            "a system must be a StateSpace, a control.StateSpace or a tuple (A, B, C, D); "
-            f"got {type(system).__name__}."
-        )
+        A, B, C, D, dt_s = system_parts(system)
+        if dt_s is None:
+            raise ProblemError(
+                "the system must be in discrete time; got a continuous one (dt = 0). "
+                "Try control.sample_system(system, dt)."
+            )
+        return cls(A=A, B=B, C=C, D=D, dt_s=dt_s)
 
     def to_control(self) -> Any:
         """Return the system as a ``control.StateSpace`` with its sampling period.
@@ -160,11 +152,7 @@ class StateSpace(LinearSystem):
         >>> lag.to_control().dt
         0.01
         """
-        import control
-
-        return control.StateSpace(
-            self.A, self.B, self.C, self.D, self.dt_s, remove_useless_states=False
-        )
+        return control_system(self.A, self.B, self.C, self.D, self.dt_s)
 
     def balanced(self) -> StateSpace:
         """Scale the states by powers of two, which leaves the input-output map as it is.

@@ -1,0 +1,1 @@
+"""Controllers from measurements for any generalised plant, each with a certificate."""

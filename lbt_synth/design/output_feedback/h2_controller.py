@@ -1,0 +1,85 @@
+"""H2 control from measurements: the least variance of the errors (LQG)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.design.output_feedback.result import ControllerDesign, certified_controller
+from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.output_feedback.discrete_form import discrete_form
+from lbt_synth.linear.output_feedback.least_level import TwoRiccati
+
+
+def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
+    """Design the controller of least variance of a generalised plant, ``u = K y``.
+
+    Parameters
+    ----------
+    plant : GeneralizedPlant
+        In discrete time. w is white, of unit variance per sample.
+
+    Returns
+    -------
+    ControllerDesign
+        Certified; ``rms`` is the standard deviation of z, which no controller makes less.
+
+    Raises
+    ------
+    DetectabilityError
+        If no controller stabilises the plant; with the mode and its eigenvector.
+    ProblemError
+        If the plant is in continuous time.
+    NumericalError
+        If an equation was not solved.
+    CertificateError
+        If the controller does not pass its checks.
+
+    References
+    ----------
+    T. Chen, B. Francis, "Optimal Sampled-Data Control Systems", Springer (1995), chapter 6.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> P = lbt.linear.GeneralizedPlant(
+    ...     A=1.0,
+    ...     B1=[[1.0, 0.0]],
+    ...     B2=1.0,
+    ...     C1=[[1.0], [0.0]],
+    ...     C2=1.0,
+    ...     D12=[[0.0], [1.0]],
+    ...     D21=[[0.0, 1.0]],
+    ... )
+    >>> round(lbt.h2_controller(P).rms ** 4, 6)
+    5.0
+    """
+    form = discrete_form(plant, continuous=False)
+    equations, share = form.equations()
+    return certified_controller(
+        form,
+        equations.least_variance(),
+        method="h2",
+        route="riccati",
+        regularised=share,
+        least_rms=_least_rms(equations) if share == 0 else np.nan,
+    )
+
+
+def _least_rms(equations: TwoRiccati) -> float:
+    """Return the least standard deviation: that with known state, and that of estimating the law.
+
+    ``|z|^2`` is the cost with known state and disturbance, plus that of the distance of the
+    control from ``F x + F0 w``, of which the measurements leave an error.
+    """
+    P, control = equations.plant, equations.control
+    X, Y = control.least, equations.estimation.least
+    law = np.linalg.solve(
+        control.weight,
+        np.hstack([P.B2.T @ X @ P.A + P.D12.T @ P.C1, P.B2.T @ X @ P.B1 + P.D12.T @ P.D11]),
+    )
+    n = len(P.A)
+    F, F0 = law[:, :n], law[:, n:]
+    innovation = P.D21 @ P.D21.T + P.C2 @ Y @ P.C2.T
+    seen = F @ Y @ P.C2.T + F0 @ P.D21.T
+    error = F @ Y @ F.T + F0 @ F0.T - seen @ np.linalg.solve(innovation, seen.T)
+    return float(np.sqrt(np.trace(control.pushed) + np.trace(control.weight @ error)))

@@ -1,0 +1,203 @@
+"""H-infinity control from measurements: the least energy gain from disturbances to errors."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lbt_synth.design.output_feedback.result import ControllerDesign, certified_controller
+from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
+from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
+from lbt_synth.linear.output_feedback.least_level import TwoRiccati
+from lbt_synth.linear.output_feedback.lower_bound import NO_PROOF, infeasible_control_level
+from lbt_synth.validation import choice, number
+
+if TYPE_CHECKING:
+    from lbt_synth.linear.output_feedback.lower_bound import ControlWitness
+    from lbt_synth.linear.state_space import StateSpace
+
+_AT_LEAST = 1e-9  # a level this close to the least one counts as the least one itself
+_LOOSE = 1e-7  # a proof further from the least level is tried by the inequality as well
+_LARGEST_LMI = 20  # states
+_APART = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # of levels tried next to the least
+_GREATEST_RATIO = 1e6
+
+
+def hinf_controller(
+    plant: GeneralizedPlant,
+    *,
+    gamma: float | None = None,
+    gamma_ratio: float | None = None,
+    route: str = "riccati",
+) -> ControllerDesign:
+    """Design an H-infinity controller of a generalised plant, ``u = K y``.
+
+    With neither ``gamma`` nor ``gamma_ratio`` the controller is that of the least gamma, at which
+    the closed loop is all-pass and every other property suffers: ratios from 1.05 to 1.5 are
+    for use.
+
+    Parameters
+    ----------
+    plant : GeneralizedPlant
+        In discrete or, with ``dt_s=None``, in continuous time; D11 and D22 may be anything,
+        D12 and D21 singular.
+    gamma : float, optional
+        Bound on the H-infinity norm from w to z.
+    gamma_ratio : float, optional
+        The same bound as a multiple, at least 1, of the least gamma.
+    route : {"riccati", "lmi"}
+        How the least gamma is found: by two Riccati equations, or by linear matrix
+        inequalities. Both give the central controller.
+
+    Returns
+    -------
+    ControllerDesign
+        Certified. ``gamma_least`` is the norm that a controller achieves, ``gamma_infeasible`` a
+        level that no controller reaches, proved by ``witness``.
+
+    Raises
+    ------
+    DetectabilityError
+        If no controller stabilises the plant; with the mode and its eigenvector.
+    InfeasibleError
+        If the bound is below the least gamma; with the least, and the reason.
+    ProblemError
+        If both bounds are given, or a value is out of its range.
+    NumericalError
+        If the equations or the inequality were not solved.
+    CertificateError
+        If the controller does not pass its checks.
+
+    References
+    ----------
+    M. Green, D. J. N. Limebeer, "Linear Robust Control", Prentice-Hall (1995), appendix B;
+    P. Gahinet, P. Apkarian, Int. J. Robust Nonlinear Control 4, 421 (1994),
+    doi:10.1002/rnc.4590040403.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> P = lbt.linear.GeneralizedPlant(
+    ...     A=1.0,
+    ...     B1=[[1.0, 0.0]],
+    ...     B2=1.0,
+    ...     C1=[[1.0], [0.0]],
+    ...     C2=1.0,
+    ...     D12=[[0.0], [1.0]],
+    ...     D21=[[0.0, 1.0]],
+    ... )
+    >>> K = lbt.hinf_controller(P, gamma_ratio=1.1)
+    >>> K.gamma_infeasible <= K.gamma_least < K.gamma <= K.gamma_requested
+    True
+    """
+    choice(route, "route", ("riccati", "lmi"))
+    if gamma is not None and gamma_ratio is not None:
+        raise ProblemError(
+            "give gamma or gamma_ratio, not both; "
+            f"got gamma={gamma!r} and gamma_ratio={gamma_ratio!r}."
+        )
+    if gamma is not None:
+        gamma = number(gamma, "gamma", above=0)
+    if gamma_ratio is not None:
+        gamma_ratio = number(gamma_ratio, "gamma_ratio", at_least=1, at_most=_GREATEST_RATIO)
+    form = discrete_form(plant)
+    equations, share = form.equations()
+    bracket = _Bracket(form, equations, route)
+    requested = bracket.least * (gamma_ratio or 1.0) if gamma is None else gamma
+    if requested < bracket.least * (1 - _AT_LEAST):
+        raise InfeasibleError(
+            f"no controller was found at gamma = {requested:.9g}: the least is "
+            f"{bracket.least:.9g}, and none reaches {bracket.infeasible:.9g}, because "
+            f"{bracket.witness.reason}. Try gamma_ratio=1.1.",
+            gamma=requested,
+            gamma_least=bracket.least,
+        )
+    controller = bracket.controller
+    if requested > bracket.least * (1 + _AT_LEAST):
+        above = _central(equations, requested)
+        controller = controller if above is None else above
+    return certified_controller(
+        form,
+        controller,
+        method="hinf",
+        route=route,
+        gamma_requested=max(requested, bracket.least),
+        gamma_least=bracket.least,
+        gamma_infeasible=bracket.infeasible,
+        witness=bracket.witness,
+        regularised=share,
+        hint="Try a larger gamma_ratio.",
+    )
+
+
+class _Bracket:
+    """The least gamma between the norm of a controller and a level that is proved infeasible."""
+
+    def __init__(self, form: DiscreteForm, equations: TwoRiccati, route: str) -> None:
+        solution = equations.least_level()
+        self.controller, self.least = _least_controller(form, equations, solution.gamma)
+        proofs = [(0.0, NO_PROOF)]
+        if equations.plant is form.plant:  # a proof for a plant next to it proves nothing here
+            witness = equations.witness(solution)
+            proofs = [(infeasible_control_level(form.plant, witness), witness)]
+        loose = proofs[0][0] < self.least * (1 - _LOOSE)
+        if route == "lmi":
+            proofs.append(_inequality_proof(form.plant, equations, solution.gamma))
+        elif loose and len(form.plant.A) <= _LARGEST_LMI:
+            with suppress(NumericalError):
+                proofs.append(_inequality_proof(form.plant, equations, solution.gamma))
+        proved, self.witness = max(proofs, key=lambda each: each[0])
+        if proved > self.least * (1 + _LOOSE):
+            raise NumericalError(
+                f"no controller should have a norm below {proved:.9g}, yet one achieves "
+                f"{self.least:.9g}. Scale states and signals to similar sizes.",
+                status="contradiction",
+            )
+        self.infeasible = min(proved, self.least)
+
+
+def _inequality_proof(
+    plant: GeneralizedPlant, equations: TwoRiccati, gamma: float
+) -> tuple[float, ControlWitness]:
+    """Return the level that the dual of the matrix inequalities proves, and the proof."""
+    from lbt_synth.linear.lmi.output_feedback import least_level_lmi
+
+    X, Y = equations.control.least, equations.estimation.least
+    _, witness = least_level_lmi(plant, X, Y, gamma)
+    return infeasible_control_level(plant, witness), witness
+
+
+def _least_controller(
+    form: DiscreteForm, equations: TwoRiccati, least: float
+) -> tuple[StateSpace, float]:
+    """Return a controller next to the least level, as near as its numbers allow, and its norm."""
+    best: tuple[float, StateSpace] | None = None
+    for apart in _APART:
+        controller = _central(equations, least * (1 + apart))
+        if controller is None:
+            continue
+        norm = form.norm(controller)
+        if best is None or norm < best[0]:
+            best = norm, controller
+        if norm <= least * (1 + 2 * apart):
+            break
+    if best is None or not np.isfinite(best[0]):
+        raise NumericalError(
+            f"no controller next to the least gamma, {least:.9g}, is stable in working accuracy. "
+            "Scale states and signals to similar sizes.",
+            status="search",
+        )
+    return best[1], best[0]
+
+
+def _central(equations: TwoRiccati, gamma: float) -> StateSpace | None:
+    """Return the central controller of a level, or None where it has none to be computed."""
+    _, solution = equations.solve(gamma)
+    if solution is None:
+        return None
+    with suppress(NumericalError):
+        return equations.controller(solution)
+    return None

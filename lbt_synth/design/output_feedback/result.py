@@ -1,0 +1,171 @@
+"""A controller of a generalised plant, with its certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from lbt_synth.design.certificate import (
+    INFEASIBLE_TOLERANCE,
+    LEVEL_SETS,
+    NORM_TOLERANCE,
+    VARIANCE_TOLERANCE,
+    Certificate,
+    Check,
+    certify_error,
+)
+from lbt_synth.linear.continuous_system import ContinuousSystem
+from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm
+from lbt_synth.linear.output_feedback.lower_bound import ControlWitness, infeasible_control_level
+from lbt_synth.linear.state_space import StateSpace, sigma_sparkline
+from lbt_synth.storage.rows import column, fact_table, row_table, table_row
+from lbt_synth.storage.summaries import Summarised, Summary
+
+System: TypeAlias = StateSpace | ContinuousSystem
+
+
+@table_row
+class ControllerFacts:
+    """What a controller of a generalised plant is, and what it leaves."""
+
+    method: str = column("method")
+    route: str = column("route")
+    n_states: int = column("states of the controller")
+    gamma: float = column("gamma, the norm from w to z")
+    gamma_requested: float | None = column("gamma requested")
+    gamma_least: float | None = column("least gamma, reached by a controller")
+    gamma_infeasible: float | None = column("gamma that no controller reaches")
+    rms: float | None = column("rms of z for white w of unit variance")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControllerDesign(Summarised):
+    """A certified controller of a generalised plant.
+
+    Attributes
+    ----------
+    plant : GeneralizedPlant
+        The plant.
+    controller : StateSpace or ContinuousSystem
+        From y to u, in textbook form and in the plant's time: ``u = K y``.
+    closed_loop : StateSpace or ContinuousSystem
+        From w to z.
+    gamma : float
+        H-infinity norm of the closed loop, recomputed.
+    rms : float
+        Standard deviation of z for white w of unit variance per sample (nan in continuous time).
+    gamma_requested, gamma_least, gamma_infeasible : float
+        The bound that was given; the norm that a controller achieves; and a level that none
+        reaches, proved by ``witness``. Where they were not computed they are nan.
+    witness : ControlWitness or None
+        The proof that ``gamma_infeasible`` cannot be reached; its ``reason`` says why in words.
+    certificate : Certificate
+        The checks, computed from the matrices of plant and controller alone.
+    method, route : str
+        "h2", "hinf", "mixed" or "mu", and how it was solved.
+    regularised : float
+        Share of the errors and disturbances that was added to solve a singular problem; 0 for
+        a regular one. The certificate is that of the plant as given.
+    """
+
+    plant: GeneralizedPlant
+    controller: System
+    closed_loop: System
+    gamma: float
+    rms: float
+    gamma_requested: float = np.nan
+    gamma_least: float = np.nan
+    gamma_infeasible: float = np.nan
+    witness: ControlWitness | None = None
+    certificate: Certificate
+    method: str
+    route: str
+    regularised: float = 0.0
+
+    def _brief(self) -> str:
+        return f"{self.method}, {len(self.controller.A)} states, gamma {self.gamma:.6g}"
+
+    def _summarise(self) -> Summary:
+        facts = ControllerFacts(
+            method=self.method,
+            route=self.route,
+            n_states=len(self.controller.A),
+            gamma=self.gamma,
+            gamma_requested=_given(self.gamma_requested),
+            gamma_least=_given(self.gamma_least),
+            gamma_infeasible=_given(self.gamma_infeasible),
+            rms=_given(self.rms),
+        )
+        notes = [] if self.witness is None else [f"below: {self.witness.reason}"]
+        if self.regularised:
+            notes.append(f"singular problem, regularised by a share of {self.regularised:g}")
+        loop, curve = self.closed_loop, None
+        if isinstance(loop, StateSpace):
+            curve = sigma_sparkline(loop, "largest singular value from w to z")
+        tables = [
+            fact_table("Controller", facts),
+            row_table("Certificate", self.certificate.checks),
+        ]
+        return Summary(tables=tables, notes=notes, curve=curve)
+
+
+def _given(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def certified_controller(
+    form: DiscreteForm,
+    controller: StateSpace,
+    *,
+    method: str,
+    route: str,
+    gamma_requested: float = np.nan,
+    gamma_least: float = np.nan,
+    gamma_infeasible: float = np.nan,
+    witness: ControlWitness | None = None,
+    regularised: float = 0.0,
+    least_rms: float = np.nan,
+    hint: str = "",
+) -> ControllerDesign:
+    """Close the loop, check every claim from the matrices, and return the design.
+
+    The controller is in the discrete form; ``least_rms`` is what the least variance is known to
+    be. Raises a CertificateError if a check fails.
+    """
+    K, loop, discrete = form.closed_loop(controller)
+    name = "spectral radius of the closed loop"
+    certificate = certify_error(discrete, stability=name, white=form.rate is None)
+    checks = list(certificate.checks)
+    if np.isfinite(certificate.gamma):
+        if np.isfinite(gamma_requested):
+            limit = gamma_requested * (1 + NORM_TOLERANCE)
+            checks.append(Check("norm of the closed loop", certificate.gamma, limit, LEVEL_SETS))
+        if np.isfinite(least_rms):
+            above = certificate.rms / max(least_rms, 1e-300) - 1
+            how = "closed loop against the Riccati equations"
+            checks.append(Check("rms over the least, less 1", above, VARIANCE_TOLERANCE, how))
+        if witness is not None:
+            proved = infeasible_control_level(form.plant, witness)
+            above = gamma_infeasible / max(proved, 1e-300) - 1
+            how = "pairs that no measurement shows and no control moves"
+            name = "infeasible level over the level proved, less 1"
+            checks.append(Check(name, above, INFEASIBLE_TOLERANCE, how))
+    certificate = replace(certificate, checks=tuple(checks)).require(hint)
+    return ControllerDesign(
+        plant=form.given,
+        controller=K,
+        closed_loop=loop,
+        gamma=certificate.gamma,
+        rms=certificate.rms if form.rate is None else np.nan,
+        gamma_requested=gamma_requested,
+        gamma_least=gamma_least,
+        gamma_infeasible=gamma_infeasible,
+        witness=witness,
+        certificate=certificate,
+        method=method,
+        route=route,
+        regularised=regularised,
+    )

@@ -1,0 +1,214 @@
+"""The generalised plant: what a controller sees and moves, and what it is judged by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, NumericalError
+from lbt_synth.linear.continuous_system import ContinuousSystem, linear_system, require_same_time
+from lbt_synth.linear.state_space import StateSpace
+from lbt_synth.storage.summaries import Summarised, count_text
+from lbt_synth.validation import FloatArray, integer, matrix, number, set_fields, square
+
+_ILL_POSED = 1e-12
+_ZERO = cast(FloatArray, None)  # of a feedthrough that is not given
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GeneralizedPlant(Summarised):
+    """Plant from disturbances w and controls u to errors z and measurements y.
+
+    ``x+ = A x + B1 w + B2 u``, ``z = C1 x + D11 w + D12 u``, ``y = C2 x + D21 w + D22 u``, with
+    ``x+ = x(k+1)``, or dx/dt where ``dt_s`` is None.
+
+    Parameters
+    ----------
+    A : (n, n) array_like
+        State matrix.
+    B1, B2 : (n, m1), (n, m2) array_like
+        Disturbance and control to state.
+    C1, C2 : (p1, n), (p2, n) array_like
+        State to error and to measurement.
+    D11, D12, D21, D22 : array_like, optional
+        Feedthroughs (p1, m1), (p1, m2), (p2, m1), (p2, m2); zero where not given.
+    dt_s : float or None, optional
+        Sampling period [s]; None for continuous time.
+
+    Raises
+    ------
+    ProblemError
+        If a matrix is not finite or the sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> P = lbt.linear.GeneralizedPlant(
+    ...     A=1.0,
+    ...     B1=[[1.0, 0.0]],
+    ...     B2=1.0,
+    ...     C1=[[1.0], [0.0]],
+    ...     C2=1.0,
+    ...     D12=[[0.0], [1.0]],
+    ...     D21=[[0.0, 1.0]],
+    ... )
+    >>> P
+    <GeneralizedPlant: 1 state, 2 disturbances, 1 control, 2 errors, 1 measurement>
+    """
+
+    A: FloatArray
+    B1: FloatArray
+    B2: FloatArray
+    C1: FloatArray
+    C2: FloatArray
+    D11: FloatArray = _ZERO
+    D12: FloatArray = _ZERO
+    D21: FloatArray = _ZERO
+    D22: FloatArray = _ZERO
+    dt_s: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        A = square(self.A, "A")
+        why = f"to match A {A.shape}"
+        B1, B2 = (matrix(getattr(self, k), k, rows=(len(A), why)) for k in ("B1", "B2"))
+        C1, C2 = (matrix(getattr(self, k), k, cols=(len(A), why)) for k in ("C1", "C2"))
+        set_fields(self, A=A, B1=B1, B2=B2, C1=C1, C2=C2)
+        for i, C in enumerate((C1, C2), 1):
+            for j, B in enumerate((B1, B2), 1):
+                name = f"D{i}{j}"
+                given = getattr(self, name)
+                value = np.zeros((len(C), B.shape[1])) if given is _ZERO else given
+                rows = (len(C), f"to match C{i} {C.shape}")
+                cols = (B.shape[1], f"to match B{j} {B.shape}")
+                set_fields(self, **{name: matrix(value, name, rows=rows, cols=cols)})
+        for word, value in (("B1", B1.T), ("B2", B2.T), ("C1", C1), ("C2", C2)):
+            if not len(value):
+                raise DimensionError(f"{word} must have at least one signal; got {value.shape}.")
+        if self.dt_s is not None:
+            set_fields(self, dt_s=number(self.dt_s, "dt_s", above=0))
+
+    def _brief(self) -> str:
+        words = ("state", "disturbance", "control", "error", "measurement")
+        sizes = (len(self.A), *self.sizes)
+        text = ", ".join(count_text(*each) for each in zip(sizes, words, strict=True))
+        return text + (", continuous time" if self.dt_s is None else "")
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of disturbances, controls, errors and measurements."""
+        return self.B1.shape[1], self.B2.shape[1], len(self.C1), len(self.C2)
+
+    @classmethod
+    def of(cls, system: Any, *, measurements: int, controls: int) -> GeneralizedPlant:
+        """Partition a system whose last inputs are the controls, whose last outputs are measured.
+
+        Parameters
+        ----------
+        system : object
+            As :func:`linear_system` takes it.
+        measurements, controls : int
+            Numbers of the last outputs and of the last inputs.
+
+        Raises
+        ------
+        ProblemError
+            If no disturbance or no error is left.
+        """
+        G = linear_system(system)
+        p, m = G.D.shape
+        q = integer(measurements, "measurements", at_least=1, at_most=p - 1)
+        r = integer(controls, "controls", at_least=1, at_most=m - 1)
+        return cls(
+            **_partition(G.A, G.B, G.C, G.D, p - q, m - r),
+            dt_s=require_same_time(G),
+        )
+
+    @property
+    def whole(self) -> StateSpace | ContinuousSystem:
+        """System from [w; u] to [z; y]."""
+        B, C = np.hstack([self.B1, self.B2]), np.vstack([self.C1, self.C2])
+        D = np.block([[self.D11, self.D12], [self.D21, self.D22]])
+        if self.dt_s is None:
+            return ContinuousSystem(A=self.A, B=B, C=C, D=D)
+        return StateSpace(A=self.A, B=B, C=C, D=D, dt_s=self.dt_s)
+
+    def with_whole(self, system: StateSpace | ContinuousSystem) -> GeneralizedPlant:
+        """Return the plant of another system with the same partition."""
+        m1, _, p1, _ = self.sizes
+        parts = _partition(system.A, system.B, system.C, system.D, p1, m1)
+        return GeneralizedPlant(**parts, dt_s=require_same_time(system))
+
+    def without_D22(self) -> GeneralizedPlant:
+        """Return the plant whose measurements do not see the control at once."""
+        return replace(self, D22=np.zeros_like(self.D22))
+
+    def closed_loop(self, controller: StateSpace | ContinuousSystem) -> Any:
+        """Return the system from w to z with ``u = K y``.
+
+        Parameters
+        ----------
+        controller : StateSpace or ContinuousSystem
+            From y (p2) to u (m2), in textbook form and in the plant's time.
+
+        Raises
+        ------
+        DimensionError
+            If the controller does not fit.
+        NumericalError
+            If ``I - D22 D`` is singular, so that the loop has no solution.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> P = lbt.linear.GeneralizedPlant(A=1.0, B1=1.0, B2=1.0, C1=1.0, C2=1.0)
+        >>> P.closed_loop(lbt.linear.StateSpace(A=0.0, B=0.0, C=0.0, D=-1.0)).spectral_radius
+        0.0
+        """
+        _, m2, _, p2 = self.sizes
+        K = controller
+        if K.D.shape != (m2, p2):
+            raise DimensionError(
+                f"the controller must map {p2} measurements to {m2} controls; got D {K.D.shape}."
+            )
+        require_same_time(self.whole, K)
+        x, w, y = len(self.A), self.B1.shape[1], invert_well_posed(self.D22, K.D)
+        # y = loop (C2 x + D21 w + D22 C xk)
+        measured = y @ np.hstack([self.C2, self.D22 @ K.C, self.D21])
+        control = K.D @ measured
+        control[:, x : x + len(K.A)] += K.C
+        rows = np.vstack(
+            [
+                np.hstack([self.A, np.zeros((x, len(K.A))), self.B1]) + self.B2 @ control,
+                np.hstack([np.zeros((len(K.A), x)), K.A, np.zeros((len(K.A), w))]) + K.B @ measured,
+            ]
+        )
+        error = np.hstack([self.C1, np.zeros((len(self.C1), len(K.A))), self.D11])
+        error = error + self.D12 @ control
+        n = x + len(K.A)
+        return replace(K, A=rows[:, :n], B=rows[:, n:], C=error[:, :n], D=error[:, n:])
+
+
+def invert_well_posed(D22: FloatArray, D: FloatArray) -> FloatArray:
+    """Return ``(I - D22 D)^-1``, (p2, p2); refuse a singular one."""
+    loop = np.eye(len(D22)) - D22 @ D
+    size = max(1.0, float(np.linalg.norm(loop)))
+    if np.linalg.svd(loop, compute_uv=False)[-1] < _ILL_POSED * size:
+        raise NumericalError(
+            "the loop is not well posed: I - D22 D is singular, so control and measurement of "
+            "one instant contradict each other. Try a slightly larger gamma, or a delay in the "
+            "plant.",
+            status="ill posed",
+        )
+    return np.asarray(np.linalg.inv(loop))
+
+
+def _partition(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, p1: int, m1: int
+) -> dict[str, Any]:
+    """Parts of a system whose first p1 outputs are errors, first m1 inputs disturbances."""
+    first, last, own, other = slice(p1), slice(p1, None), slice(m1), slice(m1, None)
+    parts = {"A": A, "B1": B[:, own], "B2": B[:, other], "C1": C[first], "C2": C[last]}
+    parts |= {"D11": D[first, own], "D12": D[first, other]}
+    return parts | {"D21": D[last, own], "D22": D[last, other]}

@@ -1,0 +1,78 @@
+"""The least gamma of a controller by linear matrix inequalities, without its matrices.
+
+P. Gahinet, P. Apkarian, Int. J. Robust Nonlinear Control 4, 421 (1994),
+doi:10.1002/rnc.4590040403, theorem 4.2 in discrete time. It asks nothing of D12 and D21. The dual
+solution proves that no controller reaches less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+from scipy.linalg import null_space
+
+from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
+from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
+from lbt_synth.linear.output_feedback.full_information import Side, control_side, estimation_side
+from lbt_synth.linear.output_feedback.lower_bound import ControlWitness
+from lbt_synth.validation import FloatArray
+
+_REASON = "the dual of the matrix inequalities has a point there"
+
+
+def least_level_lmi(
+    plant: GeneralizedPlant, X: FloatArray, Y: FloatArray, scale: float
+) -> tuple[float, ControlWitness]:
+    """Return the least gamma of the programme, and the witness of its dual solution.
+
+    X and Y (n, n), least costs of control and of estimation, give each side coordinates in which
+    its storage matrix is at most gamma; the scale is the size of gamma.
+    """
+    scaled = replace(plant, C1=plant.C1 / scale, D11=plant.D11 / scale, D12=plant.D12 / scale)
+    X = X / scale**2
+    level = cp.Variable()
+    sides = [_Storage(estimation_side(scaled), Y), _Storage(control_side(scaled), X)]
+    constraints = [side.dissipation(level) << 0 for side in sides]
+    shared = sides[0].basis.T @ sides[1].basis
+    coupling = cp.bmat([[sides[0].storage, shared], [shared.T, sides[1].storage]])
+    run = solve(cp.Minimize(level), [*constraints, symmetrise(coupling) >> 0])
+    require_optimum(run, "the least gamma's semidefinite programme", 'Try route="riccati".')
+    unseen, unmoved = (
+        side.pairs(each.dual_value) for side, each in zip(sides, constraints, strict=True)
+    )
+    unmoved = replace(unmoved, disturbances=unmoved.disturbances / scale)
+    witness = ControlWitness(unseen=unseen, unmoved=unmoved, reason=_REASON)
+    return float(level.value) * scale, witness
+
+
+class _Storage:
+    """The storage matrix of one side, and the pairs that its constraint hides."""
+
+    def __init__(self, side: Side, least: FloatArray) -> None:
+        self.side = side
+        self.basis, self.inverse = whitening_coordinates(least)
+        self.size = self.basis.shape[1]
+        self.hidden = null_space(np.hstack([side.B2.T @ self.basis, side.D12.T]))
+        self.storage = cp.Variable((self.size, self.size), symmetric=True)
+
+    def dissipation(self, level: Any) -> Any:
+        """Return the matrix that must be negative."""
+        side, states, signals = self.side, self.hidden[: self.size], self.hidden[self.size :]
+        x = self.basis @ states
+        after = self.inverse @ (side.A.T @ x + side.C1.T @ signals)
+        gained = side.B1.T @ x + side.D11.T @ signals
+        growth = after.T @ self.storage @ after - states.T @ self.storage @ states
+        spent = growth - level * (signals.T @ signals)
+        return symmetrise(cp.bmat([[spent, gained.T], [gained, -level * np.eye(len(gained))]]))
+
+    def pairs(self, dual: FloatArray) -> Witness:
+        """Return the pairs of a dual solution."""
+        count = self.hidden.shape[1]
+        moments = dual[:count, :count]
+        values, vectors = np.linalg.eigh((moments + moments.T) / 2)
+        found = self.hidden @ (vectors * np.sqrt(np.maximum(values, 0)))
+        return Witness(states=self.basis @ found[: self.size], disturbances=found[self.size :])

@@ -1,0 +1,94 @@
+"""The form in which a generalised plant is solved: discrete time, balanced states."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lbt_synth.errors import NumericalError, ProblemError, SynthesisError
+from lbt_synth.linear.continuous_system import ContinuousSystem
+from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.norms import hinf_norm
+from lbt_synth.linear.output_feedback.existence import require_stabilisable
+from lbt_synth.linear.output_feedback.least_level import TwoRiccati
+from lbt_synth.linear.output_feedback.regularised import regularise
+from lbt_synth.linear.state_space import StateSpace
+from lbt_synth.validation import require_instance
+
+_RATES = (1.0, 1.37, 0.73, 2.91)  # tried in turn, where a pole is in the way of the map
+_SHARES = (1e-6, 1e-5, 1e-4)  # of the errors and disturbances, for singular problems
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DiscreteForm:
+    """A plant as it was given, and as it is solved."""
+
+    given: GeneralizedPlant
+    plant: GeneralizedPlant  # in discrete time, states scaled by powers of two
+    rate: float | None  # of the bilinear map [1/s]; None for a plant in discrete time
+
+    def original(self, controller: StateSpace) -> Any:
+        """Return a controller in the time of the plant that was given."""
+        if self.rate is None:
+            return controller
+        return ContinuousSystem.from_discrete(controller, self.rate)
+
+    def closed_loop(self, controller: StateSpace) -> tuple[Any, Any, StateSpace]:
+        """Return the controller in the time that was given, its loop, and its discrete map."""
+        K = self.original(controller)
+        loop = self.given.closed_loop(K)
+        return K, loop, loop if self.rate is None else loop.to_discrete(self.rate)
+
+    def norm(self, controller: StateSpace) -> float:
+        """Return the norm of the loop, from above; infinite if it is not stable."""
+        try:
+            loop = self.closed_loop(controller)[2]
+        except NumericalError:
+            return np.inf
+        return hinf_norm(loop).upper if loop.spectral_radius < 1 else np.inf
+
+    def equations(self) -> tuple[TwoRiccati, float]:
+        """Return the equations of the plant, or of the one next to it if it is singular.
+
+        The second value is the share of errors and disturbances that was added.
+        """
+        for share in (0.0, *_SHARES[:-1]):
+            with suppress(ProblemError, SynthesisError):
+                plant = regularise(self.plant, share) if share else self.plant
+                return TwoRiccati(plant, self.rate), share
+        return TwoRiccati(regularise(self.plant, _SHARES[-1]), self.rate), _SHARES[-1]
+
+
+def discrete_form(plant: GeneralizedPlant, *, continuous: bool = True) -> DiscreteForm:
+    """Return the form in which a plant is solved, if some controller stabilises it.
+
+    Raises a DetectabilityError if none does, and a ProblemError for a plant in continuous time
+    where ``continuous`` is False.
+    """
+    require_instance(plant, GeneralizedPlant, "plant")
+    whole = plant.whole
+    if isinstance(whole, StateSpace):
+        require_stabilisable(plant)
+        return DiscreteForm(given=plant, plant=plant.with_whole(whole.balanced()), rate=None)
+    if not continuous:
+        raise ProblemError(
+            "the least variance needs a plant in discrete time; got dt_s=None. Try "
+            "control.sample_system, or hinf_controller, whose norm the bilinear map keeps."
+        )
+    rate = _map_rate(whole)
+    mapped = plant.with_whole(whole.to_discrete(rate))
+    require_stabilisable(mapped, rate)
+    balanced = mapped.with_whole(mapped.whole.balanced())  # type: ignore[union-attr]
+    return DiscreteForm(given=plant, plant=balanced, rate=rate)
+
+
+def _map_rate(system: ContinuousSystem) -> float:
+    """Rate of the map that puts the poles about a quarter of the circle: their geometric mean."""
+    size = np.abs(system.poles)
+    size = size[size > 1e-9 * max(float(size.max()), 1e-300)]
+    middle = float(np.exp(np.mean(np.log(size)))) if size.size else 1.0
+    away = [np.min(np.abs(system.poles / (middle * factor) - 1)) for factor in _RATES]
+    return middle * _RATES[int(np.argmax(np.array(away) > 0.05))]

@@ -1,0 +1,208 @@
+"""Prove that no controller reaches a level of gamma, in closed form.
+
+Two kinds of pairs are used. States and disturbances (x, w) that no measurement shows,
+``C2 x + D21 w = 0``, leave the controller without a reason to act. Costates and error weights
+(p, v) that no control moves, ``B2'p + D12'v = 0``, leave it without a means. Let the successors
+``A x + B1 w`` have the second moments of the x and some growth G1 >= 0 more, those ``A'p + C1'v``
+of the p and G2 >= 0 more. Then, whatever the controller,
+
+    gamma^2 (|w|^2 + |v|^2) > |C1 x + D11 w|^2 + |B1'p + D11'v|^2 + 2 gamma ||G1^(1/2) G2^(1/2)||_*
+
+(Frobenius norms, and the nuclear norm) by weak duality with the inequalities of P. Gahinet,
+P. Apkarian, Int. J. Robust Nonlinear Control 4, 421 (1994), doi:10.1002/rnc.4590040403. Where
+rounding makes a growth indefinite, the price of the shortfall is added on the left.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import eigh, null_space
+from scipy.optimize import minimize_scalar
+
+from lbt_synth.errors import ProblemError, SynthesisError
+from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.output_feedback.full_information import (
+    Side,
+    WorstCase,
+    control_side,
+    estimation_side,
+)
+from lbt_synth.linear.riccati.dare import solve_dare
+from lbt_synth.validation import FloatArray
+
+_STEPS = 64  # of the recursion that bounds the storage matrix
+_STRAYED = 1e-9  # share of the successors that may lie outside of its range
+_WIDEST = 12.0  # logarithm of the relative weight of the two sides
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlWitness:
+    """Why no controller reaches a level.
+
+    Attributes
+    ----------
+    unseen : Witness or None
+        States (n, r) and disturbances (m1, r) that no measurement shows.
+    unmoved : Witness or None
+        Costates (n, s) and weights of the error (p1, s) that no control moves.
+    reason : str
+        The reason in words.
+    """
+
+    unseen: Witness | None
+    unmoved: Witness | None
+    reason: str
+
+
+NO_PROOF = ControlWitness(unseen=None, unmoved=None, reason="no proof was found")
+
+
+@dataclass(frozen=True, slots=True)
+class _Moments:
+    """What a set of pairs gains and spends, and a root of its growth."""
+
+    gained: float
+    spent: float
+    root: FloatArray  # (n, r)
+
+
+def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -> float:
+    """Level of gamma below which a witness proves that no controller exists.
+
+    Parameters
+    ----------
+    plant : GeneralizedPlant
+        In discrete time.
+    witness : ControlWitness
+        The pairs; what measurements would show or controls move is removed first.
+
+    Returns
+    -------
+    float
+        The level; 0 if the witness proves nothing.
+
+    Examples
+    --------
+    A disturbance that is seen only after it has acted:
+
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.linear import ControlWitness, GeneralizedPlant, Witness
+    >>> P = GeneralizedPlant(A=0.0, B1=1.0, B2=0.0, C1=0.0, C2=1.0, D11=2.0, D12=1.0)
+    >>> push = Witness(states=np.zeros((1, 1)), disturbances=np.ones((1, 1)))
+    >>> lbt.linear.infeasible_control_level(
+    ...     P, ControlWitness(unseen=push, unmoved=None, reason="not seen in time")
+    ... )
+    2.0
+    """
+    pairs = (witness.unseen, estimation_side(plant)), (witness.unmoved, control_side(plant))
+    found = [_moments(side, each) for each, side in pairs if each is not None]
+    levels = [np.sqrt(m.gained / m.spent) for m in found if m.spent > 0]
+    if len(found) == 2:
+        levels.append(_coupled_level(*found))
+    return float(max(levels, default=0.0))
+
+
+def _coupled_level(one: _Moments, two: _Moments) -> float:
+    """Level that both sides prove together, at the best relative weight of the two."""
+    shared = float(np.linalg.norm(one.root.T @ two.root, "nuc"))
+
+    def level(weight: float) -> float:
+        t = np.exp(weight)
+        spent = t * one.spent + two.spent / t
+        gained = t * one.gained + two.gained / t
+        return float((shared + np.sqrt(shared**2 + gained * spent)) / max(spent, 1e-300))
+
+    grid = np.linspace(-_WIDEST, _WIDEST, 97)
+    best = float(grid[int(np.argmax([level(w) for w in grid]))])
+    step = float(grid[1] - grid[0])
+    found = minimize_scalar(
+        lambda w: -level(w),
+        bounds=(best - step, best + step),
+        method="bounded",
+        options={"xatol": 1e-9},
+    )
+    return max(level(best), level(float(found.x)))
+
+
+def _moments(side: Side, pairs: Witness) -> _Moments:
+    """Evaluate pairs against the side in whose equation they are the costates."""
+    basis, inverse = whitening_coordinates(_least_storage(side))
+    states = basis @ (inverse @ pairs.states)
+    # the least change that hides the pairs, by any signal that the constraint reads
+    shown = side.B2.T @ states + side.D12.T @ pairs.disturbances
+    signals = pairs.disturbances - np.linalg.pinv(side.D12.T, rcond=1e-10) @ shown
+    left = side.B2.T @ states + side.D12.T @ signals
+    size = np.linalg.norm(side.B2.T @ states) + np.linalg.norm(side.D12.T @ signals)
+    after = side.A.T @ states + side.C1.T @ signals
+    strayed = np.linalg.norm(after - basis @ (inverse @ after))
+    nothing = _Moments(0.0, 1.0, np.zeros((len(states), 1)))
+    if strayed > _STRAYED * np.linalg.norm(after) or np.linalg.norm(left) > 1e-12 * size:
+        return nothing
+    growth = inverse @ (after @ after.T - states @ states.T) @ inverse.T
+    values, vectors = np.linalg.eigh((growth + growth.T) / 2)
+    gained = float(np.sum((side.B1.T @ states + side.D11.T @ signals) ** 2))
+    spent = float(np.sum(signals**2)) - float(values[values < 0].sum())
+    return _Moments(gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
+
+
+def _least_storage(side: Side) -> FloatArray:
+    """Bound from below what any law leaves: the least cost, or some steps of its recursion."""
+    A, B, Q = side.A, side.B2, side.C1.T @ side.C1
+    R, S = side.D12.T @ side.D12, side.C1.T @ side.D12
+    with suppress(ProblemError, SynthesisError):  # a singular problem has no stabilising law
+        return solve_dare(A, B, Q, R, S).X
+    X = np.zeros_like(A)
+    for _ in range(_STEPS):
+        law = np.linalg.lstsq(R + B.T @ X @ B, B.T @ X @ A + S.T, rcond=1e-13)[0]
+        step, error = A - B @ law, side.C1 - side.D12 @ law
+        X = step.T @ X @ step + error.T @ error
+        X = (X + X.T) / 2
+    return X
+
+
+def last_step(worst: WorstCase, X: FloatArray) -> Witness:
+    """Return the burst that ends with the worst last disturbance."""
+    burst = _burst(worst, X, worst.entry)
+    return replace(
+        burst,
+        states=np.hstack([burst.states, X @ worst.entry]),
+        disturbances=np.hstack([burst.disturbances, worst.error]),
+    )
+
+
+def _burst(worst: WorstCase, X: FloatArray, seed: FloatArray) -> Witness:
+    """Return the pairs along the worst trajectory from a seed (n, 1)."""
+    values, vectors = np.linalg.eigh(stationary_covariance(worst.A, seed @ seed.T))
+    roots = vectors * np.sqrt(np.maximum(values, 0))
+    return Witness(states=X @ worst.A @ roots, disturbances=worst.C @ roots)
+
+
+def coupled_bursts(
+    control: WorstCase, X: FloatArray, estimation: WorstCase, Y: FloatArray
+) -> tuple[Witness, Witness]:
+    """Return the bursts of both sides that meet where the product of X and Y is largest."""
+    values, vectors = np.linalg.eigh(X)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    meeting = root @ np.linalg.eigh(root.T @ Y @ root)[1][:, -1:]
+    return _burst(estimation, Y, meeting), _burst(control, X, Y @ meeting)
+
+
+def steady_oscillation(side: Side, angle: float) -> Witness:
+    """Return the pairs of one frequency that gain most: no law changes them."""
+    n = len(side.A)
+    turn = np.exp(1j * angle) * np.eye(n)
+    pairs = null_space(np.block([[turn - side.A.T, -side.C1.T], [side.B2.T, side.D12.T]]))
+    if pairs.shape[1] == 0:
+        return Witness(states=np.zeros((n, 1)), disturbances=np.zeros((len(side.C1), 1)))
+    gain = side.B1.T @ pairs[:n] + side.D11.T @ pairs[n:]
+    spent = pairs[n:].conj().T @ pairs[n:]
+    floor = 1e-13 * max(np.trace(spent).real, 1e-300) * np.eye(len(spent))
+    best = pairs @ eigh(gain.conj().T @ gain, spent + floor)[1][:, -1]
+    parts = np.stack([best.real, best.imag], axis=1)
+    return Witness(states=parts[:n], disturbances=parts[n:])

@@ -1,0 +1,131 @@
+"""H-infinity controllers of generalised plants, and why there is none."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+import scipy.signal
+from support.generalized_plants import random_plant
+
+import lbt_synth as lbt
+from lbt_synth.errors import DetectabilityError, InfeasibleError, ProblemError
+from lbt_synth.linear import GeneralizedPlant, linear_system
+
+
+@pytest.mark.parametrize("route", ["riccati", "lmi"])
+@pytest.mark.parametrize("dt_s", [1e-3, None])
+def test_routes_agree(route, dt_s):
+    plant = random_plant(3, n=4, dt_s=dt_s)
+    design = lbt.hinf_controller(plant, gamma_ratio=1.1, route=route)
+    assert design.gamma <= design.gamma_requested * (1 + 1e-9)
+    assert design.gamma_least == pytest.approx(lbt.hinf_controller(plant).gamma_least, rel=1e-6)
+    assert design.certificate.passed
+
+
+def test_continuous_norm_is_that_of_the_response():
+    design = lbt.hinf_controller(random_plant(4, n=4, dt_s=None), gamma_ratio=1.05)
+    assert np.all(design.closed_loop.poles.real < 0)
+    response = design.closed_loop.frequency_response(np.geomspace(1e-4, 1e3, 2000))
+    highest = np.linalg.norm(response, 2, axis=(1, 2)).max()
+    assert highest == pytest.approx(design.gamma, rel=1e-3)
+    assert np.isnan(design.rms)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_singular_feedthrough(seed):
+    """A control without a weight and a measurement without noise: the limit of small ones."""
+    plant = random_plant(seed, n=4, D12=0.0 if seed % 2 else None, D21=0.0 if seed % 3 else None)
+    singular = lbt.hinf_controller(plant)
+    small = 1e-5
+    n = len(plant.A)
+    m1, m2, p1, p2 = plant.sizes
+    near = GeneralizedPlant(
+        A=plant.A,
+        B1=np.hstack([plant.B1, np.zeros((n, p2))]),
+        B2=plant.B2,
+        C1=np.vstack([plant.C1, np.zeros((m2, n))]),
+        C2=plant.C2,
+        D11=np.block([[plant.D11, np.zeros((p1, p2))], [np.zeros((m2, m1 + p2))]]),
+        D12=np.vstack([plant.D12, small * np.eye(m2)]),
+        D21=np.hstack([plant.D21, small * np.eye(p2)]),
+        D22=plant.D22,
+    )
+    assert singular.gamma_least == pytest.approx(lbt.hinf_controller(near).gamma_least, rel=1e-4)
+    assert singular.gamma_infeasible <= singular.gamma_least
+
+
+def test_unreachable_mode_is_named():
+    plant = GeneralizedPlant(
+        A=[[1.2, 0.0, 0.0], [0.0, 0.5, 1.0], [0.0, 0.0, 0.3]],
+        B1=np.ones((3, 1)),
+        B2=[[0.0], [0.0], [1.0]],
+        C1=np.ones((1, 3)),
+        C2=np.ones((1, 3)),
+        D12=1.0,
+        D21=1.0,
+    )
+    with pytest.raises(DetectabilityError, match=r"at 1\.2 .* no control .* states 0 \(1\)") as got:
+        lbt.hinf_controller(plant)
+    assert got.value.eigenvalue == pytest.approx(1.2)
+    assert got.value.eigenvector == pytest.approx([1, 0, 0], abs=1e-9)
+
+
+def test_unseen_mode_is_named_in_continuous_time():
+    """A weight that integrates: nobody can stabilise it."""
+    plant = GeneralizedPlant(
+        A=[[-1.0, 0.0], [1.0, 0.0]],
+        B1=[[1.0], [0.0]],
+        B2=[[1.0], [0.0]],
+        C1=[[0.0, 1.0], [0.0, 0.0]],
+        C2=[[1.0, 0.0]],
+        D12=[[0.0], [1.0]],
+        D21=[[1.0]],
+        dt_s=None,
+    )
+    with pytest.raises(DetectabilityError, match=r"no measurement sees it.*states 1 \(1\)") as got:
+        lbt.hinf_controller(plant)
+    assert abs(got.value.eigenvalue) < 1e-9
+
+
+def test_infeasible_level_names_least_and_reason():
+    plant = random_plant(3, n=4)
+    least = lbt.hinf_controller(plant).gamma_least
+    with pytest.raises(InfeasibleError, match="because") as got:
+        lbt.hinf_controller(plant, gamma=0.9 * least)
+    assert got.value.gamma_least == pytest.approx(least)
+
+
+def test_arguments():
+    plant = random_plant(3, n=3)
+    with pytest.raises(ProblemError, match="not both"):
+        lbt.hinf_controller(plant, gamma=3.0, gamma_ratio=1.1)
+    with pytest.raises(ProblemError, match="gamma_ratio must be at least 1"):
+        lbt.hinf_controller(plant, gamma_ratio=0.9)
+    with pytest.raises(ProblemError, match="must be a GeneralizedPlant"):
+        lbt.hinf_controller(np.eye(2))
+
+
+def test_systems_of_others():
+    """python-control and scipy.signal give the same plant, and take the controller back."""
+    plant = random_plant(3, n=3, dt_s=None)
+    whole = plant.whole
+    _, controls, _, measurements = plant.sizes
+    least = lbt.hinf_controller(plant).gamma_least
+    for system in (whole.to_control(), scipy.signal.StateSpace(whole.A, whole.B, whole.C, whole.D)):
+        same = GeneralizedPlant.of(system, measurements=measurements, controls=controls)
+        assert same.dt_s is None
+        design = lbt.hinf_controller(same)
+        assert design.gamma_least == pytest.approx(least, rel=1e-6)
+    back = linear_system(design.controller.to_control())
+    assert back.D == pytest.approx(design.controller.D)
+    assert linear_system(control.tf([1.0], [1.0, 0.5], 0.1)).dt_s == 0.1
+    assert linear_system(scipy.signal.dlti([1.0], [1.0, 0.5], dt=0.2)).dt_s == 0.2
+    with pytest.raises(ProblemError, match="a system must be"):
+        linear_system(3.0)
+
+
+def test_printed_design():
+    text = lbt.hinf_controller(random_plant(3, n=3), gamma_ratio=1.1).summary()
+    assert "gamma that no controller reaches" in text
+    assert "below: " in text

@@ -1,0 +1,80 @@
+"""The least gamma of a controller, against SLICOT, closed forms and the inequality."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.generalized_plants import random_plant, stacked
+
+import lbt_synth as lbt
+from lbt_synth.linear.lmi.output_feedback import least_level_lmi
+from lbt_synth.linear.output_feedback.least_level import TwoRiccati
+
+slycot = pytest.importorskip("slycot")
+
+
+def slicot_norm(plant, gamma):
+    """Norm of the loop of SB10DD at a level, infinite where it has none."""
+    sizes, parts = stacked(plant)
+    try:
+        A, B, C, D = slycot.sb10dd(*sizes, gamma, *parts)[1:5]
+    except slycot.exceptions.SlycotError:
+        return np.inf
+    loop = plant.closed_loop(lbt.linear.StateSpace(A=A, B=B, C=C, D=D))
+    return float(lbt.hinf_norm(loop)) if loop.spectral_radius < 1 else np.inf
+
+
+@pytest.mark.parametrize("seed", range(1, 13))
+def test_slicot_reaches_no_less(seed):
+    plant = random_plant(seed)
+    least = lbt.hinf_controller(plant).gamma_least
+    assert slicot_norm(plant, least * (1 - 1e-6)) > least * (1 - 1e-6)
+    assert slicot_norm(plant, least * 1.01) < least * 1.01
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_witness_closes_the_bracket(seed):
+    design = lbt.hinf_controller(random_plant(seed))
+    assert design.gamma_least * (1 - 1e-6) < design.gamma_infeasible <= design.gamma_least
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_inequality_finds_the_same_level(seed):
+    plant = random_plant(seed, n=5, D22=False)
+    equations = TwoRiccati(plant)
+    least = equations.least_level().gamma
+    X, Y = equations.control.least, equations.estimation.least
+    level, witness = least_level_lmi(plant, X, Y, 2 * least)
+    assert level == pytest.approx(least, rel=1e-6)
+    assert lbt.linear.infeasible_control_level(plant, witness) == pytest.approx(least, rel=1e-6)
+
+
+def test_unseen_disturbance_at_one_instant():
+    """What is pushed and not measured is left: z = 2 w."""
+    plant = lbt.linear.GeneralizedPlant(
+        A=0.5, B1=[[0.0, 1.0]], B2=1.0, C1=0.0, C2=1.0, D11=[[2.0, 0.0]], D12=1.0, D21=[[0.0, 1.0]]
+    )
+    assert lbt.hinf_controller(plant).gamma_least == pytest.approx(2.0, rel=1e-8)
+
+
+def test_least_level_of_nothing_left():
+    """Three measurements of three disturbances and a control of the only error."""
+    plant = lbt.linear.GeneralizedPlant(
+        A=0.5, B1=np.ones((1, 3)), B2=1.0, C1=1.0, C2=np.zeros((3, 1)), D12=1.0, D21=np.eye(3)
+    )
+    assert lbt.hinf_controller(plant).gamma_least < 1e-9
+
+
+@pytest.mark.parametrize("seed", [14, 23])
+def test_oscillation_limits_the_level(seed):
+    """No controller makes good what happens at one frequency: the response there says so."""
+    design = lbt.hinf_controller(random_plant(seed, D22=False))
+    *_, frequency, unit = design.witness.reason.split()
+    assert unit == "Hz"
+    response = design.plant.whole.frequency_response([float(frequency)])[0]
+    _, m2, _, p2 = design.plant.sizes
+    P11, P12, P21 = response[:-p2, :-m2], response[:-p2, -m2:], response[-p2:, :-m2]
+    left = (np.eye(len(P12)) - P12 @ np.linalg.pinv(P12)) @ P11
+    right = P11 @ (np.eye(P21.shape[1]) - np.linalg.pinv(P21) @ P21)
+    least = max(np.linalg.norm(left, 2), np.linalg.norm(right, 2))
+    assert design.gamma_least == pytest.approx(least, rel=1e-6)

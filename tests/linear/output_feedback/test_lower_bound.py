@@ -1,0 +1,47 @@
+"""What a witness proves, and what it does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.generalized_plants import random_plant
+
+import lbt_synth as lbt
+from lbt_synth.linear import ControlWitness, Witness, infeasible_control_level
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_no_controller_is_better_than_proved(seed):
+    """Levels proved by arbitrary pairs lie below the norm of every controller."""
+    plant = random_plant(seed, D22=False)
+    m1, _, p1, _ = plant.sizes
+    rng = np.random.default_rng(seed)
+    least = lbt.hinf_controller(plant).gamma_least
+    for _ in range(20):
+        sizes = (len(plant.A), m1), (len(plant.A), p1)
+        unseen, unmoved = (
+            Witness(states=rng.normal(size=(n, 4)), disturbances=rng.normal(size=(m, 4)))
+            for n, m in sizes
+        )
+        witness = ControlWitness(unseen=unseen, unmoved=unmoved, reason="drawn")
+        assert infeasible_control_level(plant, witness) < least * (1 + 1e-9)
+
+
+def test_perturbed_witness_proves_less():
+    plant = random_plant(4, D22=False)
+    design = lbt.hinf_controller(plant)
+    rng = np.random.default_rng(0)
+    unseen = design.witness.unseen
+    noise = 0.1 * np.abs(unseen.states).max() * rng.normal(size=unseen.states.shape)
+    moved = replace(unseen, states=unseen.states + noise)
+    proved = infeasible_control_level(plant, replace(design.witness, unseen=moved))
+    assert proved < design.gamma_infeasible
+    assert infeasible_control_level(plant, design.witness) > 0.999999 * design.gamma_infeasible
+
+
+def test_nothing_is_proved_by_nothing():
+    plant = random_plant(4)
+    nothing = ControlWitness(unseen=None, unmoved=None, reason="")
+    assert infeasible_control_level(plant, nothing) == 0

@@ -1,0 +1,62 @@
+"""Generalised plants: their partition, and the loop around a controller."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.generalized_plants import random_plant
+
+import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.linear import GeneralizedPlant, StateSpace
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_closed_loop_is_the_fractional_transformation(seed):
+    P = random_plant(seed, n=4)
+    m1, m2, p1, p2 = P.sizes
+    rng = np.random.default_rng(seed)
+    K = StateSpace(
+        A=0.3 * rng.normal(size=(3, 3)),
+        B=rng.normal(size=(3, p2)),
+        C=rng.normal(size=(m2, 3)),
+        D=0.1 * rng.normal(size=(m2, p2)),
+    )
+    frequency_hz = np.linspace(0.01, 0.5, 9)
+    G, Kf = P.whole.frequency_response(frequency_hz), K.frequency_response(frequency_hz)
+    P11, P12, P21, P22 = (
+        G[:, a, b] for a in (slice(p1), slice(p1, None)) for b in (slice(m1), slice(m1, None))
+    )
+    expected = P11 + P12 @ np.linalg.solve(np.eye(m2) - Kf @ P22, Kf @ P21)
+    assert P.closed_loop(K).frequency_response(frequency_hz) == pytest.approx(expected, rel=1e-8)
+
+
+def test_partition_and_back():
+    P = random_plant(2, n=3)
+    _, controls, _, measurements = P.sizes
+    again = GeneralizedPlant.of(P.whole, measurements=measurements, controls=controls)
+    for name in ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21", "D22"):
+        assert np.array_equal(getattr(P, name), getattr(again, name))
+
+
+def test_bad_plants():
+    with pytest.raises(DimensionError, match=r"D12 must have 1 row to match C1"):
+        GeneralizedPlant(A=1.0, B1=1.0, B2=1.0, C1=1.0, C2=1.0, D12=np.ones((2, 1)))
+    with pytest.raises(DimensionError, match="B2 must have at least one signal"):
+        GeneralizedPlant(A=1.0, B1=1.0, B2=np.zeros((1, 0)), C1=1.0, C2=1.0)
+    with pytest.raises(ProblemError, match="measurements must be at most 1"):
+        GeneralizedPlant.of(
+            lbt.linear.StateSpace(A=1.0, B=[[1.0, 1.0]], C=[[1.0], [1.0]], D=np.zeros((2, 2))),
+            measurements=2,
+            controls=1,
+        )
+
+
+def test_bad_loops():
+    P = GeneralizedPlant(A=0.5, B1=1.0, B2=1.0, C1=1.0, C2=1.0, D22=1.0)
+    with pytest.raises(DimensionError, match="1 measurements to 1 controls"):
+        P.closed_loop(StateSpace(A=0.0, B=np.zeros((1, 2)), C=0.0, D=np.zeros((1, 2))))
+    with pytest.raises(NumericalError, match="not well posed"):
+        P.closed_loop(StateSpace(A=0.0, B=0.0, C=0.0, D=1.0))
+    with pytest.raises(ProblemError, match="same time"):
+        P.closed_loop(lbt.linear.ContinuousSystem(A=-1.0, B=1.0, C=1.0, D=0.0))

@@ -1,0 +1,44 @@
+"""Random generalised plants."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import lbt_synth as lbt
+
+
+def random_plant(seed, *, n=None, dt_s=1.0, D22=True, D12=None, D21=None):
+    """A generalised plant of 2 to 20 states, stable or unstable, with all feedthroughs."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 21)) if n is None else n
+    m1, m2, p1, p2 = (int(rng.integers(1, 4)) for _ in range(4))
+    m1, p1 = max(m1, p2), max(p1, m2)
+
+    def draw(*shape):
+        return rng.normal(size=shape)
+
+    A = draw(n, n)
+    size = rng.uniform(0.5, 1.3)
+    A = A * (size / np.max(np.abs(np.linalg.eigvals(A))))
+    if dt_s is None:
+        A = draw(n, n) - rng.uniform(0, 2) * np.eye(n)
+    parts = {"A": A, "B1": draw(n, m1), "B2": draw(n, m2), "C1": draw(p1, n), "C2": draw(p2, n)}
+    parts |= {"D11": draw(p1, m1), "D12": draw(p1, m2), "D21": draw(p2, m1)}
+    if dt_s is None:
+        parts["D11"] = np.zeros((p1, m1))
+    if D22:
+        parts["D22"] = 0.3 * draw(p2, m2)
+    if D12 is not None:
+        parts["D12"] = D12 * parts["D12"]
+    if D21 is not None:
+        parts["D21"] = D21 * parts["D21"]
+    return lbt.linear.GeneralizedPlant(**parts, dt_s=dt_s)
+
+
+def stacked(plant):
+    """Sizes and matrices in the order of SLICOT."""
+    P = plant
+    m1, m2, p1, p2 = P.sizes
+    B, C = np.hstack([P.B1, P.B2]), np.vstack([P.C1, P.C2])
+    D = np.block([[P.D11, P.D12], [P.D21, P.D22]])
+    return (len(P.A), m1 + m2, p1 + p2, m2, p2), (P.A, B, C, D)
