@@ -15,6 +15,7 @@ from fractions import Fraction
 import numpy as np
 from scipy.linalg import block_diag
 
+from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller
 from lbt_synth.validation import FloatArray, frozen_copy
 
@@ -25,6 +26,7 @@ def build_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controlle
     """Build the controller of coefficients (axes, k), which ascend in z.
 
     The last state of each axis is its command. A and C depend on the denominators alone.
+    Coefficients out of the range of numbers raise a NumericalError.
 
     Examples
     --------
@@ -35,7 +37,14 @@ def build_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controlle
     >>> [float(run.step([1.0])[0]) for _ in range(3)]
     [0.5, 1.0, 1.5]
     """
-    axes = [_realise(top, bottom) for top, bottom in zip(num, den, strict=True)]
+    try:
+        axes = [_realise(top, bottom) for top, bottom in zip(num, den, strict=True)]
+    except OverflowError as error:
+        raise NumericalError(
+            "the controller's transfer function has coefficients beyond the range of its numbers. "
+            "Try a target that keeps the states (c, matlab), or a design with fewer states.",
+            status="overflow",
+        ) from error
     m, size = len(axes), len(axes[0][0])
     return Controller(
         A=block_diag(*(A for A, _ in axes)),

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lbt_synth.errors import NumericalError
 from lbt_synth.interop.iir.realisation import build_controller
 
 
@@ -66,3 +67,10 @@ def test_numerators_change_the_entry_alone(order):
     assert np.array_equal(one.C, other.C)
     assert np.allclose(3 * one.B, other.B, rtol=1e-14)
     assert one.B[-1, 0] == 0.5
+
+
+@pytest.mark.parametrize("beyond", [np.inf, 1e300])
+def test_coefficients_beyond_the_range_are_refused(beyond):
+    """Single precision makes them infinite; the quotient of others is too large."""
+    with pytest.raises(NumericalError, match="beyond the range"):
+        build_controller(np.array([[beyond, 1.0]]), np.array([[0.5, 1e-30]]), 1.0)
