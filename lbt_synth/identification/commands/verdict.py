@@ -311,6 +311,10 @@ def _score(
             surprising |= ~possible
     if surprising[0] and not surprising.all():  # the law says what is wrong
         score[1:][surprising[1:]] = np.inf
+        low, high = PLAUSIBLE_GAINS
+        plausible = np.all((compared.gain >= low) & (compared.gain <= high), axis=0)
+        if not plausible[0] and np.any(plausible & ~surprising):  # and so does the sensor
+            score[0] = np.inf
     return score, surprising
 
 

@@ -103,6 +103,35 @@ def test_a_slow_computer_is_not_a_late_record() -> None:
     assert "the total delay of a new design is 3 frames" in verdict.notes[0]
 
 
+@pytest.mark.parametrize("sign_only", [False, True])
+def test_the_law_decides_where_the_lines_hide_the_gain(sign_only) -> None:
+    """Three strong lines fit the coarse spectrum best with no sensor gain at all."""
+    lines = [(138.0, 68.0, 0.3), (43.0, 86.0, 1.2), (23.0, 57.0, 2.3)]
+    truth = lbt.Truth(
+        turbulence=lbt.models.ARModel(
+            coefficients=[1.99809789, -0.99810753], driving_rms_nm=0.15137506, frame_rate_hz=1000
+        ),
+        vibrations=[
+            lbt.Vibration(
+                frequency_hz=f, damping=0.004, rms_nm=rms, direction=(np.cos(a), np.sin(a))
+            )
+            for f, rms, a in lines
+        ],
+        noise_nm=3.5,
+        sensor_gain=0.55,
+    )
+    path = lbt.LoopHardware(frame_rate_hz=1000)
+    run = lbt.simulate(
+        lbt.integrator(path, gain=0.38).controller, truth, hardware=path, frames=20_000, seed=3
+    )
+    y, u = run.measurements[0], run.commands[0]
+    u = -u if sign_only else np.roll(u, 1, axis=0)
+    verdict = explain_commands(
+        lbt.identification.loop_record(y[5:], u[5:], frame_rate_hz=1000, delay_frames=2, unit="nm")
+    )
+    assert verdict.options == ("--command-sign -1" if sign_only else "--command-shift-frames -1")
+
+
 def test_a_known_gain_decides_on_the_scale() -> None:
     y, u = ordinary_loop()
     assert explain_commands(record(y, u / 2), sensor_gain=1.4).accepted
