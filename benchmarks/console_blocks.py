@@ -3,7 +3,9 @@
     python benchmarks/console_blocks.py docs/tutorial.md            # prints the lines that differ
     python benchmarks/console_blocks.py --write docs/tutorial.md    # and corrects their numbers
 
-Only lines that have the same words are compared; the numbers may be others.
+Pages share a folder: those whose files other pages need come first.
+Lines that have the same words are compared; the numbers may be others. Lines with words that no
+command prints are named, and left as they are.
 """
 
 from __future__ import annotations
@@ -63,6 +65,8 @@ def corrected(page: Path, folder: Path) -> list[str]:
                 if distance(line, new) > TOLERANCE:
                     print(f"{page.name}:{number}\n  - {line}\n  + {new}")
                     line = new
+            elif found and re.search(r"\w", line):
+                print(f"{page.name}:{number} is not printed\n  - {line}")
         out.append(line)
     return out
 
@@ -73,14 +77,14 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parser.add_argument("pages", nargs="+", type=Path)
     arguments = parser.parse_args()
-    for page in arguments.pages:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            (folder / "examples").symlink_to(ROOT / "examples")
-            (folder / "out").mkdir()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "examples").symlink_to(ROOT / "examples")
+        (folder / "out").mkdir()
+        for page in arguments.pages:
             lines = corrected(page, folder)
-        if arguments.write:
-            page.write_text("\n".join(lines) + "\n")
+            if arguments.write:
+                page.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

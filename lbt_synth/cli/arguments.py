@@ -209,6 +209,7 @@ def simulate(parser: ArgumentParser) -> None:
 def telemetry(parser: ArgumentParser) -> None:
     """Show what a telemetry file holds, and write it in another format."""
     parser.add_argument("file", help="telemetry (.fits or .npz; FITS of the AOT standard, too)")
+    add_unit(parser)
     add_output(parser, "file to write (.fits, .npz or .aot.fits)", required=False)
     endings = ("fits", "npz", "aot")
     add_option(parser, "--format", endings, "of the file to write (default: its ending)")

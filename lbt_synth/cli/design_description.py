@@ -55,7 +55,8 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
         named |= described.matrices
         report.data["matrices"] = named
         with np.printoptions(precision=8, linewidth=160, suppress=False):
-            report.notes += [f"{name} =\n{value}" for name, value in named.items()]
+            for name, value in named.items():
+                report.notes += [f"{name} =", *str(value).splitlines()]
     return report
 
 

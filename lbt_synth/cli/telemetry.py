@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import write_telemetry
 from lbt_synth.errors import ProblemError
@@ -14,6 +15,7 @@ from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
 
@@ -46,6 +48,7 @@ def run(arguments: Namespace) -> Report:
         require_telemetry_name(output, arguments.format)
         require_writable(output, inputs=[arguments.file])
     telemetry = load_telemetry(arguments.file)
+    choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)
     report.data["file"] = arguments.file
     if "timing" not in telemetry.metadata:  # of another program
@@ -97,7 +100,13 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         f"mode{'s' if telemetry.modes > 1 else ''}",
         ("array", "shape", "axes", "unit", "rms"),
         [
-            (name, " x ".join(map(str, array.shape)), layer.axes, units[name], rms.get(name))
+            (
+                name,
+                " x ".join(map(str, array.shape)),
+                layer.axes,
+                shown_unit(units[name])[0],
+                shown_unit(units[name])[1] * rms[name] if name in rms else None,
+            )
             for name, array, layer in arrays
         ],
     )

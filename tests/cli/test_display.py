@@ -10,6 +10,7 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
+from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
 
 CONFIG = str(LBT_YAML)
 
@@ -36,6 +37,7 @@ COMMANDS = {
     "bode": ("{}/k.fits",),
     "step": ("{}/k.fits", "-o", "{}/t.svg"),
     "identify": ("{}/n.fits", "-o", "{}/i.yaml"),
+    "rehearse": ("{}/k.fits", "--for", "matlab", "--frames", "600"),
 }
 
 
@@ -96,3 +98,24 @@ def test_modes_beside_tilt_have_lengths_only(capsys, tmp_path):
     assert re.findall(r".*\bnm\b.*", out) == []
     assert main([*words, "--unit", "mas"]) == 2
     assert "--unit mas is an angle of tip and tilt" in capsys.readouterr().err
+
+
+def test_telemetry_is_shown_in_an_angle(capsys, files):
+    """The rms of the series, which files and JSON have in nm."""
+    path = str(files / "n.fits")
+    assert main(["telemetry", path, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["units"]["residual_nm"] == "nm"
+    assert main(["telemetry", path, "--unit", "mas"]) == 0
+    (row,) = re.findall(r"residual_nm .*", capsys.readouterr().out)
+    scale = lbt.models.nm_per_mas(data["diameter_m"])
+    assert float(row.split()[-1]) == pytest.approx(data["rms"]["residual_nm"] / scale, rel=1e-5)
+    assert row.split()[-2] == "mas"
+
+
+def test_a_demand_has_its_limit_in_the_unit():
+    step = lbt.design.shaping.CommandRms(at_most_nm=30.0, turbulence=None, noise_nm=5.0)
+    with own_display_unit():
+        show_in(DisplayUnit(name="mas", nm=10.0))
+        assert step.label == "command stroke of at most 3 mas rms"
+    assert step.label == "command stroke of at most 30 nm rms"

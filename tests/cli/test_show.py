@@ -19,6 +19,9 @@ def test_show_and_verify(capsys, gains, name):
     status, text, _ = run(capsys, "show", gains[name], "--matrices")
     assert status == 0
     assert "stable sensor gains, from" in text
+    lines = text.splitlines()
+    assert lines[lines.index("A =") + 1].startswith("[[")
+    assert lines[lines.index("D =") + 2].startswith(" [0.")
     status, text, _ = run(capsys, "show", gains[name], "--json", "--matrices")
     data = json.loads(text)
     assert status == 0

@@ -29,6 +29,7 @@ from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBou
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.models import Spectrum
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray, Positive, set_fields
 
 
@@ -193,7 +194,7 @@ class CommandRms(CheckedFields):
     'command step of at most 30 nm rms'
     """
 
-    _label: ClassVar = "command {0._what} of at most {0.at_most_nm:g} nm rms"
+    _label: ClassVar = "command {0._what} of at most {0._shown_limit}"
     at_most_nm: Positive
     turbulence: Spectrum | None
     noise_nm: float
@@ -229,6 +230,10 @@ class CommandRms(CheckedFields):
         variance = adaptive_integral(power, np.unique(np.concatenate(edges)))[0, 0]
         name = f"command {self._what} [nm rms]"
         return (Check(name, float(np.sqrt(variance)), self.at_most_nm, "adaptive quadrature"),)
+
+    @property
+    def _shown_limit(self) -> str:
+        return nm_text(self.at_most_nm, "g", unit="nm rms")
 
     @property
     def _what(self) -> str:
