@@ -139,10 +139,12 @@ class _Bracket:
     def __init__(self, form: DiscreteForm, equations: TwoRiccati, route: str) -> None:
         solution = equations.least_level()
         self.controller, self.least = _least_controller(form, equations, solution.gamma)
-        proofs = [(0.0, NO_PROOF)]
-        if equations.plant is form.plant:  # a proof for a plant next to it proves nothing here
-            witness = equations.witness(solution)
-            proofs = [(infeasible_control_level(form.plant, witness), witness)]
+        if equations.plant is form.plant:
+            candidates = [equations.witness(solution)]
+        else:  # of the plant next to it the oscillations alone are also its own
+            candidates = [NO_PROOF, *equations.oscillations(solution, form.plant)]
+        levels = [(infeasible_control_level(form.plant, each), each) for each in candidates]
+        proofs = [max(levels, key=lambda each: each[0])]
         loose = proofs[0][0] < self.least * (1 - _LOOSE)
         if route == "lmi":
             proofs.append(_inequality_proof(form.plant, equations, solution.gamma))

@@ -74,7 +74,7 @@ def central_controller(
     observer = StateSpace(
         A=A - state @ C2 + plant.B2 @ C, B=state + plant.B2 @ D, C=C, D=D, dt_s=plant.dt_s or 1.0
     )
-    return _seeing_controls(observer, plant.D22)
+    return with_seen_controls(observer, plant.D22)
 
 
 def _best_control(
@@ -115,7 +115,7 @@ def _injection(
     return _solve(innovation, seen.T).T
 
 
-def _seeing_controls(controller: StateSpace, D22: FloatArray) -> StateSpace:
+def with_seen_controls(controller: StateSpace, D22: FloatArray) -> StateSpace:
     """Return the controller for measurements that see the control at once, by D22."""
     if not np.any(D22):
         return controller

@@ -53,4 +53,4 @@ def _states(vector: FloatArray) -> str:
 
 
 def _number(value: complex) -> str:
-    return f"{value.real:.6g}" if abs(value.imag) < 1e-9 * abs(value) else f"{value:.6g}"
+    return f"{value.real + 0.0:.6g}" if abs(value.imag) <= 1e-9 * abs(value) else f"{value:.6g}"

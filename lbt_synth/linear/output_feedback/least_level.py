@@ -30,6 +30,7 @@ from lbt_synth.validation import FloatArray
 
 _TOLERANCE = 1e-11
 _NOTHING = 1e-6  # part of the level of the least variance that counts as none
+_HIGHEST = 1e-6  # angle from the Nyquist frequency at which the map has no frequency any more
 _SLOW = 0.99  # a pole of the worst case beyond this may belong to a steady oscillation
 
 
@@ -110,11 +111,13 @@ class TwoRiccati:
             brentq(slack, lower, upper, xtol=_TOLERANCE * upper, rtol=_TOLERANCE)
         return found[min(found)]
 
-    def _frequency_hz(self, angle: float) -> float:
+    def _frequency_text(self, angle: float) -> str:
         """Return the frequency of an angle on the unit circle, in the plant that was given."""
-        if self.rate is not None:
-            return self.rate * float(np.tan(angle / 2)) / (2 * np.pi)
-        return angle / (2 * np.pi * (self.plant.dt_s or 1.0))
+        if self.rate is None:
+            return f"{angle / (2 * np.pi * (self.plant.dt_s or 1.0)):.6g} Hz"
+        if np.pi - angle < _HIGHEST:
+            return "the highest frequencies"
+        return f"{self.rate * np.tan(angle / 2) / (2 * np.pi):.6g} Hz"
 
     def witness(self, solution: LevelSolution) -> ControlWitness:
         """Return the best proof against the levels below a solution."""
@@ -131,22 +134,34 @@ class TwoRiccati:
                 unseen=last_step(estimation, solution.Y), unmoved=None, reason=_ESTIMATION
             ),
         ]
-        for angle in _slow_angles(control):
-            pairs = steady_oscillation(self.control.side, angle)
-            words = f"{_CONTROL_AT} {self._frequency_hz(angle):.6g} Hz"
-            candidates.append(ControlWitness(unseen=None, unmoved=pairs, reason=words))
-        for angle in _slow_angles(estimation):
-            pairs = steady_oscillation(self.estimation.side, angle)
-            words = f"{_ESTIMATION_AT} {self._frequency_hz(angle):.6g} Hz"
-            candidates.append(ControlWitness(unseen=pairs, unmoved=None, reason=words))
+        candidates += self.oscillations(solution, self.plant)
         return max(candidates, key=lambda each: infeasible_control_level(self.plant, each))
+
+    def oscillations(
+        self, solution: LevelSolution, plant: GeneralizedPlant
+    ) -> list[ControlWitness]:
+        """Return the steady oscillations of a plant, this or the one next to it, that may prove.
+
+        Their frequencies are zero, the highest, and those of the slow poles of the worst cases.
+        """
+        out = []
+        X, Y, gamma = solution.X, solution.Y, solution.gamma
+        for angle in _slow_angles(self.control.worst_case(X, gamma)):
+            pairs = steady_oscillation(control_side(plant), angle)
+            words = f"{_CONTROL_AT} {self._frequency_text(angle)}"
+            out.append(ControlWitness(unseen=None, unmoved=pairs, reason=words))
+        for angle in _slow_angles(self.estimation.worst_case(Y, gamma)):
+            pairs = steady_oscillation(estimation_side(plant), angle)
+            words = f"{_ESTIMATION_AT} {self._frequency_text(angle)}"
+            out.append(ControlWitness(unseen=pairs, unmoved=None, reason=words))
+        return out
 
 
 def _slow_angles(worst: WorstCase) -> list[float]:
-    """Angles of the slow poles of a worst case, the slowest few."""
+    """Angles of the slow poles of a worst case, the slowest few, and both ends."""
     poles = np.linalg.eigvals(worst.A)
     slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
-    return [float(np.angle(pole)) for pole in slow[np.argsort(-np.abs(slow))][:4]]
+    return [*(float(np.angle(pole)) for pole in slow[np.argsort(-np.abs(slow))][:4]), 0.0, np.pi]
 
 
 _COUPLED = "what is not seen in time cannot be made good in time"

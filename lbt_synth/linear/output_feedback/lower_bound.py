@@ -10,7 +10,8 @@ of the p and G2 >= 0 more. Then, whatever the controller,
 
 (Frobenius norms, and the nuclear norm) by weak duality with the inequalities of P. Gahinet,
 P. Apkarian, Int. J. Robust Nonlinear Control 4, 421 (1994), doi:10.1002/rnc.4590040403. Where
-rounding makes a growth indefinite, the price of the shortfall is added on the left.
+rounding makes a growth indefinite, the price of the shortfall is added on the left. A steady
+oscillation has no growth but for rounding, and no price.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.validation import FloatArray
 
 _STEPS = 64  # of the recursion that bounds the storage matrix
+_STEADY = 1e-12  # part of the states' moments by which those of an oscillation may change
 _STRAYED = 1e-9  # share of the successors that may lie outside of its range
 _WIDEST = 12.0  # logarithm of the relative weight of the two sides
 
@@ -132,23 +134,47 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
 
 def _moments(side: Side, pairs: Witness) -> _Moments:
     """Evaluate pairs against the side in whose equation they are the costates."""
+    steady = _hidden(side, pairs.states, pairs.disturbances)
+    growth = steady.after @ steady.after.T - pairs.states @ pairs.states.T
+    size = float(np.sum(pairs.states**2))
+    turning = pairs.states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
+    if steady.hidden and turning:
+        return _Moments(steady.gained, steady.spent, np.zeros((len(pairs.states), 1)))
     basis, inverse = whitening_coordinates(_least_storage(side))
     states = basis @ (inverse @ pairs.states)
-    # the least change that hides the pairs, by any signal that the constraint reads
-    shown = side.B2.T @ states + side.D12.T @ pairs.disturbances
-    signals = pairs.disturbances - np.linalg.pinv(side.D12.T, rcond=1e-10) @ shown
+    found = _hidden(side, states, pairs.disturbances)
+    strayed = np.linalg.norm(found.after - basis @ (inverse @ found.after))
+    if strayed > _STRAYED * np.linalg.norm(found.after) or not found.hidden:
+        return _Moments(0.0, 1.0, np.zeros((len(states), 1)))
+    growth = inverse @ (found.after @ found.after.T - states @ states.T) @ inverse.T
+    values, vectors = np.linalg.eigh((growth + growth.T) / 2)
+    spent = found.spent - float(values[values < 0].sum())
+    return _Moments(found.gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
+
+
+@dataclass(frozen=True, slots=True)
+class _Hidden:
+    """Pairs after the least change that hides them."""
+
+    after: FloatArray  # (n, r)
+    gained: float
+    spent: float
+    hidden: bool
+
+
+def _hidden(side: Side, states: FloatArray, signals: FloatArray) -> _Hidden:
+    """Change signals as little as hides them from what the constraint reads."""
+    shown = side.B2.T @ states + side.D12.T @ signals
+    signals = signals - np.linalg.pinv(side.D12.T, rcond=1e-10) @ shown
     left = side.B2.T @ states + side.D12.T @ signals
     size = np.linalg.norm(side.B2.T @ states) + np.linalg.norm(side.D12.T @ signals)
-    after = side.A.T @ states + side.C1.T @ signals
-    strayed = np.linalg.norm(after - basis @ (inverse @ after))
-    nothing = _Moments(0.0, 1.0, np.zeros((len(states), 1)))
-    if strayed > _STRAYED * np.linalg.norm(after) or np.linalg.norm(left) > 1e-12 * size:
-        return nothing
-    growth = inverse @ (after @ after.T - states @ states.T) @ inverse.T
-    values, vectors = np.linalg.eigh((growth + growth.T) / 2)
-    gained = float(np.sum((side.B1.T @ states + side.D11.T @ signals) ** 2))
-    spent = float(np.sum(signals**2)) - float(values[values < 0].sum())
-    return _Moments(gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
+    gain = side.B1.T @ states + side.D11.T @ signals
+    return _Hidden(
+        after=side.A.T @ states + side.C1.T @ signals,
+        gained=float(np.sum(gain**2)),
+        spent=float(np.sum(signals**2)),
+        hidden=bool(np.linalg.norm(left) <= _STEADY * size),
+    )
 
 
 def _least_storage(side: Side) -> FloatArray:
