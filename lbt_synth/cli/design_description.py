@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
 from lbt_synth.design.facts import DesignFacts, without_units
-from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins, moving_gain
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import LoopFacts
@@ -58,6 +58,15 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
             for name, value in named.items():
                 report.notes += [f"{name} =", *str(value).splitlines()]
     return report
+
+
+def add_moving_gain(report: Report, design: Design) -> None:
+    """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
+    if design.hardware is None:
+        return
+    loop = close_loop(design.hardware, design)
+    if loop.is_stable:
+        report.add_facts("Sensor gain that moves", moving_gain(loop), key="moving_gain")
 
 
 def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:

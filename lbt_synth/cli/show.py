@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from lbt_synth.cli.design_description import describe_design
+from lbt_synth.cli.design_description import add_moving_gain, describe_design
 from lbt_synth.cli.display import choose_design_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
@@ -21,6 +21,7 @@ def run(arguments: Namespace) -> Report:
     design, digest = load_with_digest(arguments.gain)
     choose_design_unit(arguments, design)
     report = describe_design(design, matrices=arguments.matrices)
+    add_moving_gain(report, design)
     cost = frame_cost(design)
     report.data |= {"file": arguments.gain, "digest": digest, "frame_cost": json_record(cost)}
     unproved = ["route and status of the solver"]

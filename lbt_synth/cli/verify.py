@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from lbt_synth.cli.design_description import add_moving_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.files.gain_file.store import read_design
 
@@ -26,4 +27,5 @@ def run(arguments: Namespace) -> Report:
         passed=certificate.passed,
     )
     report.add_rows("checks", "Certificate", certificate.checks)
+    add_moving_gain(report, design)
     return report

@@ -10,7 +10,7 @@ from lbt_synth.design.loop_shaping import ShapedDesign, noise_per_mode, shape
 from lbt_synth.design.shaping.bounds import ModulusMargin
 from lbt_synth.design.shaping.objectives import Leaf, ResidualVariance, Total, VibrationBand
 from lbt_synth.design.shaping.specification import Demand, Specification
-from lbt_synth.design.shaping.uncertainty import SensorGainRange
+from lbt_synth.design.shaping.uncertainty import MovingSensorGain, SensorGainRange
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import Spectrum, TipTiltPlant
 from lbt_synth.validation import number, require_instance, sequence
@@ -21,6 +21,7 @@ def robust(
     *,
     bands: Sequence[VibrationBand] | Sequence[Sequence[VibrationBand]] = (),
     sensor_gain: tuple[float, float] = (1.0, 1.0),
+    moving_gain: bool = False,
     scenarios: Sequence[float] = (1.0,),
     modulus_margin: float = 0.45,
     turbulence: Spectrum | None = None,
@@ -46,6 +47,8 @@ def robust(
         them.
     sensor_gain : tuple of float, optional
         Interval of sensor gains, around 1, for which the loop stays stable.
+    moving_gain : bool, optional
+        Whether it also stays stable while the gain moves in that interval, at any speed.
     scenarios : sequence of float, optional
         Sensor gains whose residuals are added up.
     modulus_margin : float, optional
@@ -96,7 +99,8 @@ def robust(
     further = sequence(demands, "demands")
     fixed: list[Demand] = [ModulusMargin(at_least=modulus_margin)]
     if (low, high) != (1, 1):
-        fixed.append(SensorGainRange(low=low, high=high))
+        kind = MovingSensorGain if moving_gain else SensorGainRange
+        fixed.append(kind(low=low, high=high))
     deviations = noise_per_mode(plant.hardware, plant.R)
     by_mode: dict[object, Specification] = {}
     specifications = []

@@ -18,6 +18,8 @@ from .least_residuals.residual_limit import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins
 from .margins import stable_sensor_gains as stable_sensor_gains
+from .moving_gain import MovingGain as MovingGain
+from .moving_gain import moving_gain as moving_gain
 from .simulation.run import Simulation as Simulation
 from .simulation.run import filter_series as filter_series
 from .simulation.run import simulate as simulate

@@ -165,7 +165,7 @@ def close_loop(
     require_instance(hardware, LoopHardware, "hardware")
     gain = number(sensor_gain, "sensor_gain", above=0)
     own = as_controller(controller)
-    A0, A1, B, C0, C1, D = _checked_loop_matrices(hardware, own)
+    A0, A1, B, C0, C1, D = checked_loop_matrices(hardware, own)
     system = StateSpace(A=A0 + gain * A1, B=B, C=C0 + gain * C1, D=D, dt_s=hardware.dt_s)
     return ClosedLoop(system=system, hardware=hardware, controller=own, sensor_gain=gain)
 
@@ -177,7 +177,7 @@ def radii_by_gain(
 
     The eigenvalues are those of the parts whose states act on one another; equal parts count once.
     """
-    A0, A1, *_ = _checked_loop_matrices(hardware, as_controller(controller))
+    A0, A1, *_ = checked_loop_matrices(hardware, as_controller(controller))
     links = csr_matrix((A0 != 0) | (A1 != 0))
     count, label = connected_components(links, connection="strong")
     parts = (np.ix_(label == part, label == part) for part in range(count))
@@ -191,10 +191,8 @@ def radii_by_gain(
     return radii
 
 
-def _checked_loop_matrices(
-    hardware: LoopHardware, controller: Controller
-) -> tuple[FloatArray, ...]:
-    """Matrices of :func:`loop_matrices`, for a controller that matches the loop."""
+def checked_loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:
+    """Return the matrices of :func:`loop_matrices`, for a controller that matches the loop."""
     require_matching_controller(hardware, controller)
     k, mirror = controller.to_statespace(), hardware.mirror_system.whole
     path = {"sensor": hardware.sensor, "influence": hardware.influence}

@@ -70,7 +70,7 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
     assumed = inputs.sensor_gain
     arguments: dict[str, Any] = {
         name: getattr(section, name)
-        for name in ("modulus_margin", "functions", "pole", "states", "loss")
+        for name in ("moving_gain", "modulus_margin", "functions", "pole", "states", "loss")
     }
     if section.sensor_gain is not None:
         low, high = section.sensor_gain

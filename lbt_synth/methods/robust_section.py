@@ -69,6 +69,9 @@ class RobustSection(Section):
         max_length=2,
         description="[low, high]: stable for every real sensor gain between",
     )
+    moving_gain: bool = Field(
+        default=False, description="stable while the gain moves in sensor_gain, at any speed"
+    )
     scenarios: list[Gain] | None = Field(
         default=None,
         min_length=1,

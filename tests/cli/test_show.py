@@ -57,3 +57,13 @@ def test_show_says_what_is_only_the_files_word(tmp_path, capsys):
         assert status == 0
         assert f"not proved, the file's word: route and status of the solver{more}" in text
         assert f"digest {load_with_digest(path)[1]}" in text
+
+
+@pytest.mark.parametrize("command", ["show", "verify"])
+def test_intervals_of_a_gain_that_moves(capsys, gains, command):
+    _, text, _ = run(capsys, command, gains["kalman"])
+    assert "proved while it moves at any speed, from" in text
+    _, text, _ = run(capsys, command, gains["kalman"], "--json")
+    moving = json.loads(text)["moving_gain"]
+    assert moving["constant_low"] < moving["broken_low"] < moving["fast_low"] < 1
+    assert moving["rate_per_s"] == 1

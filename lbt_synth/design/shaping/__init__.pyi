@@ -9,4 +9,5 @@ from .objectives import Worst as Worst
 from .specification import Specification as Specification
 from .uncertainty import DelayError as DelayError
 from .uncertainty import MirrorUncertainty as MirrorUncertainty
+from .uncertainty import MovingSensorGain as MovingSensorGain
 from .uncertainty import SensorGainRange as SensorGainRange

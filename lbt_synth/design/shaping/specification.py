@@ -43,9 +43,9 @@ class Specification:
     objective : ResidualVariance, VibrationBand, Total or Worst
         What is made least.
     demands : sequence of demands, optional
-        What has to hold: ModulusMargin, NoisePeak, Attenuation, SensorGainRange, DelayError,
-        MirrorUncertainty, CommandRms. Stability at every sensor gain that the objective or a
-        demand names is added where no range covers it.
+        What has to hold: ModulusMargin, NoisePeak, Attenuation, SensorGainRange, MovingSensorGain,
+        DelayError, MirrorUncertainty, CommandRms. Stability at every sensor gain that the objective
+        or a demand names is added where no range covers it.
 
     Raises
     ------

@@ -14,7 +14,9 @@ from lbt_synth.design.shaping.frequencies import LEVEL_SETS, ROOM, Band, Checked
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
+from lbt_synth.linear.moving_parameter.stability_proof import prove_any_speed
 from lbt_synth.linear.norms import largest_real_part
+from lbt_synth.loop.closed_loop import checked_loop_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror
 from lbt_synth.validation import FloatArray, Positive
@@ -73,6 +75,56 @@ class SensorGainRange(CheckedFields):
             name = f"real part of the complementary sensitivity, {which}"
             checks.append(Check(name, peak, bound, LEVEL_SETS))
         return tuple(checks)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MovingSensorGain(SensorGainRange):
+    """Guaranteed stability for a sensor gain that moves in an interval, at any speed.
+
+    With ``a = high - 1`` and ``b = 1 - low``, one Lyapunov function for all gains exists if and
+    only if ``|T - (a - b) / (2 a b)| < (a + b) / (2 a b)`` at all frequencies (the circle
+    criterion): convex in T, so nothing is lost. At an end of 1 the disc is a half-plane.
+
+    Parameters
+    ----------
+    low, high : float
+        Ends of the interval, around 1 (the gain that is designed for).
+
+    Raises
+    ------
+    ProblemError
+        If the interval does not hold 1, or is not positive.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.design.shaping.MovingSensorGain(low=0.25, high=1.3).label
+    'stability while the sensor gain moves in 0.25 to 1.3'
+    """
+
+    _label: ClassVar = "stability while the sensor gain moves in {0.low:g} to {0.high:g}"
+
+    def _disc(self) -> tuple[float, float] | None:
+        """Return centre and radius of the disc for T; None for a half-plane."""
+        a, b = self.high - 1, 1 - self.low
+        return ((a - b) / (2 * a * b), (a + b) / (2 * a * b)) if a > 0 and b > 0 else None
+
+    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
+        """Return the convex constraints at the points of a grid."""
+        disc, f = self._disc(), grid.points_hz
+        if disc is None:
+            return SensorGainRange.constraints(self, channel, grid)
+        return (discs(f, channel.complementary_rows(f), -disc[0], (1 - ROOM) * disc[1]),)
+
+    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
+        """Check the real loop, and prove a Lyapunov function with bounds on rounding."""
+        A0, A1, *_ = checked_loop_matrices(loop.hardware, loop.controller)
+        ends = {"low": self.low, "high": self.high}
+        proof = prove_any_speed(A0, A1, **ends, nominal=float(np.sqrt(self.low * self.high)))
+        low, high = (np.nan, np.nan) if proof is None else (proof.low, proof.high)
+        share = np.log(high / low) / np.log(self.high / self.low)
+        name = f"interval of the moving gain that is not proved (proved {low:.4g} to {high:.4g})"
+        return (Check(name, 1 - float(share), 1e-9, "common Lyapunov function"),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -181,4 +233,4 @@ class MirrorUncertainty(Band):
         return (self.check(name, self.relative * self.peak(loop.complementary), 1.0),)
 
 
-Uncertainty: TypeAlias = SensorGainRange | DelayError | MirrorUncertainty
+Uncertainty: TypeAlias = SensorGainRange | MovingSensorGain | DelayError | MirrorUncertainty

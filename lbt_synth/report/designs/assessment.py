@@ -15,9 +15,11 @@ from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import (
     ClosedLoop,
     LoopMargins,
+    MovingGain,
     ResidualBudget,
     close_loop,
     loop_margins,
+    moving_gain,
     residual_budget,
     stable_sensor_gains,
     strehl,
@@ -74,6 +76,8 @@ class DesignAssessment:
     sensor_gains : tuple of (float, float)
         Intervals of real sensor gains for which the loop is stable, relative to the sensor
         matrix of the configuration; searched for between 0.01 and 100 times the assumed one.
+    moving : MovingGain or None
+        Intervals of a sensor gain that moves, around the real one; None where the loop is unstable.
     checks : tuple of Check
         The certificate, recomputed.
     certificate_error : str
@@ -104,6 +108,7 @@ class DesignAssessment:
     strehl: float
     margins: LoopMargins | None
     sensor_gains: tuple[tuple[float, float], ...]
+    moving: MovingGain | None
     checks: tuple[Check, ...]
     certificate_error: str
     cost: FrameCost
@@ -161,6 +166,7 @@ def assess_design(
             (low * assumed_gain, high * assumed_gain)
             for low, high in stable_intervals(loop, design.controller, margins)
         ),
+        moving=moving_gain(loop) if loop.is_stable else None,
         checks=checks,
         certificate_error=complaint,
         cost=frame_cost(design),

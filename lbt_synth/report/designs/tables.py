@@ -27,6 +27,9 @@ from lbt_synth.storage.tables import Cell, Table
 # titles of what is an interval, not a column of the row
 _GOOD = "within 10 % of its best Strehl ratio [Hz]"
 _GAIN_MARGIN, _STABLE_GAINS = "gain margin, factors", "stable real sensor gains"
+_SLOW_GAINS = "proved while the gain moves by at most 1 per second"
+_FAST_GAINS = "proved while it moves at any speed"
+_BREAKING_GAINS = "destabilised by a gain that moves in"
 _OWN_CELLS: dict[str, Callable[[DesignReport, DesignAssessment], str | Cell]] = {
     "certified": lambda _, one: _certificate_cell(one),
     "stable": lambda _, one: _stability_cell(one),
@@ -34,6 +37,9 @@ _OWN_CELLS: dict[str, Callable[[DesignReport, DesignAssessment], str | Cell]] = 
     _GOOD: lambda _, one: _good_text(one),
     _GAIN_MARGIN: lambda _, one: _gain_margin_text(one),
     _STABLE_GAINS: lambda _, one: _stable_gains_text(one),
+    _SLOW_GAINS: lambda report, one: _moving_text(report, one, "slow"),
+    _FAST_GAINS: lambda report, one: _moving_text(report, one, "fast"),
+    _BREAKING_GAINS: lambda report, one: _moving_text(report, one, "broken"),
 }
 _DESIGN = ("method", "route", "n_states", "multiplications", "gamma", "estimation_rms", "certified")
 _LOOP = (
@@ -41,7 +47,10 @@ _LOOP = (
     *("strehl", "strehl_simulated"),
 )
 _RANGE = ("worst_nm", "worst_strehl", _GOOD)
-_MARGINS = ("modulus", _GAIN_MARGIN, "phase_deg", "delay_frames", "crossover_hz", _STABLE_GAINS)
+_MARGINS = (
+    *("modulus", _GAIN_MARGIN, "phase_deg", "delay_frames", "crossover_hz", _STABLE_GAINS),
+    *(_SLOW_GAINS, _FAST_GAINS, _BREAKING_GAINS),
+)
 
 
 def summary_table(report: DesignReport) -> Table:
@@ -167,3 +176,10 @@ def _stable_gains_text(one: DesignAssessment) -> str | Cell:
     if not one.sensor_gains:
         return Cell(text="none found", tone="bad")
     return ", ".join(interval_text(low, high, 4) for low, high in one.sensor_gains)
+
+
+def _moving_text(report: DesignReport, one: DesignAssessment, kind: str) -> str:
+    """Return an interval of a gain that moves, in real sensor gains as those above it."""
+    found = (getattr(one.moving, f"{kind}_{end}", None) for end in ("low", "high"))
+    low, high = (np.nan if end is None else report.config.sensor_gain * end for end in found)
+    return DASH if np.isnan(low) else interval_text(low, high, 4)

@@ -9,6 +9,7 @@ from support.shaping import (
 )
 
 import lbt_synth as lbt
+from lbt_synth.design.shaping.channel import mode_loop
 
 
 @pytest.mark.parametrize(
@@ -31,3 +32,47 @@ def test_a_loop_is_stable_at_every_delay_within_its_error(delay, error):
         free = lbt.design.shape(path, spec(objective=eager), functions=20, states=None)
         late = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=3.0, modes=1)
         assert not lbt.close_loop(late, free.controller).is_stable
+
+
+def shape_for_a_gain(kind, low, high):
+    """One design, and the check of a gain that moves in its interval."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    line = lbt.design.shaping.VibrationBand(low_hz=16, high_hz=24, rms_nm=500)
+    demand = getattr(lbt.design.shaping, kind)(low=low, high=high)
+    design = lbt.design.shape(path, spec(demand, objective=line), functions=12, states=None)
+    moves = lbt.design.shaping.MovingSensorGain(low=low, high=high)
+    return design, moves.checks(mode_loop(path, design.parameters[0]))[0]
+
+
+def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
+    """The circle criterion, on a loop that a switch between stable gains breaks without it."""
+    still, failed = shape_for_a_gain("SensorGainRange", 0.3, 1.5)
+    moves, passed = shape_for_a_gain("MovingSensorGain", 0.3, 1.5)
+    assert passed.passed
+    assert not failed.passed
+    assert "proved 0.3 to 1.5" in passed.name
+    assert "proved 0.3 to 1.5" not in failed.name
+    broken = lbt.loop.moving_gain(lbt.close_loop(still.hardware, still))
+    assert 0.3 < broken.broken_low < broken.broken_high < 1.5
+    assert moves.objective_nm[0] > still.objective_nm[0]
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.3, 1.0), (1.0, 1.5)])
+def test_a_gain_that_moves_on_one_side_costs_nothing(low, high):
+    """The disc is a half-plane then, the same as for a constant gain."""
+    still, check = shape_for_a_gain("SensorGainRange", low, high)
+    assert check.passed
+    moves, _ = shape_for_a_gain("MovingSensorGain", low, high)
+    assert moves.objective_nm == pytest.approx(still.objective_nm, rel=1e-6)
+
+
+def test_a_moving_gain_that_clashes_is_named():
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    line = lbt.design.shaping.VibrationBand(low_hz=16, high_hz=24, rms_nm=500)
+    demands = (
+        lbt.design.shaping.MovingSensorGain(low=0.5, high=3.0),
+        lbt.design.shaping.Attenuation(low_hz=16, high_hz=24, at_most=1e-3),
+    )
+    with pytest.raises(lbt.errors.InfeasibleError) as caught:
+        lbt.design.shape(path, spec(*demands, objective=line), functions=16, states=None)
+    assert any("while the sensor gain moves" in text for text in caught.value.conflict)

@@ -1,0 +1,1 @@
+"""Systems whose matrix follows a parameter that moves in time: proofs, and counterexamples."""
