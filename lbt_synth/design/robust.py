@@ -101,6 +101,8 @@ def robust(
     if (low, high) != (1, 1):
         kind = MovingSensorGain if moving_gain else SensorGainRange
         fixed.append(kind(low=low, high=high))
+    elif moving_gain:
+        raise ProblemError("moving_gain needs the interval in which it moves; give sensor_gain.")
     deviations = noise_per_mode(plant.hardware, plant.R)
     by_mode: dict[object, Specification] = {}
     specifications = []

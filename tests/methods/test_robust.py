@@ -30,6 +30,19 @@ def test_sensor_gains_of_the_file_are_real_ones(small):
     assert noise[1] == pytest.approx(2 * noise[0])
 
 
+def test_a_moving_gain_is_demanded_and_kept_in_the_file(small, tmp_path):
+    section = SMALL + "    sensor_gain: [0.4, 1.4]\n    moving_gain: true\n"
+    design = lbt.load_config(small(section)).design("robust")
+    kept = lbt.load_gain(lbt.save_gain(tmp_path / "moving.fits", design))
+    for each in (design, kept):
+        kinds = [type(d).__name__ for d in each.specifications[0].demands]
+        assert kinds == ["ModulusMargin", "MovingSensorGain"]
+    assert any("moving gain" in check.name for check in kept.recertify().checks)
+    with pytest.raises(ProblemError, match="sensor_gain") as caught:
+        lbt.load_config(small(SMALL + "    moving_gain: true\n")).design("robust")
+    assert "moving_gain" in str(caught.value)
+
+
 def test_every_demand_of_the_file_reaches_the_specification(small):
     section = (
         SMALL
