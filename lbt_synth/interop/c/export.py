@@ -123,14 +123,7 @@ def export_c(
         for dtype in (np.float64, np.float32)
     )
     error = error_single if single else error_double
-    if not math.isfinite(error):
-        raise NumericalError(
-            f"the commands must stay finite in {precision} precision; they grew beyond all "
-            f"numbers within {FRAMES} frames. "
-            + ("Try double precision." if single else "Scale the states of the controller."),
-            status="arithmetic",
-            residual=error,
-        )
+    _require_finite(error, precision)
     lines = provenance_lines(design, gain_digest)
     if single:  # in double precision the figure would depend on this machine's matrix products
         lines.append(("precision", f"single: commands within {error:.1e} of the largest one"))
@@ -163,6 +156,22 @@ def export_c(
         checks=checks,
         cost=frame_cost(written),
     )
+
+
+def _require_finite(error: float, precision: str) -> None:
+    """Refuse commands that grow beyond all numbers of a precision."""
+    if not math.isfinite(error):
+        raise NumericalError(
+            f"the commands must stay finite in {precision} precision; they grew beyond all "
+            f"numbers within {FRAMES} frames. "
+            + (
+                "Try double precision."
+                if precision == "single"
+                else "Scale the states of the controller."
+            ),
+            status="arithmetic",
+            residual=error,
+        )
 
 
 def _form_of(design: Design, form: str) -> tuple[Controller, int]:
