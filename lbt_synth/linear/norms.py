@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import NumericalError, UnstableLoopError
 from lbt_synth.linear.state_space import StateSpace, pointwise_response, schur_response
@@ -87,7 +89,29 @@ def hinf_norm(system: Any) -> HinfNorm:
             f"{radius:.9g}. An unstable system has no finite norm.",
             spectral_radius=radius,
         )
-    return _peak(G.balanced(), 0.0, np.pi)
+    found = [_peak(part.balanced(), 0.0, np.pi) for part in _independent_parts(G)]
+    return max(found, key=float)
+
+
+def _independent_parts(G: StateSpace) -> list[StateSpace]:
+    """Return the parts of a system that share no state, input or output, equal ones once."""
+    (n, m), p = G.B.shape, len(G.C)
+    x, u, y = np.split(np.arange(n + m + p), [n, n + m])
+    links = np.zeros((n + m + p, n + m + p), dtype=np.bool_)
+    links[:n, : n + m] = np.hstack([G.A, G.B]) != 0
+    links[n + m :, : n + m] = np.hstack([G.C, G.D]) != 0
+    count, label = connected_components(csr_matrix(links), directed=False)
+    parts = {}
+    for part in range(count):
+        states, inputs, outputs = (np.flatnonzero(label[nodes] == part) for nodes in (x, u, y))
+        if inputs.size and outputs.size:
+            if not states.size:
+                return [G]
+            A, B = G.A[np.ix_(states, states)], G.B[np.ix_(states, inputs)]
+            C, D = G.C[np.ix_(outputs, states)], G.D[np.ix_(outputs, inputs)]
+            key = tuple(matrix.tobytes() for matrix in (A, B, C, D))
+            parts[key] = replace(G, A=A, B=B, C=C, D=D)
+    return list(parts.values()) or [G]
 
 
 def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:

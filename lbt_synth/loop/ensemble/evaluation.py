@@ -255,7 +255,7 @@ def turbulence_and_noise_nm2(
                 assert isinstance(process, Process)
                 for mode in modes:
                     axis = np.eye(n)[mode]
-                    _add_process(turbulence_nm2, chosen[0].rows, chosen, process, axis)
+                    _add_process(turbulence_nm2, chosen[0].rows, chosen, process, axis, {})
     return turbulence_nm2, noise_nm2
 
 
@@ -286,26 +286,47 @@ def vibration_residuals(
                     modes = group.subloop.modes
                     left = group.rejections(turn) @ peak[:, modes, None]
                     amplitudes_nm[rows[:, None], i, modes] = left[..., 0]
+            alike: dict[tuple[bool, ...], list[EnsembleVibration]] = {}  # by the subloops reached
             for line in random:
-                numbers = line.frequency_hz[rows], line.damping[rows], line.rms_nm[rows]
-                a, drive = sampled_lines(*numbers, rate)
+                reached = (bool(np.any(line.direction[rows][:, g.subloop.modes])) for g in chosen)
+                alike.setdefault(tuple(reached), []).append(line)
+            known: dict[tuple[bytes, ...], FloatArray] = {}  # equal axes are computed once
+            for same in alike.values():
+                frequency_hz, damping, rms_nm, along = (
+                    np.concatenate([getattr(line, name)[rows] for line in same])
+                    for name in ("frequency_hz", "damping", "rms_nm", "direction")
+                )
+                a, drive = sampled_lines(frequency_hz, damping, rms_nm, rate)
                 process = ModalTurbulence(coefficients=a, driving_rms_nm=drive, frame_rate_hz=rate)
-                _add_process(random_nm2, rows, chosen, process, line.direction[rows])
+                _add_process(random_nm2, rows, chosen, process, along, known)
     return random_nm2, amplitudes_nm
 
 
 def _add_process(
-    total: FloatArray, rows: IntArray, groups: list[LoopGroup], process: Process, along: FloatArray
+    total: FloatArray,
+    rows: IntArray,
+    groups: list[LoopGroup],
+    process: Process,
+    along: FloatArray,
+    known: dict[tuple[bytes, ...], FloatArray],
 ) -> None:
     """Add to ``total[rows]`` (p, n, n) what a process leaves in all subloops that it reaches.
 
-    The direction ``along`` is (n,), or (k, n) with one per loop.
+    The direction ``along`` is (n,), or (l k, n) for l processes of all loops in turn.
     """
     reached = [group for group in groups if np.any(along[..., group.subloop.modes])]
     if reached:
         modes = np.concatenate([group.subloop.modes for group in reached])
         at = (rows[:, None, None], *np.ix_(modes, modes))
-        total[at] += _process_covariances(_join(reached), process, along[..., modes])
+        turns = len(along) // rows.size if along.ndim == 2 else 1
+        loops = tuple(np.tile(part, (turns, 1, 1)) for part in _join(reached))
+        own = along[..., modes]
+        numbers = (*loops, process.coefficients, process.driving_rms_nm, own)
+        key = tuple(np.asarray(part).tobytes() for part in numbers)
+        if key not in known:
+            known[key] = _process_covariances(loops, process, own)
+        found = known[key].reshape(turns, rows.size, modes.size, modes.size)
+        total[at] += np.sum(found, axis=0)
 
 
 def _join(groups: list[LoopGroup]) -> tuple[FloatArray, ...]:
