@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,15 +69,16 @@ class TwoRiccati:
     def solve(self, gamma: float) -> tuple[float, LevelSolution | None]:
         """Return the least slack of the three conditions, and the solutions where it is above 0."""
         self.trials += 1
-        slack, X = self.control.solve(gamma)
-        if X is None:
+        try:
+            slack, X = self.control.solve(gamma)
+            other, Y = (-1.0, None) if X is None else self.estimation.solve(gamma)
+            if X is None or Y is None:
+                return -1.0, None
+            values, vectors = np.linalg.eigh(X)
+            root = vectors * np.sqrt(np.maximum(values, 0))
+            coupling = 1 - float(np.linalg.eigvalsh(root.T @ Y @ root)[-1]) / gamma**2
+        except np.linalg.LinAlgError:  # singular to working accuracy, as next to a level of zero
             return -1.0, None
-        other, Y = self.estimation.solve(gamma)
-        if Y is None:
-            return -1.0, None
-        values, vectors = np.linalg.eigh(X)
-        root = vectors * np.sqrt(np.maximum(values, 0))
-        coupling = 1 - float(np.linalg.eigvalsh(root.T @ Y @ root)[-1]) / gamma**2
         least = min(slack, other, coupling)
         return least, LevelSolution(gamma=gamma, X=X, Y=Y) if least > 0 else None
 
@@ -145,15 +147,16 @@ class TwoRiccati:
         Their frequencies are zero, the highest, and those of the slow poles of the worst cases.
         """
         out = []
-        X, Y, gamma = solution.X, solution.Y, solution.gamma
-        for angle in _slow_angles(self.control.worst_case(X, gamma)):
-            pairs = steady_oscillation(control_side(plant), angle)
-            words = f"{_CONTROL_AT} {self._frequency_text(angle)}"
-            out.append(ControlWitness(unseen=None, unmoved=pairs, reason=words))
-        for angle in _slow_angles(self.estimation.worst_case(Y, gamma)):
-            pairs = steady_oscillation(estimation_side(plant), angle)
-            words = f"{_ESTIMATION_AT} {self._frequency_text(angle)}"
-            out.append(ControlWitness(unseen=pairs, unmoved=None, reason=words))
+        with suppress(np.linalg.LinAlgError):
+            for angle in _slow_angles(self.control.worst_case(solution.X, solution.gamma)):
+                pairs = steady_oscillation(control_side(plant), angle)
+                words = f"{_CONTROL_AT} {self._frequency_text(angle)}"
+                out.append(ControlWitness(unseen=None, unmoved=pairs, reason=words))
+        with suppress(np.linalg.LinAlgError):
+            for angle in _slow_angles(self.estimation.worst_case(solution.Y, solution.gamma)):
+                pairs = steady_oscillation(estimation_side(plant), angle)
+                words = f"{_ESTIMATION_AT} {self._frequency_text(angle)}"
+                out.append(ControlWitness(unseen=pairs, unmoved=None, reason=words))
         return out
 
 
