@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -11,6 +12,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
+from ruamel.yaml.constructor import ConstructorError, SafeConstructor
+from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from lbt_synth.config.end_to_end import build_end_to_end_setup
@@ -235,7 +238,7 @@ def read_mapping(source: Path) -> dict[str, Any]:
         raise ConfigError(f"{source} is not a text file: {error.reason}.") from error
     try:
         raw = _load_yaml(text)
-    except Exception as error:  # the constructors of YAML raise whatever they like
+    except Exception as error:  # the parsers of YAML raise whatever they like
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or error_reason(error)
@@ -245,9 +248,25 @@ def read_mapping(source: Path) -> dict[str, Any]:
     return raw
 
 
+class _Constructor(SafeConstructor):
+    """Makes values of YAML, and names those that are not of their type."""
+
+    def construct_non_recursive_object(self, node: Node, tag: str | None = None) -> Any:
+        """Return the value of a node; its constructor raises whatever it likes."""
+        try:
+            return super().construct_non_recursive_object(node, tag)
+        except YAMLError:
+            raise
+        except Exception as error:
+            kind, got = str(node.tag).rpartition(":")[2], reprlib.repr(node.value)
+            problem = f"expected a value of type {kind}; got {got}"
+            raise ConstructorError(None, None, problem, node.start_mark) from error
+
+
 def _load_yaml(text: str) -> Any:
     """Return what a text holds; refuse one that is deep, or grows by its aliases."""
     yaml = YAML(typ="safe", pure=True)
+    yaml.Constructor = _Constructor
     node = yaml.compose(text)
     if node is None:
         return None
