@@ -215,10 +215,28 @@ def judged(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[
     return out
 
 
+def stood_for(
+    it: Case, axis: lbt.identification.IdentifiedAxis
+) -> list[tuple[lbt.identification.IdentifiedLine, list[lbt.Vibration]]]:
+    """Return each line found, with the true lines to which it is nearest, within 4 half widths."""
+    out: dict[int, list[lbt.Vibration]] = {i: [] for i in range(len(axis.lines))}
+    for line in it.truth.vibrations:
+        away = [abs(x.frequency_hz - line.frequency_hz) for x in axis.lines]
+        if away and min(away) < NEAR_HZ + 4 * line.frequency_hz * line.damping:
+            out[int(np.argmin(away))].append(line)
+    return [(axis.lines[i], lines) for i, lines in out.items() if lines]
+
+
 def deviations(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[float]]:
     """Return how far estimates are from the truth, in their standard errors."""
     truth, gain_error = it.truth, axis.sensor_gain_error
-    found = [(line, near) for line, near, _ in paired(it, axis)[0] if near is not None]
+    pairs = stood_for(it, axis)
+    found = [(lines[0], near) for near, lines in pairs if len(lines) == 1]
+    merged = [
+        (near, [line.frequency_hz for line in lines], [line.rms_nm**2 for line in lines])
+        for near, lines in pairs
+        if len(lines) > 1
+    ]
     return {
         "sensor gain": []
         if gain_error is None
@@ -229,6 +247,17 @@ def deviations(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, l
         ],
         "line, rms": [(x.rms_nm - line.rms_nm) / x.rms_error_nm for line, x in found],
         "line, damping": [(x.damping - line.damping) / x.damping_error for line, x in found],
+        "one for several, mean": [
+            (x.frequency_hz - np.average(f, weights=power)) / x.frequency_error_hz
+            for x, f, power in merged
+        ],
+        "one for several, rms": [
+            (x.rms_nm - np.sum(power) ** 0.5) / x.rms_error_nm for x, _, power in merged
+        ],
+        "one for several, strongest": [
+            (x.frequency_hz - f[int(np.argmax(power))]) / x.frequency_error_hz
+            for x, f, power in merged
+        ],
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ TURNED = np.array([[0.9, -0.3], [0.2, 1.1]])  # of the mirror, which couples the
 AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=RATE)
 
 
+@cache
 def setting(*, coupled: bool, sinusoids: bool):
     """A loop designed for a mirror that mixes its axes or not, and its truth."""
     lines = [(22.0, 60.0, (0.8, 0.6)), (61.0, 25.0, (0.0, 1.0))]
@@ -79,7 +81,7 @@ def test_it_is_attained_by_sinusoids_of_one_axis() -> None:
     lines = tuple(replace(line, direction=(0.0, 1.0)) for line in truth.vibrations)
     truth = replace(truth, vibrations=lines)
     found = lbt.studies.guaranteed_residual(
-        hardware, controller, truth, error_hz=2.0, sensor_gains=(0.8, 1.2), tolerance=0.01
+        hardware, controller, truth, error_hz=2.0, sensor_gains=(0.8, 1.2), tolerance=0.03
     )
     path = replace(hardware, sensor_matrix=np.diag(found.sensor_gains))
     response = lbt.close_loop(path, controller).sensitivity
@@ -90,7 +92,7 @@ def test_it_is_attained_by_sinusoids_of_one_axis() -> None:
         places.append(grid[np.argmax(size_of)] - line.frequency_hz)
     at = left_nm(hardware, controller, truth, found.sensor_gains, places)
     assert at == pytest.approx(found.value_nm, rel=1e-5)
-    assert found.upper_nm == pytest.approx(at, rel=0.011)
+    assert found.upper_nm == pytest.approx(at, rel=0.031)
 
 
 def test_without_errors_it_is_the_residual() -> None:

@@ -134,9 +134,12 @@ def identify_axis(
         return describe_axis(search, model, relative or None, note)
     if not data.closed:
         return describe_axis(search, model, None, "1: of an open loop it has no meaning")
-    error = _gain_error(search, model)
+    own_error = standard_errors(model.spectrum, parameter_covariance(model)).log_gain
+    error = _gain_error(search, model, own_error or float("inf"))
     if error <= _GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
+        if error > own_error:  # what the gain moves is as ambiguous
+            model = hold_gain(search, model, error)
         return describe_axis(search, model, error, f"found in the closed loop's data{poor}")
     search = replace(search, gain=assumed)
     by = f" by {100 * error:.0f} %" if error < 1 else ""
@@ -292,10 +295,9 @@ def estimate_averages(density: FloatArray) -> float | None:
     return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))
 
 
-def _gain_error(search: Search, model: FittedModel) -> float:
-    """Return the standard error of the logarithm of the gain, infinite where it is unknown."""
+def _gain_error(search: Search, model: FittedModel, error: float) -> float:
+    """Return the standard error of the logarithm of the gain, given that of the fit alone."""
     spectrum = model.spectrum
-    error = standard_errors(spectrum, parameter_covariance(model)).log_gain or float("inf")
     if error > _GAIN_ERROR or spectrum.drop_wide(WIDE_DAMPING) == spectrum:
         return error
     # a model with wide resonances may stand for another gain

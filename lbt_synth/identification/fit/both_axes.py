@@ -12,6 +12,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.fit.axis import estimate_averages, identify_axis, identify_spectrum
+from lbt_synth.identification.fit.close_lines import describe_close_lines
 from lbt_synth.identification.fit.coupled_axes import couple_axes
 from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES
 from lbt_synth.identification.fit.identified_model import (
@@ -35,6 +36,7 @@ _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _APART = 3.0  # standard errors between gains that differ
+_UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
 _NOT_WHITE = 1e-3  # probability of white innovations below which a note says so
 _BOTH = 2  # axes that may share resonances
 
@@ -255,7 +257,7 @@ def _pool_gains(
 def _find_doubts(
     axes: Sequence[IdentifiedAxis], found_gain: Sequence[int], most_lines: int
 ) -> Iterator[str]:
-    """Yield notes on odd gains, hidden noise, the limit of lines, and what no model explains."""
+    """Yield notes on odd gains, hidden noise, close and too many lines, and what no model has."""
     for i in found_gain:
         if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN:
             yield (
@@ -272,11 +274,19 @@ def _find_doubts(
                 "the rest of the model suffers"
             )
     for i, axis in enumerate(axes):
+        yield from describe_close_lines(axis, i)
+    for i, axis in enumerate(axes):
         if axis.noise_correlation:
             yield (
                 f"the noise of axis {i} is not white: neighbouring frames have a correlation of "
                 f"{axis.noise_correlation:.3f} +- {axis.noise_correlation_error:.3f}, which the "
                 "model and its errors hold. Designs take white noise of the same rms"
+            )
+        elif i in found_gain and axis.noise_correlation_error > _UNSEEN_COLOUR:
+            yield (
+                f"warning: the record does not show whether the noise of axis {i} is white (its "
+                f"correlation is 0 +- {axis.noise_correlation_error:.2g}): noise, sensor gain and "
+                "their errors hold if it is"
             )
     for i, axis in enumerate(axes):
         test = axis.whiteness

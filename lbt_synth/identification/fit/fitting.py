@@ -201,16 +201,22 @@ def required_gain(
     Less where its place was not searched for: an announced line, or one of a close pair
     (with ``earlier``, of a pair with one of the components before it).
     """
-    component = spectrum.components[i]
-    if component.announced is not None:
+    if spectrum.components[i].announced is not None:
         return _ANNOUNCED
-    if component.kind == "line":
-        centre, half = search.place(component)
-        lines = [c for c in spectrum.components[: i if earlier else None] if c.kind == "line"]
-        places = [search.place(line) for line in lines if line is not component]
-        if any(abs(centre - at) < 4 * (half + its_half) for at, its_half in places):
-            return _SPLIT
-    return search.price
+    return _SPLIT if lies_in_skirts(search, spectrum, i, earlier=earlier) else search.price
+
+
+def lies_in_skirts(
+    search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
+) -> bool:
+    """Whether a component is a line close to another (with ``earlier``, to one before it)."""
+    component = spectrum.components[i]
+    if component.kind != "line":
+        return False
+    centre, half = search.place(component)
+    others = spectrum.components[:i] if earlier else spectrum.exchange(i).components
+    places = [search.place(other) for other in others if other.kind == "line"]
+    return any(abs(centre - at) < 4 * (half + its_half) for at, its_half in places)
 
 
 def cost(search: Search, model: FittedModel) -> float:

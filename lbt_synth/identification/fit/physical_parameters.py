@@ -62,11 +62,23 @@ def gain_error_covariance(
 
 
 def hold_gain(search: Search, model: FittedModel, error: float) -> FittedModel:
-    """Return a model fitted at a gain, with the relative error of that in its information."""
+    """Return a model with a relative error of its gain, and all that this moves."""
     slope = derivatives(search.merge(model.spectrum), model.spectrum)[2][GAIN]
-    held = parameter_covariance(model)
+    information = model.information.copy()
+    information[GAIN] = information[:, GAIN] = 0  # as if it were fitted at that gain
+    held = invert_information(information)
     whole = held + gain_error_covariance(held, slope, [GAIN], error)
     return replace(model, information=invert_information(whole))
+
+
+def _colour_error(search: Search, spectrum: SpectrumModel) -> float:
+    """Return the standard error that the colour of white noise would have if it were fitted."""
+    information = derivatives(search.merge(spectrum), spectrum)[2]
+    priors = search.priors(replace(spectrum, colour=1.0))
+    fixed = np.setdiff1d(np.arange(priors.width.size), priors.free)
+    information[fixed] = information[:, fixed] = 0
+    information[priors.free, priors.free] += 1 / priors.width[priors.free] ** 2
+    return standard_errors(spectrum, invert_information(information)).colour
 
 
 def describe_axis(
@@ -101,7 +113,8 @@ def describe_axis(
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
         noise_correlation=correlation,
-        noise_correlation_error=(1 - correlation**2) * errors.colour,
+        noise_correlation_error=(1 - correlation**2)
+        * (errors.colour if spectrum.colour else _colour_error(search, spectrum)),
         sensor_gain=gain,
         sensor_gain_error=None if gain_error is None else gain * gain_error,
         sensor_gain_note=note,

@@ -1,0 +1,90 @@
+"""Lines that may be several, closer to each other than the record can separate.
+
+The sum of two resonances within some half widths has nearly the spectrum of one, and the fit gives
+one: at the mean of their frequencies, with the sum of their power. Its standard errors hold for
+these. Here each line becomes two of like damping, and what that adds to the likelihood decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from lbt_synth.identification.fit.fitting import Search, lies_in_skirts
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.whittle import (
+    WIDE_DAMPING,
+    Priors,
+    SpectrumModel,
+    contrast,
+    minimise,
+)
+
+_LIKELY = 5.5  # log-likelihood that a split rarely adds to a single line
+_WEAK = 40.0  # the same of a line in the skirts of another whose errors are too small
+_SHARES = (0.5, 0.8, 0.2)  # of the power in the lower line, where a fit begins
+_APART = 1.4  # half widths between the lines there
+_NARROWER = -0.25  # of the logarithm of the damping
+_LIKE = 0.5  # width of the prior around that
+_REACH = 20.0  # half widths around a line that are fitted
+_TRIPLE = 3  # parameters of a component, the last in a packed vector
+
+
+def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
+    """Yield notes on lines that may be several, and on lines that are hardly separate."""
+    search, model = Search(data=axis.data), axis.fitted_model
+    spectrum = model.spectrum
+    lines = [
+        i
+        for i, c in enumerate(spectrum.components)
+        if c.kind == "line" and c.damping_ratio < WIDE_DAMPING
+    ]
+    for i in lines:
+        place = (
+            f"warning: the line of axis {name} at {search.place(spectrum.components[i])[0]:.4g} Hz"
+        )
+        if split_gain(search, spectrum, i) > _LIKELY:
+            yield (
+                f"{place} may be two, closer than the record separates: its errors hold for the "
+                "mean of their frequencies and for their power together"
+            )
+        elif model.evidence[i] < _WEAK and lies_in_skirts(search, spectrum, i):
+            yield f"{place} lies in the skirts of another: the errors of both may be too small"
+
+
+def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
+    """Return what two lines of like damping in the place of line i add to the log-likelihood."""
+    line = spectrum.components[i]
+    centre, half = search.place(line)
+    data = _window(search.merge(spectrum), centre - _REACH * half, centre + _REACH * half)
+    best = single = contrast(data, spectrum)
+    for share in _SHARES:
+        lower, upper = (
+            line.shift(float(np.log1p(move * half / centre)), _NARROWER, float(np.log(power)))
+            for move, power in ((-_APART * (1 - share), share), (_APART * share, 1 - share))
+        )
+        start = spectrum.exchange(i).add(lower, replace(upper, announced=None))
+        width = np.zeros(start.pack().size)
+        width[-2 * _TRIPLE :] = 2 * (np.inf, _LIKE, np.inf)
+        priors = Priors(centre=start.pack(), width=width)
+        found = minimise(data, start, priors)
+        if found is not None:
+            away = (found.spectrum.pack() - priors.centre)[[1 - 2 * _TRIPLE, 1 - _TRIPLE]]
+            best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)
+    return single - best
+
+
+def _window(data: LoopPeriodogram, low_hz: float, high_hz: float) -> LoopPeriodogram:
+    """Return the values of a periodogram between two frequencies."""
+    inside = slice(*np.searchsorted(data.frequency_hz, [low_hz, high_hz]))
+    return replace(
+        data,
+        frequency_hz=data.frequency_hz[inside],
+        measured=data.measured[inside],
+        crossed=data.crossed[inside],
+        corrected=data.corrected[inside],
+        count=data.count[inside],
+    )
