@@ -154,11 +154,12 @@ def changes(value, rng):
         yield from (("not", not value), ("type", "yes"))
     elif isinstance(value, int | float):
         yield from ((f"times {f}", f * value) for f in (0.8, 1.01, 0.1, -1, 7))
-        yield from (("zero", 0.0), ("huge", 1e300), ("one", 1))
+        yield from (("zero", 0.0), ("huge", 1e300), ("one", 1), ("huge", 10**400))
+        yield from (("no number", float("nan")), ("no number", float("inf")))
         yield from (("type", str(value)), ("type", True), ("type", [value]), ("type", {}))
     elif isinstance(value, str):
         words = ("kalman", "hinf", "mixed", "integrator", "lqg", "polytopic-h2", "shaped", "plant")
-        yield from (("word", word) for word in (*words, value + " x", value[:-1], ""))
+        yield from (("word", word) for word in (*words, value + " x", value[:-1], "", "\ud800"))
         yield from (("type", 3), ("type", [value]), ("type", {value: 1}))
     elif isinstance(value, list):
         yield from (("shorter", value[:-1]), ("longer", [*value, 1.0]), ("type", "list"))
