@@ -149,9 +149,10 @@ def attack_channels(seed: int) -> None:
     B, C = rng.standard_normal((2, states, channels)) * scale ** rng.integers(0, 2)
     C = C.T / scale[:, None] ** (2 * rng.integers(0, 2))
     D = rng.standard_normal((channels, channels)) * (rng.random((channels, channels)) < 0.6)
-    bound = lbt.linear.structured_norm(lbt.linear.StateSpace(A=A, B=B, C=C, D=D))
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D)
+    bound = lbt.linear.mu_bound(system, [lbt.linear.Block()] * len(C), tolerance=1e-4)
     poles = np.abs(np.angle(np.linalg.eigvals(A))) / (2 * np.pi)
-    places = np.concatenate([rng.uniform(0, 0.5, 60), poles, [bound.peak_frequency_hz]])
+    places = np.concatenate([rng.uniform(0, 0.5, 60), poles, [bound.frequency_hz]])
     z = np.exp(2j * np.pi * places)[:, None, None]
     responses = (
         C @ np.linalg.solve(z * np.eye(states) - A, np.broadcast_to(B, (len(z), *B.shape))) + D

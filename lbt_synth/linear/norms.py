@@ -27,6 +27,8 @@ from lbt_synth.validation import ComplexArray, FloatArray
 _TOLERANCE = 2e-11
 _CAREFUL = 8
 
+_Array = FloatArray | ComplexArray
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HinfNorm:
@@ -148,7 +150,7 @@ def level_angles(G: StateSpace, level: float) -> FloatArray:
     """Angles of a balanced system at which a singular value may be at a level."""
     # one scaling of states serves both x and p; levels are scaled to one
     B, C, D = G.B / np.sqrt(level), G.C / np.sqrt(level), G.D / level
-    return _pencil_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
+    return popov_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
 
 
 def largest_real_part(system: StateSpace) -> float:
@@ -175,7 +177,7 @@ def largest_real_part(system: StateSpace) -> float:
         return float(values[best]), float(angles[best])
 
     def pencil(level: float) -> FloatArray:
-        return _pencil_angles(G.A, G.B, np.zeros_like(G.A), G.C, 2 * (moved.D - level))
+        return popov_angles(G.A, G.B, np.zeros_like(G.A), G.C, 2 * (moved.D - level))
 
     peak, _ = _climb(G, 0.0, np.pi, largest, pencil)
     return peak * (1 + 2 * _TOLERANCE) - 2 * size
@@ -280,9 +282,7 @@ def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
     return float(careful[best]), float(angles[high[best]])
 
 
-def _pencil_angles(
-    A: FloatArray, B: FloatArray, Q: FloatArray, S: FloatArray, R: FloatArray
-) -> FloatArray:
+def popov_angles(A: FloatArray, B: _Array, Q: _Array, S: _Array, R: _Array) -> FloatArray:
     """Angles of the generalised eigenvalues of a symplectic pencil; no matrix is inverted.
 
     ``z [x; A'p + Q x + S'w; 0] = [A x + B w; p; S x + B'p + R w]`` with the adjoint state p. For
@@ -290,8 +290,10 @@ def _pencil_angles(
     the real part of a scalar response, ``Q = 0``, ``S = C`` and ``R = 2 (D - level)``.
     """
     (n, m), zero = B.shape, np.zeros
-    E = np.block([[np.eye(n), zero((n, n + m))], [Q, A.T, S.T], [zero((m, 2 * n + m))]])
-    F = np.block([[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, B.T, R]])
+    E = np.block([[np.eye(n), zero((n, n + m))], [Q, A.T, S.conj().T], [zero((m, 2 * n + m))]])
+    F = np.block(
+        [[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, B.conj().T, R]]
+    )
     with np.errstate(all="ignore"):
         values = eigvals(F, E)
     return np.asarray(np.angle(values[np.isfinite(values) & (values != 0)]))

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from lbt_synth.linear import Controller, hinf_norm, structured_norm
+from lbt_synth.linear import Block, Controller, hinf_norm
 from lbt_synth.linear.held_controller import HasController
+from lbt_synth.linear.structured_singular_value.bound import upper_bound
 from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
@@ -21,6 +22,7 @@ _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the in
 _WIDEST = 1e4
 _AT_ONCE = 32  # gains, whose loops are in memory together
 _DIVISION, _DIVISIONS = 64, 3  # of the delays in which the delay margin is sought
+_DISK_TOLERANCE = 1e-4  # of the disk margin, relative
 _LONGEST = 100  # delay up to which it is sought [frames]
 
 
@@ -197,10 +199,11 @@ def _disk_margin(loop: ClosedLoop) -> float:
     """Return the symmetric disk margin of all measurements at once.
 
     Eq. 32 of P. Seiler, A. Packard, P. Gahinet, IEEE Control Syst. 40(5), 78 (2020),
-    doi:10.1109/MCS.2020.3005277: one over the structured norm of ``(S - T) / 2``.
+    doi:10.1109/MCS.2020.3005277: one over the structured singular value of ``(S - T) / 2``.
     """
     S = loop.output_sensitivity()
-    return 1 / structured_norm(replace(S, D=S.D - np.eye(len(S.D)) / 2)).upper
+    centred = replace(S, D=S.D - np.eye(len(S.D)) / 2)
+    return 1 / upper_bound(centred, (Block(),) * len(S.D), _DISK_TOLERANCE)[0]
 
 
 def _delay_margin_frames(loop: ClosedLoop) -> float:

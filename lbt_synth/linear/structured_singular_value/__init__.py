@@ -1,0 +1,1 @@
+"""The structured singular value: how much uncertainty in several places a system survives."""
