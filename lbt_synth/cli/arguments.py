@@ -314,13 +314,12 @@ def robustness(parser: ArgumentParser) -> None:
     add_option(redesigned, "--gamma-ratio", float, "H-infinity bound of each row")
     add_option(redesigned, "--sensor-gain", float, "real sensor gain")
     fixed = parser.add_argument_group("with gain files")
-    ends = ("LOW", "HIGH", "COUNT")
     for name, text in (
         ("--errors-hz", "true frequency less that of the design, of the line that moves most [Hz]"),
         ("--sensor-gains", "real sensor gain"),
     ):
         text += ": COUNT values (default: the configuration's)"
-        add_option(fixed, name, float, text, nargs=3, metavar=ends)
+        add_option(fixed, name, float, text, nargs=3, metavar=("LOW", "HIGH", "COUNT"))
     text = "real delay less that of the design [frames] (default: the configuration's, else 0)"
     name, dest = "--delay-errors", "delay_errors_frames"
     add_option(fixed, name, float, text, nargs="+", dest=dest, metavar="FRAMES")
