@@ -83,9 +83,11 @@ def test_commands_of_another_kind(make, doubt, repair):
 
 
 def test_a_record_too_short_for_a_likelihood_has_a_law():
-    found = lbt.identification.diagnose(short_record(-1.0, frames=900))
+    found = lbt.identification.diagnose(short_record(-1.0, frames=500))
     assert found.commands.accepted
     assert found.doubt == "by their law they have the opposite sign"
+    longer = lbt.identification.diagnose(short_record(-1.0, frames=900))
+    assert longer.commands.options == "--command-sign -1"  # with a likelihood it is named
 
 
 def test_an_open_loop():
