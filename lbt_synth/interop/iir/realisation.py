@@ -39,7 +39,7 @@ def build_controller(num: FloatArray, den: FloatArray, dt_s: float) -> Controlle
     """
     try:
         axes = [_realise(top, bottom) for top, bottom in zip(num, den, strict=True)]
-    except OverflowError as error:
+    except (OverflowError, ValueError) as error:  # a number that is none, or too large a one
         raise NumericalError(
             "the controller's transfer function has coefficients beyond the range of its numbers. "
             "Try a target that keeps the states (c, matlab), or a design with fewer states.",

@@ -69,7 +69,7 @@ def test_numerators_change_the_entry_alone(order):
     assert one.B[-1, 0] == 0.5
 
 
-@pytest.mark.parametrize("beyond", [np.inf, 1e300])
+@pytest.mark.parametrize("beyond", [np.inf, np.nan, 1e300])
 def test_coefficients_beyond_the_range_are_refused(beyond):
     """Single precision makes them infinite; the quotient of others is too large."""
     with pytest.raises(NumericalError, match="beyond the range"):
