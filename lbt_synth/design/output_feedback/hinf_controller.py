@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from lbt_synth.linear.state_space import StateSpace
 
 _AT_LEAST = 1e-9  # a level this close to the least one counts as the least one itself
+_SAME_REASON = 0.99  # of the least level, at which a looser proof has the same reason
 _LOOSE = 1e-7  # a proof further from the least level is tried by the inequality as well
 _LARGEST_LMI = 20  # states
 _APART = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # of levels tried next to the least
@@ -152,6 +154,8 @@ class _Bracket:
             with suppress(NumericalError):
                 proofs.append(_inequality_proof(form.plant, equations, solution.gamma))
         proved, self.witness = max(proofs, key=lambda each: each[0])
+        if proofs[0][0] > _SAME_REASON * self.least:  # an inequality gives no reason in words
+            self.witness = replace(self.witness, reason=proofs[0][1].reason)
         if proved > self.least * (1 + _LOOSE):
             raise NumericalError(
                 f"no controller should have a norm below {proved:.9g}, yet one achieves "
