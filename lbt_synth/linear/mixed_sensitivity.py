@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.continuous_system import ContinuousSystem, linear_system, require_same_time
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.validation import FloatArray, matrix
+from lbt_synth.linear.weights import Weight, constant_weight, stack_weights, weigh_plant
+from lbt_synth.validation import matrix
 
 
 def mixed_sensitivity(
@@ -67,51 +66,35 @@ def mixed_sensitivity(
     names = [name for name, value in given.items() if value is not None]
     if not names:
         raise ProblemError("give at least one of performance, control and robustness.")
-    systems = [_weight(given[name], name, len(reads[name][0]), G) for name in names]
-    from_state, from_w, from_u = (np.vstack([reads[name][i] for name in names]) for i in range(3))
-    entry = block_diag(*(W.B for W in systems))
-    through = block_diag(*(W.D for W in systems))
-    A = block_diag(G.A, *(W.A for W in systems))
-    n = len(G.A)
-    A[n:, :n] = entry @ from_state
-    return GeneralizedPlant(
-        A=A,
-        B1=np.vstack([np.zeros((n, p)), entry @ from_w]),
-        B2=np.vstack([G.B, entry @ from_u]),
-        C1=np.hstack([through @ from_state, block_diag(*(W.C for W in systems))]),
-        C2=np.hstack([-G.C, np.zeros((p, len(A) - n))]),
-        D11=through @ from_w,
-        D12=through @ from_u,
+    weight = stack_weights(_weight(given[name], name, len(reads[name][0]), G) for name in names)
+    C1, D11, D12 = (np.vstack([reads[name][i] for name in names]) for i in range(3))
+    loop = GeneralizedPlant(
+        A=G.A,
+        B1=np.zeros((len(G.A), p)),
+        B2=G.B,
+        C1=C1,
+        C2=-G.C,
+        D11=D11,
+        D12=D12,
         D21=np.eye(p),
         D22=-G.D,
         dt_s=require_same_time(G),
     )
+    return weigh_plant(loop, weight)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Weight:
-    """Matrices of a weight; a gain has no states."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-
-def _weight(value: Any, name: str, size: int, like: StateSpace | ContinuousSystem) -> _Weight:
+def _weight(value: Any, name: str, size: int, like: StateSpace | ContinuousSystem) -> Weight:
     """Return a weight of signals of some size, in the time of a system."""
     if isinstance(value, int | float | np.ndarray):
-        D = matrix(value, name)
-        parts = {"A": np.zeros((0, 0)), "B": np.zeros((0, D.shape[1])), "C": np.zeros((len(D), 0))}
-        parts["D"] = D
+        weight = constant_weight(matrix(value, name))
     else:
         W = linear_system(value)
         require_same_time(like, W)
-        parts = {key: getattr(W, key) for key in "ABCD"}
-    if parts["D"].shape == (1, 1):
-        parts = {key: block_diag(*[part] * size) for key, part in parts.items()}
-    if parts["D"].shape[1] != size:
+        weight = Weight(W.A, W.B, W.C, W.D)
+    if weight.D.shape == (1, 1):
+        weight = stack_weights([weight] * size)
+    if weight.D.shape[1] != size:
         raise DimensionError(
-            f"the weight {name} must take {size} signals; got one of {parts['D'].shape[1]}."
+            f"the weight {name} must take {size} signals; got one of {weight.D.shape[1]}."
         )
-    return _Weight(**parts)
+    return weight

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from lbt_synth.design.output_feedback.hinf_controller import hinf_controller
 from lbt_synth.design.output_feedback.result import ControllerDesign, System, certified_controller
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.linear import Block, GeneralizedPlant, StateSpace, mu_bound
-from lbt_synth.linear.output_feedback.discrete_form import discrete_form
+from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
 from lbt_synth.linear.structured_singular_value.blocks import checked_blocks, places
 from lbt_synth.linear.structured_singular_value.scales import best_scales
+from lbt_synth.linear.weights import Weight, constant_weight, stack_weights, weigh_plant
 from lbt_synth.validation import FloatArray, integer, require_instance
 
 _POINTS = 65  # frequencies at which scales are fitted
@@ -96,13 +95,14 @@ def mu_controller(
     m1, _, p1, _ = plant.sizes
     given = checked_blocks(blocks, (p1, m1))
     order = integer(order, "order", at_least=0, at_most=3)
-    best = _bounded(hinf_controller(plant, gamma_ratio=_RATIO).controller, plant, given)
+    form = discrete_form(plant)
+    best = _bounded(hinf_controller(plant, gamma_ratio=_RATIO).controller, form, given)
     design = best
     for _ in range(integer(iterations, "iterations", at_least=1, at_most=50)):
         try:
             scaled = _scaled_plant(plant, design.closed_loop, given, order)
             found = hinf_controller(scaled, gamma_ratio=_RATIO)
-            design = _bounded(found.controller, plant, given)
+            design = _bounded(found.controller, form, given)
         except (NumericalError, CertificateError):  # scales that the equations do not bear
             break
         improved = design.mu < best.mu * (1 - _ENOUGH)
@@ -112,12 +112,9 @@ def mu_controller(
     return best
 
 
-def _bounded(
-    controller: System, plant: GeneralizedPlant, blocks: Sequence[Block]
-) -> ControllerDesign:
+def _bounded(controller: System, form: DiscreteForm, blocks: Sequence[Block]) -> ControllerDesign:
     """Return a controller as a certified design of the plant, with its bound of mu."""
     assert isinstance(controller, StateSpace)  # the plant is in discrete time
-    form = discrete_form(plant)
     design = certified_controller(form, controller, method="mu", route="D-K iteration")
     return replace(design, mu=mu_bound(design.closed_loop, blocks).upper)
 
@@ -139,19 +136,10 @@ def _scaled_plant(
     scales = [_fitted_scale(angles, *each) for each in zip(sizes, orders, strict=True)]
     left = _repeated(scales, [columns for _, columns in own])
     right = _repeated([_inverse(scale) for scale in scales], [rows for rows, _ in own])
-    return _between(plant, left, right)
+    return weigh_plant(plant, left, right)
 
 
-class _Scale(NamedTuple):
-    """A scale in textbook form; a constant one has no states."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-
-def _fitted_scale(angles: FloatArray, size: FloatArray, order: int) -> _Scale:
+def _fitted_scale(angles: FloatArray, size: FloatArray, order: int) -> Weight:
     """Fit ``k prod (z - a) / (z - b)``, all a and b real and inside the circle, to a modulus."""
     z = np.exp(1j * angles)
     target = np.log(size)
@@ -170,48 +158,23 @@ def _fitted_scale(angles: FloatArray, size: FloatArray, order: int) -> _Scale:
     spread = np.linspace(0.3, 1.5, max(order, 1))[:order]
     start = np.concatenate([[np.mean(target)], spread, spread])
     gain, zeros, poles = parts(least_squares(apart, start).x)
-    A, B, C, D = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[np.exp(gain)]])
+    A, B, C, D = constant_weight(np.array([[np.exp(gain)]]))
     for zero, pole in zip(zeros, poles, strict=True):  # (z - a)/(z - b) = 1 + (b - a)/(z - b)
         A = np.block([[A, np.zeros((len(A), 1))], [C, np.array([[pole]])]])
         B, C = np.vstack([B, D]), np.hstack([C, np.array([[pole - zero]])])
-    return _Scale(A, B, C, D)
+    return Weight(A, B, C, D)
 
 
-def _inverse(scale: _Scale) -> _Scale:
+def _inverse(scale: Weight) -> Weight:
     back = 1 / scale.D
     A = scale.A - scale.B @ back @ scale.C
-    return _Scale(A, scale.B @ back, -back @ scale.C, back)
+    return Weight(A, scale.B @ back, -back @ scale.C, back)
 
 
-def _repeated(scales: Sequence[_Scale], channels: Sequence[slice]) -> _Scale:
-    """Return the scales on their channels, as one system."""
-    each = [
+def _repeated(scales: Sequence[Weight], channels: Sequence[slice]) -> Weight:
+    """Return the scales on their channels, as one weight."""
+    return stack_weights(
         scale
         for scale, own in zip(scales, channels, strict=True)
         for _ in range(own.stop - own.start)
-    ]
-    return _Scale(*(block_diag(*parts) for parts in zip(*each, strict=True)))
-
-
-def _between(plant: GeneralizedPlant, left: _Scale, right: _Scale) -> GeneralizedPlant:
-    """Return the plant with a system after its errors and one before its disturbances."""
-    P, n, r, s = plant, len(plant.A), len(right.A), len(left.A)
-    none = np.zeros
-    A = np.block(
-        [
-            [P.A, P.B1 @ right.C, none((n, s))],
-            [none((r, n)), right.A, none((r, s))],
-            [left.B @ P.C1, left.B @ P.D11 @ right.C, left.A],
-        ]
-    )
-    return replace(
-        P,
-        A=A,
-        B1=np.vstack([P.B1 @ right.D, right.B, left.B @ P.D11 @ right.D]),
-        B2=np.vstack([P.B2, none((r, P.B2.shape[1])), left.B @ P.D12]),
-        C1=np.hstack([left.D @ P.C1, left.D @ P.D11 @ right.C, left.C]),
-        C2=np.hstack([P.C2, P.D21 @ right.C, none((len(P.C2), s))]),
-        D11=left.D @ P.D11 @ right.D,
-        D12=left.D @ P.D12,
-        D21=P.D21 @ right.D,
     )
