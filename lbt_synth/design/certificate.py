@@ -34,9 +34,6 @@ INFEASIBLE_TOLERANCE = 1e-9
 VARIANCE_TOLERANCE = 1e-6
 LEVEL_SETS = "level sets on the symplectic pencil"
 _GRID = 513  # frequencies from 0 to the Nyquist frequency
-_ONE_NORM = "relative, 1-norm"
-_TWO_EQUATIONS = "relative, two Lyapunov equations"
-_VARIANCE = (_ONE_NORM, _TWO_EQUATIONS)  # the checks of a variance
 _NOTHING = 1e-14  # part of a system's size that counts as rounding
 _TINY = 1e-300  # keeps a quotient finite where the denominator is zero
 
@@ -199,38 +196,40 @@ def certify_error(
     level sets and on a frequency grid. ``stability`` names the first check. Without ``white`` the
     disturbance is no white noise, and the variance means nothing.
     """
-    certificate, norm, _ = _examine_error(error, stability)
-    if white or norm is None:
-        return certificate
-    kept = tuple(check for check in certificate.checks if check.computed_by not in _VARIANCE)
-    return replace(certificate, checks=kept, rms_per_output=frozen_copy(np.empty(0)))
+    return _examine_error(error, stability, white)[0]
 
 
 def _examine_error(
-    error: StateSpace, stability: str = "spectral radius of the filter"
+    error: StateSpace, stability: str = "spectral radius of the filter", white: bool = True
 ) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
     """Return the certificate of an error, with its norm and covariance if it is stable."""
     stable = _stability_check(stability, error.spectral_radius)
     if not stable.passed:
         infinite = frozen_copy(np.full(len(error.C), np.inf))
         return Certificate(checks=(stable,), gamma=np.inf, rms_per_output=infinite), None, None
-    drive = error.B @ error.B.T
-    P = stationary_covariance(error.A, drive)
-    variances = np.diag(error.C @ P @ error.C.T + error.D @ error.D.T)
+    P, variances, checks = _examine_variance(error) if white else (None, np.empty(0), ())
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     highest = float(np.max(largest_singular_values(error, grid)))
-    residual = lyapunov_residual(error.A, drive, P)
     above = (highest - _rounding(error)) / max(norm.upper, _TINY) - 1
     how = f"{_GRID} frequencies against level sets"
-    checks = (
-        stable,
-        Check("residual of the Lyapunov equation", residual, RESIDUAL_TOLERANCE, _ONE_NORM),
-        _adjoint_variance_check(error, float(variances.sum())),
-        Check("singular values above the norm", above, NORM_TOLERANCE, how),
-    )
+    peak = Check("singular values above the norm", above, NORM_TOLERANCE, how)
     rms = frozen_copy(np.sqrt(np.maximum(variances, 0)))
-    return Certificate(checks=checks, gamma=norm.value, rms_per_output=rms), norm, P
+    certificate = Certificate(checks=(stable, *checks, peak), gamma=norm.value, rms_per_output=rms)
+    return certificate, norm, P
+
+
+def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[Check, ...]]:
+    """Return covariance and variances of an error driven by white noise, with their checks."""
+    drive = error.B @ error.B.T
+    P = stationary_covariance(error.A, drive)
+    variances = np.diag(error.C @ P @ error.C.T + error.D @ error.D.T)
+    residual, how = lyapunov_residual(error.A, drive, P), "relative, 1-norm"
+    checks = (
+        Check("residual of the Lyapunov equation", residual, RESIDUAL_TOLERANCE, how),
+        _adjoint_variance_check(error, float(variances.sum())),
+    )
+    return P, variances, checks
 
 
 def _rounding(error: StateSpace) -> float:
@@ -245,8 +244,8 @@ def _adjoint_variance_check(error: StateSpace, variance: float) -> Check:
     adjoint = float(np.trace(error.B.T @ weight @ error.B + error.D.T @ error.D))
     size = max(abs(variance), abs(adjoint), _rounding(error) ** 2)
     apart = abs(variance - adjoint) / size if size > 0 else 0.0
-    name = "variance, against its adjoint equation"
-    return Check(name, apart, VARIANCE_TOLERANCE, _TWO_EQUATIONS)
+    how = "relative, two Lyapunov equations"
+    return Check("variance, against its adjoint equation", apart, VARIANCE_TOLERANCE, how)
 
 
 def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
