@@ -96,6 +96,23 @@ def hinf(
     require_problem(problem)
     if route is not None:
         choice(route, "route", ("lmi", "riccati"))
+    gamma, gamma_ratio = checked_bounds(
+        gamma, gamma_ratio, far_above="the filter is the Kalman filter"
+    )
+    problem = problem.ahead(horizon)
+    start = kalman_riccati(problem)
+    if route is None and len(problem.A) <= _LARGEST_LMI:
+        try:
+            return _design(problem, start, "lmi", gamma, gamma_ratio)
+        except (NumericalError, CertificateError):  # noise far below the signal
+            pass
+    return _design(problem, start, route or "riccati", gamma, gamma_ratio)
+
+
+def checked_bounds(
+    gamma: float | None, gamma_ratio: float | None, *, far_above: str
+) -> tuple[float | None, float | None]:
+    """Check the two ways to bound the norm, of which at most one may be given."""
     if gamma is not None and gamma_ratio is not None:
         raise ProblemError(
             "give gamma or gamma_ratio, not both; "
@@ -109,16 +126,9 @@ def hinf(
             "gamma_ratio",
             at_least=1,
             at_most=_GREATEST_RATIO,
-            hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
+            hint=f"At 1 the bound is the least one; far above it {far_above}.",
         )
-    problem = problem.ahead(horizon)
-    start = kalman_riccati(problem)
-    if route is None and len(problem.A) <= _LARGEST_LMI:
-        try:
-            return _design(problem, start, "lmi", gamma, gamma_ratio)
-        except (NumericalError, CertificateError):  # noise far below the signal
-            pass
-    return _design(problem, start, route or "riccati", gamma, gamma_ratio)
+    return gamma, gamma_ratio
 
 
 def _design(

@@ -21,6 +21,7 @@ from scipy.linalg import eigh, null_space
 
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
 from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
@@ -131,8 +132,7 @@ def worst_invisible_disturbance(
     backward = np.asarray(np.linalg.solve(np.eye(len(A)) + W @ P, A.T), dtype=np.float64)
     worst = np.linalg.eigh(L @ P @ L.T)[1][:, -1]
     end = L.T @ worst
-    values, vectors = np.linalg.eigh(stationary_covariance(backward, np.outer(end, end)))
-    costates = vectors * np.sqrt(np.maximum(values, 0))
+    costates = semidefinite_root(stationary_covariance(backward, np.outer(end, end)))
     candidates = [_hide(problem, P @ backward @ costates, B.T @ costates)]
     poles = np.linalg.eigvals(backward)
     slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]

@@ -71,15 +71,8 @@ def _least_rms(equations: TwoRiccati) -> float:
     ``|z|^2`` is the cost with known state and disturbance, plus that of the distance of the
     control from ``F x + F0 w``, of which the measurements leave an error.
     """
-    P, control = equations.plant, equations.control
-    X, Y = control.least, equations.estimation.least
-    law = np.linalg.solve(
-        control.weight,
-        np.hstack([P.B2.T @ X @ P.A + P.D12.T @ P.C1, P.B2.T @ X @ P.B1 + P.D12.T @ P.D11]),
-    )
-    n = len(P.A)
-    F, F0 = law[:, :n], law[:, n:]
-    innovation = P.D21 @ P.D21.T + P.C2 @ Y @ P.C2.T
+    P, control, estimation = equations.plant, equations.control, equations.estimation
+    F, F0, Y = control.feedback, control.feedforward, estimation.least
     seen = F @ Y @ P.C2.T + F0 @ P.D21.T
-    error = F @ Y @ F.T + F0 @ F0.T - seen @ np.linalg.solve(innovation, seen.T)
+    error = F @ Y @ F.T + F0 @ F0.T - seen @ np.linalg.solve(estimation.weight, seen.T)
     return float(np.sqrt(np.trace(control.pushed) + np.trace(control.weight @ error)))

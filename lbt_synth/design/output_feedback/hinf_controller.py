@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lbt_synth.design.hinf import checked_bounds
 from lbt_synth.design.output_feedback.result import ControllerDesign, certified_controller
-from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
+from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.lower_bound import NO_PROOF, infeasible_control_level
-from lbt_synth.validation import choice, number
+from lbt_synth.validation import choice
 
 if TYPE_CHECKING:
     from lbt_synth.linear.output_feedback.lower_bound import ControlWitness
@@ -25,7 +26,6 @@ _SAME_REASON = 0.99  # of the least level, at which a looser proof has the same 
 _LOOSE = 1e-7  # a proof further from the least level is tried by the inequality as well
 _LARGEST_LMI = 20  # states
 _APART = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # of levels tried next to the least
-_GREATEST_RATIO = 1e6
 
 
 def hinf_controller(
@@ -96,15 +96,8 @@ def hinf_controller(
     True
     """
     choice(route, "route", ("riccati", "lmi"))
-    if gamma is not None and gamma_ratio is not None:
-        raise ProblemError(
-            "give gamma or gamma_ratio, not both; "
-            f"got gamma={gamma!r} and gamma_ratio={gamma_ratio!r}."
-        )
-    if gamma is not None:
-        gamma = number(gamma, "gamma", above=0)
-    if gamma_ratio is not None:
-        gamma_ratio = number(gamma_ratio, "gamma_ratio", at_least=1, at_most=_GREATEST_RATIO)
+    far_above = "the controller is that of least variance"
+    gamma, gamma_ratio = checked_bounds(gamma, gamma_ratio, far_above=far_above)
     form = discrete_form(plant)
     equations, share = form.equations()
     bracket = _Bracket(form, equations, route)
@@ -141,10 +134,7 @@ class _Bracket:
     def __init__(self, form: DiscreteForm, equations: TwoRiccati, route: str) -> None:
         solution = equations.least_level()
         self.controller, self.least = _least_controller(form, equations, solution.gamma)
-        if equations.plant is form.plant:
-            candidates = [equations.witness(solution)]
-        else:  # of the plant next to it the oscillations alone are also its own
-            candidates = [NO_PROOF, *equations.oscillations(solution, form.plant)]
+        candidates = [NO_PROOF, *equations.proofs(solution, form.plant)]
         levels = [(infeasible_control_level(form.plant, each), each) for each in candidates]
         proofs = [max(levels, key=lambda each: each[0])]
         loose = proofs[0][0] < self.least * (1 - _LOOSE)

@@ -74,8 +74,8 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
     form = discrete_form(plant, continuous=False)
     equations, share = form.equations()
     loop = free_parameter(equations)
-    controller, norm = equations.least_variance(), form.norm(equations.least_variance())
-    if norm > gamma:
+    controller = equations.least_variance()
+    if form.norm(controller) > gamma:
         least = hinf_controller(plant, gamma=gamma)  # refuses what no controller reaches
         frequency_hz = np.linspace(0, 0.5 / loop.T11.dt_s, _POINTS)
         from lbt_synth.linear.lmi.mixed_control import least_variance_below

@@ -25,6 +25,7 @@ from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
+from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.validation import FloatArray, frozen_copy
 
 
@@ -80,8 +81,7 @@ class BalancedProblem:
 
     def witness(self, moments: FloatArray, basis: FloatArray) -> Witness:
         """Witness from a dual point: moments over a basis of balanced states and disturbances."""
-        values, vectors = np.linalg.eigh((moments + moments.T) / 2)
-        pairs = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+        pairs = basis @ semidefinite_root(moments)
         n = self.basis.shape[1]
         return Witness(states=self.basis @ pairs[:n], disturbances=pairs[n:])
 

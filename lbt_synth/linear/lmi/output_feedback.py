@@ -17,6 +17,7 @@ from scipy.linalg import null_space
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
+from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import Side, control_side, estimation_side
 from lbt_synth.linear.output_feedback.lower_bound import ControlWitness
 from lbt_synth.validation import FloatArray
@@ -72,7 +73,5 @@ class _Storage:
     def pairs(self, dual: FloatArray) -> Witness:
         """Return the pairs of a dual solution."""
         count = self.hidden.shape[1]
-        moments = dual[:count, :count]
-        values, vectors = np.linalg.eigh((moments + moments.T) / 2)
-        found = self.hidden @ (vectors * np.sqrt(np.maximum(values, 0)))
+        found = self.hidden @ semidefinite_root(dual[:count, :count])
         return Witness(states=self.basis @ found[: self.size], disturbances=found[self.size :])

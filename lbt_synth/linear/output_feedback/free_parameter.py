@@ -65,19 +65,12 @@ class FreeParameter:
 
 def free_parameter(equations: TwoRiccati) -> FreeParameter:
     """Return the affine form of the loop of a plant, by its least-variance solutions."""
-    P, side = equations.plant, equations.control
-    X, Y, n = side.least, equations.estimation.least, len(equations.plant.A)
-    law = np.linalg.solve(
-        side.weight,
-        np.hstack([P.B2.T @ X @ P.A + P.D12.T @ P.C1, P.B2.T @ X @ P.B1 + P.D12.T @ P.D11]),
-    )
-    F, F0 = law[:, :n], law[:, n:]
-    S = P.D21 @ P.D21.T + P.C2 @ Y @ P.C2.T
-    seen = np.vstack([P.A, F]) @ Y @ P.C2.T + np.vstack([P.B1, F0]) @ P.D21.T
-    gains = np.asarray(np.linalg.solve(S, seen.T).T, dtype=np.float64)
-    state, through = gains[:n], gains[n:]
-    control_unit = np.linalg.inv(np.linalg.cholesky(side.weight).T)
-    innovation_unit = np.linalg.inv(np.linalg.cholesky(S))
+    P, control, estimation = equations.plant, equations.control, equations.estimation
+    F, state = control.feedback, estimation.feedback.T
+    seen = F @ estimation.least @ P.C2.T + control.feedforward @ P.D21.T
+    through = np.linalg.solve(estimation.weight, seen.T).T
+    control_unit = np.linalg.inv(np.linalg.cholesky(control.weight).T)
+    innovation_unit = np.linalg.inv(np.linalg.cholesky(estimation.weight))
     dt_s = P.dt_s or 1.0
     B2, D12 = P.B2 @ control_unit, P.D12 @ control_unit
     C2, D21 = innovation_unit @ P.C2, innovation_unit @ P.D21
@@ -85,7 +78,7 @@ def free_parameter(equations: TwoRiccati) -> FreeParameter:
         plant=P,
         feedback=F,
         injection=state,
-        through=through,
+        through=np.asarray(through),
         control_unit=np.asarray(control_unit),
         innovation_unit=np.asarray(innovation_unit),
         T11=P.closed_loop(equations.least_variance()),

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.matrix_functions import is_stable
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.routes import doubling
@@ -60,9 +61,10 @@ class WorstCase:
 class FullInformation:
     """Solves ``X`` of one side for any gamma, as the excess over the least-variance solution.
 
-    With the feedback of least variance u = -F x - F0 w, what is left is a problem without state
-    weight, so that the doubling starts inside the reach of the stabilising solution and D12 may
-    be singular.
+    With the law of least variance ``u = -feedback x - feedforward w``, what is left is a problem
+    without state weight, so that the doubling starts inside the reach of the stabilising solution
+    and D12 may be singular. Of the side of estimation, transposed, ``weight`` is the covariance of
+    the innovation and ``feedback`` its gain into the state.
     """
 
     def __init__(self, side: Side) -> None:
@@ -70,9 +72,10 @@ class FullInformation:
         dare = solve_dare(A, B2, C1.T @ C1, D12.T @ D12, C1.T @ D12)
         self.side, self.least = side, dare.X
         self.weight = D12.T @ D12 + B2.T @ dare.X @ B2
-        feedforward = np.linalg.solve(self.weight, B2.T @ dare.X @ B1 + D12.T @ D11)
-        self.A, self.B = A - B2 @ dare.gain_feedback, B1 - B2 @ feedforward
-        C, D = C1 - D12 @ dare.gain_feedback, D11 - D12 @ feedforward
+        self.feedback = dare.gain_feedback
+        self.feedforward = np.linalg.solve(self.weight, B2.T @ dare.X @ B1 + D12.T @ D11)
+        self.A, self.B = A - B2 @ self.feedback, B1 - B2 @ self.feedforward
+        C, D = C1 - D12 @ self.feedback, D11 - D12 @ self.feedforward
         self.pushed = D.T @ D + self.B.T @ dare.X @ self.B
         self.cross = self.A.T @ dare.X @ self.B + C.T @ D
         self.reach = B2 @ np.linalg.solve(self.weight, B2.T)
@@ -95,7 +98,7 @@ class FullInformation:
             return -1.0, None
         spectrum = np.linalg.eigvalsh(found)
         closed = np.linalg.solve(np.eye(n) + G @ found, A)
-        if spectrum[0] < -_NEGATIVE * abs(spectrum[-1]) or not _stable(closed):
+        if spectrum[0] < -_NEGATIVE * abs(spectrum[-1]) or not is_stable(closed):
             return -1.0, None
         BX = self.side.B2.T @ found
         answer = np.linalg.solve(self.weight + BX @ self.side.B2, BX @ self.B)
@@ -127,7 +130,3 @@ class FullInformation:
 
 
 _NAMES = ("A", "B1", "B2", "C1", "D11", "D12")
-
-
-def _stable(A: FloatArray) -> bool:
-    return bool(np.max(np.abs(np.linalg.eigvals(A))) < 1)

@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.norms import hinf_norm
 from lbt_synth.linear.output_feedback.central_controller import central_controller
 from lbt_synth.linear.output_feedback.full_information import (
@@ -19,10 +20,8 @@ from lbt_synth.linear.output_feedback.full_information import (
     estimation_side,
 )
 from lbt_synth.linear.output_feedback.lower_bound import (
-    NO_PROOF,
     ControlWitness,
     coupled_bursts,
-    infeasible_control_level,
     last_step,
     steady_oscillation,
 )
@@ -54,7 +53,6 @@ class TwoRiccati:
         self.plant, self.rate = plant, rate
         self.control = FullInformation(control_side(plant))
         self.estimation = FullInformation(estimation_side(plant))
-        self.trials = 0
 
     def least_variance(self) -> StateSpace:
         """Return the controller of least variance."""
@@ -68,14 +66,12 @@ class TwoRiccati:
 
     def solve(self, gamma: float) -> tuple[float, LevelSolution | None]:
         """Return the least slack of the three conditions, and the solutions where it is above 0."""
-        self.trials += 1
         try:
             slack, X = self.control.solve(gamma)
             other, Y = (-1.0, None) if X is None else self.estimation.solve(gamma)
             if X is None or Y is None:
                 return -1.0, None
-            values, vectors = np.linalg.eigh(X)
-            root = vectors * np.sqrt(np.maximum(values, 0))
+            root = semidefinite_root(X)
             coupling = 1 - float(np.linalg.eigvalsh(root.T @ Y @ root)[-1]) / gamma**2
         except np.linalg.LinAlgError:  # singular to working accuracy, as next to a level of zero
             return -1.0, None
@@ -121,39 +117,28 @@ class TwoRiccati:
             return "the highest frequencies"
         return f"{self.rate * np.tan(angle / 2) / (2 * np.pi):.6g} Hz"
 
-    def witness(self, solution: LevelSolution) -> ControlWitness:
-        """Return the best proof against the levels below a solution."""
-        try:
+    def proofs(self, solution: LevelSolution, plant: GeneralizedPlant) -> list[ControlWitness]:
+        """Return what may prove of a plant, this or the one next to it, that no level is lower.
+
+        Bursts belong to this plant alone. Steady oscillations have frequency zero, the highest one,
+        and those of the slow poles of the worst cases. At levels next to zero there may be none.
+        """
+        out: list[ControlWitness] = []
+        with suppress(np.linalg.LinAlgError):
             control = self.control.worst_case(solution.X, solution.gamma)
             estimation = self.estimation.worst_case(solution.Y, solution.gamma)
-            unseen, unmoved = coupled_bursts(control, solution.X, estimation, solution.Y)
-        except np.linalg.LinAlgError:  # at levels next to zero
-            return NO_PROOF
-        candidates = [
-            ControlWitness(unseen=unseen, unmoved=unmoved, reason=_COUPLED),
-            ControlWitness(unseen=None, unmoved=last_step(control, solution.X), reason=_CONTROL),
-            ControlWitness(
-                unseen=last_step(estimation, solution.Y), unmoved=None, reason=_ESTIMATION
-            ),
-        ]
-        candidates += self.oscillations(solution, self.plant)
-        return max(candidates, key=lambda each: infeasible_control_level(self.plant, each))
-
-    def oscillations(
-        self, solution: LevelSolution, plant: GeneralizedPlant
-    ) -> list[ControlWitness]:
-        """Return the steady oscillations of a plant, this or the one next to it, that may prove.
-
-        Their frequencies are zero, the highest, and those of the slow poles of the worst cases.
-        """
-        out = []
-        with suppress(np.linalg.LinAlgError):
-            for angle in _slow_angles(self.control.worst_case(solution.X, solution.gamma)):
+            if plant is self.plant:
+                unseen, unmoved = coupled_bursts(control, solution.X, estimation, solution.Y)
+                out.append(ControlWitness(unseen=unseen, unmoved=unmoved, reason=_COUPLED))
+                unmoved = last_step(control, solution.X)
+                out.append(ControlWitness(unseen=None, unmoved=unmoved, reason=_CONTROL))
+                unseen = last_step(estimation, solution.Y)
+                out.append(ControlWitness(unseen=unseen, unmoved=None, reason=_ESTIMATION))
+            for angle in _slow_angles(control):
                 pairs = steady_oscillation(control_side(plant), angle)
                 words = f"{_CONTROL_AT} {self._frequency_text(angle)}"
                 out.append(ControlWitness(unseen=None, unmoved=pairs, reason=words))
-        with suppress(np.linalg.LinAlgError):
-            for angle in _slow_angles(self.estimation.worst_case(solution.Y, solution.gamma)):
+            for angle in _slow_angles(estimation):
                 pairs = steady_oscillation(estimation_side(plant), angle)
                 words = f"{_ESTIMATION_AT} {self._frequency_text(angle)}"
                 out.append(ControlWitness(unseen=pairs, unmoved=None, reason=words))

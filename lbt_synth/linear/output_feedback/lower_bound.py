@@ -27,6 +27,7 @@ from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import (
     Side,
     WorstCase,
@@ -204,8 +205,7 @@ def last_step(worst: WorstCase, X: FloatArray) -> Witness:
 
 def _burst(worst: WorstCase, X: FloatArray, seed: FloatArray) -> Witness:
     """Return the pairs along the worst trajectory from a seed (n, 1)."""
-    values, vectors = np.linalg.eigh(stationary_covariance(worst.A, seed @ seed.T))
-    roots = vectors * np.sqrt(np.maximum(values, 0))
+    roots = semidefinite_root(stationary_covariance(worst.A, seed @ seed.T))
     return Witness(states=X @ worst.A @ roots, disturbances=worst.C @ roots)
 
 
@@ -213,8 +213,7 @@ def coupled_bursts(
     control: WorstCase, X: FloatArray, estimation: WorstCase, Y: FloatArray
 ) -> tuple[Witness, Witness]:
     """Return the bursts of both sides that meet where the product of X and Y is largest."""
-    values, vectors = np.linalg.eigh(X)
-    root = vectors * np.sqrt(np.maximum(values, 0))
+    root = semidefinite_root(X)
     meeting = root @ np.linalg.eigh(root.T @ Y @ root)[1][:, -1:]
     return _burst(estimation, Y, meeting), _burst(control, X, Y @ meeting)
 

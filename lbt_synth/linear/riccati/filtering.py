@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
+from lbt_synth.linear.matrix_functions import is_stable
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.routes import doubling
@@ -171,7 +172,7 @@ class GammaEquation:
         spectrum = np.linalg.eigvalsh(X)
         slack = 1 - float(np.linalg.eigvalsh(L @ P @ L.T)[-1]) / gamma**2
         transition = np.linalg.solve((self.identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
-        if spectrum[0] < -1e-9 * abs(spectrum[-1]) or not _stable(transition):
+        if spectrum[0] < -1e-9 * abs(spectrum[-1]) or not is_stable(transition):
             return LevelTrial(slack=-1.0)
         return LevelTrial(slack=slack, P=P if slack > 0 else None, iterations=int(steps[0]))
 
@@ -204,7 +205,7 @@ class GammaEquation:
         innovations = outputs @ P @ outputs.T + weight
         gain_filter = np.linalg.solve(innovations, outputs @ P)[:q].T
         gain = self.A @ gain_filter + self.injection
-        if not _stable(problem.A - gain @ problem.C):
+        if not is_stable(problem.A - gain @ problem.C):
             return None
         return FilterRiccati(
             P=frozen_copy(P),
@@ -313,7 +314,3 @@ def least_gamma(
         f"the least gamma was not bracketed: it lies between {lower:.9g} and {upper:.9g}.",
         status="search",
     )
-
-
-def _stable(A: FloatArray) -> bool:
-    return bool(np.max(np.abs(np.linalg.eigvals(A))) < 1)
