@@ -12,17 +12,18 @@ from lbt_synth.design.certificate import Certificate, certify_loop
 from lbt_synth.design.facts import IntegratorFacts
 from lbt_synth.design.integrator_law import PURE, IntegratorLaw
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
-from lbt_synth.errors import InfeasibleError, ProblemError, UnstableLoopError
+from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
-    ClosedLoop,
-    ResidualBudget,
+    LoopEnsemble,
     close_loop,
+    ensemble_residuals,
     model_budget,
-    residual_budget,
     stable_sensor_gains,
 )
+from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -307,9 +308,18 @@ def optimal_integrator(
         raise ProblemError(
             "the truth must disturb the loop; got no turbulence, vibration or noise."
         )
-    return _least_residual(
-        hardware, law, lambda loop: residual_budget(loop, truth), truth.sensor_gain
+    ensemble = LoopEnsemble(
+        sensor_gain=truth.sensor_gain,
+        turbulence=truth.turbulence_per_mode(hardware.modes),
+        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
+        vibrations=tuple(map(ensemble_vibration, stationary_vibrations(truth.vibrations))),
     )
+
+    def variances(controllers: list[Controller]) -> FloatArray:
+        loops = replace(ensemble, loops=len(controllers))
+        return ensemble_residuals(controllers, hardware, loops).rms_nm ** 2
+
+    return _least_residual(hardware, law, variances, truth.sensor_gain)
 
 
 def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> IntegratorDesign:
@@ -345,33 +355,38 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     True
     """
     require_instance(plant, TipTiltPlant)
-    return _least_residual(plant.hardware, law, lambda loop: model_budget(loop, plant), 1.0)
+
+    def variances(controllers: list[Controller]) -> FloatArray:
+        loops = (close_loop(plant.hardware, controller) for controller in controllers)
+        found = [model_budget(one, plant).rms_nm if one.is_stable else np.nan for one in loops]
+        return np.square(found)
+
+    return _least_residual(plant.hardware, law, variances, 1.0)
 
 
 def _least_residual(
     hardware: LoopHardware,
     law: IntegratorLaw,
-    budget: Callable[[ClosedLoop], ResidualBudget],
+    variances: Callable[[list[Controller]], FloatArray],
     sensor_gain: float,
 ) -> IntegratorDesign:
-    """Refine each local minimum over a grid of gains, and design with the least."""
+    """Refine each local minimum over a grid of gains, and design with the least.
+
+    ``variances`` are those that stable loops leave, and nan of an unstable one.
+    """
     gains = _TRIALS * hardware_gain_limit(hardware, law) / max(1.0, sensor_gain)
     trials = _allowed_gains(hardware, law, gains) if law.demands else np.log(gains)
 
-    def variance(log_gain: float) -> float:
-        controller = law.controller(hardware, float(np.exp(log_gain)))
-        try:
-            loop = close_loop(hardware, controller, sensor_gain=sensor_gain)
-            return budget(loop).rms_nm ** 2
-        except UnstableLoopError:
-            return np.inf
+    def left(log_gains: FloatArray) -> FloatArray:
+        found = variances([law.controller(hardware, gain) for gain in np.exp(log_gains).tolist()])
+        return np.where(np.isnan(found), np.inf, found)
 
-    values = np.array([variance(trial) for trial in trials])
+    values = left(trials)
     walls = np.concatenate([[np.inf], values, [np.inf]])
     low = np.flatnonzero((values < walls[:-2]) & (values <= walls[2:])).tolist()
     refined = [
         minimize_scalar(
-            variance,
+            lambda log_gain: float(left(np.array([log_gain]))[0]),
             bounds=(float(trials[max(i - 1, 0)]), float(trials[min(i + 1, trials.size - 1)])),
             method="bounded",
             options={"xatol": 1e-7},

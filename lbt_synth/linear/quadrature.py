@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -26,9 +27,12 @@ def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]
     return nodes.ravel(), weights.ravel()
 
 
+_legendre_rule = cache(np.polynomial.legendre.leggauss)
+
+
 def panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
     """Nodes and weights (panels, order) of panels that need not touch."""
-    x, w = np.polynomial.legendre.leggauss(order)
+    x, w = _legendre_rule(order)
     half, middle = (high - low)[:, None] / 2, (high + low)[:, None] / 2
     return middle + half * x, half * w
 
@@ -41,6 +45,20 @@ def _panel_integrals(
     values = integrand(nodes.ravel())
     values = values.reshape(low.size, order, *values.shape[1:])
     return np.asarray(np.einsum("po,po...->p...", weights, values))
+
+
+def _halves(
+    integrand: Callable[[FloatArray], FloatArray],
+    low: FloatArray,
+    middle: FloatArray,
+    high: FloatArray,
+    order: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Integrals over the lower and upper halves of panels, (panels, ...) each, in one call."""
+    both = _panel_integrals(
+        integrand, np.concatenate([low, middle]), np.concatenate([middle, high]), order
+    )
+    return both[: low.size], both[low.size :]
 
 
 def _stack(left: FloatArray, right: FloatArray, rows: BoolArray) -> FloatArray:
@@ -66,8 +84,7 @@ def adaptive_integral(
     done = np.zeros(coarse.shape[1:])
     for _ in range(40):
         middle = (low + high) / 2
-        left = _panel_integrals(integrand, low, middle, 6)
-        right = _panel_integrals(integrand, middle, high, 6)
+        left, right = _halves(integrand, low, middle, high, 6)
         fine = left + right
         total = np.trace(done + fine.sum(axis=0), axis1=-2, axis2=-1)
         change = np.abs(np.trace(fine - coarse, axis1=-2, axis2=-1))
@@ -118,8 +135,7 @@ def refine_panels(
     done_size = moved = 0.0
     for _ in range(45):
         middle = (low + high) / 2
-        left = _panel_integrals(with_size, low, middle, 10)
-        right = _panel_integrals(with_size, middle, high, 10)
+        left, right = _halves(with_size, low, middle, high, 10)
         fine = left + right
         scale = min(1.0, done_size + float(fine[:, -1].sum()))
         change = np.max(np.abs(fine - coarse)[:, :-1], axis=1)

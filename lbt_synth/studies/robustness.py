@@ -21,9 +21,10 @@ from lbt_synth.loop import (
     residual_budget,
     strehl,
 )
+from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
-from lbt_synth.models import LoopHardware, TipTiltPlant, Truth, Vibration, retuned_plant
+from lbt_synth.models import LoopHardware, TipTiltPlant, Truth, retuned_plant
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
@@ -360,12 +361,5 @@ def _shift_vibrations(
                 f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at {place_hz:.6g} Hz to "
                 f"{frequencies[wrong][0]:.6g} Hz."
             )
-        moved.append(
-            EnsembleVibration(
-                frequency_hz=frequencies,
-                rms_nm=vibration.rms_nm,
-                direction=vibration.direction,
-                damping=vibration.damping if isinstance(vibration, Vibration) else None,
-            )
-        )
+        moved.append(replace(ensemble_vibration(vibration), frequency_hz=frequencies))
     return moved

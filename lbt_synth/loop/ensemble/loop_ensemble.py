@@ -9,7 +9,14 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models import FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
+from lbt_synth.models import (
+    FrozenFlows,
+    LoopHardware,
+    ModalTurbulence,
+    SinusoidalVibration,
+    Spectrum,
+    Vibration,
+)
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.spectra import spectrum_key
 from lbt_synth.validation import (
@@ -74,6 +81,16 @@ class EnsembleVibration:
             wanted = "a vector over the modes, or one per loop, and not zero"
             raise ProblemError(f"direction must be {wanted}; got shape {direction.shape}.")
         set_fields(self, direction=frozen_copy(direction / size))
+
+
+def ensemble_vibration(vibration: Vibration | SinusoidalVibration) -> EnsembleVibration:
+    """Return a vibration as all loops meet it."""
+    return EnsembleVibration(
+        frequency_hz=vibration.frequency_hz,
+        rms_nm=vibration.rms_nm,
+        direction=vibration.direction,
+        damping=vibration.damping if isinstance(vibration, Vibration) else None,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
