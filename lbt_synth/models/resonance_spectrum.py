@@ -13,45 +13,49 @@ ratio above 1 means two real poles; the formulas are smooth at 1.
 
 from __future__ import annotations
 
+import math
+from typing import TypeVar
+
 import numpy as np
 
 from lbt_synth.validation import FloatArray
 
 PARAMETERS = 3  # of a component: log frequency, log damping, log variance
+Jacobian = tuple[tuple[float, float], tuple[float, float]]
+Number = TypeVar("Number", float, FloatArray)
 
 
-def recursion(frequency: float, damping: float) -> tuple[float, float, FloatArray]:
+def recursion(frequency: float, damping: float) -> tuple[float, float, Jacobian]:
     """Return b, 1 - q and their Jacobian (2, 2) by the logarithms of frequency and damping."""
-    w, decay = frequency, damping * frequency
-    rho = np.exp(-decay)
-    p = -np.expm1(-2 * decay)
+    w, decay = float(frequency), float(damping * frequency)
+    rho = math.exp(-decay)
+    p = -math.expm1(-2 * decay)
     square = (1 - damping) * (1 + damping)
-    root = np.sqrt(abs(square))
+    root = math.sqrt(abs(square))
     turn = w * root
     # half is rho (1 - cos(turn)), ratio is rho sin(turn) / root; two real poles where square < 0
     if square >= 0:
-        half = 2 * rho * np.sin(turn / 2) ** 2
-        ratio = rho * w * np.sinc(turn / np.pi)
-        b = np.expm1(-decay) ** 2 + 2 * half
+        half = 2 * rho * math.sin(turn / 2) ** 2
+        ratio = rho * w * (math.sin(turn) / turn if turn else 1.0)
+        b = math.expm1(-decay) ** 2 + 2 * half
     else:
         slow = w / (damping + root)  # decay - turn without cancellation
-        gaps = np.expm1(-slow), np.expm1(-decay - turn)
+        gaps = math.expm1(-slow), math.expm1(-decay - turn)
         difference = gaps[0] - gaps[1]
-        half = -0.5 * (gaps[0] + gaps[1] - 2 * np.expm1(-decay))
+        half = -0.5 * (gaps[0] + gaps[1] - 2 * math.expm1(-decay))
         ratio = 0.5 * difference / root
         b = gaps[0] * gaps[1]
-    by_decay = -2 * rho * np.expm1(-decay) - 2 * half  # of b, the turn held
+    by_decay = -2 * rho * math.expm1(-decay) - 2 * half  # of b, the turn held
     by_frequency = by_decay * decay + 2 * ratio * w * square
     by_damping = by_decay * decay - 2 * ratio * w * damping**2
     p_by_log = 2 * decay * (1 - p)
-    return float(b), float(p), np.array([[by_frequency, by_damping], [p_by_log, p_by_log]])
+    return b, p, ((by_frequency, by_damping), (p_by_log, p_by_log))
 
 
 def coefficients(frequency: float, damping: float) -> tuple[float, float, float]:
     """Return a1, a2 and var v / P of a sampled resonance."""
     b, p, _ = recursion(frequency, damping)
-    q = 1 - p
-    drive = p * b * (2 * (1 + q) - b) / (1 + q)
+    q, drive = 1 - p, _drive(b, p)
     if damping >= 1:
         return 1 - b + q, -q, drive
     decay = np.exp(-damping * frequency)
@@ -66,25 +70,51 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     return np.stack([2 * decay * np.cos(turn), -(decay**2)], axis=-1)
 
 
+def unit_density(frequency: float, damping: float, s: FloatArray) -> FloatArray:
+    """Spectrum of unit variance of a resonance, (f,) as s is."""
+    b, p, _ = recursion(frequency, damping)
+    size = (b - (2 - p) / 2 * s) ** 2
+    size += p**2 * (s - s**2 / 4)
+    return np.asarray(_drive(b, p) / size)
+
+
+def unit_densities(
+    frequency: FloatArray, damping: FloatArray, s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Spectra of unit variance of c resonances, (c, f), with their logarithmic slopes (c, 2, f).
+
+    The slopes are those of the logarithm by the logarithms of frequency and damping ratio; s is
+    (f,).
+    """
+    each = [recursion(*pair) for pair in zip(frequency.tolist(), damping.tolist(), strict=True)]
+    b, p = np.array([row[:2] for row in each]).T[..., None]
+    jacobian = np.array([row[2] for row in each])
+    near = b - (2 - p) / 2 * s
+    wide = s * (1 - s / 4)
+    over = 1 / (near**2 + p**2 * wide)
+    rest = 2 * (2 - p) - b
+    # of the logarithm of the numerator by b, and by p = 1 - q with b held
+    top = np.hstack([1 / b - 1 / rest, 1 / p - 2 / rest + 1 / (2 - p)])
+    slopes = np.empty((b.size, 2, s.size))
+    for i in range(2):
+        by_b, by_p = jacobian[:, 0, i, None], jacobian[:, 1, i, None]
+        constant = np.sum(top * jacobian[:, :, i], axis=1, keepdims=True)
+        bottom = (2 * by_b + by_p * s) * near + (2 * p * by_p) * wide
+        np.subtract(constant, bottom * over, out=slopes[:, i])
+    return _drive(b, p) * over, slopes
+
+
+def _drive(b: Number, p: Number) -> Number:
+    """Variance of the driving noise of a resonance of unit variance."""
+    return p * b * (2 * (2 - p) - b) / (2 - p)
+
+
 def log_density(
     frequency: float, damping: float, s: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Logarithm of the spectrum of unit variance, and its derivatives; all are (f,) as s is."""
-    b, p, jacobian = recursion(frequency, damping)
-    q = 1 - p
-    near = b - (1 + q) / 2 * s
-    wide = s * (1 - s / 4)
-    size = near**2 + p**2 * wide
-    drive = 2 * (1 + q) - b
-    value = np.log(p * b * drive / ((1 + q) * size))
-    by_b = (1 / b - 1 / drive) - 2 * near / size
-    # by p = 1 - q, b held
-    by_p = (1 / p - 2 / drive + 1 / (1 + q)) - (near * s + 2 * p * wide) / size
-    return (
-        value,
-        by_b * jacobian[0, 0] + by_p * jacobian[1, 0],
-        by_b * jacobian[0, 1] + by_p * jacobian[1, 1],
-    )
+    value, slopes = unit_densities(np.array([frequency]), np.array([damping]), s)
+    return np.log(value[0]), slopes[0, 0], slopes[0, 1]
 
 
 def log_roll_off(corner: float, order: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:

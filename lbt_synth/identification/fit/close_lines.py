@@ -14,10 +14,9 @@ import numpy as np
 
 from lbt_synth.identification.fit.fitting import Search, lies_in_skirts
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.scoring import Priors
 from lbt_synth.identification.fit.whittle import (
     WIDE_DAMPING,
-    Priors,
     SpectrumModel,
     contrast,
     minimise,
@@ -59,7 +58,7 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
     """Return what two lines of like damping in the place of line i add to the log-likelihood."""
     line = spectrum.components[i]
     centre, half = search.place(line)
-    data = _window(search.merge(spectrum), centre - _REACH * half, centre + _REACH * half)
+    data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
     best = single = contrast(data, spectrum)
     for share in _SHARES:
         lower, upper = (
@@ -75,16 +74,3 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
             away = (found.spectrum.pack() - priors.centre)[[1 - 2 * _TRIPLE, 1 - _TRIPLE]]
             best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)
     return single - best
-
-
-def _window(data: LoopPeriodogram, low_hz: float, high_hz: float) -> LoopPeriodogram:
-    """Return the values of a periodogram between two frequencies."""
-    inside = slice(*np.searchsorted(data.frequency_hz, [low_hz, high_hz]))
-    return replace(
-        data,
-        frequency_hz=data.frequency_hz[inside],
-        measured=data.measured[inside],
-        crossed=data.crossed[inside],
-        corrected=data.corrected[inside],
-        count=data.count[inside],
-    )

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.scoring import EXACT, SEARCHED, Priors
 from lbt_synth.identification.fit.whittle import (
     NO_CORNER,
     Component,
     FittedModel,
     Kind,
-    Priors,
     SpectrumModel,
     contrast,
     damping_parameter,
@@ -134,18 +134,29 @@ class Search:
         return np.flatnonzero(np.diff(group, prepend=-np.inf) > 0)
 
 
-def fit(search: Search, start: SpectrumModel) -> FittedModel | None:
+def fit(
+    search: Search,
+    start: SpectrumModel,
+    *,
+    better_than: FittedModel | None = None,
+    margin: float = 0.0,
+    accuracy: float = SEARCHED,
+) -> FittedModel | None:
     """Fit all parameters; None if no fit settles.
 
-    Components that leave the band, from the first bin to the Nyquist frequency, are dropped.
+    Components that leave the band, from the first bin to the Nyquist frequency, are dropped. A fit
+    is given up where its log-likelihood will hardly reach that of ``better_than`` less a margin.
     """
-    found = minimise(search.merge(start), start, search.priors(start))
+    data, bound = search.merge(start), float("inf")
+    if better_than is not None:
+        bound = contrast(data, better_than.spectrum) + margin
+    found = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
     if found is None:
         return None
     lowest = search.log_angle(_LOWEST * search.data.step_hz)
     inside = found.spectrum.keep(lambda c: lowest < c.log_frequency < _HIGHEST)
     if len(inside.components) < len(start.components):
-        return fit(search, inside)
+        return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(found, contrast=contrast(search.data, found.spectrum))
 
 
@@ -180,14 +191,18 @@ def simplify(search: Search, model: FittedModel) -> FittedModel:
 def prune(search: Search, model: FittedModel) -> FittedModel:
     """Drop the components that add less than they must, the least first."""
     trials = []
+    data = search.merge(model.spectrum)
+    whole = contrast(data, model.spectrum)
     for i in range(len(model.spectrum.components)):
         less = model.spectrum.drop(i)
         if less is not None:
             required = required_gain(search, model.spectrum, i)
-            spare = contrast(search.data, less) - model.contrast - 4 * required
+            spare = contrast(data, less) - whole - 4 * required
             trials.append((spare, required, less))
     for spare, required, less in sorted(trials, key=lambda trial: trial[0]):
-        made = fit(search, less) if spare <= 0 else None
+        if spare > 0:
+            break
+        made = fit(search, less, better_than=model, margin=required)
         if made is not None and made.contrast - model.contrast < required:
             return prune(search, made)
     return model
@@ -222,12 +237,16 @@ def lies_in_skirts(
 def cost(search: Search, model: FittedModel) -> float:
     """Return the contrast of a model plus what the criterion asks for its components."""
     spectrum = model.spectrum
-    others = range(1, len(spectrum.components))
+    first, *rest = spectrum.components
+    # the same for any order of the search
+    rest = sorted(rest, key=lambda component: component.log_frequency)
+    spectrum, others = replace(spectrum, components=(first, *rest)), range(1, 1 + len(rest))
     return model.contrast + sum(required_gain(search, spectrum, i, earlier=True) for i in others)
 
 
 def add_evidence(search: Search, model: FittedModel) -> FittedModel:
-    """Return the model with what each component adds, and its exact information."""
+    """Return the model at its minimum, with what each component adds and exact information."""
+    model = fit(search, model.spectrum, accuracy=EXACT) or model
     spectrum = model.spectrum
     exact = observe_information(search.merge(spectrum), model, search.priors(spectrum))
     evidence = [
@@ -249,4 +268,5 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     moves = product(np.log1p(_SHIFTS * step / centre), _POWERS)
     # the width stays
     trials = [spectrum.exchange(i, line.shift(move, -move, power)) for move, power in moves]
-    return min([spectrum, *trials], key=lambda trial: contrast(search.data, trial))
+    data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
+    return min([spectrum, *trials], key=lambda trial: contrast(data, trial))

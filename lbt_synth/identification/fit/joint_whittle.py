@@ -19,14 +19,13 @@ import numpy as np
 
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.scoring import Priors, scoring_minimum
 from lbt_synth.identification.fit.whittle import (
     Component,
-    Priors,
     SpectrumModel,
     densities,
     invert_information,
     log_slopes,
-    scoring_minimum,
 )
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray

@@ -10,7 +10,7 @@ Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,8 +18,9 @@ from scipy.integrate import trapezoid
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
+from lbt_synth.identification.fit.excesses import Candidate, find_candidates, measure_excess
 from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.whittle import (
     NO_CORNER,
     WIDE_DAMPING,
@@ -33,7 +34,6 @@ from lbt_synth.identification.fit.whittle import (
 )
 from lbt_synth.validation import FloatArray
 
-_WIDEST = 0.3  # band, of its frequency
 _STARTING_GAINS = (0.6, 0.35, 1.0)
 _STARTING_TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz], damping ratio
 _OVERDAMPED = 2.0  # damping ratio of a turbulence that is a drift already
@@ -45,16 +45,6 @@ _HALF = float(np.log(0.5))
 _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
 _COLOUR = 0.3  # of the noise, where a fit begins
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
-    """An excess of power in a band."""
-
-    frequency_hz: float  # where it is highest
-    half_width_hz: float  # at half height
-    variance_nm2: float  # of a resonance of that height and width
-    gain: float  # log-likelihood that a model with the mean of the band would add
 
 
 def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
@@ -99,7 +89,7 @@ def gain_ambiguity(search: Search, best: FittedModel) -> float:
             continue
         try:
             begin = replace(search, gain=trial, colour=best.spectrum.colour)
-            other = find_components(begin, None, rounds=_FEW_ROUNDS)
+            other = find_components(begin, best.spectrum, rounds=_FEW_ROUNDS)
         except NumericalError:
             continue
         made = fitting.fit(search, other.spectrum)
@@ -131,7 +121,7 @@ def find_components(
 def _improve(search: Search, model: FittedModel) -> FittedModel | None:
     """Return the first model that is clearly better; None if none is."""
     for trial, least in _trials(search, model.spectrum):
-        made = fitting.fit(search, trial)
+        made = fitting.fit(search, trial, better_than=model)
         if made is not None:
             made = fitting.prune(search, made)
             if fitting.cost(search, made) < fitting.cost(search, model) - least:
@@ -176,14 +166,15 @@ def _begin(search: Search) -> FittedModel | None:
     if model is None or not search.finds_gain:
         return model
     _, *lines = model.spectrum.components
-    fits = [fitting.fit(search, model.spectrum)]
+    best = fitting.fit(search, model.spectrum)
     for gain in gains[1:]:
         ground = _fit_background(search, gain)
         if ground is not None:
             more = 2 * float(np.log(gain / gains[0]))
             moved = [line.shift(0.0, 0.0, more) for line in lines]
-            fits.append(fitting.fit(search, ground.spectrum.add(*moved)))
-    return fitting.likeliest(search, fits)
+            made = fitting.fit(search, ground.spectrum.add(*moved))
+            best = fitting.likeliest(search, [best, made])
+    return best
 
 
 def _fit_background(search: Search, gain: float) -> FittedModel | None:
@@ -201,8 +192,12 @@ def _fit_background(search: Search, gain: float) -> FittedModel | None:
         ground.add(known.component("turbulence", hz, ratio, slow))
         for hz, ratio in _STARTING_TURBULENCE
     ]
-    fits = [minimise(smooth, start, known.priors(start)) for start in starts]
-    return fitting.likeliest(known, fits)
+    best: FittedModel | None = None
+    for start in starts:
+        bound = float("inf") if best is None else best.contrast
+        made = minimise(smooth, start, known.priors(start), bound=bound, accuracy=SEARCHED)
+        best = fitting.likeliest(known, [best, made])
+    return best
 
 
 def _add_candidates(
@@ -289,7 +284,7 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     reach = max(10 * half, 20 * step)
     start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
     rest = density(data, spectrum.exchange(i))
-    seen = _measure_excess(data, data.power(spectrum.gain), rest, int(start), int(stop))
+    seen = measure_excess(data, data.power(spectrum.gain), rest, int(start), int(stop))
     if abs(seen.frequency_hz - centre) > 0.5 * half + step:
         ratio = min(seen.half_width_hz / seen.frequency_hz, 0.5)
         again = search.component("line", seen.frequency_hz, ratio, seen.variance_nm2)
@@ -312,68 +307,6 @@ def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
     if made is not None and fitting.cost(search, made) < fitting.cost(search, model) + search.price:
         return made
     return model
-
-
-def find_candidates(
-    data: LoopPeriodogram, power: FloatArray, model: FloatArray, *, least: float, most: int
-) -> list[Candidate]:
-    """Find the bands with the most significant excess of power over a model.
-
-    Bands of 1, 2, 4, ... bins are tried everywhere, at steps of a quarter of their width. A band of
-    n values with the mean ratio R of power to model would gain ``n (R - 1 - log R)``.
-    """
-    f, step = data.frequency_hz, data.step_hz
-    ratio = np.cumsum(np.append(0.0, power / model))
-    weight = np.cumsum(np.append(0.0, data.count))
-    found: list[tuple[float, int, int]] = []
-    width = 1
-    while width * step < _WIDEST * f[-1] and width < f.size:
-        starts = np.arange(0, f.size - width + 1, max(1, width // 4))
-        widest = np.maximum(_WIDEST * f[starts + width // 2], 4 * step)
-        starts = starts[width * step <= widest]
-        mean = np.maximum((ratio[starts + width] - ratio[starts]) / width, 1)
-        gain = (weight[starts + width] - weight[starts]) * (mean - 1 - np.log(mean))
-        best = np.argsort(gain)[::-1][: 8 * most]
-        best = best[gain[best] > least]
-        found += [(float(gain[i]), int(starts[i]), int(starts[i]) + width) for i in best]
-        width *= 2
-    apart: list[tuple[float, int, int]] = []
-    for worth, start, stop in sorted(found, reverse=True):
-        reach = max(3, stop - start)
-        if all(start >= b + reach or stop <= a - reach for _, a, b in apart):
-            apart.append((worth, start, stop))
-    return [
-        _measure_excess(data, power, model, start, stop, worth)
-        for worth, start, stop in apart[:most]
-    ]
-
-
-def _measure_excess(
-    data: LoopPeriodogram,
-    power: FloatArray,
-    model: FloatArray,
-    start: int,
-    stop: int,
-    gain: float = 0.0,
-) -> Candidate:
-    """Measure place, half width and variance of the highest excess between two bins."""
-    excess = power[start:stop] - model[start:stop]
-    count = max(1, (stop - start) // 2).bit_length()
-    each = [(2**k, np.convolve(excess, np.ones(2**k) / 2**k, mode="same")) for k in range(count)]
-    # the smoothing at which the peak is highest over its scatter, which falls with its root
-    _, smooth = max(each, key=lambda one: float(np.max(one[1])) * np.sqrt(one[0]))
-    peak = int(np.argmax(smooth))
-    low_enough = np.flatnonzero(smooth <= 0.5 * smooth[peak])
-    low = low_enough[low_enough <= peak].max(initial=0)
-    high = low_enough[low_enough >= peak].min(initial=smooth.size - 1)
-    half = max(0.5 * float(high - low - 1), 0.5) * data.step_hz
-    height = max(float(smooth[peak]), float(np.min(model[start:stop])))
-    return Candidate(
-        frequency_hz=float(data.frequency_hz[start + peak]),
-        half_width_hz=half,
-        variance_nm2=np.pi * half * height,
-        gain=gain,
-    )
 
 
 def _smooth_background(

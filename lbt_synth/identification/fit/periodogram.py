@@ -36,21 +36,24 @@ _NARROWEST = 1e-9
 _WIDTHS = 72
 _LOBES = 64.0  # distance up to which single lobes are resolved
 _STEP = 0.1
+_VALLEY = 0.003  # of the mean over a lobe, the least between lobes
 _GROWTH = 1.03  # of the steps beyond, where lobes are averaged
 _SAMPLES = 4096  # of the taper
-_PADDED = 1 << 17
 
 
 def tukey(length: int) -> FloatArray:
     """Return the taper of a segment, a cosine at either end."""
-    from scipy.signal.windows import tukey as window
-
-    return np.asarray(window(length, TAPER))
+    edge = np.minimum(np.arange(length), np.arange(length)[::-1]) / (TAPER / 2 * (length - 1))
+    return np.asarray(np.sin(np.pi / 2 * np.minimum(edge, 1)) ** 2)
 
 
 @lru_cache(maxsize=1)
-def _table() -> tuple[Any, FloatArray]:
-    """Return a spline over log g of log K on a grid of distances, and the grid."""
+def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return knots of log g (w,), a grid of distances (d,), and log K between both.
+
+    The last has the coefficients of polynomials in two variables, cubic in the part of a step of
+    the grid and in log g beyond its knot, the highest power of the latter first: (w, d, 4, 4).
+    """
     from scipy.interpolate import CubicSpline
 
     h = tukey(_SAMPLES)
@@ -64,20 +67,19 @@ def _table() -> tuple[Any, FloatArray]:
     while far[-1] < 1.05 * FAR:
         far.append(far[-1] + (far[-1] - (far[-2] if len(far) > 1 else near[-1])) * _GROWTH)
     grid = np.concatenate([near, far])
-    fine = np.arange(_PADDED // 2 + 1) * (_SAMPLES / _PADDED)
-    spread = int(_PADDED / _SAMPLES)  # points of a unit of distance
-    kernel = np.ones(spread) / spread
+    decaying = 2 / _SAMPLES * correlation * np.exp(-2 * np.pi * np.outer(widths, t))
+    decaying[:, 0] /= 2
+    waves = np.cos(2 * np.pi * np.outer(t, grid))
+    at, mean = decaying @ waves, (decaying * np.sinc(t)) @ waves  # the mean over a lobe
+    at = np.maximum(at, _VALLEY * mean)  # no fit crosses the zeros between lobes
     blend = np.clip((grid - _LOBES / 2) / (_LOBES / 2), 0, 1)
-    rows = []
-    for g in widths:
-        decaying = correlation * np.exp(-2 * np.pi * g * t)
-        decaying[0] /= 2
-        k = 2 * np.fft.rfft(decaying, _PADDED).real / _SAMPLES
-        k = np.maximum(k, 1e-14)
-        mean = np.convolve(k, kernel, mode="same")
-        at = np.exp(np.interp(grid, fine, np.log(k)))
-        rows.append(np.log(at * (1 - blend) + np.interp(grid, fine, mean) * blend))
-    return CubicSpline(np.log(widths), np.array(rows)), grid
+    k = np.maximum(at * (1 - blend) + mean * blend, 1e-14)
+    knots = np.log(widths)
+    value = np.asarray(CubicSpline(knots, np.log(k)).c).transpose(1, 2, 0)  # (w, d, 4)
+    slope = np.gradient(value, axis=1)
+    rise, (m0, m1) = np.diff(value, axis=1), (slope[:, :-1], slope[:, 1:])
+    powers = [value[:, :-1], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise]
+    return knots, grid, np.stack(powers, axis=2)
 
 
 def log_smearing(
@@ -87,33 +89,24 @@ def log_smearing(
 
     Its derivatives by the logarithm of the width and by the distance follow.
     """
-    spline, grid = _table()
+    knots, grid, table = _table()
     log_width = np.log(max(half_width, _NARROWEST))
+    row = min(int(np.searchsorted(knots, log_width, side="right")) - 1, len(table) - 1)
+    w = log_width - knots[row]
     size = np.abs(distance)
     left = np.minimum(np.searchsorted(grid, size, side="right") - 1, grid.size - 2)
     step = grid[left + 1] - grid[left]
-    part = (size - grid[left]) / step
-    value, by_place = _between(spline(log_width), left, part)
-    by_size = by_place / step
-    by_width = np.zeros_like(value)
-    if half_width > _NARROWEST:
-        by_width, _ = _between(spline(log_width, 1), left, part)
+    x = (size - grid[left]) / step
+    by_log_width = [3 * w**2, 2 * w, 1.0, 0.0] if half_width > _NARROWEST else [0.0] * 4
+    both = table[row, left] @ np.array([[w**3, w**2, w, 1.0], by_log_width]).T  # (f, 4, 2)
+    (y0, y1, y2, y3), (v0, v1, v2, v3) = both.T
     g = half_width
-    both = g**2 + distance**2
+    square = g**2 + distance**2
     return (
-        value + np.log(np.pi * both / g),
-        by_width + (2 * g**2 / both - 1),
-        by_size * np.sign(distance) + 2 * distance / both,
+        y0 + x * (y1 + x * (y2 + x * y3)) + np.log((np.pi / g) * square),
+        v0 + x * (v1 + x * (v2 + x * v3)) + (2 * g**2 / square - 1),
+        (y1 + x * (2 * y2 + 3 * x * y3)) / step * np.sign(distance) + 2 * distance / square,
     )
-
-
-def _between(row: FloatArray, left: IntArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a cubic between the values of a row, and its derivative, at ``left + x``."""
-    slope = np.gradient(row)
-    y0, m0, m1 = row[left], slope[left], slope[left + 1]
-    rise = row[left + 1] - y0
-    second, third = 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise
-    return y0 + x * (m0 + x * (second + x * third)), m0 + x * (2 * second + 3 * x * third)
 
 
 _FLOOR = 1e-12  # of the mean density: below, there is nothing but rounding
@@ -164,6 +157,13 @@ class LoopPeriodogram:
         names = ("frequency_hz", "measured", "crossed", "corrected")
         means: Any = {name: np.add.reduceat(getattr(self, name), starts) / size for name in names}
         return replace(self, **means, count=np.add.reduceat(self.count, starts))
+
+    def window(self, low_hz: float, high_hz: float) -> LoopPeriodogram:
+        """Return the values between two frequencies."""
+        inside = slice(*np.searchsorted(self.frequency_hz, [low_hz, high_hz]))
+        names = ("frequency_hz", "measured", "crossed", "corrected", "count")
+        values: Any = {name: getattr(self, name)[inside] for name in names}
+        return replace(self, **values)
 
 
 def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:

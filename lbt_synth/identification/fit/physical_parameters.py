@@ -15,11 +15,11 @@ from lbt_synth.identification.fit.identified_model import (
     Whiteness,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.scoring import Priors
 from lbt_synth.identification.fit.whittle import (
     GAIN,
     WIDE_DAMPING,
     FittedModel,
-    Priors,
     SpectrumModel,
     densities,
     derivatives,

@@ -19,13 +19,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from lbt_synth.identification.fit.periodogram import FAR, WIDE, LoopPeriodogram, log_smearing
-from lbt_synth.models.resonance_spectrum import log_density, log_roll_off
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.identification.fit.scoring import EXACT, Priors, scoring_minimum
+from lbt_synth.models.resonance_spectrum import (
+    PARAMETERS,
+    log_roll_off,
+    unit_densities,
+    unit_density,
+)
+from lbt_synth.validation import FloatArray
 
 GAIN = 0  # place of the sensor gain in a packed vector
 WIDE_DAMPING = 0.1  # damping ratio of a resonance that is no line
@@ -172,27 +178,6 @@ class SpectrumModel:
 
 
 _DIFFERENCE = 1e-4  # of a logarithm
-_FARTHEST = 60.0  # of a logarithm: exp stays finite
-_LEAST_INFORMATION = 1e-6  # of a parameter: a step is finite where the data say nothing
-_OPTIONS: dict[str, Any] = {
-    "maxiter": 40,
-    "gtol": 1e-3,
-    "initial_trust_radius": 1.0,
-    "max_trust_radius": 8.0,
-}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Priors:
-    """Normal priors on the packed parameters: a width of infinity is none, 0 fixes one."""
-
-    centre: FloatArray  # (p,): means
-    width: FloatArray  # (p,): standard deviations
-
-    @property
-    def free(self) -> IntArray:
-        """Places of the parameters that a fit varies."""
-        return np.flatnonzero(self.width > 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -214,30 +199,44 @@ def densities(
     the turbulence by its corner (2, f).
     """
     s, white = data.half_angle_square, 2 / data.frame_rate_hz
-    count = len(spectrum.components)
-    density, slopes = np.empty((1 + count, s.size)), np.empty((count, 2, s.size))
+    components = spectrum.components
+    frequency, ratio, slope, power = (
+        np.array(
+            [
+                (c.frequency, c.damping_ratio, c.damping_slope, np.exp(c.log_power))
+                for c in components
+            ]
+        )
+        .reshape(-1, 4)
+        .T
+    )
+    density = np.empty((1 + len(components), s.size))
     shape, by_colour = _log_colour(spectrum.colour, s)
     density[0] = white * np.exp(spectrum.log_noise + shape)
+    unit, slopes = unit_densities(frequency, ratio, s)
+    np.multiply(unit, white * power[:, None], out=density[1:])
     fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
-    for c, own, slope in zip(spectrum.components, density[1:], slopes, strict=True):
-        value, slope[0], slope[1] = log_density(c.frequency, c.damping_ratio, s)
+    for c, own, by_shape in zip(components, density[1:], slopes, strict=True):
         if c.kind == "turbulence":
-            value = value + fall
+            own *= np.exp(fall)
         else:
-            _smear(data, c, value, slope)
-        slope[1] *= c.damping_slope
-        np.exp(value + (c.log_power + np.log(white)), out=own)
+            _smear(data, c, own, by_shape)
+    slopes[:, 1] *= slope[:, None]
     return density, slopes, np.array([by_colour, by_corner])
 
 
 def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the spectrum of first-order noise over that of white noise, and its slope, (f,)."""
+    if colour == 0:
+        return np.zeros_like(s), 2 - s
     a = np.tanh(colour)
     below = (1 - a) ** 2 + a * s
     return np.log1p(-(a**2)) - np.log(below), -2 * a + (1 - a**2) * (2 * (1 - a) - s) / below
 
 
-def _smear(data: LoopPeriodogram, line: Component, value: FloatArray, slope: FloatArray) -> None:
+def _smear(
+    data: LoopPeriodogram, line: Component, own: FloatArray, slope: FloatArray | None = None
+) -> None:
     """Let the taper smear a narrow line, in place; ``slope`` is by log f and log damping."""
     if data.duration_s is None:
         return
@@ -249,14 +248,36 @@ def _smear(data: LoopPeriodogram, line: Component, value: FloatArray, slope: Flo
     start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
     distance = (data.frequency_hz[start:stop] - centre) * data.duration_s
     more, by_width, by_distance = log_smearing(half_width, distance)
-    value[start:stop] += more
+    own[start:stop] *= np.exp(more)
+    if slope is None:
+        return
     slope[0, start:stop] += by_width - by_distance * centre * data.duration_s
     slope[1, start:stop] += by_width
 
 
+@lru_cache(maxsize=64)
+def _component_density(
+    data: LoopPeriodogram, component: Component, corner: float, order: float
+) -> FloatArray:
+    """Return the density of a component, (f,)."""
+    s, c = data.half_angle_square, component
+    own = unit_density(c.frequency, c.damping_ratio, s)
+    if c.kind == "turbulence":
+        own *= np.exp(log_roll_off(float(np.exp(corner)), order, s)[0])
+    else:
+        _smear(data, c, own)
+    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * own)
+
+
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
     """Return the density of the whole spectrum, (f,)."""
-    return np.asarray(densities(data, spectrum)[0].sum(axis=0))
+    shape, _ = _log_colour(spectrum.colour, data.half_angle_square)
+    total = np.asarray(2 / data.frame_rate_hz * np.exp(spectrum.log_noise + shape))
+    for c in spectrum.components:
+        rolls = c.kind == "turbulence"
+        corner = (spectrum.log_corner, spectrum.roll_off_order) if rolls else (0.0, 1.0)
+        total += _component_density(data, c, *corner)
+    return total
 
 
 def contrast(data: LoopPeriodogram, spectrum: SpectrumModel) -> float:
@@ -274,12 +295,12 @@ def log_slopes(
     The first three arguments are those of :func:`densities`. The gain changes the data, not the
     spectrum.
     """
-    noise = each[0] / model
-    rows = [np.zeros_like(model), noise, by_shape[0] * noise, by_shape[1] * each[1] / model]
-    for own, (by_frequency, by_damping) in zip(each[1:], slopes, strict=True):
-        share = own / model
-        rows += [by_frequency * share, by_damping * share, share]
-    return np.array(rows)
+    share = each / model
+    rows = np.zeros((4 + PARAMETERS * len(slopes), model.size))
+    rows[1], rows[2], rows[3] = share[0], by_shape[0] * share[0], by_shape[1] * share[1]
+    rows[4::3], rows[5::3] = slopes[:, 0] * share[1:], slopes[:, 1] * share[1:]
+    rows[6::3] = share[1:]
+    return rows
 
 
 def derivatives(
@@ -303,53 +324,18 @@ def derivatives(
     return float(np.sum(count * (np.log(model) + ratio))), gradient, information
 
 
-def scoring_minimum(
-    differentiate: Callable[[FloatArray], tuple[float, FloatArray, FloatArray]],
-    start: FloatArray,
+def minimise(
+    data: LoopPeriodogram,
+    start: SpectrumModel,
     priors: Priors,
-) -> tuple[FloatArray, FloatArray] | None:
-    """Minimise a contrast of the free parameters and their priors by scoring in a trust region.
+    *,
+    bound: float = float("inf"),
+    accuracy: float = EXACT,
+) -> FittedModel | None:
+    """Minimise L by scoring in a trust region, to an accuracy.
 
-    ``differentiate`` returns the contrast, its gradient and its information matrix. Return the
-    parameters (free,) and the information (free, free); None if the contrast is not finite.
+    Return None if L is not finite, or will hardly fall below a bound.
     """
-    from scipy.optimize import minimize
-
-    free = priors.free
-    centre, precision = priors.centre[free], 1 / priors.width[free] ** 2
-
-    @lru_cache(maxsize=1)  # scipy asks for value, gradient and Hessian one after the other
-    def evaluate(raw: bytes) -> tuple[float, FloatArray, FloatArray]:
-        x = np.clip(np.frombuffer(raw), -_FARTHEST, _FARTHEST)
-        value, gradient, information = differentiate(x)
-        away = x - centre
-        return (
-            value + 0.5 * float(np.sum(precision * away**2)),
-            gradient + precision * away,
-            information + np.diag(precision + _LEAST_INFORMATION),
-        )
-
-    try:
-        found = minimize(  # type: ignore[call-overload]
-            lambda x: evaluate(x.tobytes())[0],
-            start,
-            jac=lambda x: evaluate(x.tobytes())[1],
-            hess=lambda x: evaluate(x.tobytes())[2],
-            method="trust-exact",
-            options=_OPTIONS,
-        )
-    except OverflowError:  # a step of the trust region that is not finite
-        return None
-    _, gradient, reduced = evaluate(found.x.tobytes())
-    # what a Newton step would still gain
-    left = 0.5 * float(gradient @ np.linalg.lstsq(reduced, gradient, rcond=None)[0])
-    if not (np.isfinite(found.fun) and np.isfinite(left)):
-        return None
-    return found.x, reduced
-
-
-def minimise(data: LoopPeriodogram, start: SpectrumModel, priors: Priors) -> FittedModel | None:
-    """Minimise L by scoring in a trust region; None if L is not finite."""
     free, theta = priors.free, start.pack()
 
     def differentiate(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -357,7 +343,7 @@ def minimise(data: LoopPeriodogram, start: SpectrumModel, priors: Priors) -> Fit
         value, gradient, information = derivatives(data, start.unpack(theta))
         return value, gradient[free], information[np.ix_(free, free)]
 
-    found = scoring_minimum(differentiate, theta[free], priors)
+    found = scoring_minimum(differentiate, theta[free], priors, bound=bound, accuracy=accuracy)
     if found is None:
         return None
     theta[free], reduced = found

@@ -13,12 +13,10 @@ from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_perio
 from lbt_synth.identification.fit.whittle import (
     GAIN,
     Component,
-    Priors,
     SpectrumModel,
     contrast,
     density,
     derivatives,
-    scoring_minimum,
 )
 
 RATE = 1000.0
@@ -82,18 +80,3 @@ def test_gradient_and_information_of_the_likelihood() -> None:
         ]
     )
     assert expected[1:, 1:] == pytest.approx(rows[:, 1:], rel=1e-3, abs=1e-3 * np.max(rows))
-
-
-def test_parameters_without_information_leave_the_steps_finite() -> None:
-    # a component of no power has denormal information, and a step along it overflows
-    scale = np.array([2.0, 1e-311, 1e-300, 1e-16])
-    priors = Priors(centre=np.zeros(4), width=np.full(4, np.inf))
-
-    def bowl(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        value = 0.5 * float(scale @ (x - 1) ** 2) - 1e-9 * float(np.sum(x))
-        return value, scale * (x - 1) - 1e-9, np.diag(scale)
-
-    found = scoring_minimum(bowl, np.array([5.0, 4.0, 3.0, 2.0]), priors)
-    assert found is not None
-    assert np.all(np.isfinite(found[0]))
-    assert found[0][0] == pytest.approx(1, abs=1e-3)
