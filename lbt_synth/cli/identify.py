@@ -8,7 +8,12 @@ from lbt_synth.cli import command_repairs, loop_records
 from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.identification import LoopRecord, SpectrumRecord, identify
+from lbt_synth.identification import (
+    LoopRecord,
+    SpectrumRecord,
+    accelerometer_transfers,
+    identify,
+)
 
 
 def run(arguments: Namespace) -> Report:
@@ -27,6 +32,10 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, model)
+    if arguments.accelerometers is not None and isinstance(record, LoopRecord):
+        readings = loop_records.read_accelerations(arguments, record)
+        found = accelerometer_transfers(model, record, readings.values, channels=readings.channels)
+        loop_records.add_accelerometers(report, found)
     report.notes += [loop_records.marked_note(note) for note in notes]
     loop_records.write_files(report, places, arguments, record, model)
     return report

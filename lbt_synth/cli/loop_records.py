@@ -16,6 +16,7 @@ from lbt_synth.config.write import config_text
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
+    AccelerometerTransfers,
     IdentifiedAxis,
     IdentifiedModel,
     LinePrior,
@@ -26,11 +27,15 @@ from lbt_synth.identification import (
     load_record,
     require_length,
 )
+from lbt_synth.identification.accelerometers.readings import (
+    Readings,
+    fill_missing,
+    load_readings,
+)
 from lbt_synth.identification.auto import RecordedDesign
 from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.fit.model_tables import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS
-from lbt_synth.identification.records.line_priors import load_accelerations
 from lbt_synth.identification.records.record import LEAST_SECONDS
 from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
@@ -143,13 +148,33 @@ def _expected_lines(
                 "accelerometers are compared with the recorded series; got a spectrum. Give their "
                 "lines by --lines-hz."
             )
+        values, known = fill_missing(read_accelerations(arguments, record).beside(record.frames))
         lines += accelerometer_lines(
-            load_accelerations(arguments.accelerometers),
+            values,
             record.pseudo_open_loop(),
             record.frame_rate_hz,
-            usable=record.usable,
+            usable=record.usable & known,
         )
     return tuple(lines)
+
+
+def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
+    """Read the accelerometers of the command line."""
+    return load_readings(
+        arguments.accelerometers,
+        record.frame_rate_hz,
+        rate_hz=arguments.accelerometer_rate_hz,
+        unit=arguments.acceleration_unit or "m/s2",
+    )
+
+
+def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
+    """Add how the channels of accelerometers move with the lines, and what each is worth."""
+    if found.transfers:
+        report.add_rows("accelerometer_lines", "Accelerometers and lines", found.transfers)
+    report.add_rows("accelerometers", "Accelerometers", found.channels)
+    report.data["accelerometer_shift"] = asdict(found.shift)
+    report.notes.append(f"note: {found.shift_text}")
 
 
 def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:

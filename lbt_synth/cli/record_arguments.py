@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser
 
 from lbt_synth.cli.argument_kinds import add_option, add_switch
+from lbt_synth.identification.accelerometers.units import M_S2
 from lbt_synth.storage.display_unit import UNITS
 
 
@@ -56,10 +57,14 @@ def add_prior_knowledge(parser: ArgumentParser) -> None:
     add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
     add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")
     text = (
-        "NPY or CSV with one column per sensor and one row per frame of the record: what is "
+        "NPY or CSV with one column per channel and one row per frame of the record: what is "
         "coherent with it is expected as a line"
     )
     add_option(known, "--accelerometers", str, text)
+    text = "their rate, a whole multiple of the frame rate (default: the frame rate) [Hz]"
+    add_option(known, "--accelerometer-rate-hz", float, text)
+    text = f"their unit: {', '.join(M_S2)} (default m/s2)"
+    add_option(known, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
     add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
     add_option(known, "--most-lines", int, "most vibrations per axis", 20)
 

@@ -1,3 +1,8 @@
+from .accelerometers.clock_shift import ClockShift as ClockShift
+from .accelerometers.transfers import AccelerometerTransfers as AccelerometerTransfers
+from .accelerometers.transfers import ChannelRow as ChannelRow
+from .accelerometers.transfers import TransferRow as TransferRow
+from .accelerometers.transfers import accelerometer_transfers as accelerometer_transfers
 from .auto import RecordedDesign as RecordedDesign
 from .auto import design_from_record as design_from_record
 from .commands.axis_matrix import AxisMatrix as AxisMatrix

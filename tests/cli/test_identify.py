@@ -138,6 +138,35 @@ def test_accelerometers_and_lists_announce_lines(tmp_path, capsys, recorded_loop
         assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
 
 
+def test_accelerometers_are_compared_with_the_lines_of_the_model(
+    tmp_path, capsys, recorded_loop, recorded_night
+):
+    """Two readings a frame in mm/s^2: a channel that follows the line twofold, and a dead one."""
+    run_, _, _ = recorded_loop
+    shake = np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0])  # mm/s^2 at 1 kHz
+    readings = 2 * shake + 0.05 * np.std(shake) * np.random.default_rng(4).standard_normal(
+        shake.size
+    )
+    table = np.column_stack([readings, np.zeros(shake.size)]).repeat(2, axis=0)
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="m1,m2", comments="")
+    base = ("identify", recorded_night, "-o", tmp_path / "m.yaml", "--no-figure")
+    own = ("--accelerometers", tmp_path / "a.csv", "--acceleration-unit", "mm/s2")
+    status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 2000, "--json")
+    assert (status, error) == (0, "")
+    found = json.loads(text)
+    (line,) = [row for row in found["accelerometer_lines"] if row["useful"]]
+    assert (line["channel"], found["vibrations"][line["line"]]["kind"]) == ("m1", "line")
+    assert line["motion_nm_per_nm"] == pytest.approx(2, rel=0.05)
+    assert [row["verdict"] for row in found["accelerometers"]] == [
+        "used for 31.1 Hz",
+        "dead; adds nothing",
+    ]
+    status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 1500)
+    assert status == 2
+    assert "whole multiple of the frame rate" in error
+    assert "1.5 times" in error
+
+
 def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
     run_, _, _ = recorded_loop
     y, u = run_.measurements[0].copy(), run_.commands[0]

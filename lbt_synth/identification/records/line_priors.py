@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
-from lbt_synth.identification.records.column_selection import CLOCKS, join_names
+from lbt_synth.identification.records.column_selection import join_names
 from lbt_synth.identification.records.columns import Column
 from lbt_synth.identification.records.contents import TEXTS, read_contents
 from lbt_synth.storage.atomic_files import require_ending
@@ -23,7 +23,6 @@ from lbt_synth.validation import (
     NotNegative,
     Positive,
     check_fields,
-    frozen_copy,
     integer,
     number,
     real_array,
@@ -154,20 +153,6 @@ def _frequency_rows(columns: list[Column]) -> FloatArray:
     if gaps.size:
         raise ProblemError(f"row {gaps[0] + 1} of the numbers has no frequency.")
     return np.column_stack([found[word] for word in _HEADINGS if word in found])
-
-
-def load_accelerations(path: str | os.PathLike[str]) -> FloatArray:
-    """Read accelerations (frames, sensors) from a file of any format that records have."""
-    source = Path(path)
-    found = [each.values for each in read_contents(source).columns if each.role not in CLOCKS]
-    sizes = sorted({values.size for values in found})
-    if len(sizes) != 1:
-        raise TelemetryError(
-            f"{source} must hold columns of one length, a sensor each; got {len(found)} of "
-            f"{sizes} rows.",
-            path=source,
-        )
-    return frozen_copy(np.stack(found, axis=1))
 
 
 def accelerometer_lines(

@@ -1,0 +1,35 @@
+"""Faults that a channel of an accelerometer shows by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lbt_synth.validation import FloatArray
+
+_FEWEST_VALUES = 4  # a series of no more different numbers is rounding
+_ROUNDING = 1e-12  # of the largest number
+_CLIPPED = 10  # frames at either end, at least
+_DRIFT = 100.0  # power at low frequencies over the median
+_SLOW_HZ = 1.0
+
+
+def channel_fault(readings: FloatArray, rate_hz: float) -> str:
+    """Return dead, saturated, drifting, or an empty text, for the readings (frames,) of one."""
+    values, counts = np.unique(readings, return_counts=True)
+    spread = float(values[-1] - values[0])
+    if values.size <= _FEWEST_VALUES or spread <= _ROUNDING * float(np.max(np.abs(values))):
+        return "dead"
+    ends = (counts[0], counts[1]), (counts[-1], counts[-2])
+    if all(end >= _CLIPPED and end > 2 * inner for end, inner in ends):
+        return "saturated"
+    return "drifting" if _drifts(readings, rate_hz) else ""
+
+
+def _drifts(readings: FloatArray, rate_hz: float) -> bool:
+    from scipy.signal import periodogram
+
+    frequency, power = periodogram(readings, rate_hz, window="cosine")
+    slow = (frequency > 0) & (frequency < _SLOW_HZ)
+    if not slow.any():
+        return False
+    return bool(np.mean(power[slow]) > _DRIFT * np.median(power[1:]))

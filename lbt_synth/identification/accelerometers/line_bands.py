@@ -1,0 +1,163 @@
+"""Bands of frequencies around the lines of a model, as wavefront and accelerometers show them.
+
+The transform of a stretch of a record is tapered by a sine, whose square is a cosine: values of
+white noise at neighbouring frequencies have the correlation -1/2, those farther apart none. The
+expected spectrum of a line is that of its tapered series, so lines narrower than the resolution
+keep their power. From the wavefront, the model's lines and its background, each line's motion is
+estimated as by a Wiener filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
+from lbt_synth.models.resonance_spectrum import coefficients
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
+
+NM = 1e-9
+_HALF_WIDTHS = 20.0  # of a line, from its centre to the edge of its band
+_CORE_HALF_WIDTHS = 5.0
+_BINS = 40.0
+_CORE_BINS = 2.0
+_PART = 0.25  # of the frequency of a line, to which its band reaches at most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LineBand:
+    """A band around one line, or around lines whose bands overlap."""
+
+    lines: tuple[int, ...]  # indices of the lines
+    angle: FloatArray  # (f,) [rad per frame]
+    readings: ComplexArray  # (f, channels) [m/s^2 per sqrt(Hz)]
+    expected: ComplexArray  # (f, lines): of a motion of 1 nm per nm [m/s^2 per sqrt(Hz)]
+    unseen: FloatArray  # (f, lines, lines): covariance that the wavefront leaves of it
+    core: BoolArray  # (f, lines): frequencies of the lines themselves
+    follows: BoolArray  # (f - 1,): whether a value is a neighbour of the one before
+
+
+def line_bands(
+    model: IdentifiedModel,
+    lines: Sequence[IdentifiedLine],
+    wavefront: FloatArray,
+    readings: FloatArray,
+    stretches: Sequence[tuple[int, int]],
+) -> list[LineBand]:
+    """Return the bands of all lines, wavefront (frames, axes) and readings (frames, channels)."""
+    rate = model.frame_rate_hz
+    length = max(stop - start for start, stop in stretches)
+    kept = [each for each in stretches if each[1] - each[0] >= length / 4]
+    parts = [_transform(np.hstack([wavefront, readings])[start:stop], rate) for start, stop in kept]
+    frequency = np.concatenate([part[0] for part in parts])
+    values = np.concatenate([part[1] for part in parts])
+    shapes = np.concatenate(
+        [
+            np.stack([tapered_line(line, stop - start, rate) for line in lines], axis=1)
+            for start, stop in kept
+        ]
+    )
+    follows = np.diff(frequency) > 0
+    z, a = values[:, : wavefront.shape[1]], values[:, wavefront.shape[1] :]
+    out = []
+    resolution = rate / length
+    for group, low, high in _groups(lines, resolution):
+        inside = np.flatnonzero((frequency >= low) & (frequency <= high))
+        f = frequency[inside]
+        estimate, unseen = _wiener(
+            model, [lines[j] for j in group], shapes[inside][:, group], f, z[inside]
+        )
+        second = -NM * (2 * rate * np.sin(np.pi * f / rate)) ** 2
+        reach = np.array(
+            [_reach(lines[j], resolution, _CORE_HALF_WIDTHS, _CORE_BINS) for j in group]
+        )
+        centres = np.array([lines[j].frequency_hz for j in group])
+        out.append(
+            LineBand(
+                lines=tuple(group),
+                angle=2 * np.pi * f / rate,
+                readings=a[inside],
+                expected=second[:, None] * estimate,
+                unseen=second[:, None, None] ** 2 * unseen,
+                core=np.abs(f[:, None] - centres) <= reach,
+                follows=(np.diff(inside) == 1) & follows[inside[:-1]],
+            )
+        )
+    return out
+
+
+def _transform(series: FloatArray, rate: float) -> tuple[FloatArray, ComplexArray]:
+    """Return frequencies and tapered transforms (f, series), whose squares are densities."""
+    from scipy.fft import rfft
+
+    n = len(series)
+    values = rfft(_taper(n)[:, None] * (series - series.mean(axis=0)), axis=0)
+    frequency: FloatArray = np.arange(1.0, (n + 1) // 2) * (rate / n)
+    return frequency, np.asarray(values[1 : (n + 1) // 2] * np.sqrt(4 / (rate * n)))
+
+
+def _taper(n: int) -> FloatArray:
+    return np.asarray(np.sin(np.pi * (np.arange(n) + 0.5) / n))
+
+
+def tapered_line(line: IdentifiedLine, n: int, rate: float) -> FloatArray:
+    """Return the expected density of the tapered transform of a line [nm^2/Hz], (f,)."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    size = int(next_fast_len(2 * n, real=True))
+    a1, a2, _ = coefficients(2 * np.pi * line.frequency_hz / rate, line.damping)
+    root = np.roots([1, -a1, -a2]).astype(complex)[0]
+    lags = np.arange(n)
+    # r(t) = Re(c root^t) with r(0) = 1 and r(1) = a1 / (1 - a2)
+    slope = (a1 / (1 - a2) - root.real) / root.imag if root.imag else 0.0
+    decay = np.exp(lags * np.log(root))
+    overlap = irfft(np.abs(rfft(_taper(n), size)) ** 2, size)[:n] * (2 / n)
+    series = line.rms_nm**2 * overlap * (decay.real + slope * decay.imag)
+    # at the frequencies k rate / n: fold the even series onto n lags
+    folded = series.copy()
+    folded[1:] += series[:0:-1]
+    spectrum = rfft(folded).real[1 : (n + 1) // 2]
+    return np.asarray(np.maximum(spectrum, 0.0) * (2 / rate))
+
+
+def _reach(line: IdentifiedLine, resolution: float, widths: float, bins: float) -> float:
+    half_width = line.damping * line.frequency_hz
+    return float(min(max(widths * half_width, bins * resolution), _PART * line.frequency_hz))
+
+
+def _groups(
+    lines: Sequence[IdentifiedLine], resolution: float
+) -> list[tuple[list[int], float, float]]:
+    """Return the lines of each band with its edges [Hz]; bands that overlap are one."""
+    out: list[tuple[list[int], float, float]] = []
+    for j in sorted(range(len(lines)), key=lambda j: lines[j].frequency_hz):
+        reach = _reach(lines[j], resolution, _HALF_WIDTHS, _BINS)
+        low, high = lines[j].frequency_hz - reach, lines[j].frequency_hz + reach
+        if out and low <= out[-1][2]:
+            group, first, last = out.pop()
+            out.append(([*group, j], min(first, low), max(last, high)))
+        else:
+            out.append(([j], low, high))
+    return out
+
+
+def _wiener(
+    model: IdentifiedModel,
+    lines: Sequence[IdentifiedLine],
+    shapes: FloatArray,
+    frequency: FloatArray,
+    wavefront: ComplexArray,
+) -> tuple[ComplexArray, FloatArray]:
+    """Return the estimate of each line (f, lines) and the covariance of its error."""
+    axes = len(model.axes)
+    along = np.array([(line.direction or (1.0,))[:axes] for line in lines])  # (lines, axes)
+    background = [np.interp(frequency, a.frequency_hz, a.background_nm2_hz) for a in model.axes]
+    total = np.einsum("fj,ja,jb->fab", shapes, along, along)
+    total += np.stack(background, axis=1)[:, :, None] * np.eye(axes)
+    cross = shapes[:, :, None] * along  # (f, lines, axes)
+    gain = np.linalg.solve(total, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
+    estimate = np.einsum("fja,fa->fj", gain, wavefront)
+    unseen = shapes[:, :, None] * np.eye(len(lines)) - np.einsum("fja,fka->fjk", gain, cross)
+    return estimate, unseen

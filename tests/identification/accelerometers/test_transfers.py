@@ -1,0 +1,165 @@
+"""How channels of accelerometers move with lines: factors, clocks, and what is left out."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import lbt_synth as lbt
+
+RATE = 1000.0
+FRAMES = 20_000
+MARGIN = 300
+# frequency [Hz], damping, rms [nm], axis
+LINES = ((14.0, 0.02, 60.0, 0), (31.0, 0.01, 50.0, 1), (56.0, 0.01, 40.0, 0))
+
+
+@dataclass(frozen=True)
+class Night:
+    """Two axes with lines and noise, the motions of the lines, and the model of the record."""
+
+    record: lbt.identification.LoopRecord
+    motions: np.ndarray  # (lines, frames + 2 MARGIN)
+    model: lbt.identification.IdentifiedModel
+
+
+@lru_cache(maxsize=1)
+def night() -> Night:
+    """An open loop whose wavefront follows its lines by one frame."""
+    rng = np.random.default_rng(3)
+    motions = []
+    for frequency, damping, rms, _ in LINES:
+        model = lbt.Vibration(frequency_hz=frequency, damping=damping, rms_nm=rms).ar_model(RATE)
+        drive = model.driving_rms_nm * rng.standard_normal(FRAMES + 2 * MARGIN + 2000)
+        motions.append(lfilter([1], [1, *-model.coefficients], drive)[2000:])
+    seen = np.zeros((FRAMES, 2))
+    for (_, _, _, axis), motion in zip(LINES, motions, strict=True):
+        seen[:, axis] += motion[MARGIN - 1 : MARGIN - 1 + FRAMES]
+    seen += 8 * rng.standard_normal(seen.shape)
+    record = lbt.identification.loop_record(seen, frame_rate_hz=RATE, unit="nm")
+    return Night(record, np.array(motions), lbt.identify(record))
+
+
+def reading(*factors: float, age: int = 1, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Return a channel that moves with the lines by real factors, as old as ``age``."""
+    total = np.asarray(factors) @ night().motions[: len(factors)]
+    second = 1e-9 * RATE**2 * np.diff(total, 2)  # value k is centred on frame k + 1 - MARGIN
+    start = MARGIN - 1 - age
+    noisy = noise * np.random.default_rng(seed).standard_normal(FRAMES)
+    return np.asarray(second[start : start + FRAMES] + noisy)
+
+
+def find(*channels: np.ndarray, **options) -> lbt.identification.AccelerometerTransfers:
+    return lbt.identification.accelerometer_transfers(
+        night().model, night().record, np.column_stack(channels), **options
+    )
+
+
+def line_index(row) -> int:
+    return int(np.argmin([abs(f - row.frequency_hz) for f, *_ in LINES]))
+
+
+def phase_error(row, phase_deg: float) -> float:
+    return abs((row.phase_deg - phase_deg + 180) % 360 - 180)
+
+
+def test_factors_shift_and_noise_are_those_of_the_channels():
+    noise = 2e-3
+    found = find(reading(2.0, -0.7, 1.3, noise=noise), reading(0.0, 1.1, 0.4, noise=noise, seed=1))
+    truth = {"channel1": (2.0, -0.7, 1.3), "channel2": (0.0, 1.1, 0.4)}
+    assert found.age_frames == 1
+    assert abs(found.shift.frames) < 4 * found.shift.error_frames < 0.2
+    for row in found.transfers:
+        factor = truth[row.channel][line_index(row)]
+        assert row.useful == (factor != 0)
+        if factor:
+            assert abs(row.motion_nm_per_nm - abs(factor)) < 4 * row.motion_error_nm_per_nm
+            assert row.motion_error_nm_per_nm < 0.05 * abs(factor)
+            assert phase_error(row, 180 * (factor < 0)) < 4 * row.phase_error_deg < 15
+            assert row.coherence > 0.5
+    for row in found.channels:
+        assert row.noise_m_s2 == pytest.approx(noise, rel=0.2)
+    assert found.channels[1].verdict == "used for 31.1, 56 Hz"
+
+
+@pytest.mark.parametrize("age", [0, 6, 140])
+def test_readings_of_any_age_are_laid_beside_the_wavefront(age):
+    found = find(reading(2.0, -0.7, 1.3, age=age, noise=1e-3))
+    assert found.shift.by_phases
+    assert found.age_frames == age
+    assert abs(found.shift.frames - (age - 1)) < 5 * found.shift.error_frames < 0.3
+    assert "by the phases of lines" in found.shift_text
+
+
+def test_a_fraction_of_a_frame_goes_into_the_phases():
+    late = (reading(2.0, -0.7, 1.3) + reading(2.0, -0.7, 1.3, age=2)) / 2
+    found = find(late + 1e-3 * np.random.default_rng(0).standard_normal(FRAMES))
+    assert found.shift.frames == pytest.approx(0.5, abs=5 * found.shift.error_frames)
+    for row in found.transfers:
+        j = line_index(row)
+        phase = 360 * LINES[j][0] / RATE * (found.age_frames - 1.5) + 180 * (j == 1)
+        assert phase_error(row, phase) < 5 * row.phase_error_deg
+
+
+def test_one_narrow_line_does_not_tell_the_shift():
+    found = find(reading(0.0, 1.5, age=3, noise=1e-3))
+    assert not found.shift.by_phases
+    assert "do not tell the shift" in found.shift_text
+    (row,) = (row for row in found.transfers if row.useful)
+    phase = 360 * LINES[1][0] / RATE * (found.age_frames - 3)
+    assert phase_error(row, phase) < 5 * row.phase_error_deg
+
+
+def test_channels_that_fail_are_named_and_left_out():
+    rng = np.random.default_rng(8)
+    good = reading(2.0, -0.7, 1.3, noise=1e-3)
+    limit = 1.5 * good.std()
+    gone = good.copy()
+    gone[: FRAMES // 4] = np.nan
+    drift = good + 1e-3 * np.cumsum(rng.standard_normal(FRAMES))
+    found = find(
+        good,
+        np.full(FRAMES, 3.3),
+        1e-3 * rng.integers(0, 2, FRAMES),
+        np.clip(good, -limit, limit),
+        gone,
+        drift,
+        1e-2 * rng.standard_normal(FRAMES),
+    )
+    heads = [row.verdict.split(";")[0] for row in found.channels]
+    assert heads[1:] == ["dead", "dead", "saturated", "dead", "drifting", "adds nothing"]
+    assert [row.channel for row in found.used] == ["channel1", "channel6"]
+
+
+def test_a_channel_with_another_clock_is_named():
+    channels = [reading(2.0, -0.7, 1.3, noise=1e-3, seed=k, age=1 + 4 * (k == 2)) for k in range(3)]
+    found = find(*channels)
+    assert [row.verdict.startswith("shifted by 4") for row in found.channels] == [0, 0, 1]
+    assert found.age_frames == 1
+
+
+def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used():
+    other = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        model = lbt.Vibration(frequency_hz=31.0, damping=0.01, rms_nm=50).ar_model(RATE)
+        drive = model.driving_rms_nm * rng.standard_normal(FRAMES)
+        alone = 1e-5 * lfilter([1], [1, *-model.coefficients], drive)
+        other.append(alone + 1e-4 * rng.standard_normal(FRAMES))
+    assert find(*other, largest_shift_s=0.1).used == ()
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "words"),
+    [
+        (np.ones((100, 2, 2)), {}, r"must be \(frames, channels\)"),
+        (np.ones((FRAMES, 2)), {"channels": ["a", "a"]}, "2 different names"),
+        (np.ones(FRAMES), {"false_alarm": 2}, "false_alarm"),
+        (np.random.default_rng(0).standard_normal(100), {}, "usable frames in a row"),
+    ],
+)
+def test_readings_that_are_refused(given, options, words):
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        lbt.identification.accelerometer_transfers(night().model, night().record, given, **options)
