@@ -56,7 +56,7 @@ lint: $(VENV)/.ready     ## style, types, import layers
 	$(BIN)/lint-imports
 
 test: lint               ## the whole default check
-	$(BIN)/pytest -n 2 -m "not study and not e2e and not browser" --doctest-modules lbt_synth tests
+	$(BIN)/pytest -n 2 --dist loadfile -m "not study and not e2e and not browser" --doctest-modules lbt_synth tests
 
 test-all:                ## the check on each supported Python that is found
 	PYTHON=$(PYTHON) .ci/each-python $(MAKE) test
@@ -76,7 +76,8 @@ browser: $(VENV)/.ready-browser ## pages in headless Chromium (Debian: chromium,
 study: $(VENV)/.ready    ## the long numerical studies
 	$(BIN)/pytest -m study tests
 
-bench: $(VENV)/.ready    ## speed against peers, as ratios within one run
+bench: $(VENV)/.ready    ## whole commands beside an earlier version, and speed against peers
+	$(BIN)/python benchmarks/commands.py
 	$(BIN)/python benchmarks/speed.py
 
 docs: $(VENV)/.ready     ## the documentation, warnings are errors

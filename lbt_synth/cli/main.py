@@ -6,6 +6,7 @@ Nothing heavy is imported before a command runs.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import signal
@@ -93,6 +94,7 @@ def _terminate(*_: object) -> None:
 
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
+    gc.set_threshold(100_000, 50, 50)  # what imports and charts make stays until the end
     reopen_closed()
     try:
         try:

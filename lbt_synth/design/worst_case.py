@@ -47,7 +47,9 @@ def search_worst_error(
     grid = np.linspace(interval.low_hz, interval.high_hz, _GRID)
     found = [(size(float(f)), float(f)) for f in grid]
     sizes = np.array([value for value, _ in found])
-    for i in np.argsort(sizes)[-3:]:
+    beside = np.concatenate([[-np.inf], sizes, [-np.inf]])
+    peaks = np.flatnonzero((sizes >= beside[:-2]) & (sizes > beside[2:]))
+    for i in peaks[np.argsort(sizes[peaks])[-3:]]:
         around = grid[max(i - 1, 0)], grid[min(i + 1, _GRID - 1)]
         x, least, *_ = fminbound(lambda f: -size(float(f)), *around, xtol=1e-7, full_output=True)
         found.append((-float(least), float(x)))

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.design.modal.gains import LoopInputs, ModalGains, find_gains
 from lbt_synth.design.modal.plants import number_per_mode
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear.power_spectrum import welch_spectrum
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import FloatArray, integer, real_array
@@ -102,8 +103,6 @@ def modal_gains_from_telemetry(
     >>> bool(abs(found.noise_nm[0] - 5) < 0.5), bool(0.1 < found.gains[0] < 0.25)
     (True, True)
     """
-    from scipy.signal import get_window, welch
-
     path = LoopHardware(
         frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
     )
@@ -125,12 +124,12 @@ def modal_gains_from_telemetry(
         )
     open_loop = y[:, first:] / gain[:, None] + past_corrections(taps, u.T)[first:].T
     steps = np.diff(open_loop, axis=1)
-    frequency, power = welch(steps, fs=rate, nperseg=segment, axis=1, detrend=False)
+    frequency, power = welch_spectrum(steps, rate, segment)
     power[:, 0] *= 2  # one-sided as the others
     if segment % 2 == 0:
         power[:, -1] *= 2
     # exact mean of the periodogram for differences of white noise of 1 nm
-    window = get_window("hann", segment)
+    window = np.hanning(segment + 1)[:-1]
     neighbours = window[1:] @ window[:-1] / (window @ window)
     unit = 4 / rate * (1 - neighbours * np.cos(2 * np.pi * frequency / rate))
     if noise_nm is None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
+from lbt_synth.linear.power_spectrum import welch_spectrum
 from lbt_synth.loop import ClosedLoop, close_loop, simulate, step_response
 from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
@@ -43,8 +44,6 @@ class DesignSimulation:
 
 def simulate_design(design: Design, config: Config, *, settle_frames: int) -> DesignSimulation:
     """Run a design in the loop of a configuration, which settles for at least so many frames."""
-    from scipy.signal import welch  # slow to import
-
     settings, hardware, truth = config.settings.simulation, config.hardware, config.truth
     frames = min(settings.frames, _MOST_FRAMES)
     run = simulate(
@@ -60,8 +59,8 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
     rate, length = hardware.frame_rate_hz, min(frames, _SEGMENT)
     spectra = []
     for series in (run.total_nm, run.residual_nm):
-        frequency, density = welch(series, fs=rate, nperseg=length, axis=1, detrend=False)
-        spectra.append(density.mean(axis=0).sum(axis=1))
+        frequency, density = welch_spectrum(np.swapaxes(series, 1, 2), rate, length)
+        spectra.append(density.mean(axis=0).sum(axis=0))
     strehls = run.strehl(config.imaging)
     shown = min(frames, _EXCERPT)
     step = step_response(loop)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lbt_synth.linear.power_spectrum import welch_spectrum
 from lbt_synth.loop import Simulation
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
@@ -47,8 +48,6 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
     >>> len(lbt.report.figures.simulation_figure(run).axes)
     2
     """
-    from scipy.signal import welch
-
     _, frames, n = run.residual_nm.shape
     names = ("tip", "tilt") if n <= 2 else [f"mode {i}" for i in range(n)]
     shown = min(frames, int(np.ceil(_SERIES_S * run.frame_rate_hz)))
@@ -60,7 +59,8 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
         series.append(Curve(name=name, x=time, y=y, look=i, width=0.8, opacity=0.8, dash=0))
         # the residual is solid, what there was before it is dotted
         for data, word, dash in ((run.total_nm, "open loop", 3), (run.residual_nm, "residual", 0)):
-            f, s = welch(data[:, :, i], fs=run.frame_rate_hz, nperseg=min(frames, 2048), axis=1)
+            length = min(frames, 2048)
+            f, s = welch_spectrum(data[:, :, i], run.frame_rate_hz, length, remove_mean=True)
             name, mean = f"{names[i]}, {word}", s.mean(axis=0)[1:]
             spectra.append(Curve(name=name, x=f[1:], y=mean, look=i, width=1.0, dash=dash))
     panels = (series_panel(series), spectra_panel(spectra))
