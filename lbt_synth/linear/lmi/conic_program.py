@@ -26,7 +26,8 @@ from lbt_synth.linear.convex_functions import (
     FunctionBound,
     HalfPlanes,
 )
-from lbt_synth.linear.lmi.solver import USABLE, require_optimum, solve
+from lbt_synth.linear.lmi.conic_data import USABLE, require_optimum
+from lbt_synth.linear.lmi.solver import solve
 from lbt_synth.validation import ComplexArray, FloatArray
 
 

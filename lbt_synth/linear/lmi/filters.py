@@ -24,7 +24,8 @@ from scipy.linalg import null_space
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
-from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
+from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.solver import solve, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.validation import FloatArray, frozen_copy
 

@@ -11,15 +11,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cvxpy as cp
 import numpy as np
+from scipy import sparse
 from scipy.linalg import solve_triangular
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.lmi.solver import require_optimum, solve
+from lbt_synth.linear.lmi.conic_data import ConicProgramme, require_optimum
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+
+_APART = 1e-11  # cosine of two responses below which they have nothing in common
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,70 +84,123 @@ class InnovationProgramme:
 
         Returns the taps (l, T q), gamma and the status of the solver.
         """
-        taps = cp.Variable(self.target.shape)
-        bounds = self._bounds(taps, gamma / self.scale, frequency_hz)
-        run = solve(cp.Minimize(self._distance(taps)), bounds)
-        return self._unscaled(taps, run), gamma, run[0]
+        taps, _, status = self._solve(frequency_hz, level=gamma / self.scale, distance=None)
+        return taps, gamma, status
 
     def minimize_level(
         self, variance: float, frequency_hz: FloatArray
     ) -> tuple[FloatArray, float, str]:
         """Minimise the level at the frequencies with a bound on the variance; likewise."""
-        taps, level = cp.Variable(self.target.shape), cp.Variable(nonneg=True)
         slack = float(np.sqrt(max(variance - self.floor, 0.0))) / self.scale
-        bounds = self._bounds(taps, level, frequency_hz)
-        run = solve(cp.Minimize(level), [*bounds, self._distance(taps) <= slack])
-        return self._unscaled(taps, run), float(level.value) * self.scale, run[0]
+        taps, level, status = self._solve(frequency_hz, level=None, distance=slack)
+        return taps, level * self.scale, status
 
-    def _distance(self, taps: cp.Variable) -> cp.Expression:
-        return cp.norm(taps @ self.root - self.target / self.scale, "fro")
-
-    def _unscaled(self, taps: cp.Variable, run: tuple[str, int]) -> FloatArray:
+    def _solve(
+        self, frequency_hz: FloatArray, *, level: float | None, distance: float | None
+    ) -> tuple[FloatArray, float, str]:
+        """Minimise the level or the distance, whichever is None; it is the last unknown."""
+        N, E = (s.frequency_response(frequency_hz) for s in (self.innovation, self.error))
+        E = E / self.scale
+        groups = _independent_groups(N, E)
+        outputs, q = len(self.target), N.shape[1]
+        # unknown of each tap, (l, T, q): none between groups
+        unknowns = np.full((outputs, self.taps, q), -1)
+        for rows, columns in groups:
+            unknowns[np.ix_(rows, range(self.taps), columns)] = 0
+        free = unknowns.ravel() == 0
+        unknowns[unknowns == 0] = np.arange(np.count_nonzero(free))
+        programme = ConicProgramme(int(np.count_nonzero(free)) + 1)
+        root = sparse.kron(np.eye(outputs), self.root.T, format="csc")[:, free]
+        first = sparse.csr_matrix(([float(distance is None)], ([0], [programme.size - 1])))
+        spread = sparse.csr_matrix(sparse.hstack([root, sparse.csr_matrix((root.shape[0], 1))]))
+        offsets = np.r_[distance or 0.0, -self.target.ravel() / self.scale]
+        programme.add_second_order(sparse.vstack([first, spread]), offsets[None])
+        phase = np.exp(-2j * np.pi * frequency_hz * self.error.dt_s)
+        powers = phase[:, None] ** np.arange(1, self.taps + 1)
+        for rows, columns in groups:
+            chosen = unknowns[np.ix_(rows, range(self.taps), columns)]
+            _bound_norm(programme, N[:, columns], E[:, rows], powers, chosen, level)
+        goal = np.zeros(programme.size)
+        goal[-1] = 1.0
+        found = programme.minimize(goal)
         require_optimum(
-            run,
+            (found.status, found.iterations),
             "the programme of the mixed filter",
             "Try a larger bound, or another number of taps.",
         )
-        unscaled = taps.value * self.scale @ np.kron(np.eye(self.taps), self.whitening)
-        return np.asarray(unscaled, dtype=np.float64)
-
-    def _bounds(
-        self, taps: cp.Variable, level: float | cp.Variable, frequency_hz: FloatArray
-    ) -> list[cp.Constraint]:
-        """Constrain the spectral norm of the error below a level, frequency by frequency.
-
-        With ``[N; E] = [[N1, 0], [E1, E2]] U`` and U orthonormal, ``E - Q N`` has the
-        singular values of ``[E1 - Q N1, E2]``, of l rows and q + l columns.
-        """
-        outputs, q = len(self.target), self.innovation.C.shape[0]
-        N, E = (s.frequency_response(frequency_hz) for s in (self.innovation, self.error))
-        stacked = np.concatenate([N, E / self.scale], axis=1).conj().swapaxes(1, 2)
-        triangle = np.asarray(np.linalg.qr(stacked, mode="r")).conj().swapaxes(1, 2)
-        columns = triangle.shape[2]
-        fixed, steered = triangle[:, q:, :], triangle[:, :q, :q]
-        phase = np.exp(-2j * np.pi * frequency_hz * self.error.dt_s)
-        constraints = []
-        rows: list[cp.Expression] = []
-        for i, z_inverse in enumerate(phase):
-            powers = z_inverse ** np.arange(1, self.taps + 1)
-            response = np.kron(powers[:, None], np.eye(q)) @ steered[i]  # (T q, q)
-            shaped = np.zeros((self.taps * q, columns), dtype=np.complex128)
-            shaped[:, :q] = response
-            real = fixed[i].real - taps @ shaped.real
-            imaginary = fixed[i].imag - taps @ shaped.imag
-            if outputs == 1:
-                rows.append(cp.hstack([real[0], imaginary[0]]))
-                continue
-            block = cp.bmat([[real, -imaginary], [imaginary, real]])
-            constraints.append(_norm_below(block, level, 2 * outputs, 2 * columns))
-        if rows:
-            levels = cp.multiply(level, np.ones(len(rows)))
-            constraints.append(cp.SOC(levels, cp.vstack(rows), axis=1))
-        return constraints
+        taps = np.zeros(self.target.size)
+        taps[free] = found.x[:-1] * self.scale
+        unscaled = taps.reshape(self.target.shape) @ np.kron(np.eye(self.taps), self.whitening)
+        return np.asarray(unscaled, dtype=np.float64), float(found.x[-1]), found.status
 
 
-def _norm_below(
-    block: cp.Expression, level: float | cp.Variable, rows: int, columns: int
-) -> cp.Constraint:
-    """Constrain the spectral norm of a matrix below a level."""
-    return cp.bmat([[level * np.eye(rows), block], [block.T, level * np.eye(columns)]]) >> 0
+def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int], list[int]]]:
+    """Group outputs and innovations, (F, q, w) and (F, l, w), that share a disturbance.
+
+    The best filter has no taps between groups, such as axes that do not couple.
+    """
+    stacked = np.concatenate([N, E], axis=1)
+    size = np.linalg.norm(stacked, axis=(0, 2))
+    products = np.abs(stacked @ stacked.conj().swapaxes(1, 2)).sum(axis=0)
+    _, labels = connected_components(products > _APART * size[:, None] * size)
+    q = N.shape[1]
+    groups = []
+    for label in np.unique(labels[q:]):
+        rows, columns = np.nonzero(labels[q:] == label)[0], np.nonzero(labels[:q] == label)[0]
+        groups.append((rows.tolist(), columns.tolist()))
+    return groups
+
+
+def _bound_norm(
+    programme: ConicProgramme,
+    N: ComplexArray,
+    E: ComplexArray,
+    powers: ComplexArray,
+    unknowns: IntArray,
+    level: float | None,
+) -> None:
+    """Keep the spectral norm of ``E - Q N`` below a level, or the last unknown, at F frequencies.
+
+    With ``[N; E] = [[N1, 0], [E1, E2]] U`` and U orthonormal, ``E - Q N`` has the singular
+    values of ``[E1 - Q N1, E2]``, of l rows and at most q + l columns.
+    """
+    count, q, _ = N.shape
+    outputs = E.shape[1]
+    stacked = np.concatenate([N, E], axis=1).conj().swapaxes(1, 2)
+    triangle = np.asarray(np.linalg.qr(stacked, mode="r")).conj().swapaxes(1, 2)
+    width = triangle.shape[2]
+    fixed, steered = triangle[:, q:], triangle[:, :q]
+    # entry (f, i, k), real then imaginary, changes by minus this per tap
+    slopes = powers[:, None, None, :, None] * steered.swapaxes(1, 2)[:, None, :, None, :]
+    slopes = np.broadcast_to(slopes, (count, outputs, width, *slopes.shape[3:]))
+    parts = np.stack([slopes.real, slopes.imag], axis=3)
+    entries = np.arange(count * outputs * width * 2).reshape(count, outputs, width, 2)
+    taps = np.broadcast_to(unknowns[None, :, None, None], parts.shape)
+    places = np.broadcast_to(entries[..., None, None], parts.shape)
+    rows = sparse.csr_matrix(
+        (-parts.ravel(), (places.ravel(), taps.ravel())), shape=(entries.size, programme.size)
+    )
+    # two further rows: the level, and nothing
+    last = sparse.csr_matrix(
+        ([float(level is None)], ([0], [programme.size - 1])), shape=(2, programme.size)
+    )
+    rows = sparse.vstack([rows, last], format="csr")
+    offsets = np.concatenate(
+        [np.stack([fixed.real, fixed.imag], axis=3).ravel(), [level or 0.0, 0.0]]
+    )
+    bound, nothing = entries.size, entries.size + 1
+    if outputs == 1:
+        chosen = np.column_stack([np.full(count, bound), entries.reshape(count, -1)])
+        programme.add_second_order(rows[chosen.ravel()], offsets[chosen])
+        return
+    size = 2 * (outputs + width)
+    chosen, sign = np.full((count, size, size), nothing), np.ones((size, size))
+    chosen[:, range(size), range(size)] = bound
+    top, left = slice(0, outputs), slice(outputs, 2 * outputs)
+    real, imaginary = slice(2 * outputs, 2 * outputs + width), slice(2 * outputs + width, size)
+    chosen[:, top, real] = chosen[:, left, imaginary] = entries[..., 0]
+    chosen[:, left, real] = chosen[:, top, imaginary] = entries[..., 1]
+    sign[top, imaginary] = -1
+    signs = np.broadcast_to(sign, chosen.shape)
+    signed = sparse.diags(signs.ravel()) @ rows[chosen.ravel()]
+    programme.add_semidefinite(signed.tocsr(), signs * offsets[chosen])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import cvxpy as cp
 import numpy as np
 
-from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
+from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.solver import solve, symmetrise
 from lbt_synth.linear.output_feedback.free_parameter import FreeParameter
 from lbt_synth.validation import FloatArray
 

@@ -16,7 +16,8 @@ from scipy.linalg import null_space
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
-from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
+from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.solver import solve, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import Side, control_side, estimation_side
 from lbt_synth.linear.output_feedback.lower_bound import ControlWitness

@@ -29,7 +29,8 @@ import numpy as np
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.infeasibility_proof import whitening_coordinates
-from lbt_synth.linear.lmi.solver import require_optimum, solve, symmetrise
+from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.solver import solve, symmetrise
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.validation import FloatArray, frozen_copy
 
