@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from lbt_synth.identification.accelerometers.clock_shift import (
 )
 from lbt_synth.identification.accelerometers.line_bands import LineBand, line_bands
 from lbt_synth.identification.accelerometers.readings import fill_missing
+from lbt_synth.identification.accelerometers.swapped import Factor, swapped_channels
 from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
@@ -141,6 +142,7 @@ def accelerometer_transfers(
     channels: Sequence[str] | None = None,
     false_alarm: float = 1e-3,
     largest_shift_s: float = 1.0,
+    earlier: Sequence[tuple[float, Mapping[str, complex]]] = (),
 ) -> AccelerometerTransfers:
     r"""Find how the channels of accelerometers move with the lines of an identified model.
 
@@ -169,6 +171,9 @@ def accelerometer_transfers(
         Probability that any line shows in any of these channels without being there.
     largest_shift_s : float, optional
         Largest shift between the clocks that is looked for [s].
+    earlier : sequence of (float, mapping of str to complex), optional
+        Lines of an earlier model: frequency [Hz] and the factors of channels by name. Without
+        them, exchanged channels cannot be found.
 
     Returns
     -------
@@ -227,6 +232,7 @@ def accelerometer_transfers(
     rows = [_row(fit, names[live[fit[3]]], places, model, limit) for fit in fits]
     rows.sort(key=lambda row: (names.index(row.channel), row.frequency_hz))
     noises = {live[c]: _noise(fits, c, model.frame_rate_hz, limit) for c in range(len(live))}
+    swapped = swapped_channels(_factors(rows), earlier) if earlier else {}
     wrong = {live[c]: f"shifted by {frames:.3g} frames against others" for c, frames in odd.items()}
     return AccelerometerTransfers(
         transfers=tuple(rows),
@@ -234,7 +240,9 @@ def accelerometer_transfers(
             ChannelRow(
                 channel=name,
                 noise_m_s2=noises.get(c, float("nan")),
-                verdict=_verdict(name, rows, faults[c], wrong.get(c, "")),
+                verdict=_verdict(
+                    name, rows, faults[c], wrong.get(c, ""), _swap_text(swapped.get(name))
+                ),
             )
             for c, name in enumerate(names)
         ),
@@ -347,6 +355,20 @@ def _noise(pairs: Sequence[Pair], channel: int, rate: float, limit: float) -> fl
     own = [pair for pair in pairs if pair[3] == channel]
     shown = [pair for pair in own if _chance(pair) < limit] or own
     return float(np.sqrt(np.mean([pair[1].noise[pair[2]] for pair in shown]) * rate / 2))
+
+
+def _factors(rows: Sequence[TransferRow]) -> dict[str, list[Factor]]:
+    """Return frequency, complex factor and standard error of each line, by channel."""
+    out: dict[str, list[Factor]] = {}
+    for row in rows:
+        factor = complex(row.motion_nm_per_nm * np.exp(1j * np.radians(row.phase_deg)))
+        own = (row.frequency_hz, factor, row.motion_error_nm_per_nm)
+        out.setdefault(row.channel, []).append(own)
+    return out
+
+
+def _swap_text(other: str | None) -> str:
+    return f"swapped with {other}" if other else ""
 
 
 def _verdict(name: str, rows: Sequence[TransferRow], *wrong: str) -> str:

@@ -140,6 +140,19 @@ def test_a_channel_with_another_clock_is_named():
     assert found.age_frames == 1
 
 
+def test_exchanged_channels_are_named_against_an_earlier_model():
+    first, second = reading(2.0, -0.7, 1.3, noise=1e-3), reading(0.0, 1.1, 0.4, noise=1e-3, seed=1)
+    factors = ({"a": 2.1}, {"a": -0.65, "b": 1.15}, {"a": 1.3, "b": 0.4})
+    earlier = [(frequency, own) for (frequency, *_), own in zip(LINES, factors, strict=True)]
+    for names, heads in (
+        (("a", "b"), ("used", "used")),
+        (("b", "a"), ("swapped with a", "swapped")),
+    ):
+        found = find(first, second, channels=names, earlier=earlier)
+        for row, head in zip(found.channels, heads, strict=True):
+            assert row.verdict.startswith(head)
+
+
 def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used():
     other = []
     for seed in range(12):
