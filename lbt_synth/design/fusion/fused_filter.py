@@ -1,0 +1,313 @@
+"""Filters of several sensors: Kalman and H-infinity, periodic where the rates differ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lbt_synth.design.certificate import (
+    GAIN_TOLERANCE,
+    LEVEL_SETS,
+    NORM_TOLERANCE,
+    Certificate,
+    Check,
+    certify_error,
+)
+from lbt_synth.design.fusion.failures import Fallback, failed_loop, make_fallbacks
+from lbt_synth.design.hinf import checked_bounds, require_reachable
+from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
+from lbt_synth.errors import InfeasibleError
+from lbt_synth.linear import hinf_norm
+from lbt_synth.linear.periodic.riccati import (
+    PeriodicRiccati,
+    kalman_gain,
+    least_periodic_gamma,
+    periodic_hinf,
+    periodic_kalman,
+)
+from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.loop.fusion.fused_loop import FusedLoop, close_fused_loop
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.fusion.plant import FusedPlant
+from lbt_synth.storage.rows import column, fact_table, table_row
+from lbt_synth.storage.summaries import Summary
+from lbt_synth.validation import ComplexArray, FloatArray, require_instance, set_fields
+
+FUSED = "fused "  # before the name of the method, in the name of its designs
+
+
+@table_row
+class FusedFacts:
+    """What a filter of several sensors achieves."""
+
+    sensors: str = column("sensors and channels")
+    period: int = column("common period", unit="frames")
+    rms: float = column("estimation error, rms", unit="nm")
+    gamma: float = column("estimation error, H-infinity norm over a period", unit="nm")
+    gamma_requested: float | None = column("bound asked for", unit="nm")
+    gamma_least: float | None = column("least norm of any filter", unit="nm", format=".9g")
+    loop_radius: float = column("spectral radius of the loop, over a period", format=".6f")
+    gain_low: float = column("stable sensor gains, from", format=".4g")
+    gain_high: float = column("stable sensor gains, to", format=".4g")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FusedFilter(Design):
+    """A filter of several sensors, with the filters that take over when some fail.
+
+    Attributes
+    ----------
+    problem : FusedPlant
+        The plant that the sensors see.
+    gains : (N, n, q) ndarray
+        Predictor gains of each phase; zero for measurements that are not read.
+    fallbacks : tuple of Fallback
+        Filter of the remaining sensors, for each set of sensors and channels that may fail.
+    gamma_requested : float or None
+        Bound that an H-infinity design was given.
+    gamma_least : float or None
+        Norm that a filter of the problem achieves, the least one to 1e-9.
+    """
+
+    controller: PeriodicController = field(init=False)  # type: ignore[assignment]
+    problem: FusedPlant
+    gains: FloatArray
+    fallbacks: tuple[Fallback, ...] = ()
+    gamma_requested: float | None = None
+    gamma_least: float | None = None
+
+    def __post_init__(self) -> None:
+        set_fields(self, controller=self.problem.controller(self.gains))
+
+    @property
+    def loop_hardware(self) -> LoopHardware:
+        """Mirror, delay and own sensor of the loop."""
+        return self.problem.own.hardware
+
+    @property
+    def gamma(self) -> float:
+        """Norm of the estimation error over a period, recomputed."""
+        return self.certificate.gamma
+
+    @property
+    def rms(self) -> float:
+        """Standard deviation of the estimation error, mean over the period, recomputed."""
+        return self.certificate.rms
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles of the estimation error over a period, (n,)."""
+        error = self.problem.error_system(self.gains)
+        return np.linalg.eigvals(error.monodromy).astype(np.complex128)
+
+    def loop(self, sensor_gain: float = 1.0) -> FusedLoop:
+        """Return the loop that the design is for, closed."""
+        return close_fused_loop(
+            self.loop_hardware, self.problem.suite, self.controller, sensor_gain=sensor_gain
+        )
+
+    def fallback(self, missing: tuple[str, ...]) -> Fallback:
+        """Return the filter for some missing sensors; without any, that of the design."""
+        if not missing:
+            return Fallback(missing=(), gains=self.gains)
+        return next(f for f in self.fallbacks if set(f.missing) == set(missing))
+
+    def facts(self) -> FusedFacts:
+        """Return what the filter achieves."""
+        low, high = stable_gains(lambda gain: self.loop(gain).is_stable)
+        return FusedFacts(
+            sensors=", ".join(self.problem.suite.units),
+            period=self.problem.period,
+            rms=self.rms,
+            gamma=self.gamma,
+            gamma_requested=self.gamma_requested,
+            gamma_least=self.gamma_least,
+            loop_radius=self.loop().spectral_radius,
+            gain_low=low,
+            gain_high=high,
+        )
+
+    def _brief(self) -> str:
+        return f"{self.method}, {self.problem._brief()}"
+
+    def _summarise(self) -> Summary:
+        notes = [f"assumes: {assumption}." for assumption in self.assumptions]
+        return Summary(tables=[fact_table("Design", self.facts())], notes=notes)
+
+    def recertify(self) -> Certificate:
+        """Compute the certificate again: the filter, its claims, its loop and its fall-backs."""
+        problem, period = self.problem, self.problem.period
+        certificate = certify_error(
+            problem.error_system(self.gains).lifted(), stability="spectral radius over a period"
+        )
+        checks = list(certificate.checks)
+        if checks[0].passed:
+            if self.gamma_requested is None:
+                checks.append(_least_variance_check(problem, self.gains, ""))
+            else:
+                checks += self._bound_checks(certificate)
+        loop = self.loop().system.radius_per_frame
+        checks.append(_stable("spectral radius of the closed loop, per frame", loop))
+        for fallback in self.fallbacks:
+            name = " + ".join(fallback.missing)
+            radius = failed_loop(problem, fallback.gains, fallback.missing).system.radius_per_frame
+            checks.append(_stable(f"spectral radius of the loop without {name}, per frame", radius))
+            checks.append(_least_variance_check(problem, fallback.gains, name))
+        shape = (period, len(problem.L))
+        rms = certificate.rms_per_output
+        rms = (
+            np.sqrt(np.mean(rms.reshape(shape) ** 2, axis=0)) if rms.size == np.prod(shape) else rms
+        )
+        return replace(certificate, checks=tuple(checks), rms_per_output=rms)
+
+    def _bound_checks(self, certificate: Certificate) -> list[Check]:
+        limit = (self.gamma_requested or 0.0) * (1 + NORM_TOLERANCE)
+        checks = [Check("norm of the estimation error", certificate.gamma, limit, LEVEL_SETS)]
+        start = periodic_kalman(self.problem)
+        if self.gamma_least is not None:
+            meets = [
+                periodic_hinf(self.problem, self.gamma_least * (1 + side), start) is not None
+                for side in (-NORM_TOLERANCE, NORM_TOLERANCE)
+            ]
+            off = 0.0 if meets == [False, True] else np.inf
+            how = "gamma-Riccati equation on both sides"
+            checks.append(Check("least norm of any filter, error", off, NORM_TOLERANCE, how))
+        central = periodic_hinf(self.problem, self.gamma_requested or 0.0, start)
+        apart = np.inf if central is None else _apart(self.gains, central.gains)
+        name, how = "distance from its Riccati filter", "relative"
+        checks.append(Check(name, apart, 1e-5, how))
+        return checks
+
+
+def _stable(name: str, radius: float) -> Check:
+    return Check(name, radius, 1 - STABILITY_MARGIN, "eigenvalues of the monodromy")
+
+
+def _apart(own: FloatArray, other: FloatArray) -> float:
+    return float(np.linalg.norm(own - other) / max(np.linalg.norm(other), 1e-300))
+
+
+def _least_variance_check(problem: FusedPlant, gains: FloatArray, without: str) -> Check:
+    """Check that gains are those of least variance, by the covariance of a Lyapunov equation."""
+    name = "distance from the least-variance gains" + (f" without {without}" if without else "")
+    how = "gains recomputed from the Lyapunov covariances"
+    missing = tuple(without.split(" + ")) if without else ()
+    remaining = ~problem.unit_rows(missing)
+    if not np.any(problem.read & remaining):
+        return Check(name, float(np.max(np.abs(gains), initial=0.0)), GAIN_TOLERANCE, how)
+    error = problem.error_system(gains)
+    if not error.spectral_radius < 1:
+        return Check(name, np.inf, GAIN_TOLERANCE, how)
+    own = problem.restricted(remaining)
+    optimal = [kalman_gain(own, t, P) for t, P in enumerate(error.covariances())]
+    return Check(name, _apart(gains, np.stack(optimal)), GAIN_TOLERANCE, how)
+
+
+def stable_gains(stable: Callable[[float], bool]) -> tuple[float, float]:
+    """Return the interval of sensor gains around 1 at which a loop is stable, to 1e-4.
+
+    A loop that is stable down to a gain of 0.001 counts as stable from 0.
+    """
+    ends = []
+    for factor, far in ((0.8, 1e-3), (1.25, 1e3)):
+        inside, outside = 1.0, factor
+        while stable(outside):
+            inside, outside = outside, outside * factor
+            if (outside < far) if factor < 1 else (outside > far):
+                break
+        else:
+            while abs(outside - inside) > 1e-4 * inside:
+                middle = (inside + outside) / 2
+                inside, outside = (middle, outside) if stable(middle) else (inside, middle)
+        ends.append(inside if inside > 2e-3 else 0.0)
+    return ends[0], ends[1]
+
+
+def fused_kalman(plant: FusedPlant) -> FusedFilter:
+    """Design the Kalman filter of several sensors.
+
+    Parameters
+    ----------
+    plant : FusedPlant
+        Loop, disturbances and sensors.
+
+    Returns
+    -------
+    FusedFilter
+        Certified design, with a certified fall-back for each set of sensors that may fail.
+
+    Raises
+    ------
+    DetectabilityError
+        If no stable filter exists.
+    NumericalError
+        If the periodic Riccati equation was not solved.
+    CertificateError
+        If the design or a fall-back does not pass its checks.
+    ProblemError
+        If there are more than six sensors and channels.
+    """
+    require_instance(plant, FusedPlant, "plant")
+    return _design(plant, periodic_kalman(plant), "kalman")
+
+
+def fused_hinf(
+    plant: FusedPlant, *, gamma: float | None = None, gamma_ratio: float | None = None
+) -> FusedFilter:
+    """Design the H-infinity filter of several sensors; its fall-backs are Kalman filters.
+
+    Parameters
+    ----------
+    plant : FusedPlant
+        Loop, disturbances and sensors.
+    gamma, gamma_ratio : float, optional
+        Bound of the norm of the error over a period, or the bound as a multiple of the least one;
+        by default 1.2 times the least.
+
+    Returns
+    -------
+    FusedFilter
+        Certified design.
+
+    Raises
+    ------
+    InfeasibleError
+        If the bound is below the least gamma; the message names the least.
+    SynthesisError
+        As :func:`fused_kalman`.
+    """
+    require_instance(plant, FusedPlant, "plant")
+    gamma, gamma_ratio = checked_bounds(
+        gamma, gamma_ratio, far_above="the filter is the Kalman filter"
+    )
+    start = periodic_kalman(plant)
+    upper = hinf_norm(plant.error_system(start.gains).lifted()).upper
+    _, least = least_periodic_gamma(plant, start, upper)
+    requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
+    require_reachable(requested, least)
+    found = periodic_hinf(plant, max(requested, least), start)
+    if found is None:
+        raise InfeasibleError(
+            f"the gamma-Riccati equation has no stabilising solution at gamma = {requested:.9g}. "
+            "Try a larger gamma.",
+            gamma=requested,
+        )
+    return _design(plant, found, "hinf", gamma_requested=max(requested, least), gamma_least=least)
+
+
+def _design(
+    plant: FusedPlant, solution: PeriodicRiccati, method: str, **claims: float
+) -> FusedFilter:
+    design = FusedFilter(
+        method=FUSED + method,
+        certificate=UNCERTIFIED,
+        solver=SolverReport(route="riccati", status="cyclic doubling", iterations=solution.steps),
+        problem=plant,
+        gains=solution.gains,
+        fallbacks=make_fallbacks(plant),
+        **claims,
+    )
+    return with_certificate(design, "Scale the states to similar sizes, or leave out a sensor.")

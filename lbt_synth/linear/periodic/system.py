@@ -1,0 +1,197 @@
+"""Periodic linear systems: their monodromy, their variances, and their system over a period.
+
+S. Bittanti, P. Colaneri, "Periodic Systems: Filtering and Control", Springer (2009),
+doi:10.1007/978-1-84800-911-0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.errors import DimensionError
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.state_space import Controller, StateSpace
+from lbt_synth.validation import ComplexArray, FloatArray, number, real_array, set_fields
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PeriodicSystem:
+    """System ``x(k+1) = A[t] x(k) + B[t] w(k)``, ``y(k) = C[t] x(k) + D[t] w(k)``, t = k mod N.
+
+    Parameters
+    ----------
+    A, B, C, D : (N, n, n), (N, n, m), (N, p, n), (N, p, m) array_like
+        Matrices of each phase; those of one phase, (1, ...), are repeated.
+    dt_s : float, optional
+        Sampling period [s].
+
+    Raises
+    ------
+    ProblemError
+        If a matrix is not finite or the sizes clash.
+
+    Examples
+    --------
+    >>> from lbt_synth.linear.periodic.system import PeriodicSystem
+    >>> one = [[[1.0]]]
+    >>> slow = PeriodicSystem(A=[[[0.5]], [[0.8]]], B=one, C=one, D=[[[0.0]]])
+    >>> slow.spectral_radius
+    0.4
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    dt_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        parts = {name: real_array(getattr(self, name), name) for name in "ABCD"}
+        for name, part in parts.items():
+            if part.ndim != 3:
+                raise DimensionError(f"{name} must be a matrix per phase; got {part.shape}.")
+        period = max(len(part) for part in parts.values())
+        n, m, p = parts["A"].shape[2], parts["B"].shape[2], parts["C"].shape[1]
+        sizes = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
+        for name, part in parts.items():
+            if part.shape[1:] != sizes[name] or len(part) not in (1, period):
+                raise DimensionError(f"{name} must be {(period, *sizes[name])}; got {part.shape}.")
+            parts[name] = np.broadcast_to(part, (period, *sizes[name]))
+        set_fields(self, **parts, dt_s=number(self.dt_s, "dt_s", above=0))
+
+    @property
+    def period(self) -> int:
+        """Number of phases N."""
+        return len(self.A)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[1])
+
+    @property
+    def monodromy(self) -> FloatArray:
+        """Transition over a period, from phase 0 to the next phase 0, (n, n)."""
+        out = np.eye(self.n_states)
+        for A in self.A:
+            out = A @ out
+        return out
+
+    @property
+    def spectral_radius(self) -> float:
+        """Largest modulus of the eigenvalues of the monodromy: of a period, not of a frame."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.monodromy)), initial=0.0))
+
+    @property
+    def radius_per_frame(self) -> float:
+        """The spectral radius of a period as a factor per frame."""
+        return float(self.spectral_radius ** (1 / self.period))
+
+    def lifted(self) -> StateSpace:
+        """Return the system over a period: inputs and outputs of all phases side by side.
+
+        Examples
+        --------
+        >>> from lbt_synth.linear.periodic.system import PeriodicSystem
+        >>> one = [[[1.0]]]
+        >>> slow = PeriodicSystem(A=[[[0.5]], [[0.8]]], B=one, C=one, D=[[[0.0]]])
+        >>> slow.lifted().C.ravel().tolist()
+        [1.0, 0.5]
+        """
+        (N, p, m), n = self.D.shape, self.n_states
+        reach, inputs = np.eye(n), np.zeros((n, N * m))
+        C, D = np.zeros((N * p, n)), np.zeros((N * p, N * m))
+        for t in range(N):
+            rows, own = slice(t * p, (t + 1) * p), slice(t * m, (t + 1) * m)
+            C[rows], D[rows] = self.C[t] @ reach, self.C[t] @ inputs
+            D[rows, own] = self.D[t]
+            reach, inputs = self.A[t] @ reach, self.A[t] @ inputs
+            inputs[:, own] = self.B[t]
+        return StateSpace(A=reach, B=inputs, C=C, D=D, dt_s=N * self.dt_s)
+
+    def covariances(self) -> FloatArray:
+        """Return the stationary covariance of x at each phase, for white w of unit variance.
+
+        Returns
+        -------
+        (N, n, n) ndarray
+            Covariances; the system has to be stable.
+        """
+        system = self.lifted()
+        out = np.empty_like(self.A)
+        P = stationary_covariance(system.A, system.B @ system.B.T)
+        for t in range(self.period):
+            out[t] = P
+            P = self.A[t] @ P @ self.A[t].T + self.B[t] @ self.B[t].T
+        return out
+
+    def output_covariances(self) -> FloatArray:
+        """Return the stationary covariance of y at each phase, for white w, (N, p, p)."""
+        swap = (0, 2, 1)
+        state = self.C @ self.covariances() @ self.C.transpose(swap)
+        return np.asarray(state + self.D @ self.D.transpose(swap))
+
+    def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
+        """Complex amplitude of y at each phase for the input ``exp(2 pi i f k dt)``, (f, N, p, m).
+
+        The output is this amplitude times the input's own ``exp``: for one phase it is the
+        transfer matrix. Its mean square over the phases is the mean power of the output.
+
+        Examples
+        --------
+        >>> from lbt_synth.linear.periodic.system import PeriodicSystem
+        >>> one = [[[1.0]]]
+        >>> slow = PeriodicSystem(A=[[[0.5]], [[0.8]]], B=one, C=one, D=[[[0.0]]])
+        >>> slow.frequency_response([0.0])[0, :, 0, 0].real.tolist()
+        [3.0, 2.5]
+        """
+        frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
+        z = np.exp(2j * np.pi * frequency * self.dt_s)
+        (N, p, m), n = self.D.shape, self.n_states
+        # with w(k) = z^k, x(t) = reach x(0) + forced(t): solve for the x(0) that repeats as z^N x(0)
+        forced = np.zeros((z.size, n, m), dtype=np.complex128)
+        for t in range(N):
+            forced = self.A[t] @ forced + self.B[t] * (z**t)[:, None, None]
+        x = np.linalg.solve((z**N)[:, None, None] * np.eye(n) - self.monodromy, forced)
+        out = np.empty((z.size, N, p, m), dtype=np.complex128)
+        for t in range(N):
+            out[:, t] = self.C[t] @ x + self.D[t]  # x is x(t) z^-t
+            x = (self.A[t] @ x + self.B[t]) / z[:, None, None]
+        return out
+
+    def select(self, outputs: slice, inputs: slice) -> PeriodicSystem:
+        """Return the system of some outputs and inputs."""
+        return replace(
+            self,
+            B=self.B[:, :, inputs],
+            C=self.C[:, outputs],
+            D=self.D[:, outputs, inputs],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PeriodicController(PeriodicSystem):
+    """Controller ``x(k+1) = A[t] x(k) + B[t] y(k)``, ``u(k) = C[t] x(k+1) + D[t] y(k)``.
+
+    The output is read from the new state, as in :class:`Controller`, which is the case N = 1.
+
+    Examples
+    --------
+    >>> from lbt_synth.linear.periodic.system import PeriodicController
+    >>> PeriodicController(A=[[[1.0]]], B=[[[0.5]]], C=[[[1.0]]], D=[[[0.0]]]).phase(0).n_states
+    1
+    """
+
+    def phase(self, t: int) -> Controller:
+        """Return the controller of a phase, as if it were that of all."""
+        A, B, C, D = (getattr(self, name)[t % self.period] for name in "ABCD")
+        return Controller(A=A, B=B, C=C, D=D, dt_s=self.dt_s)
+
+    def to_system(self) -> PeriodicSystem:
+        """Return the same input-output map in the textbook form."""
+        return PeriodicSystem(
+            A=self.A, B=self.B, C=self.C @ self.A, D=self.C @ self.B + self.D, dt_s=self.dt_s
+        )

@@ -1,0 +1,313 @@
+"""The closed loop of a plant that several sensors see, and what it leaves, exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
+from lbt_synth.linear.quadrature import adaptive_integral
+from lbt_synth.loop.budget import ResidualBudget, distinct_edges, pole_edges
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, require_loop_rate
+from lbt_synth.models import ARModel, LoopHardware, Spectrum, Truth, Vibration
+from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
+from lbt_synth.models.fusion.plant import FusedPlant
+from lbt_synth.models.fusion.sensors import (
+    OWN_SENSOR,
+    Motion,
+    Motions,
+    SensorSuite,
+    acceleration_taps,
+    checked_motions,
+)
+from lbt_synth.models.spectra import breakpoints_below
+from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FusedLoop:
+    """A loop around the controller of several sensors.
+
+    Attributes
+    ----------
+    system : PeriodicSystem
+        From ``[phi_tot (n), added to each reading (q)]`` to ``[phi_res (n), u (m), y (q)]``.
+    hardware : LoopHardware
+        Mirror, delay and own sensor.
+    suite : SensorSuite
+        The other sensors.
+    sensor_gain : float
+        Real gain of the loop's own sensor, relative to its matrix.
+    blind : tuple of str
+        Sensors and channels whose readings are zero, or frozen.
+    """
+
+    system: PeriodicSystem
+    hardware: LoopHardware
+    suite: SensorSuite
+    sensor_gain: float
+    blind: tuple[str, ...] = ()
+
+    @property
+    def spectral_radius(self) -> float:
+        """Spectral radius of the monodromy: of a period."""
+        return self.system.spectral_radius
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether the spectral radius is below 1 by more than 1e-9 per frame."""
+        return self.system.radius_per_frame < 1 - STABILITY_MARGIN
+
+    def require_stable(self) -> None:
+        """Raise an UnstableLoopError if the loop is not stable."""
+        if not self.is_stable:
+            raise UnstableLoopError(
+                f"the closed loop must be stable; got a spectral radius of "
+                f"{self.spectral_radius:.6g} over a period of {self.system.period} frames at a "
+                f"sensor gain of {self.sensor_gain:.6g}.",
+                spectral_radius=self.spectral_radius,
+            )
+
+
+def close_fused_loop(
+    hardware: LoopHardware,
+    suite: SensorSuite,
+    controller: PeriodicController,
+    *,
+    sensor_gain: float = 1.0,
+    blind: tuple[str, ...] = (),
+) -> FusedLoop:
+    """Close the loop of several sensors.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Mirror, delay and own sensor.
+    suite : SensorSuite
+        The other sensors.
+    controller : PeriodicController
+        From all measurements to the commands, as :meth:`FusedPlant.controller` makes it.
+    sensor_gain : float, optional
+        Real gain of the loop's own sensor, relative to its matrix.
+    blind : tuple of str, optional
+        Sensors whose readings do not follow the phase: they are zero, or frozen.
+
+    Returns
+    -------
+    FusedLoop
+        The loop, stable or not.
+
+    Raises
+    ------
+    ProblemError
+        If the controller has other sizes or another sampling period than the loop.
+    """
+    gain, period = number(sensor_gain, "sensor_gain", above=0), suite.period(hardware)
+    rows = suite.rows(hardware)
+    n, m, q = hardware.modes, hardware.n_commands, max(own.stop for own in rows.values())
+    shape = (controller.period, *controller.D.shape[1:])
+    if shape != (period, m, q) or not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
+        raise ProblemError(
+            f"the controller must map {q} measurements to {m} commands in a period of {period} "
+            f"frames at {hardware.frame_rate_hz:.6g} Hz; got {shape[2]} to {shape[1]} in {shape[0]} "
+            f"at {1 / controller.dt_s:.6g} Hz."
+        )
+    exposures = [own_exposure(hardware), *suite_exposures(suite, hardware)]
+    held, k = memory(exposures, n, period, hardware.dt_s), controller.to_system()
+    mirror, each = hardware.mirror_system.whole, np.eye(m)
+    A_m, B_m = np.kron(mirror.A, each), np.kron(mirror.B[:, None], each)
+    position, direct = hardware.influence @ np.kron(mirror.C, each), mirror.D * hardware.influence
+    nk, nv, nh = k.n_states, len(A_m), held.n_states
+    x, v, h = slice(nk), slice(nk, nk + nv), slice(nk + nv, nk + nv + nh)
+    size = nk + nv + nh
+    # y = measured s + e, u = command s + k.D e, phi_res = phi_tot + residual s - direct k.D e
+    measured, command = np.zeros((period, q, size)), np.zeros((period, m, size))
+    measured[:, : held.C.shape[1], h] = held.C
+    measured[:, rows[OWN_SENSOR]] *= gain
+    for unit in blind:
+        measured[:, rows[unit]] = 0.0
+    command[:, :, x] = k.C
+    command += k.D @ measured
+    residual = -direct @ command
+    residual[:, :, v] -= position
+    entry = np.zeros((period, n, n + q))
+    entry[:, :, :n], entry[:, :, n:] = np.eye(n), -direct @ k.D
+    A, B = np.zeros((period, size, size)), np.zeros((period, size, n + q))
+    A[:, x] = k.B @ measured
+    A[:, x, x] += k.A
+    B[:, x, n:] = k.B
+    A[:, v] = B_m @ command
+    A[:, v, v] += A_m
+    B[:, v, n:] = B_m @ k.D
+    A[:, h] = held.B @ residual
+    A[:, h, h] += held.A
+    B[:, h] = held.B @ entry
+    D = np.zeros((period, n + m + q, n + q))
+    D[:, :n], D[:, n : n + m, n:], D[:, n + m :, n:] = entry, k.D, np.eye(q)
+    C = np.concatenate([residual, command, measured], axis=1)
+    system = PeriodicSystem(A=A, B=B, C=C, D=D, dt_s=hardware.dt_s)
+    return FusedLoop(
+        system=system, hardware=hardware, suite=suite, sensor_gain=gain, blind=tuple(blind)
+    )
+
+
+def fused_budget(loop: FusedLoop, truth: Truth, motions: Motions = ()) -> ResidualBudget:
+    """Return the exact stationary residual of a fused loop under a truth, mean over the period.
+
+    Parameters
+    ----------
+    loop : FusedLoop
+        The loop, at the truth's sensor gain.
+    truth : Truth
+        Turbulence, vibrations, and the noise of the loop's own sensor.
+    motions : tuple of mapping, optional
+        For each vibration of the truth, the :class:`Motion` of each channel that it moves.
+
+    Returns
+    -------
+    ResidualBudget
+        Covariances by origin; the noise is that of all sensors.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is not stable.
+    ProblemError
+        If sensor gains differ, or a vibration drifts.
+    """
+    if loop.sensor_gain != truth.sensor_gain:
+        raise ProblemError(
+            f"the loop must be closed with the truth's sensor gain {truth.sensor_gain:.6g}; got "
+            f"{loop.sensor_gain:.6g}."
+        )
+    noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
+    return _budget(loop, truth, motions, np.diag(noise_nm))
+
+
+def fused_model_budget(loop: FusedLoop, plant: FusedPlant) -> ResidualBudget:
+    """Return the exact residual of a loop where a plant's model is the truth."""
+    truth = Truth(turbulence=plant.own.turbulence, vibrations=plant.own.vibrations)
+    return _budget(loop, truth, plant.motions, plant.own.parts().noise_factor)
+
+
+def _budget(
+    loop: FusedLoop, truth: Truth, motions: Motions, noise_factor: FloatArray
+) -> ResidualBudget:
+    loop.require_stable()
+    hardware, n = loop.hardware, loop.hardware.modes
+    turbulence, vibration = np.zeros((2, n, n))
+    for spectrum, modes in truth.turbulence_groups(n):
+        for mode in modes:
+            entry = np.zeros((loop.system.B.shape[2], 2))
+            entry[mode, 1] = 1.0
+            turbulence += _power(loop, spectrum, entry)
+    lines = stationary_vibrations(truth.vibrations)
+    moving = checked_motions(motions or ({},) * len(lines), loop.suite, len(lines))
+    amplitudes: list[ComplexArray] = []
+    for line, motion in zip(lines, moving, strict=True):
+        entry = line_entry(loop, checked_direction(line, hardware), motion, line.frequency_hz)
+        if isinstance(line, Vibration):
+            vibration += _power(loop, line.ar_model(hardware.frame_rate_hz), entry)
+        else:
+            response = _line_response(loop, entry, np.array([line.frequency_hz]))[0]
+            amplitudes += list(line.amplitude_nm * response / np.sqrt(len(response)))
+    return ResidualBudget(
+        turbulence_nm2=frozen_copy(turbulence),
+        noise_nm2=frozen_copy(_noise_power(loop, noise_factor)),
+        random_vibration_nm2=frozen_copy(vibration),
+        line_amplitudes_nm=np.array(amplitudes, dtype=np.complex128).reshape(len(amplitudes), n),
+    )
+
+
+def line_entry(
+    loop: FusedLoop, direction: FloatArray, motion: Mapping[str, Motion], frequency_hz: float
+) -> FloatArray:
+    """Return how the samples v(k+1), v(k), v(k-1), ... of a vibration enter a loop, (n + q, t)."""
+    hardware, suite, n = loop.hardware, loop.suite, loop.hardware.modes
+    rows, rate = suite.rows(hardware), hardware.frame_rate_hz
+    columns: list[tuple[int, int, FloatArray]] = []
+    for sensor in suite.accelerometers:
+        age = sensor.age_frames(hardware)
+        for channel in motion.keys() & set(sensor.channels) - set(loop.blind):
+            factor = motion[channel].factor * sensor.band(frequency_hz)
+            newest, taps = acceleration_taps(factor, frequency_hz, rate, age)
+            columns.append((n + rows[channel].start, newest + 1, taps))
+    width = max([2, *(first + len(taps) for _, first, taps in columns)])
+    entry = np.zeros((loop.system.B.shape[2], width))
+    entry[:n, 1] = direction
+    for row, first, taps in columns:
+        entry[row, first : first + len(taps)] = taps
+    return entry
+
+
+def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray:
+    """Return the residual's covariance for a process whose samples enter as given, (n, n)."""
+    if isinstance(spectrum, ARModel):
+        require_loop_rate(spectrum.frame_rate_hz, loop.hardware)
+        return _ar_power(loop, spectrum, entry)
+
+    def density(frequency: FloatArray) -> FloatArray:
+        response = _line_response(loop, entry, frequency)
+        power = np.real(np.einsum("fti,ftj->fij", response, response.conj())) / response.shape[1]
+        return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
+
+    nyquist = loop.hardware.frame_rate_hz / 2
+    poles = np.linalg.eigvals(loop.system.monodromy).astype(np.complex128)
+    N = loop.system.period  # a pole of the period shows at each of its roots
+    turns = np.exp(2j * np.pi * np.arange(N) / N)
+    roots = (np.abs(poles) ** (1 / N) * np.exp(1j * np.angle(poles) / N))[:, None] * turns
+    grid = np.concatenate([np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(roots)])
+    edges = distinct_edges(grid) * nyquist
+    return adaptive_integral(
+        density, np.unique(np.concatenate([edges, breakpoints_below(spectrum, nyquist)]))
+    )
+
+
+def _line_response(loop: FusedLoop, entry: FloatArray, frequency_hz: FloatArray) -> ComplexArray:
+    """Return the residual at each phase for a process ``exp(2 pi i f k dt)``, (f, N, n)."""
+    angle = 2j * np.pi * np.asarray(frequency_hz) * loop.hardware.dt_s
+    turned = np.exp(-angle[:, None] * (np.arange(entry.shape[1]) - 1)) @ entry.T
+    n = loop.hardware.modes
+    residual = loop.system.select(slice(n), slice(None))
+    return np.asarray(np.einsum("ftij,fj->fti", residual.frequency_response(frequency_hz), turned))
+
+
+def _ar_power(loop: FusedLoop, model: ARModel, entry: FloatArray) -> FloatArray:
+    s, n, order = loop.system, loop.hardware.modes, max(model.order, entry.shape[1])
+    samples = np.zeros((entry.shape[0], order))
+    samples[:, : entry.shape[1]] = entry
+    chain = np.eye(order, k=-1)
+    chain[0, : model.order] = model.coefficients
+    size = s.n_states + order
+    A, B = np.zeros((s.period, size, size)), np.zeros((1, size, 1))
+    A[:, : s.n_states, : s.n_states], A[:, : s.n_states, s.n_states :] = s.A, s.B @ samples
+    A[:, s.n_states :, s.n_states :] = chain
+    B[0, s.n_states] = model.driving_rms_nm
+    C = np.concatenate([s.C[:, :n], s.D[:, :n] @ samples], axis=2)
+    return mean_power(PeriodicSystem(A=A, B=B, C=C, D=np.zeros((1, n, 1)), dt_s=s.dt_s))
+
+
+def _noise_power(loop: FusedLoop, own: FloatArray) -> FloatArray:
+    n = loop.hardware.modes
+    factors = [
+        own,
+        *(s.noise_factor(n) for s in (*loop.suite.wavefront, *loop.suite.accelerometers)),
+    ]
+    noise, s = block_diag(*factors), loop.system
+    for unit in loop.blind:
+        noise[loop.suite.rows(loop.hardware)[unit]] = 0.0
+    return mean_power(
+        PeriodicSystem(
+            A=s.A, B=s.B[:, :, n:] @ noise, C=s.C[:, :n], D=s.D[:, :n, n:] @ noise, dt_s=s.dt_s
+        )
+    )
+
+
+def mean_power(system: PeriodicSystem) -> FloatArray:
+    """Return the covariance of a system's outputs for white inputs, mean over the phases."""
+    return np.asarray(np.mean(system.output_covariances(), axis=0))

@@ -1,0 +1,297 @@
+"""The plant that several sensors see: the loop's own plant, with what the others remember.
+
+The state is that of :class:`TipTiltPlant`, then older samples of the vibrations that accelerometers
+see, then the sums and waiting readings of the wavefront sensors. The measurements are those of the
+loop's own sensor, of the other wavefront sensors, and of the channels, in this order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from lbt_synth.errors import DimensionError
+from lbt_synth.linear.periodic.problem import PeriodicProblem
+from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
+from lbt_synth.models.fusion.memory import memory, suite_exposures
+from lbt_synth.models.fusion.sensors import (
+    Motions,
+    SensorSuite,
+    acceleration_taps,
+    checked_motions,
+)
+from lbt_synth.models.plant.parts import held_frames
+from lbt_synth.models.plant.tip_tilt import TipTiltPlant
+from lbt_synth.storage.rows import fact_table
+from lbt_synth.storage.summaries import Summarised, Summary, count_text
+from lbt_synth.validation import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FusedPlant(PeriodicProblem, Summarised):
+    """A plant whose total phase is measured by several sensors; made by :func:`fused_plant`.
+
+    Parameters
+    ----------
+    own : TipTiltPlant
+        The plant of the loop's own sensor.
+    suite : SensorSuite
+        The other sensors.
+    motions : tuple of mapping
+        For each vibration, the :class:`Motion` of each channel that it moves.
+    B_known, C_known, D_known : ndarray
+        How the last command u(k-1) drives the states of mirror and corrections, how measurements
+        see these, and how they see the command itself.
+    A_known : (N, k, k) ndarray
+        Transition of the known states.
+    """
+
+    own: TipTiltPlant
+    suite: SensorSuite
+    motions: Motions
+    A_known: FloatArray
+    B_known: FloatArray
+    C_known: FloatArray
+    D_known: FloatArray
+
+    def _brief(self) -> str:
+        sensors = count_text(len(self.suite.units), "sensor")
+        return f"{self.own._brief()}, {sensors}, period {self.period}"
+
+    def _summarise(self) -> Summary:
+        return Summary(tables=[fact_table("Plant", self.own.hardware.facts())])
+
+    def unit_rows(self, units: tuple[str, ...]) -> BoolArray:
+        """Return which measurements some sensors or channels give, (q,)."""
+        out = np.zeros(self.n_measurements, dtype=np.bool_)
+        for unit in units:
+            out[self.suite.rows(self.own.hardware)[unit]] = True
+        return out
+
+    def controller(self, gains: FloatArray) -> PeriodicController:
+        """Return the controller from all measurements to u(k), in new-state form.
+
+        Its states are the estimates of the plant's states, and the known ones. Entries of a
+        measurement that is not read do not matter: their gains are zero.
+
+        Parameters
+        ----------
+        gains : (N, n, q) ndarray
+            Predictor gains.
+        """
+        shape = (self.period, self.n_states, self.n_measurements)
+        if np.shape(gains) != shape:
+            raise DimensionError(f"gains must be {shape}; got {np.shape(gains)}.")
+        used = np.asarray(gains) * self.read[:, None, :]
+        to_command = np.zeros((self.own.hardware.n_commands, self.n_states + self.n_known))
+        to_command[:, : self.n_states] = self.own.hardware.projector @ self.L
+        n, size = self.n_states, self.n_states + self.n_known
+        A, B = np.zeros((self.period, size, size)), np.zeros((self.period, size, shape[2]))
+        A[:, :n, :n], A[:, :n, n:] = self.A - used @ self.C, -used @ self.C_known
+        A[:, n:, n:], B[:, :n] = self.A_known, used
+        applied = np.concatenate([-used @ self.D_known, self.B_known], axis=1)
+        return PeriodicController(
+            A=A + applied @ to_command,
+            B=B,
+            C=to_command[None],
+            D=np.zeros((1, len(to_command), shape[2])),
+            dt_s=self.dt_s,
+        )
+
+    @property
+    def n_known(self) -> int:
+        """Number of states that the commands make: of the mirror, and corrections that wait."""
+        return int(self.A_known.shape[1])
+
+
+def fused_plant(own: TipTiltPlant, suite: SensorSuite, motions: Motions = ()) -> FusedPlant:
+    """Return the plant of a loop that has other sensors beside its own.
+
+    Parameters
+    ----------
+    own : TipTiltPlant
+        Loop, turbulence, vibrations, and the noise of the loop's own sensor.
+    suite : SensorSuite
+        The other sensors.
+    motions : tuple of mapping, optional
+        For each vibration of the plant, in order, the :class:`Motion` of each channel that it
+        moves; by default no channel moves.
+
+    Returns
+    -------
+    FusedPlant
+        The plant, of the common period of all sensors.
+
+    Raises
+    ------
+    ProblemError
+        If a rate is not a fraction of the frame rate, a delay is too short, or names or sizes
+        clash.
+
+    Examples
+    --------
+    A 20 Hz line that shakes tip by 500 nm, and the mirror's accelerometer by 1000 nm:
+
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.models.fusion.plant import fused_plant
+    >>> from lbt_synth.models.fusion.sensors import Accelerometer, Motion, SensorSuite
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=500, direction=(1,))
+    >>> own = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=1000, turbulence=slow, vibrations=[line], noise_nm=15, modes=1
+    ... )
+    >>> mirror = Accelerometer(
+    ...     name="mirror", rate_hz=1000, delay_frames=1, channels=("m1",), noise_m_s2=2e-4
+    ... )
+    >>> plant = fused_plant(own, SensorSuite(sensors=(mirror,)), ({"m1": Motion(size=2)},))
+    >>> plant.period, plant.n_states, plant.n_measurements
+    (1, 4, 2)
+    """
+    hardware = own.hardware
+    motions = checked_motions(motions or ({},) * len(own.vibrations), suite, len(own.vibrations))
+    period, n0 = suite.period(hardware), own.n_states
+    own.parts()  # refuses a plant that holds the memory of a filter
+    # the plant's state is that of the frame in which u(k) acts: older readings by so many frames
+    ahead = held_frames(hardware) - 1
+    readings = _channel_readings(own, suite, motions, ahead)
+    exposures = suite_exposures(suite, hardware)
+    late = [replace(each, age_frames=each.age_frames + ahead) for each in exposures]
+    waiting = memory(late, hardware.modes, period, own.dt_s)
+    corrections = memory(exposures, hardware.modes, period, own.dt_s)
+    total = own.A[_newest_total(own)]  # total(k) from x(k): it is that held in x(k+1)
+
+    lags, w = readings.A.shape[0] - n0, waiting.n_states
+    size = n0 + lags + w
+    A = np.zeros((period, size, size))
+    A[:, : n0 + lags, : n0 + lags], A[:, n0 + lags :, n0 + lags :] = readings.A, waiting.A
+    A[:, n0 + lags :, :n0] = waiting.B @ total
+    q0, q1, q2 = len(own.C), waiting.C.shape[1], len(readings.C)
+    C = np.zeros((period, q0 + q1 + q2, size))
+    C[:, :q0, :n0], C[:, q0 : q0 + q1, n0 + lags :] = own.C, waiting.C
+    C[:, q0 + q1 :, : n0 + lags] = readings.C
+    noises = [s.noise_factor(hardware.modes) for s in (*suite.wavefront, *suite.accelerometers)]
+    extra = block_diag(*noises)
+    drives = own.B.shape[1]
+    B = np.zeros((size, drives + len(extra)))
+    B[:n0, :drives] = own.B
+    D = np.zeros((q0 + q1 + q2, drives + len(extra)))
+    D[:q0, :drives], D[q0:, drives:] = own.D, extra
+    D[q0 + q1 :, : len(own.vibrations)] += readings.drive
+    L = np.hstack([own.L, np.zeros((len(own.L), size - n0))])
+    A_known, B_known, C_known, D_known = _known_part(own, corrections, q2)
+    return FusedPlant(
+        A=A,
+        B=B[None],
+        C=C,
+        D=D[None],
+        L=L,
+        read=suite.read(hardware),
+        dt_s=own.dt_s,
+        own=own,
+        suite=suite,
+        motions=motions,
+        A_known=A_known,
+        B_known=B_known,
+        C_known=C_known,
+        D_known=D_known,
+    )
+
+
+def _newest_total(own: TipTiltPlant) -> slice:
+    """Return where the plant's state holds total(k-1)."""
+    parts = own.parts()
+    start = 2 * len(parts.vibrations) + parts.order * parts.hardware.modes
+    return slice(start, start + parts.hardware.modes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _ChannelReadings:
+    """The plant's transition with older samples of the vibrations, and what channels read."""
+
+    A: FloatArray  # (n0 + lags, n0 + lags)
+    C: FloatArray  # (c, n0 + lags)
+    drive: FloatArray  # (c, p): from the drives of the vibrations, where the newest is ahead
+
+
+def _channel_readings(
+    own: TipTiltPlant, suite: SensorSuite, motions: Motions, ahead: int
+) -> _ChannelReadings:
+    p, n0, rate = len(own.vibrations), own.n_states, own.hardware.frame_rate_hz
+    taps: dict[tuple[int, int], tuple[int, FloatArray]] = {}
+    oldest = [1] * p  # age of the oldest sample of each vibration that is a state
+    row = 0
+    for sensor in suite.accelerometers:
+        age = sensor.age_frames(own.hardware) + ahead
+        for channel in sensor.channels:
+            for j, line in enumerate(own.vibrations):
+                if channel not in motions[j]:
+                    continue
+                factor = motions[j][channel].factor * sensor.band(line.frequency_hz)
+                newest, weights = acceleration_taps(factor, line.frequency_hz, rate, age)
+                taps[row, j] = newest, weights
+                oldest[j] = max(oldest[j], newest + len(weights) - 1)
+            row += 1
+    where = {(j, age): age * p + j for j in range(p) for age in (0, 1)}
+    size = n0
+    for j in range(p):
+        for age in range(2, oldest[j] + 1):
+            where[j, age] = size
+            size += 1
+    A = np.zeros((size, size))
+    A[:n0, :n0] = own.A
+    for (j, age), state in where.items():
+        if age >= 2:
+            A[state, where[j, age - 1]] = 1.0
+    C, drive = np.zeros((row, size)), np.zeros((row, p))
+    for (channel_row, j), (newest, weights) in taps.items():
+        for age, weight in enumerate(weights, start=newest):
+            if age < 0:  # the sample to come
+                C[channel_row] += weight * A[j]
+                drive[channel_row] += weight * own.B[j, :p]
+            else:
+                C[channel_row, where[j, age]] += weight
+    return _ChannelReadings(A=A, C=C, drive=drive)
+
+
+def _known_part(
+    own: TipTiltPlant, waiting: PeriodicSystem, channels: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return A, B, C, D of the known states: those of the mirror, and its corrections that wait.
+
+    In frame k they are driven by u(k-1), so that the corrections remembered are those before
+    k - 1, and the reading adds the one of k - 1.
+    """
+    hardware = own.hardware
+    mirror, each = hardware.mirror_system.whole, np.eye(hardware.n_commands)
+    A_m, B_m = np.kron(mirror.A, each), np.kron(mirror.B[:, None], each)
+    seen, direct = hardware.influence @ np.kron(mirror.C, each), mirror.D * hardware.influence
+    period, v, w = len(waiting.A), len(A_m), waiting.n_states
+    last = np.roll(np.arange(period), 1)  # the phase before
+    A, B = np.zeros((period, v + w, v + w)), np.zeros((period, v + w, hardware.n_commands))
+    A[:, :v, :v], B[:, :v] = A_m, B_m
+    A[:, v:, v:], A[:, v:, :v] = waiting.A[last], waiting.B[last] @ seen
+    B[:, v:] = waiting.B[last] @ direct
+    C = -np.concatenate(
+        [
+            np.broadcast_to(
+                np.hstack([hardware.sensor @ seen, np.zeros((len(hardware.sensor), w))]),
+                (period, len(hardware.sensor), v + w),
+            ),
+            waiting.C @ A[:, v:],
+            np.zeros((period, channels, v + w)),
+        ],
+        axis=1,
+    )
+    D = -np.concatenate(
+        [
+            np.broadcast_to(
+                hardware.sensor @ direct, (period, len(hardware.sensor), hardware.n_commands)
+            ),
+            waiting.C @ B[:, v:],
+            np.zeros((period, channels, hardware.n_commands)),
+        ],
+        axis=1,
+    )
+    return A, B, C, D

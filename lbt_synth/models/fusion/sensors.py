@@ -1,0 +1,362 @@
+"""Sensors beside the loop's own: wavefront sensors of other rates, and accelerometers.
+
+The delay of a sensor counts as that of a loop does: from the beginning of what it measures to the
+frame in which a command computed from it acts, in periods of the sensor. In frames of the loop a
+reading is therefore ``age = delay_frames * period - (d - 1)`` old, with d the loop's total delay:
+the loop's own sensor, of delay d and period 1, has the age 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, TypeAlias
+
+import numpy as np
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.models.plant.parts import noise_factor
+from lbt_synth.validation import (
+    FloatArray,
+    Positive,
+    check_fields,
+    frozen_copy,
+    matrix,
+    number,
+    real_array,
+    set_fields,
+)
+
+OWN_SENSOR = "wavefront"
+LONGEST_PERIOD = 1000  # frames of the loop per reading
+_WHOLE = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """How an accelerometer moves with a vibration, at the vibration's frequency.
+
+    Parameters
+    ----------
+    size : float
+        Motion of the channel per motion of the wavefront [nm per nm rms].
+    phase_deg : float, optional
+        Phase of the channel's motion against the wavefront's [deg].
+
+    Examples
+    --------
+    >>> from lbt_synth.models.fusion.sensors import Motion
+    >>> Motion(size=2.0, phase_deg=180).factor.real
+    -2.0
+    """
+
+    size: Positive
+    phase_deg: Annotated[float, ("at_least", -360), ("at_most", 360)] = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def factor(self) -> complex:
+        """Complex motion of the channel per motion of the wavefront."""
+        return complex(self.size * np.exp(1j * np.deg2rad(self.phase_deg)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WavefrontSensor:
+    """A second sensor of the residual phase, averaged over each of its periods.
+
+    ``y = sensor_matrix (mean of phi_res over the period) + noise``.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    rate_hz : float
+        Readings per second [Hz]; the loop's frame rate is a whole multiple of it.
+    delay_frames : float
+        Total delay in its own periods, at least 1.
+    noise_nm : float, (q,) or (q, q) array_like
+        Standard deviation of the noise of a reading [nm], or its covariance [nm^2].
+    sensor_matrix : (q, n) array_like, optional
+        Response to the modes; the identity by default.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> from lbt_synth.models.fusion.sensors import WavefrontSensor
+    >>> WavefrontSensor(name="truth", rate_hz=50, delay_frames=3, noise_nm=4.0).units
+    ('truth',)
+    """
+
+    name: str
+    rate_hz: Positive
+    delay_frames: Annotated[float, ("at_least", 1), ("at_most", 20)]
+    noise_nm: float | FloatArray
+    sensor_matrix: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        given = None if self.sensor_matrix is None else matrix(self.sensor_matrix, "sensor_matrix")
+        check_fields(self, sensor_matrix=given)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of what fails as one: the sensor itself."""
+        return (self.name,)
+
+    def response(self, modes: int) -> FloatArray:
+        """Sensor matrix over the modes of a loop, (q, n)."""
+        if self.sensor_matrix is None:
+            return np.eye(modes)
+        if self.sensor_matrix.shape[1] != modes:
+            raise DimensionError(
+                f"the matrix of sensor {self.name} must have {modes} columns, one per mode; got "
+                f"{self.sensor_matrix.shape}."
+            )
+        return self.sensor_matrix
+
+    def noise_factor(self, modes: int) -> FloatArray:
+        """Square root of the noise covariance, (q, q) [nm]."""
+        return noise_factor(self.noise_nm, len(self.response(modes)))
+
+    def age_frames(self, hardware: LoopHardware) -> float:
+        """Age of the oldest frame that a reading averages [frames of the loop]."""
+        period = period_frames(self, hardware)
+        age = _age(self, hardware, period)
+        if age - period + 1 < 1 - _WHOLE:
+            least = (period + hardware.delay_frames - 1) / period
+            raise ProblemError(
+                f"the delay of sensor {self.name} must be at least {least:.4g} of its frames, so "
+                f"that its exposure has ended when it is read; got {self.delay_frames:g}."
+            )
+        return age
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Accelerometer:
+    """Channels that measure the acceleration of structures which vibrate.
+
+    Channel c reads ``a_c = 1e-9 sum_j F_cj v_j''`` [m/s^2], with ``v_j''`` the second difference of
+    vibration j [nm] over the squared frame period, and F_cj its :class:`Motion` with the channel.
+
+    Parameters
+    ----------
+    name : str
+        Name of the instrument.
+    rate_hz : float
+        Readings per second [Hz]; the loop's frame rate is a whole multiple of it.
+    delay_frames : float
+        Total delay in its own periods.
+    channels : tuple of str
+        Names of the channels.
+    noise_m_s2 : float, (c,) or (c, c) array_like
+        Standard deviation of the noise of a reading [m/s^2], or its covariance.
+    highpass_hz : float, optional
+        Corner of the first-order high pass of each channel [Hz]; its gain and phase at each line
+        multiply the motion.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range, or two channels share a name.
+
+    Examples
+    --------
+    >>> from lbt_synth.models.fusion.sensors import Accelerometer
+    >>> mirror = Accelerometer(
+    ...     name="mirror", rate_hz=1000, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-4
+    ... )
+    >>> mirror.units
+    ('m1', 'm2')
+    """
+
+    name: str
+    rate_hz: Positive
+    delay_frames: Annotated[float, ("above", 0), ("at_most", 20)]
+    channels: tuple[str, ...]
+    noise_m_s2: float | FloatArray
+    highpass_hz: Positive | None = None
+
+    def __post_init__(self) -> None:
+        channels = tuple(self.channels)
+        if not channels or len(set(channels)) < len(channels):
+            raise ProblemError(
+                f"channels of {self.name} must be different names, at least one; got {channels}."
+            )
+        check_fields(self, channels=channels)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Names of what fails as one: each channel."""
+        return self.channels
+
+    def noise_factor(self, modes: int) -> FloatArray:
+        """Square root of the noise covariance, (c, c) [m/s^2]; the modes do not matter."""
+        return noise_factor(self.noise_m_s2, len(self.channels))
+
+    def age_frames(self, hardware: LoopHardware) -> float:
+        """Age of a reading [frames of the loop]."""
+        age = _age(self, hardware, period_frames(self, hardware))
+        if age < -_WHOLE:
+            raise ProblemError(
+                f"the delay of {self.name} must be at least that of the commands, "
+                f"{hardware.delay_frames - 1:g} frames of the loop; got {self.delay_frames:g} of "
+                "its own."
+            )
+        return max(age, 0.0)
+
+    def band(self, frequency_hz: float) -> complex:
+        """Response of the channels' high pass at a frequency."""
+        if self.highpass_hz is None:
+            return 1.0 + 0.0j
+        ratio = 1j * frequency_hz / self.highpass_hz
+        return complex(ratio / (1 + ratio))
+
+
+Sensor: TypeAlias = WavefrontSensor | Accelerometer
+Motions: TypeAlias = tuple[Mapping[str, Motion], ...]  # of each vibration, by channel
+
+
+def period_frames(sensor: Sensor, hardware: LoopHardware) -> int:
+    """Return the frames of the loop from one reading of a sensor to the next."""
+    ratio = hardware.frame_rate_hz / sensor.rate_hz
+    period = round(ratio)
+    if not 1 <= period <= LONGEST_PERIOD or abs(ratio - period) > _WHOLE * ratio:
+        raise ProblemError(
+            f"the frame rate {hardware.frame_rate_hz:.6g} Hz must be a whole multiple (up to "
+            f"{LONGEST_PERIOD}) of the rate of sensor {sensor.name}; got {sensor.rate_hz:.6g} Hz. "
+            "Average its readings to such a rate."
+        )
+    return period
+
+
+def _age(sensor: Sensor, hardware: LoopHardware, period: int) -> float:
+    age = sensor.delay_frames * period - (hardware.delay_frames - 1)
+    return float(round(age)) if abs(age - round(age)) < _WHOLE * period else age
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SensorSuite:
+    """The sensors beside the loop's own, with names that differ.
+
+    Parameters
+    ----------
+    sensors : tuple of WavefrontSensor and Accelerometer
+        At least one.
+
+    Examples
+    --------
+    >>> from lbt_synth.models.fusion.sensors import SensorSuite, WavefrontSensor
+    >>> slow = WavefrontSensor(name="truth", rate_hz=50, delay_frames=3, noise_nm=4.0)
+    >>> SensorSuite(sensors=(slow,)).units
+    ('wavefront', 'truth')
+    """
+
+    sensors: tuple[Sensor, ...]
+    units: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        sensors = tuple(self.sensors)
+        units = (OWN_SENSOR, *(unit for sensor in sensors for unit in sensor.units))
+        if not sensors or len(set(units)) < len(units):
+            raise ProblemError(
+                f"sensors and channels must have different names, none of them {OWN_SENSOR!r}; "
+                f"got {', '.join(units[1:]) or 'no sensor'}."
+            )
+        set_fields(self, sensors=sensors, units=units)
+
+    @property
+    def wavefront(self) -> tuple[WavefrontSensor, ...]:
+        """The wavefront sensors."""
+        return tuple(s for s in self.sensors if isinstance(s, WavefrontSensor))
+
+    @property
+    def accelerometers(self) -> tuple[Accelerometer, ...]:
+        """The accelerometers."""
+        return tuple(s for s in self.sensors if isinstance(s, Accelerometer))
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all accelerometer channels."""
+        return tuple(name for each in self.accelerometers for name in each.channels)
+
+    def period(self, hardware: LoopHardware) -> int:
+        """Return the common period of all sensors [frames of the loop]."""
+        period = int(np.lcm.reduce([period_frames(s, hardware) for s in self.sensors]))
+        if period > LONGEST_PERIOD:
+            raise ProblemError(
+                f"the common period of the sensors must be at most {LONGEST_PERIOD} frames; got "
+                f"{period}. Choose rates of which one divides the other."
+            )
+        return period
+
+    def rows(self, hardware: LoopHardware) -> dict[str, slice]:
+        """Return which measurements each unit gives: the loop's own, wavefront, channels."""
+        sizes = {OWN_SENSOR: hardware.n_measurements}
+        sizes |= {s.name: len(s.response(hardware.modes)) for s in self.wavefront}
+        sizes |= dict.fromkeys(self.channels, 1)
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        return {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(sizes)}
+
+    def read(self, hardware: LoopHardware) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+        """Return which measurements are read in each frame of the common period, (N, q)."""
+        rows, period = self.rows(hardware), self.period(hardware)
+        out = np.zeros((period, max(own.stop for own in rows.values())), dtype=np.bool_)
+        out[:, rows[OWN_SENSOR]] = True
+        for sensor in self.sensors:
+            for unit in sensor.units:
+                out[:: period_frames(sensor, hardware), rows[unit]] = True
+        return out
+
+
+def acceleration_taps(
+    factor: complex, frequency_hz: float, frame_rate_hz: float, age_frames: float
+) -> tuple[int, FloatArray]:
+    """Return the weights of a vibration's samples in the reading of a channel.
+
+    The reading is the second difference ``age_frames`` ago, times a complex factor that two
+    successive samples realise exactly at the vibration's frequency; so is a fraction of a frame.
+
+    Returns
+    -------
+    int, (t,) ndarray
+        Age of the newest sample, -1 for that of the frame to come, and the weights of it and of
+        those before [m/s^2 per nm].
+
+    Examples
+    --------
+    >>> from lbt_synth.models.fusion.sensors import acceleration_taps
+    >>> newest, taps = acceleration_taps(1.0, 20.0, 1000.0, 1.0)
+    >>> newest, (1e3 * taps).round(9).tolist()
+    (0, [1.0, -2.0, 1.0])
+    """
+    angle = 2 * np.pi * frequency_hz / frame_rate_hz
+    whole = int(np.floor(age_frames + _WHOLE))
+    late = factor * np.exp(-1j * angle * (age_frames - whole))
+    older = -late.imag / np.sin(angle)
+    pair = np.array([late.real - older * np.cos(angle), older])
+    if abs(older) < 1e-12 * abs(late):
+        pair = pair[:1]
+    second = np.array([1.0, -2.0, 1.0]) * frame_rate_hz**2 * 1e-9
+    return whole - 1, frozen_copy(np.convolve(pair, second))
+
+
+def checked_motions(motions: Motions, suite: SensorSuite, lines: int) -> Motions:
+    """Return the motions of each vibration, which must name channels that exist."""
+    if len(motions) != lines:
+        raise DimensionError(
+            f"motions must be one mapping per vibration ({lines}); got {len(motions)}."
+        )
+    for motion in motions:
+        for name in motion:
+            if name not in suite.channels:
+                raise ProblemError(
+                    f"a vibration names the channel {name!r}; the channels are "
+                    f"{', '.join(suite.channels) or 'none'}."
+                )
+    return tuple(dict(motion) for motion in motions)
