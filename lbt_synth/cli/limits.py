@@ -50,7 +50,7 @@ def run(arguments: Namespace) -> Report:
             "band_limit_nm": study.band.rms_nm,
             "band_achieved_nm": study.band.achieved_nm,
         }
-    report.notes += [*_limit_notes(study), *_design_notes(config, designs, study)]
+    report.notes += [*_limit_notes(study, config), *_design_notes(config, designs, study)]
     write_outputs(
         report, arguments.output, study.rows, figure=lambda: limits_figure(study), without=no_band
     )
@@ -64,14 +64,14 @@ def _config_designs(config: Config) -> dict[str, Design]:
     }
 
 
-def _limit_notes(study: studies.LimitStudy) -> list[str]:
+def _limit_notes(study: studies.LimitStudy, config: Config) -> list[str]:
     if study.limit is None:
         return [
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
         ]
     notes = [
-        say_limit(study.limit)
+        say_limit(study.limit, config)
         + (" (sinusoids of known frequency cost nothing)" if study.band is not None else "")
     ]
     if study.band is not None and study.band_hz is not None:

@@ -13,6 +13,7 @@ from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config.load import config_from_text
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.interop import frame_cost
+from lbt_synth.linear import Controller
 from lbt_synth.storage.rows import fact_table, json_record
 
 
@@ -22,8 +23,7 @@ def run(arguments: Namespace) -> Report:
     choose_design_unit(arguments, design)
     report = describe_design(design, matrices=arguments.matrices)
     add_moving_gain(report, design)
-    cost = frame_cost(design)
-    report.data |= {"file": arguments.gain, "digest": digest, "frame_cost": json_record(cost)}
+    report.data |= {"file": arguments.gain, "digest": digest}
     unproved = ["route and status of the solver"]
     unproved += ["assumptions"] * bool(design.assumptions)
     unproved += ["configuration, and so the truth"] * bool(design.configuration)
@@ -32,7 +32,10 @@ def run(arguments: Namespace) -> Report:
         f"proved: the certificate, computed again from this file of digest {digest}.",
         f"not proved, the file's word: {'; '.join(unproved)}.",
     ]
-    report.tables.append(fact_table("Cost per frame, as exported to C", cost))
+    if isinstance(design.controller, Controller):
+        cost = frame_cost(design)
+        report.data["frame_cost"] = json_record(cost)
+        report.tables.append(fact_table("Cost per frame, as exported to C", cost))
     if design.configuration:
         with show_spinner("comparing in the truth", quiet=arguments.json):
             add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from lbt_synth.cli.output import Report
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.loop import ResidualLimit
+from lbt_synth.design.model_limits import limit_or_none
+from lbt_synth.loop import ResidualLimit, least_residual
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import compare_in_truth
 
@@ -13,10 +16,19 @@ _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
 _NAME = "this design"
 
 
-def say_limit(limit: ResidualLimit) -> str:
-    """Return the sentence on the limit of a truth."""
+def say_limit(limit: ResidualLimit, config: Config) -> str:
+    """Return the sentence on the limit of a truth, and on what other sensors can add to it."""
     least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
-    return f"least residual of any linear controller in the truth: {least}"
+    fused = config.fused_plant
+    if fused is None:
+        return f"least residual of any linear controller in the truth: {least}"
+    said = f"least residual of any linear controller of the loop's own sensor in the truth: {least}"
+    if fused.suite.wavefront:
+        return f"{said}; with the other sensors it is less"
+    calm = replace(config.truth, vibrations=(), motions=(), frequency_errors_hz=None)
+    floor = limit_or_none(lambda: least_residual(config.hardware, calm))
+    known = "" if floor is None else nm_text(floor.rms_nm, ".6g", unit="nm rms")
+    return f"{said}; with accelerometers not less than {known}, that of a truth without vibrations"
 
 
 def add_truth(report: Report, design: Design, config: Config) -> None:
@@ -36,6 +48,6 @@ def add_truth(report: Report, design: Design, config: Config) -> None:
         "truth_warnings": found.warnings[_NAME],
     }
     if found.limit is not None:
-        report.notes.append(say_limit(found.limit))
+        report.notes.append(say_limit(found.limit, config))
     report.notes += [f"warning: {text}." for text in found.warnings[_NAME]]
     report.notes += [f"note: {text}" for text in found.notes]

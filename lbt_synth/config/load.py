@@ -28,12 +28,14 @@ from lbt_synth.config.plant_and_truth import (
 )
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
+from lbt_synth.config.several_sensors import build_fused_plant, build_true_motions
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
+from lbt_synth.models.fusion.plant import FusedPlant
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
@@ -70,6 +72,8 @@ class Config(Summarised):
         mean of ``model.sensor_gain`` if it is a list.
     source : pathlib.Path
         The file.
+    fused_plant : FusedPlant or None
+        Plant that several sensors see; None where the loop has its own sensor alone.
     """
 
     settings: FileSection
@@ -80,6 +84,7 @@ class Config(Summarised):
     noise_nm: float | FloatArray
     sensor_gain: float
     source: Path
+    fused_plant: FusedPlant | None = None
 
     def _brief(self) -> str:
         return f"{self.source.name}, {self.hardware._brief()}"
@@ -296,6 +301,9 @@ def build_config(settings: FileSection, source: Path) -> Config:
         noise_nm = measurement_noise_nm(settings)
         plant = build_plant(settings, atmosphere, noise_nm)
         truth = build_truth(settings, atmosphere, noise_nm, plant)
+        fused = build_fused_plant(settings, plant)
+        if fused is not None:
+            truth = replace(truth, motions=build_true_motions(settings, fused))
     except ProblemError as error:
         raise ConfigError(f"{source}: {error}", path=getattr(error, "path", "")) from error
     except ArithmeticError as error:
@@ -318,4 +326,5 @@ def build_config(settings: FileSection, source: Path) -> Config:
         noise_nm=noise_nm,
         sensor_gain=reference_gain(settings),
         source=source,
+        fused_plant=fused,
     )

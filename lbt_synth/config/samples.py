@@ -16,7 +16,8 @@ from typing import Annotated, Any, cast
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from lbt_synth.config.schema import FileSection, Section
+from lbt_synth.config.schema import FileSection
+from lbt_synth.config.section import Section
 from lbt_synth.validation import BoolArray, FloatArray
 
 Keys = tuple[str | int, ...]  # the path of a number, such as ("truth", "vibrations", 0, "rms_nm")

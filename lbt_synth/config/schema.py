@@ -6,25 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
+from lbt_synth.config.section import Section
+from lbt_synth.config.sensor_sections import (
+    MotionSection,
+    OtherSensorSection,
+    SensorSection,
+    with_own_sensor,
+)
 from lbt_synth.methods import quantities as q
-from lbt_synth.methods.method import Section as MethodSection
 from lbt_synth.methods.registry import all_methods
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
-
-
-class Section(MethodSection):
-    """A section of a configuration, whose builders declare which numbers may vary."""
-
-    @property
-    def per_sample(self) -> Self:
-        """The same section, read by a builder that takes its numbers for each of many samples.
-
-        Builders declare thus which numbers may be arrays; see ``config.samples``.
-        """
-        return self
-
-    def require_one_value(self) -> None:
-        """Declare that samples evaluated together must have the same numbers in this section."""
 
 
 class TelescopeSection(Section):
@@ -48,39 +39,6 @@ class AtmosphereSection(Section):
     seeing_wavelength_um: q.Micrometres = Field(
         default=0.5, description="wavelength of the seeing [um]"
     )
-
-
-class PyramidSection(Section):
-    """Pyramid sensor, from which the noise is computed."""
-
-    wavelength_um: q.Micrometres = Field(description="sensing wavelength [um]")
-    modulation_lambda_over_d: q.Gain = Field(description="modulation radius [lambda/D]")
-    subapertures_across: q.Count = Field(le=1000, description="subapertures over the diameter")
-    photons: q.Ratio = Field(description="photons per subaperture and frame")
-    read_noise_electrons: q.RatioFromZero = Field(description="read noise per pixel [electrons]")
-
-
-class SensorSection(Section):
-    """Measurement noise: given, or from a pyramid."""
-
-    noise_nm: q.NanometresOrEach | None = Field(
-        default=None,
-        description="noise per frame [nm rms], or one per measurement",
-    )
-    noise_mas: q.Milliarcseconds | None = Field(default=None, description="noise per frame [mas]")
-    pyramid: PyramidSection | None = Field(
-        default=None, description="a pyramid, whose noise is computed"
-    )
-    matrix: list[list[q.Entry]] | None = Field(
-        default=None, description="rows: measurements by modes (default: identity)"
-    )
-
-    @model_validator(mode="after")
-    def _require_one_noise(self) -> SensorSection:
-        given = [v is not None for v in (self.noise_nm, self.noise_mas, self.pyramid)]
-        if sum(given) != 1:
-            raise ValueError("expected exactly one of noise_nm, noise_mas, pyramid")
-        return self
 
 
 class LocalLoopSection(Section):
@@ -160,6 +118,9 @@ class _LineSection(Section):
     )
     frequency_error_percent: q.RatioFromZero | None = Field(
         default=None, description="the same in percent of the frequency"
+    )
+    accelerometers: dict[str, MotionSection] | None = Field(
+        default=None, description="accelerometer channels that move with it"
     )
 
     @model_validator(mode="after")
@@ -368,6 +329,9 @@ class FileSection(Section):
     telescope: TelescopeSection | None = Field(default=None, description="the pupil")
     atmosphere: AtmosphereSection | None = Field(default=None, description="the turbulence")
     sensor: SensorSection = Field(description="noise of the measurements")
+    sensors: dict[str, OtherSensorSection] | None = Field(
+        default=None, min_length=1, description="sensors beside the loop's own, by name"
+    )
     mirror: MirrorSection = Field(default=MirrorSection(), description="the deformable mirror")
     loop: LoopSection = Field(description="timing, and the number of axes")
     model: ModelSection = Field(description="what the design assumes")
@@ -387,6 +351,11 @@ class FileSection(Section):
     end_to_end: EndToEndSection = Field(
         default=EndToEndSection(), description="the end-to-end simulation"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _move_own_sensor(cls, raw: Any) -> Any:
+        return with_own_sensor(raw)
 
     @property
     def usual_turbulence(self) -> str:

@@ -136,20 +136,26 @@ def record_common(design: Design) -> DesignRecord:
         meta["assumptions"] = list(design.assumptions)
     if design.configuration:
         meta["configuration"] = design.configuration
-    hardware = design.hardware
-    if hardware is not None:
-        arrays |= {"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}
-        meta |= {"frame_rate_hz": hardware.frame_rate_hz, "delay_frames": hardware.delay_frames}
-        taps = hardware.mirror_taps
-        meta["mean_delay_frames"] = 1 + float(np.arange(taps.size) @ taps)
-        if hardware.mirror is not None:
-            meta["mirror"] = asdict(hardware.mirror)
-        meta["units"] = {
+    record = DesignRecord(arrays, meta)
+    return record if design.hardware is None else record | record_hardware(design.hardware)
+
+
+def record_hardware(hardware: LoopHardware) -> DesignRecord:
+    """Record a loop."""
+    taps = hardware.mirror_taps
+    meta: Meta = {
+        "frame_rate_hz": hardware.frame_rate_hz,
+        "delay_frames": hardware.delay_frames,
+        "mean_delay_frames": 1 + float(np.arange(taps.size) @ taps),
+        "units": {
             "commands": "nm rms wavefront where INFLUENCE is the identity",
             "measurements": "nm rms wavefront where SENSOR is the identity",
             "phase": "nm rms wavefront",
-        }
-    return DesignRecord(arrays, meta)
+        },
+    }
+    if hardware.mirror is not None:
+        meta["mirror"] = asdict(hardware.mirror)
+    return DesignRecord({"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}, meta)
 
 
 def record_problem(problem: EstimationProblem) -> DesignRecord:

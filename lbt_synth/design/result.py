@@ -31,6 +31,7 @@ from lbt_synth.linear.riccati.filtering import (
     gamma_riccati,
     kalman_riccati,
 )
+from lbt_synth.loop import AnyLoop, close_loop
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
 from lbt_synth.storage.summaries import Summarised, Summary, count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
@@ -98,6 +99,18 @@ class Design(Summarised):
     def facts(self) -> Any:
         """Return the numbers that this kind of design has, a row; None if there are none."""
         return None
+
+    def close(self, hardware: LoopHardware, *, sensor_gain: float = 1.0) -> AnyLoop:
+        """Close a loop around the design, which is stable or not.
+
+        Parameters
+        ----------
+        hardware : LoopHardware
+            Sensor, mirror and delay.
+        sensor_gain : float, optional
+            Real sensor gain relative to the sensor matrix.
+        """
+        return close_loop(hardware, self, sensor_gain=sensor_gain)
 
     def _brief(self) -> str:
         loop = "" if self.hardware is None else f", {self.hardware._brief()}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.linear.periodic.system import PeriodicController
 from lbt_synth.linear.state_space import Controller
 from lbt_synth.validation import suggest_part
 
@@ -21,6 +22,11 @@ class HasController(Protocol):
 def as_controller(given: Controller | HasController, *, others: str = "") -> Controller:
     """Return a controller, or that of a design; refuse anything else."""
     found = given if isinstance(given, Controller) else getattr(given, "controller", None)
+    if isinstance(found, PeriodicController):
+        raise ProblemError(
+            "this needs a controller of the loop's own sensor; got one of several sensors. "
+            "simulate, limits, show, verify and export to C take it."
+        )
     if not isinstance(found, Controller):
         raise ProblemError(
             f"controller must be a Controller{others}, or a design; got {type(given).__name__}."

@@ -11,6 +11,10 @@ from .ensemble.evaluation import EnsembleResiduals as EnsembleResiduals
 from .ensemble.evaluation import ensemble_residuals as ensemble_residuals
 from .ensemble.loop_ensemble import EnsembleVibration as EnsembleVibration
 from .ensemble.loop_ensemble import LoopEnsemble as LoopEnsemble
+from .fusion.fused_loop import AnyLoop as AnyLoop
+from .fusion.fused_loop import FusedLoop as FusedLoop
+from .fusion.fused_loop import close_fused_loop as close_fused_loop
+from .fusion.fused_loop import fused_budget as fused_budget
 from .least_residuals.band_limit import BandLimit as BandLimit
 from .least_residuals.band_limit import least_worst_residual as least_worst_residual
 from .least_residuals.residual_limit import ResidualLimit as ResidualLimit

@@ -8,6 +8,7 @@ response. The same budget serves the error of assuming that the mirror settles a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -24,6 +25,9 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, fill_row, nm_column, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
+
+if TYPE_CHECKING:
+    from lbt_synth.loop.fusion.fused_loop import AnyLoop
 
 
 @table_row
@@ -100,12 +104,12 @@ def _rms(covariance: FloatArray) -> float:
     return float(np.sqrt(np.trace(covariance)))
 
 
-def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
+def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
     """Exact stationary residual of a loop under a truth.
 
     Parameters
     ----------
-    loop : ClosedLoop
+    loop : ClosedLoop or FusedLoop
         The loop; its sensor gain must be the truth's.
     truth : Truth
         Disturbances.
@@ -136,7 +140,12 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     >>> round(budget.noise_nm**2, 9)
     3.0
     """
-    require_instance(loop, ClosedLoop, "loop")
+    if not isinstance(loop, ClosedLoop):
+        from lbt_synth.loop.fusion.fused_loop import FusedLoop, fused_budget
+
+        if isinstance(loop, FusedLoop):
+            return fused_budget(loop, truth)
+        require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     if loop.sensor_gain != truth.sensor_gain:
         raise ProblemError(

@@ -11,6 +11,7 @@ from lbt_synth.methods.method import Description, Method, Section
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:
+    from lbt_synth.design.fusion.fused_filter import FusedFilter
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.result import FilterDesign
 
@@ -49,17 +50,29 @@ class BoundOptions(Section):
         return {"gamma_ratio": self.gamma_ratio} if self.gamma is None else {"gamma": self.gamma}
 
 
-def _describe_filter(design: FilterDesign) -> Description:
+def _describe_filter(design: FilterDesign | FusedFilter) -> Description:
     """Describe a filter."""
+    from lbt_synth.design.fusion.fused_filter import FusedFilter
+
+    if isinstance(design, FusedFilter):
+        from lbt_synth.methods.fused import describe_fused
+
+        return describe_fused(design)
     return Description(
         facts=design.facts(),
         matrices={"gain_predictor": design.gain_predictor, "gain_filter": design.gain_filter},
     )
 
 
-def _pack_filter(design: FilterDesign) -> DesignRecord:
+def _pack_filter(design: FilterDesign | FusedFilter) -> DesignRecord:
     """Record the gains and claims of a filter, with its problem."""
+    from lbt_synth.design.fusion.fused_filter import FusedFilter
     from lbt_synth.design.record import DesignRecord, record_problem
+
+    if isinstance(design, FusedFilter):
+        from lbt_synth.design.fusion.record import record_fused
+
+        return record_fused(design)
 
     arrays = {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
     if design.witness is not None:
@@ -68,11 +81,15 @@ def _pack_filter(design: FilterDesign) -> DesignRecord:
     return DesignRecord(arrays, meta) | record_problem(design.problem)
 
 
-def _unpack_filter(record: DesignRecord) -> FilterDesign:
+def _unpack_filter(record: DesignRecord) -> FilterDesign | FusedFilter:
     """Rebuild a filter."""
     from lbt_synth.design import FilterDesign
     from lbt_synth.linear import Witness
 
+    if record.meta["problem"] == "fused plant":
+        from lbt_synth.design.fusion.record import rebuild_fused
+
+        return rebuild_fused(record)
     problem, arrays = record.problem(), record.arrays
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
     said = {name: record.meta.get(name) for name in _CLAIMS}  # files of 0.1 have fewer

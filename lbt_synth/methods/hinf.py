@@ -10,6 +10,7 @@ from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method
 from lbt_synth.methods.method import DesignInputs
 
 if TYPE_CHECKING:
+    from lbt_synth.design.fusion.fused_filter import FusedFilter
     from lbt_synth.design.result import FilterDesign
 
 
@@ -21,7 +22,11 @@ class HinfOptions(BoundOptions):
     )
 
 
-def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign:
+def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign | FusedFilter:
+    if inputs.fused_plant is not None:
+        from lbt_synth.design.fusion.fused_filter import fused_hinf
+
+        return fused_hinf(inputs.fused_plant, **options.bound())
     from lbt_synth.design.hinf import hinf
 
     return hinf(inputs.plant, **options.bound(), horizon=options.horizon, route=options.route)
@@ -31,6 +36,7 @@ METHOD = filter_method(
     name="hinf",
     title="H-infinity filter",
     label="H∞",
+    design_names=("hinf", "fused hinf"),
     options=HinfOptions,
     build=_build,
     exclusive=BOUNDS,

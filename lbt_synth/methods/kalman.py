@@ -10,6 +10,7 @@ from lbt_synth.methods.filters import Horizon, filter_method
 from lbt_synth.methods.method import DesignInputs, Section
 
 if TYPE_CHECKING:
+    from lbt_synth.design.fusion.fused_filter import FusedFilter
     from lbt_synth.design.result import FilterDesign
 
 
@@ -20,7 +21,11 @@ class KalmanOptions(Section):
     horizon: Horizon = 1
 
 
-def _build(inputs: DesignInputs, options: KalmanOptions) -> FilterDesign:
+def _build(inputs: DesignInputs, options: KalmanOptions) -> FilterDesign | FusedFilter:
+    if inputs.fused_plant is not None:
+        from lbt_synth.design.fusion.fused_filter import fused_kalman
+
+        return fused_kalman(inputs.fused_plant)
     from lbt_synth.design.kalman import kalman
 
     return kalman(inputs.plant, horizon=options.horizon, route=options.route)
@@ -30,6 +35,7 @@ METHOD = filter_method(
     name="kalman",
     title="Kalman filter",
     label="Kalman",
+    design_names=("kalman", "fused kalman"),
     options=KalmanOptions,
     build=_build,
     batched=True,

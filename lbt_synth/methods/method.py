@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.result import Design
     from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
+    from lbt_synth.models.fusion.plant import FusedPlant
     from lbt_synth.validation import FloatArray
 
 
@@ -49,6 +50,10 @@ class DesignInputs(Protocol):
     @property
     def plant(self) -> TipTiltPlant:
         """Plant of the design."""
+
+    @property
+    def fused_plant(self) -> FusedPlant | None:
+        """Plant that several sensors see; None where the loop has its own sensor alone."""
 
     @property
     def hardware(self) -> LoopHardware:

@@ -33,6 +33,9 @@ RatioFromZero: TypeAlias = Annotated[float, Field(ge=0, le=1e6)]
 Entry: TypeAlias = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
+Acceleration: TypeAlias = Annotated[float, Field(ge=1e-12, le=1e3)]
+
+
 def tag_one_or_each(value: Any) -> str:
     """Tell a list with one value per axis or measurement from one value for all."""
     return EACH if isinstance(value, list) else ONE
@@ -44,5 +47,10 @@ NanometresOrEach = Annotated[
 ]
 GainOrEach = Annotated[
     Annotated[Gain, Tag(ONE)] | Annotated[list[Gain], Field(min_length=1), Tag(EACH)],
+    Discriminator(tag_one_or_each),
+]
+AccelerationOrEach = Annotated[
+    Annotated[Acceleration, Tag(ONE)]
+    | Annotated[list[Acceleration], Field(min_length=1), Tag(EACH)],
     Discriminator(tag_one_or_each),
 ]

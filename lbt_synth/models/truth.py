@@ -10,6 +10,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.disturbance_facts import disturbance_facts
+from lbt_synth.models.fusion.sensors import Motions
 from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
 from lbt_synth.models.vibration.in_a_loop import TrueVibration, stationary_vibrations
@@ -49,6 +50,9 @@ class Truth(Summarised):
         How far the frequency of each vibration may be from the assumed one [Hz]; 0 where it is
         known. Studies of frequency errors move the vibrations in proportion to these; by default
         in proportion to their frequencies.
+    motions : sequence of mapping, optional
+        For each vibration, the :class:`~lbt_synth.models.Motion` of each channel of an
+        accelerometer that it moves; by default none moves.
 
     Raises
     ------
@@ -79,6 +83,7 @@ class Truth(Summarised):
     noise_nm: float | FloatArray = 0.0
     sensor_gain: Positive = 1.0
     frequency_errors_hz: tuple[float, ...] | None = None
+    motions: Motions = ()
 
     def __post_init__(self) -> None:
         given = self.turbulence
@@ -101,6 +106,7 @@ class Truth(Summarised):
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
             frequency_errors_hz=self._checked_errors(),
+            motions=tuple(self.motions) or ({},) * len(self.vibrations),
         )
 
     def _brief(self) -> str:

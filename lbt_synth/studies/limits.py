@@ -11,12 +11,12 @@ from lbt_synth.design import Design
 from lbt_synth.design.model_limits import above_percent, limit_or_none
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import (
+    AnyLoop,
     BandLimit,
     ClosedLoop,
     Imaging,
     ResidualLimit,
     broken_loops,
-    close_loop,
     least_residual,
     least_worst_residual,
     residual_budget,
@@ -173,7 +173,7 @@ def limits(
         )
     rows, curves = [], []
     for name, design in designs.items():
-        loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        loop = design.close(hardware, sensor_gain=truth.sensor_gain)
         residual_nm, ratio, curve = _evaluate_loop(loop, truth, imaging, shifts)
         worst_nm = float(np.max(curve)) if shifts.size else residual_nm
         rows.append(
@@ -185,7 +185,7 @@ def limits(
                 above_limit_percent=above_percent(residual_nm, limit.rms_nm if limit else np.nan),
                 worst_nm=worst_nm,
                 above_band_limit_percent=above_percent(worst_nm, band.rms_nm if band else np.nan),
-                phase_margin_deg=phase_margin_deg(broken_loops(loop)) if loop.is_stable else np.nan,
+                phase_margin_deg=_phase_margin_deg(loop),
                 stable=loop.is_stable,
             )
         )
@@ -200,6 +200,13 @@ def limits(
         residual_nm=frozen_copy(curves),
         frequency_hz=frequencies.pop() if len(frequencies) == 1 else None,
     )
+
+
+def _phase_margin_deg(loop: AnyLoop) -> float:
+    """Return the least phase margin; nan if the loop is unstable, or of several sensors."""
+    if not loop.is_stable or not isinstance(loop, ClosedLoop):
+        return np.nan
+    return phase_margin_deg(broken_loops(loop))
 
 
 def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
@@ -221,7 +228,7 @@ def _error_band(truth: Truth, shifts: FloatArray) -> tuple[float, float] | None:
 
 
 def _evaluate_loop(
-    loop: ClosedLoop, truth: Truth, imaging: Imaging, shifts: FloatArray
+    loop: AnyLoop, truth: Truth, imaging: Imaging, shifts: FloatArray
 ) -> tuple[float, float, FloatArray]:
     """Return residual [nm], Strehl ratio and residual at each shift [nm]; nan if unstable."""
     if not loop.is_stable:

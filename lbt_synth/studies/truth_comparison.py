@@ -9,7 +9,7 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design, ShapedDesign
 from lbt_synth.design.violated_demands import violated_demands
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.loop import ResidualLimit, close_loop
+from lbt_synth.loop import ClosedLoop, ResidualLimit
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.studies.limits import LimitRow, limits
 from lbt_synth.studies.unexpected_power import unexpected_power
@@ -106,7 +106,9 @@ def _warnings(
     if not row.stable:
         yield "the loop is unstable in the truth"
         return
-    loop = close_loop(config.hardware, design.controller, sensor_gain=config.truth.sensor_gain)
+    loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
+    if not isinstance(loop, ClosedLoop):
+        return
     found = unexpected_power(design, loop, config.truth)
     yield from map(str, found)
     if not isinstance(design, ShapedDesign):

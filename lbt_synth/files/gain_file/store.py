@@ -46,7 +46,7 @@ def write_cards(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
     """Return the header of a FITS file, for people and programs that read nothing else."""
     cards: dict[str, tuple[Any, str]] = {
         "VERSION": (FITS_LAYOUT_VERSION, "layout of the HDUs A, B, C, D"),
-        "NFILTER": (design.controller.B.shape[1], "inputs of the controller"),
+        "NFILTER": (design.controller.B.shape[-1], "inputs of the controller"),
         "NSTATES": (design.controller.n_states, "states of the controller"),
         "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
         "LBTSCHEM": (SCHEMA_VERSION, "version of the lbt_synth layout"),

@@ -190,7 +190,7 @@ class PeriodicController(PeriodicSystem):
         A, B, C, D = (getattr(self, name)[t % self.period] for name in "ABCD")
         return Controller(A=A, B=B, C=C, D=D, dt_s=self.dt_s)
 
-    def to_system(self) -> PeriodicSystem:
+    def to_statespace(self) -> PeriodicSystem:
         """Return the same input-output map in the textbook form."""
         return PeriodicSystem(
             A=self.A, B=self.B, C=self.C @ self.A, D=self.C @ self.B + self.D, dt_s=self.dt_s

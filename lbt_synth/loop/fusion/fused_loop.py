@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -12,14 +13,13 @@ from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import ResidualBudget, distinct_edges, pole_edges
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, require_loop_rate
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, ClosedLoop, require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, Truth, Vibration
 from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
 from lbt_synth.models.fusion.plant import FusedPlant
 from lbt_synth.models.fusion.sensors import (
     OWN_SENSOR,
     Motion,
-    Motions,
     SensorSuite,
     acceleration_taps,
     checked_motions,
@@ -74,6 +74,9 @@ class FusedLoop:
             )
 
 
+AnyLoop: TypeAlias = ClosedLoop | FusedLoop
+
+
 def close_fused_loop(
     hardware: LoopHardware,
     suite: SensorSuite,
@@ -118,7 +121,7 @@ def close_fused_loop(
             f"at {1 / controller.dt_s:.6g} Hz."
         )
     exposures = [own_exposure(hardware), *suite_exposures(suite, hardware)]
-    held, k = memory(exposures, n, period, hardware.dt_s), controller.to_system()
+    held, k = memory(exposures, n, period, hardware.dt_s), controller.to_statespace()
     mirror, each = hardware.mirror_system.whole, np.eye(m)
     A_m, B_m = np.kron(mirror.A, each), np.kron(mirror.B[:, None], each)
     position, direct = hardware.influence @ np.kron(mirror.C, each), mirror.D * hardware.influence
@@ -156,7 +159,7 @@ def close_fused_loop(
     )
 
 
-def fused_budget(loop: FusedLoop, truth: Truth, motions: Motions = ()) -> ResidualBudget:
+def fused_budget(loop: FusedLoop, truth: Truth) -> ResidualBudget:
     """Return the exact stationary residual of a fused loop under a truth, mean over the period.
 
     Parameters
@@ -164,9 +167,7 @@ def fused_budget(loop: FusedLoop, truth: Truth, motions: Motions = ()) -> Residu
     loop : FusedLoop
         The loop, at the truth's sensor gain.
     truth : Truth
-        Turbulence, vibrations, and the noise of the loop's own sensor.
-    motions : tuple of mapping, optional
-        For each vibration of the truth, the :class:`Motion` of each channel that it moves.
+        Turbulence, vibrations and how channels move with them, noise of the loop's own sensor.
 
     Returns
     -------
@@ -186,18 +187,17 @@ def fused_budget(loop: FusedLoop, truth: Truth, motions: Motions = ()) -> Residu
             f"{loop.sensor_gain:.6g}."
         )
     noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
-    return _budget(loop, truth, motions, np.diag(noise_nm))
+    return _budget(loop, truth, np.diag(noise_nm))
 
 
 def fused_model_budget(loop: FusedLoop, plant: FusedPlant) -> ResidualBudget:
     """Return the exact residual of a loop where a plant's model is the truth."""
-    truth = Truth(turbulence=plant.own.turbulence, vibrations=plant.own.vibrations)
-    return _budget(loop, truth, plant.motions, plant.own.parts().noise_factor)
+    own = plant.own
+    truth = Truth(turbulence=own.turbulence, vibrations=own.vibrations, motions=plant.motions)
+    return _budget(loop, truth, own.parts().noise_factor)
 
 
-def _budget(
-    loop: FusedLoop, truth: Truth, motions: Motions, noise_factor: FloatArray
-) -> ResidualBudget:
+def _budget(loop: FusedLoop, truth: Truth, noise_factor: FloatArray) -> ResidualBudget:
     loop.require_stable()
     hardware, n = loop.hardware, loop.hardware.modes
     turbulence, vibration = np.zeros((2, n, n))
@@ -207,7 +207,7 @@ def _budget(
             entry[mode, 1] = 1.0
             turbulence += _power(loop, spectrum, entry)
     lines = stationary_vibrations(truth.vibrations)
-    moving = checked_motions(motions or ({},) * len(lines), loop.suite, len(lines))
+    moving = checked_motions(truth.motions, loop.suite, len(lines))
     amplitudes: list[ComplexArray] = []
     for line, motion in zip(lines, moving, strict=True):
         entry = line_entry(loop, checked_direction(line, hardware), motion, line.frequency_hz)

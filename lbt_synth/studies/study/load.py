@@ -36,7 +36,10 @@ _OPTIONS_IN_DIGEST = {
     *("norm", "half_width_hz", "command_weight", "gain"),
 }
 # keys of a configuration that came later: where they are not given, the digest is that of before
-_LATER_KEYS = {"units", "frequency_error_hz", "frequency_error_percent", INTEGRATOR.name}
+_LATER_KEYS = {
+    *("units", "frequency_error_hz", "frequency_error_percent", INTEGRATOR.name),
+    *("sensors", "accelerometers"),
+}
 _ERRORS_IN_DIGEST = [x / 2 for x in range(-7, 8)]  # where none are given; no study uses them
 # The oldest version whose results this one repeats to rounding: studies that it began are read
 # and resumed. Raise it with any change that moves a result.
