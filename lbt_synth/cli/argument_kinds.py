@@ -82,3 +82,14 @@ class TargetChoice(Action):
             list_targets()
             parser.exit()
         setattr(namespace, self.dest, values)
+
+
+def add_drops(parser: ArgumentParser) -> None:
+    """Add the option of sensors that fail in a run, which may be repeated."""
+    parser.add_argument(
+        "--drop",
+        action="append",
+        metavar="SENSOR@START[..END][:READING]",
+        help="a sensor or channel that fails [s], as in m2@10s or wavefront@20s..20.2s; READING "
+        "missing (seen, default), zero or frozen (believed)",
+    )

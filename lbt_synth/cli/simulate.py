@@ -14,10 +14,12 @@ from lbt_synth.cli.loop_inputs import given_options, loop_difference_notes, trut
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
+from lbt_synth.cli.sensor_failures import run_fused
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.design.model_limits import above_percent, limit_or_nan
-from lbt_synth.errors import UnstableLoopError
+from lbt_synth.design.fusion.fused_filter import FusedFilter
+from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
@@ -68,6 +70,13 @@ def run(arguments: Namespace) -> Report:
     config = load_config(arguments.config)
     choose_config_unit(arguments, config)
     design = load_gain(arguments.gain)
+    if isinstance(design, FusedFilter):
+        return run_fused(arguments, config, design)
+    if arguments.drop:
+        raise ProblemError(
+            "--drop goes with a design of several sensors: give sensors in the configuration and "
+            f"design again. {arguments.gain} has the loop's own sensor alone."
+        )
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
     _require_stable(loop, design, config.sensor_gain)

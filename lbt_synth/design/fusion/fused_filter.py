@@ -121,11 +121,11 @@ class FusedFilter(Design):
         """Return the loop that the design is for, closed."""
         return self.close(self.loop_hardware, sensor_gain=sensor_gain)
 
-    def fallback(self, missing: tuple[str, ...]) -> Fallback:
-        """Return the filter for some missing sensors; without any, that of the design."""
-        if not missing:
-            return Fallback(missing=(), gains=self.gains)
-        return next(f for f in self.fallbacks if set(f.missing) == set(missing))
+    @property
+    def controllers(self) -> dict[frozenset[str], PeriodicController]:
+        """The controller for each set of sensors and channels that are not read, none included."""
+        own = {frozenset(f.missing): self.problem.controller(f.gains) for f in self.fallbacks}
+        return {frozenset(): self.controller, **own}
 
     def facts(self) -> FusedFacts:
         """Return what the filter achieves."""
@@ -179,7 +179,9 @@ class FusedFilter(Design):
         for each in self.fallbacks:
             loop = failed_loop(self.problem, each.gains, each.missing)
             radii.append(
-                _stable("spectral radius of any loop with sensors missing", loop.system.radius_per_frame)
+                _stable(
+                    "spectral radius of any loop with sensors missing", loop.system.radius_per_frame
+                )
             )
             apart.append(_least_variance_check(self.problem, each.gains, each.missing))
         return [max(checks, key=lambda check: check.value) for checks in (radii, apart)]

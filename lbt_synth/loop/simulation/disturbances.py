@@ -31,9 +31,27 @@ def draw_disturbance(
     So has each mode where the modes have different spectra. Time 0 of a vibration that drifts is
     frame ``zero_frame``.
     """
+    total, motions = draw_parts(
+        truth, hardware, frames=frames, cases=cases, rng=rng, zero_frame=zero_frame
+    )
+    for vibration, motion in zip(truth.vibrations, motions, strict=True):
+        total += motion[:, :, None] * checked_direction(vibration, hardware)
+    return total
+
+
+def draw_parts(
+    truth: Truth,
+    hardware: LoopHardware,
+    *,
+    frames: int,
+    cases: int,
+    rng: np.random.Generator,
+    zero_frame: int = 0,
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Draw the turbulence, (cases, frames, n), and each vibration, (cases, frames) [nm]."""
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
-    total = np.zeros((cases, frames, n))
+    total, motions = np.zeros((cases, frames, n)), []
     spectra = truth.turbulence_per_mode(n)
     if truth.is_uniform and spectra[0] is not None:
         drawn = _draw(spectra[0], hardware, frames, cases * n, turbulence_rng)
@@ -43,7 +61,7 @@ def draw_disturbance(
             if own is not None:
                 total[:, :, mode] += _draw(own, hardware, frames, cases, mode_rng)
     for vibration, line_rng in zip(truth.vibrations, line_rngs, strict=True):
-        direction = checked_direction(vibration, hardware)
+        checked_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(hardware.frame_rate_hz)
             motion = _draw_ar(model, frames, cases, line_rng)
@@ -54,8 +72,8 @@ def draw_disturbance(
             turns = vibration.frequency_hz / hardware.frame_rate_hz * np.arange(frames)
             phase = line_rng.uniform(0, 2 * np.pi, (cases, 1))
             motion = vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase)
-        total += motion[:, :, None] * direction
-    return total
+        motions.append(motion)
+    return total, motions
 
 
 def draw_noise(

@@ -9,6 +9,7 @@ from .open_loops import nichols_figure as nichols_figure
 from .open_loops import nyquist_figure as nyquist_figure
 from .robustness import robustness_figure as robustness_figure
 from .robustness import robustness_map_figure as robustness_map_figure
+from .sensor_failures import sensor_failure_figure as sensor_failure_figure
 from .sigma import sigma_figure as sigma_figure
 from .simulation import simulation_figure as simulation_figure
 from .step import step_figure as step_figure

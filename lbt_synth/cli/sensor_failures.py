@@ -1,0 +1,152 @@
+"""The command simulate for a design of several sensors, some of which may fail on the way."""
+
+from __future__ import annotations
+
+import re
+from argparse import Namespace
+from dataclasses import replace
+
+import numpy as np
+
+from lbt_synth.cli.loop_inputs import given_options, truth_at_sensor_gain
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.progress import show_spinner
+from lbt_synth.config import Config
+from lbt_synth.design.fusion.fused_filter import FusedFilter
+from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.loop import Simulation, residual_budget, strehl
+from lbt_synth.loop.fusion.fused_loop import close_fused_loop
+from lbt_synth.loop.fusion.simulation import READINGS, Drop, Segment, run_segments, simulate_fused
+from lbt_synth.loop.strehl import series_strehl
+from lbt_synth.models import Truth
+from lbt_synth.report.figures import sensor_failure_figure
+from lbt_synth.report.figures.style import save_figure
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+
+_DROP = re.compile(
+    rf"(?P<unit>[^@]+)@(?P<start>[\d.]+)s?(\.\.(?P<end>[\d.]+)s?)?(:(?P<reading>{'|'.join(READINGS)}))?$"
+)
+_AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
+
+
+@table_row
+class SegmentRow:
+    """The residual between two events."""
+
+    start_s: float = column("from", unit="s", format="g")
+    end_s: float = column("to", unit="s", format="g")
+    sensors: str = column("sensors that fail")
+    residual_nm: float = nm_column("simulated", unit="nm rms", format=".2f")
+    exact_nm: float = nm_column(
+        "exact, once settled", unit="nm rms", format=".2f", missing="unstable"
+    )
+    strehl: float = percent_column("Strehl")
+
+
+def parse_drop(text: str) -> Drop:
+    """Return what ``--drop SENSOR@START[..END][:READING]`` says."""
+    found = _DROP.match(text)
+    if found is None:
+        raise ProblemError(
+            f"--drop takes SENSOR@START..END, in seconds, and if need be one of "
+            f"{', '.join(':' + word for word in READINGS)}; got {text!r}. Try m2@10s or "
+            "wavefront@20s..20.2s:frozen."
+        )
+    parts = found.groupdict()
+    try:
+        times = {k: float(parts[k.removesuffix("_s")] or "inf") for k in ("start_s", "end_s")}
+    except ValueError:
+        raise ProblemError(f"--drop takes times in seconds; got {text!r}.") from None
+    return Drop(unit=parts["unit"], **times, reading=parts["reading"] or READINGS[0])
+
+
+def run_fused(arguments: Namespace, config: Config, design: FusedFilter) -> Report:
+    """Run the loop of a design of several sensors."""
+    for option in ("stroke", "telemetry"):
+        if getattr(arguments, option) is not None:
+            raise ProblemError(f"--{option} goes with a design of the loop's own sensor alone.")
+    drops = [parse_drop(text) for text in arguments.drop or ()]
+    truth = truth_at_sensor_gain(config, arguments.sensor_gain)
+    loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
+    loop.require_stable()
+    settings, rate = config.settings.simulation, config.hardware.frame_rate_hz
+    given = given_options(arguments, "frames", "cases", "seed")
+    last_s = max((t for d in drops for t in (d.start_s, d.end_s) if np.isfinite(t)), default=0.0)
+    usual = max(settings.frames, int(np.ceil((last_s + _AFTER_S) * rate)) if drops else 0)
+    sizes = {"frames": usual, "cases": settings.cases, "seed": settings.seed} | given
+    if drops and last_s * rate >= sizes["frames"]:
+        raise ProblemError(
+            f"--frames must reach beyond the last --drop, {last_s:g} s or {last_s * rate:.0f} "
+            f"frames; got {sizes['frames']}."
+        )
+    segments = run_segments(drops, sizes["frames"] / rate)
+    with show_spinner("closing the loop", quiet=arguments.json):
+        simulation = simulate_fused(
+            design.controllers,
+            design.problem.suite,
+            truth,
+            hardware=config.hardware,
+            **sizes,
+            settle_frames=settings.settle_frames,
+            drops=drops,
+        )
+    exact = [_exact_nm(design, config, truth, segment) for segment in segments]
+    rows = [
+        _segment_row(simulation, segment, own, config)
+        for segment, own in zip(segments, exact, strict=True)
+    ]
+    report = Report(
+        data={
+            "residual_nm": simulation.rms_nm,
+            "frames": sizes["frames"],
+            "cases": sizes["cases"],
+            "seed": simulation.seed,
+            "wavelength_um": config.imaging.wavelength_um,
+        }
+    )
+    caption = f"{design.method} in the loop: {sizes['cases']} runs; {config.imaging.label}"
+    report.add_rows("segments", caption, rows)
+    if not truth.drifts:
+        ratio = strehl(residual_budget(loop, truth), config.imaging)
+        report.data["strehl_exact"] = ratio
+        report.notes.append(f"Strehl ratio with all sensors, exact: {100 * ratio:.2f} %")
+    if arguments.output is not None:
+        figure = sensor_failure_figure(simulation, segments, exact, title=design.method)
+        report.note_written(save_figure(figure, arguments.output))
+    return report
+
+
+def _exact_nm(design: FusedFilter, config: Config, truth: Truth, segment: Segment) -> float:
+    """Return the stationary residual of a segment; nan if it is unstable or a vibration drifts."""
+    away = (*segment.missing, *segment.wrong)
+    loop = close_fused_loop(
+        config.hardware,
+        design.problem.suite,
+        design.controllers[frozenset(segment.missing)],
+        sensor_gain=truth.sensor_gain,
+        blind=away,
+    )
+    if truth.drifts:
+        return np.nan
+    try:
+        return residual_budget(loop, truth).rms_nm
+    except UnstableLoopError:
+        return np.nan
+
+
+def _segment_row(
+    simulation: Simulation, segment: Segment, exact_nm: float, config: Config
+) -> SegmentRow:
+    rate = simulation.frame_rate_hz
+    frames = slice(
+        int(np.ceil(segment.start_s * rate - 1e-6)), int(np.ceil(segment.end_s * rate - 1e-6))
+    )
+    part = replace(simulation, residual_nm=simulation.residual_nm[:, frames])
+    return SegmentRow(
+        start_s=segment.start_s,
+        end_s=segment.end_s,
+        sensors=segment.text or "none",
+        residual_nm=float(np.sqrt(np.mean(part.rms_nm**2))),
+        exact_nm=exact_nm,
+        strehl=float(np.mean([series_strehl(case, config.imaging) for case in part.residual_nm])),
+    )

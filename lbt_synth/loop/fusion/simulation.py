@@ -1,0 +1,273 @@
+"""Runs of a loop of several sensors, some of which may fail on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.loop.simulation.disturbances import draw_noise, draw_parts
+from lbt_synth.loop.simulation.run import Simulation
+from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
+from lbt_synth.models.fusion.sensors import (
+    Accelerometer,
+    Motion,
+    SensorSuite,
+    acceleration_taps,
+    checked_motions,
+)
+from lbt_synth.models.vibration.drifting import DriftingVibration
+from lbt_synth.models.vibration.in_a_loop import TrueVibration, checked_direction
+from lbt_synth.validation import FloatArray, choice, frozen_copy, integer, number
+
+READINGS = ("missing", "zero", "frozen")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drop:
+    """A sensor or channel that fails for a while.
+
+    Parameters
+    ----------
+    unit : str
+        The sensor or channel.
+    start_s, end_s : float
+        When it fails, and when it is back [s]; by default it stays away.
+    reading : {"missing", "zero", "frozen"}
+        What it reads: nothing, which is seen, so that the fall-back filter takes over; or zeros, or
+        its last reading, which the filter believes.
+
+    Examples
+    --------
+    >>> from lbt_synth.loop.fusion.simulation import Drop
+    >>> Drop(unit="m2", start_s=10.0).reading
+    'missing'
+    """
+
+    unit: str
+    start_s: float
+    end_s: float = np.inf
+    reading: str = "missing"
+
+    def __post_init__(self) -> None:
+        number(self.start_s, "start_s", at_least=0)
+        choice(self.reading, "reading", READINGS)
+        if not self.end_s > self.start_s:
+            raise ProblemError(
+                f"{self.unit} must be back after it fails, at {self.start_s:g} s; got "
+                f"{self.end_s:g} s."
+            )
+
+    def covers(self, time_s: float) -> bool:
+        """Whether the sensor is away at a time."""
+        return self.start_s <= time_s < self.end_s
+
+
+def simulate_fused(
+    filters: Mapping[frozenset[str], PeriodicController],
+    suite: SensorSuite,
+    truth: Truth,
+    *,
+    hardware: LoopHardware,
+    frames: int,
+    cases: int = 1,
+    seed: int = 0,
+    settle_frames: int = 1000,
+    drops: Sequence[Drop] = (),
+) -> Simulation:
+    """Run a loop of several sensors, frame by frame.
+
+    Parameters
+    ----------
+    filters : mapping of frozenset of str to PeriodicController
+        The controller for each set of sensors and channels that are not read; the empty set has
+        that of all sensors. They share their states, so that a switch is without a jump.
+    suite : SensorSuite
+        The sensors beside the loop's own.
+    truth : Truth
+        Disturbances, how channels move with them, noise of the loop's own sensor, and its gain.
+    hardware : LoopHardware
+        Mirror, delay and own sensor.
+    frames, cases : int
+        Frames recorded, and independent runs.
+    seed : int, optional
+        Seed of the random series.
+    settle_frames : int, optional
+        Frames before those recorded.
+    drops : sequence of Drop, optional
+        When sensors fail, counted from the first frame recorded.
+
+    Returns
+    -------
+    Simulation
+        Series; the measurements are those of all sensors, held from one reading to the next.
+
+    Raises
+    ------
+    ProblemError
+        If a sensor that fails is not there, or has no filter.
+    """
+    frames = integer(frames, "frames", at_least=1)
+    settle = integer(settle_frames, "settle_frames", at_least=0)
+    rng, noise_rng, other_rng = np.random.default_rng(seed).spawn(3)
+    size = {"frames": settle + frames, "cases": cases}
+    total, motions = draw_parts(truth, hardware, rng=rng, zero_frame=settle, **size)
+    noise = draw_noise(truth, hardware, rng=noise_rng, **size)
+    added = np.concatenate(
+        [noise, _draw_others(truth, hardware, suite, motions, other_rng, **size)], axis=2
+    )
+    for line, motion in zip(truth.vibrations, motions, strict=True):
+        total += motion[:, :, None] * checked_direction(line, hardware)
+    for drop in drops:
+        if drop.unit not in suite.units:
+            raise ProblemError(
+                f"a sensor that fails must be one of {', '.join(suite.units)}; got {drop.unit!r}."
+            )
+    rate = hardware.frame_rate_hz
+    events = {
+        settle + int(np.ceil(segment.start_s * rate - 1e-6)): segment
+        for segment in run_segments(drops, frames / rate)
+    }
+    out = _run(filters, suite, hardware, total, added, truth.sensor_gain, events)
+    n, m = hardware.modes, hardware.n_commands
+    kept = out[:, settle:]
+    return Simulation(
+        total_nm=frozen_copy(total[:, settle:]),
+        residual_nm=frozen_copy(kept[:, :, :n]),
+        commands=frozen_copy(kept[:, :, n : n + m]),
+        measurements=frozen_copy(kept[:, :, n + m :]),
+        frame_rate_hz=hardware.frame_rate_hz,
+        seed=seed,
+    )
+
+
+def _draw_others(
+    truth: Truth,
+    hardware: LoopHardware,
+    suite: SensorSuite,
+    motions: list[FloatArray],
+    rng: np.random.Generator,
+    *,
+    frames: int,
+    cases: int,
+) -> FloatArray:
+    """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q)."""
+    parts = []
+    moving = checked_motions(truth.motions, suite, len(motions))
+    for sensor in (*suite.wavefront, *suite.accelerometers):
+        factor = sensor.noise_factor(hardware.modes)
+        drawn = rng.standard_normal((cases, frames, len(factor))) @ factor.T
+        if isinstance(sensor, Accelerometer):
+            for line, motion, own in zip(truth.vibrations, motions, moving, strict=True):
+                for i, channel in enumerate(sensor.channels):
+                    if channel in own:
+                        drawn[:, :, i] += _acceleration(
+                            sensor, hardware, line, motion, own[channel]
+                        )
+        parts.append(drawn)
+    return np.concatenate(parts, axis=2)
+
+
+def _acceleration(
+    sensor: Accelerometer,
+    hardware: LoopHardware,
+    line: TrueVibration,
+    motion: FloatArray,
+    moved: Motion,
+) -> FloatArray:
+    """Return what a channel reads of a vibration, (cases, frames) [m/s^2]."""
+    frequency_hz = line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
+    factor = moved.factor * sensor.band(frequency_hz)
+    age = sensor.age_frames(hardware)
+    newest, taps = acceleration_taps(factor, frequency_hz, hardware.frame_rate_hz, age)
+    frames, before = motion.shape[1], max(newest + len(taps) - 1, 0)
+    # beyond its ends the motion counts as still: the first readings are in the settling
+    still = np.pad(motion, ((0, 0), (before, 1)), mode="edge")
+    out = np.zeros(motion.shape)
+    for lag, tap in enumerate(taps, start=newest):
+        out += tap * still[:, before - lag : before - lag + frames]
+    return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Segment:
+    """A time between two events: what is not read, and what reads zeros or its last reading."""
+
+    start_s: float
+    end_s: float
+    missing: tuple[str, ...]
+    wrong: Mapping[str, str]
+
+    @property
+    def text(self) -> str:
+        """What fails, in words; empty if nothing does."""
+        return ", ".join(
+            [*self.missing, *(f"{unit} ({reading})" for unit, reading in self.wrong.items())]
+        )
+
+
+def run_segments(drops: Sequence[Drop], duration_s: float) -> tuple[Segment, ...]:
+    """Return the times between failures and returns of sensors in a run.
+
+    Examples
+    --------
+    >>> from lbt_synth.loop.fusion.simulation import Drop, run_segments
+    >>> [s.text for s in run_segments([Drop(unit="m1", start_s=1, end_s=2)], 3.0)]
+    ['', 'm1', '']
+    """
+    events = {0.0, *(t for d in drops for t in (d.start_s, d.end_s) if t < duration_s)}
+    starts = sorted(events)
+    out = []
+    for start_s, end_s in zip(starts, [*starts[1:], duration_s], strict=True):
+        away = [drop for drop in drops if drop.covers(start_s)]
+        missing = tuple(sorted({d.unit for d in away if d.reading == "missing"}))
+        wrong = {d.unit: d.reading for d in away if d.unit not in missing}
+        out.append(Segment(start_s=start_s, end_s=end_s, missing=missing, wrong=wrong))
+    return tuple(out)
+
+
+def _run(
+    filters: Mapping[frozenset[str], PeriodicController],
+    suite: SensorSuite,
+    hardware: LoopHardware,
+    total: FloatArray,
+    added: FloatArray,
+    sensor_gain: float,
+    events: Mapping[int, Segment],
+) -> FloatArray:
+    """Run all cases side by side; return ``phi_res, u, y``, (cases, frames, n + m + q)."""
+    cases, frames, n = total.shape
+    m, rows, read = hardware.n_commands, suite.rows(hardware), suite.read(hardware)
+    period, taps = len(read), hardware.mirror_taps
+    exposures = [own_exposure(hardware), *suite_exposures(suite, hardware)]
+    held = memory(exposures, n, period, hardware.dt_s)
+    seen = held.C.copy()
+    seen[:, : hardware.n_measurements] *= sensor_gain
+    x = np.zeros((filters[frozenset()].n_states, cases))
+    state, y = np.zeros((held.n_states, cases)), np.zeros((added.shape[2], cases))
+    commands = np.zeros((len(taps), m, cases))
+    out = np.zeros((cases, frames, n + m + len(y)))
+    own: PeriodicController = filters[frozenset()]
+    wrong: Mapping[str, str] = {}
+    for k in range(frames):
+        if k in events:
+            missing, wrong = events[k].missing, events[k].wrong
+            if frozenset(missing) not in filters:
+                raise ProblemError(f"there is no filter without {', '.join(missing)}.")
+            own = filters[frozenset(missing)]
+        t, last = k % period, y.copy()
+        y[read[t]] = added[:, k, read[t]].T
+        y[: seen.shape[1]][read[t, : seen.shape[1]]] += (seen[t] @ state)[read[t, : seen.shape[1]]]
+        for unit, reading in wrong.items():
+            y[rows[unit]] = last[rows[unit]] if reading == "frozen" else 0.0
+        x = own.A[t] @ x + own.B[t] @ y
+        commands[1:] = commands[:-1].copy()
+        commands[0] = own.C[t] @ x + own.D[t] @ y
+        residual = total[:, k].T - hardware.influence @ np.tensordot(taps, commands, 1)
+        state = held.A[t] @ state + held.B[t] @ residual
+        out[:, k] = np.concatenate([residual, commands[0], y]).T
+    return out
