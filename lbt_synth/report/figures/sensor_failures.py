@@ -60,12 +60,19 @@ def sensor_failure_figure(
     power = np.mean(np.sum(run.residual_nm[:, :whole] ** 2, axis=2), axis=0)
     size = np.sqrt(power.reshape(-1, window).mean(axis=1))
     centres = time[:whole].reshape(-1, window).mean(axis=1)
-    spans = [
-        Span(name=s.text, low=s.start_s, high=s.end_s, look=3 + i)
-        for i, s in enumerate(segment for segment in segments if segment.text)
-    ]
+    failed = [segment for segment in segments if segment.text]
+    looks = {text: 3 + i for i, text in enumerate(dict.fromkeys(s.text for s in failed))}
+    spans = [Span(name=s.text, low=s.start_s, high=s.end_s, look=looks[s.text]) for s in failed]
     series = [
-        Curve(name=names[i], x=time, y=run.residual_nm[0, :, i], look=i, width=0.5, opacity=0.8)
+        Curve(
+            name=names[i],
+            x=time,
+            y=run.residual_nm[0, :, i],
+            look=i,
+            width=0.5,
+            opacity=0.7,
+            dash=0,
+        )
         for i in range(n)
     ]
     steps = [
