@@ -5,6 +5,12 @@ from .certificate import Check as Check
 from .certificate import certify_filter as certify_filter
 from .certificate import certify_infeasible as certify_infeasible
 from .certificate import certify_loop as certify_loop
+from .fusion.failures import FailureRow as FailureRow
+from .fusion.failures import Fallback as Fallback
+from .fusion.failures import failure_rows as failure_rows
+from .fusion.fused_filter import FusedFilter as FusedFilter
+from .fusion.fused_filter import fused_hinf as fused_hinf
+from .fusion.fused_filter import fused_kalman as fused_kalman
 from .hinf import hinf as hinf
 from .integrator import IntegratorDesign as IntegratorDesign
 from .integrator import integrator as integrator

@@ -21,6 +21,12 @@ from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
 from .output_feedback.lower_bound import ControlWitness as ControlWitness
 from .output_feedback.lower_bound import infeasible_control_level as infeasible_control_level
+from .periodic.problem import PeriodicProblem as PeriodicProblem
+from .periodic.riccati import PeriodicRiccati as PeriodicRiccati
+from .periodic.riccati import periodic_hinf as periodic_hinf
+from .periodic.riccati import periodic_kalman as periodic_kalman
+from .periodic.system import PeriodicController as PeriodicController
+from .periodic.system import PeriodicSystem as PeriodicSystem
 from .riccati.dare import Attempt as Attempt
 from .riccati.dare import DareSolution as DareSolution
 from .riccati.dare import solve_dare as solve_dare

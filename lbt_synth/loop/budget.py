@@ -140,12 +140,11 @@ def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
     >>> round(budget.noise_nm**2, 9)
     3.0
     """
-    if not isinstance(loop, ClosedLoop):
-        from lbt_synth.loop.fusion.fused_loop import FusedLoop, fused_budget
+    from lbt_synth.loop.fusion.fused_loop import FusedLoop, fused_budget
 
-        if isinstance(loop, FusedLoop):
-            return fused_budget(loop, truth)
-        require_instance(loop, ClosedLoop, "loop")
+    if isinstance(loop, FusedLoop):
+        return fused_budget(loop, truth)
+    require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     if loop.sensor_gain != truth.sensor_gain:
         raise ProblemError(

@@ -18,8 +18,8 @@ def describe_fused(design: FusedFilter) -> Description:
     ]
     if unseen:
         notes.append(
-            f"note: unstable where {'; '.join(unseen)} fails unseen. The computer of the loop has to "
-            "see this failure, and take the fall-back filter."
+            f"note: unstable where {'; '.join(unseen)} fails unseen. The computer of the loop has "
+            "to see this failure, and take the fall-back filter."
         )
     return Description(
         facts=design.facts(),

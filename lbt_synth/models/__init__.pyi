@@ -1,4 +1,10 @@
 from .ar_model import ARModel as ARModel
+from .fusion.plant import FusedPlant as FusedPlant
+from .fusion.plant import fused_plant as fused_plant
+from .fusion.sensors import Accelerometer as Accelerometer
+from .fusion.sensors import Motion as Motion
+from .fusion.sensors import SensorSuite as SensorSuite
+from .fusion.sensors import WavefrontSensor as WavefrontSensor
 from .loop_hardware import LoopHardware as LoopHardware
 from .mirror.position_loop import PositionLoop as PositionLoop
 from .mirror.position_loop import StepResponse as StepResponse

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -153,7 +154,8 @@ class FusedFilter(Design):
         """Compute the certificate again: the filter, its claims, its loop and its fall-backs."""
         problem, period = self.problem, self.problem.period
         certificate = certify_error(
-            problem.error_system(self.gains).lifted(), stability="spectral radius over a period"
+            problem.error_system(self.gains).lifted_compactly(),
+            stability="spectral radius over a period",
         )
         checks = list(certificate.checks)
         if checks[0].passed:
@@ -161,30 +163,25 @@ class FusedFilter(Design):
                 checks.append(_least_variance_check(problem, self.gains))
             else:
                 checks += self._bound_checks(certificate)
-        loop = self.loop().system.radius_per_frame
-        checks.append(_stable("spectral radius of the closed loop", loop))
+        checks.append(_stable("spectral radius of the closed loop", self.loop()))
         checks += self._fallback_checks()
-        shape = (period, len(problem.L))
-        rms = certificate.rms_per_output
-        rms = (
-            np.sqrt(np.mean(rms.reshape(shape) ** 2, axis=0)) if rms.size == np.prod(shape) else rms
-        )
+        powers = certificate.rms_per_output.reshape(-1, len(problem.L)) ** 2
+        rms = np.sqrt(powers.sum(axis=0) / period)
         return replace(certificate, checks=tuple(checks), rms_per_output=rms)
 
     def _fallback_checks(self) -> list[Check]:
         """Check all fall-backs: the worst radius and the gains that are furthest from the least."""
         if not self.fallbacks:
             return []
+        problem, name = self.problem, "spectral radius of any loop with sensors missing"
         radii, apart = [], []
         for each in self.fallbacks:
-            loop = failed_loop(self.problem, each.gains, each.missing)
-            radii.append(
-                _stable(
-                    "spectral radius of any loop with sensors missing", loop.system.radius_per_frame
-                )
-            )
-            apart.append(_least_variance_check(self.problem, each.gains, each.missing))
-        return [max(checks, key=lambda check: check.value) for checks in (radii, apart)]
+            radii.append(_stable(name, failed_loop(problem, each.gains, each.missing)))
+            apart.append(_least_variance_check(problem, each.gains, each.missing))
+        return [
+            max(checks, key=lambda check: (not check.passed, check.value))
+            for checks in (radii, apart)
+        ]
 
     def _bound_checks(self, certificate: Certificate) -> list[Check]:
         limit = (self.gamma_requested or 0.0) * (1 + NORM_TOLERANCE)
@@ -205,12 +202,13 @@ class FusedFilter(Design):
         return checks
 
 
-def _stable(name: str, radius: float) -> Check:
-    return Check(name, radius, 1 - STABILITY_MARGIN, "eigenvalues of the monodromy, per frame")
+def _stable(name: str, loop: FusedLoop) -> Check:
+    how = "eigenvalues of the monodromy, per frame"
+    return Check(name, loop.system.radius_per_frame, 1 - STABILITY_MARGIN, how)
 
 
 def _apart(own: FloatArray, other: FloatArray) -> float:
-    return float(np.linalg.norm(own - other) / max(np.linalg.norm(other), 1e-300))
+    return float(np.linalg.norm(own - other)) / max(float(np.linalg.norm(other)), 1e-300)
 
 
 def _least_variance_check(
@@ -273,6 +271,19 @@ def fused_kalman(plant: FusedPlant) -> FusedFilter:
         If the design or a fall-back does not pass its checks.
     ProblemError
         If there are more than six sensors and channels.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
+    >>> own = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=75, modes=1)
+    >>> second = lbt.models.WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
+    >>> plant = lbt.models.fused_plant(own, lbt.models.SensorSuite(sensors=(second,)))
+    >>> design = lbt.design.fused_kalman(plant)
+    >>> plant.period, [each.missing for each in design.fallbacks]
+    (4, [('wavefront',), ('truth',), ('wavefront', 'truth')])
+    >>> design.rms < lbt.kalman(own).rms
+    True
     """
     require_instance(plant, FusedPlant, "plant")
     return _design(plant, periodic_kalman(plant), "kalman")
@@ -302,13 +313,24 @@ def fused_hinf(
         If the bound is below the least gamma; the message names the least.
     SynthesisError
         As :func:`fused_kalman`.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
+    >>> own = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=75, modes=1)
+    >>> second = lbt.models.WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
+    >>> plant = lbt.models.fused_plant(own, lbt.models.SensorSuite(sensors=(second,)))
+    >>> design = lbt.design.fused_hinf(plant, gamma_ratio=1.1)
+    >>> design.gamma_least < design.gamma < design.gamma_requested
+    True
     """
     require_instance(plant, FusedPlant, "plant")
     gamma, gamma_ratio = checked_bounds(
         gamma, gamma_ratio, far_above="the filter is the Kalman filter"
     )
     start = periodic_kalman(plant)
-    upper = hinf_norm(plant.error_system(start.gains).lifted()).upper
+    upper = hinf_norm(plant.error_system(start.gains).lifted_compactly()).upper
     _, least = least_periodic_gamma(plant, start, upper)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
     require_reachable(requested, least)
@@ -323,7 +345,7 @@ def fused_hinf(
 
 
 def _design(
-    plant: FusedPlant, solution: PeriodicRiccati, method: str, **claims: float
+    plant: FusedPlant, solution: PeriodicRiccati, method: str, **claims: Any
 ) -> FusedFilter:
     design = FusedFilter(
         method=FUSED + method,

@@ -60,7 +60,9 @@ def rebuild_fused(record: DesignRecord) -> FusedFilter:
     stack = arrays["FALLBACKS"]
     if len(stack) != len(missing):
         raise ValueError(f"FALLBACKS must be {len(missing)} filters; got {len(stack)}")
-    claims = {k: number(meta[k], k, above=0) for k in _CLAIMS if meta.get(k) is not None}
+    claims: dict[str, Any] = {
+        k: number(meta[k], k, above=0) for k in _CLAIMS if meta.get(k) is not None
+    }
     return FusedFilter(
         **record.common(),
         **claims,
@@ -85,7 +87,7 @@ def _checked(gains: Any, plant: FusedPlant, name: str) -> Any:
 
 def _pack_sensor(sensor: Sensor) -> Meta:
     kind = next(kind for kind, cls in _KINDS.items() if isinstance(sensor, cls))
-    packed = {"kind": kind}
+    packed: Meta = {"kind": kind}
     for name, value in asdict(sensor).items():
         if value is not None:
             packed[name] = np.asarray(value).tolist() if name != "channels" else list(value)

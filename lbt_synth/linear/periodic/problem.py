@@ -70,10 +70,8 @@ class PeriodicProblem(PeriodicSystem):
             raise DimensionError(f"L must have {self.n_states} columns; got {L.shape}.")
         set_fields(self, L=frozen_copy(L), read=read_only(read.copy()))
         for t in range(self.period):
-            noise = self.D[t][read[t]]
-            if np.linalg.matrix_rank(
-                noise, tol=1e-9 * max(np.abs(noise).max(initial=0), 1e-300)
-            ) < len(noise):
+            noise = (self.D[t] / self._noise_sizes[t])[read[t]]
+            if np.linalg.matrix_rank(noise, tol=1e-9) < len(noise):
                 raise DefinitenessError(
                     f"D D' of the measurements read at phase {t} is singular. Every measurement "
                     "needs noise of its own: add a column to D."
@@ -109,20 +107,18 @@ class PeriodicProblem(PeriodicSystem):
             dt_s=self.dt_s,
         )
 
-    def lifted(self) -> EstimationProblem:
-        """Return the problem over a period: all its measurements at once, all its z in one error.
+    def lifted_problem(self) -> EstimationProblem:
+        """Return the problem over a period, its measurements in units of the noise of a reading.
 
         Its one-step predictor knows the measurements of whole periods only, so its covariance is
         that of this problem's filter at phase 0.
         """
-        (N, q, m), n = self.D.shape, self.n_states
-        system = PeriodicSystem(A=self.A, B=self.B, C=self.C, D=self.D, dt_s=self.dt_s).lifted()
-        rows = self.read.reshape(-1)
-        return EstimationProblem(
-            A=system.A,
-            B=system.B,
-            C=system.C[rows],
-            D=system.D[rows],
-            L=self.L,
-            dt_s=system.dt_s,
-        )
+        system, rows = self.lifted(), self.read.reshape(-1)
+        size = self._noise_sizes.reshape(-1, 1)[rows]
+        C, D = system.C[rows] / size, system.D[rows] / size
+        return EstimationProblem(A=system.A, B=system.B, C=C, D=D, L=self.L, dt_s=system.dt_s)
+
+    @property
+    def _noise_sizes(self) -> FloatArray:
+        """Noise of each reading (N, q, 1): measurements may have units of very different size."""
+        return np.asarray(np.maximum(np.linalg.norm(self.D, axis=2, keepdims=True), 1e-300))

@@ -8,14 +8,18 @@ the period then gives the solution of every phase. Nothing grows with the period
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.batched import symmetrise
+from lbt_synth.linear.estimation_problem import EstimationProblem
+from lbt_synth.linear.matrix_functions import is_stable
 from lbt_synth.linear.periodic.problem import PeriodicProblem
 from lbt_synth.linear.riccati.filtering import require_detectable
 from lbt_synth.linear.riccati.routes import doubling
+from lbt_synth.linear.riccati.solvability import weight_root
 from lbt_synth.validation import FloatArray, frozen_copy
 
 _NEWTON_STEPS = 6
@@ -57,12 +61,9 @@ def join_triples(first: Triple, then: Triple) -> Triple:
     return left @ A1, symmetrise(G1 + A1.T @ right), symmetrise(H2 + left @ H1 @ A2.T)
 
 
-def fixed_point(triples: list[Triple]) -> FloatArray:
-    """Return the stabilising solution at phase 0 of a period of triples; nan if there is none."""
-    whole = triples[0]
-    for triple in triples[1:]:
-        whole = join_triples(whole, triple)
-    A, G, H = whole
+def fixed_point(triple: Triple) -> FloatArray:
+    """Return the stabilising solution of the recursion of a triple; nan if there is none."""
+    A, G, H = triple
     with np.errstate(all="ignore"):
         return np.asarray(doubling(A.T[None], G[None], H[None])[0][0])
 
@@ -97,23 +98,25 @@ def periodic_kalman(problem: PeriodicProblem) -> PeriodicRiccati:
     >>> round(float(periodic_kalman(walk).P[0, 0, 0]), 9)
     1.618033989
     """
-    require_detectable(problem.lifted())
-    P = fixed_point([_kalman_triple(problem, t) for t in range(problem.period)])
+    whole = reduce(join_triples, (_kalman_triple(problem, t) for t in range(problem.period)))
+    require_detectable(_problem_of_triple(whole))
+    P = fixed_point(whole)
     if not np.isfinite(P).all():
         raise NumericalError(
             "the periodic Riccati equation was not solved: the doubling did not converge. Scale "
             "the states to similar sizes.",
             status="doubling",
         )
-    covariances, gains, change = _sweep(problem, P), None, np.inf
-    for step in range(_NEWTON_STEPS):
+    covariances, change, steps = _sweep(problem, P), np.inf, 0
+    gains = np.zeros((problem.period, problem.n_states, problem.n_measurements))
+    while steps < _NEWTON_STEPS:
         gains = np.stack([kalman_gain(problem, t, P) for t, P in enumerate(covariances)])
         error = problem.error_system(gains)
         if not error.spectral_radius < 1:
             break
         refined = error.covariances()
         last, change = change, _relative(refined - covariances, refined)
-        covariances = refined
+        covariances, steps = refined, steps + 1
         if change < _SETTLED or change > last / 2:
             break
     if change > _CLOSED:
@@ -124,7 +127,7 @@ def periodic_kalman(problem: PeriodicProblem) -> PeriodicRiccati:
             residual=change,
         )
     return PeriodicRiccati(
-        P=frozen_copy(covariances), gains=frozen_copy(gains), residual=change, steps=step + 1
+        P=frozen_copy(covariances), gains=frozen_copy(gains), residual=change, steps=steps
     )
 
 
@@ -160,8 +163,16 @@ def _kalman_triple(problem: PeriodicProblem, t: int) -> Triple:
     return A_s, symmetrise(C.T @ np.linalg.solve(R, C)), B_s @ B_s.T
 
 
+def _problem_of_triple(triple: Triple) -> EstimationProblem:
+    """Return a problem of one rate whose Kalman recursion is that of a triple."""
+    A, G, H = triple
+    zero, identity = np.zeros_like(A), np.eye(len(A))
+    B, D = np.hstack([weight_root(H), zero]), np.hstack([zero, identity])
+    return EstimationProblem(A=A, B=B, C=weight_root(G).T, D=D, L=identity)
+
+
 def _relative(difference: FloatArray, whole: FloatArray) -> float:
-    return float(np.linalg.norm(difference) / max(np.linalg.norm(whole), 1e-300))
+    return float(np.linalg.norm(difference)) / max(float(np.linalg.norm(whole)), 1e-300)
 
 
 def periodic_hinf(
@@ -197,11 +208,13 @@ def periodic_hinf(
     >>> periodic_hinf(walk, 1.4, start) is None, periodic_hinf(walk, 1.5, start) is None
     (True, False)
     """
-    steps = [_ExcessStep.of(problem, t, gamma, start.P[t]) for t in range(problem.period)]
-    triples = [step.triple for step in steps if step is not None]
-    if len(triples) < problem.period:
-        return None
-    X = fixed_point(triples)
+    triples = []
+    for t in range(problem.period):
+        triple = _excess_triple(problem, t, gamma, start.P[t])
+        if triple is None:
+            return None
+        triples.append(triple)
+    X = fixed_point(reduce(join_triples, triples))
     L, identity = problem.L, np.eye(problem.n_states)
     P, gains = np.empty_like(problem.A), np.zeros_like(start.gains)
     transition = identity
@@ -217,37 +230,29 @@ def periodic_hinf(
         onward = np.linalg.solve((identity + X @ G1).T, A1.T).T
         transition = onward @ transition
         X = symmetrise(onward @ X @ A1.T + H1)
-    if not np.max(np.abs(np.linalg.eigvals(transition))) < 1:
-        return None
-    if not problem.error_system(gains).spectral_radius < 1:
+    if not is_stable(transition) or not problem.error_system(gains).spectral_radius < 1:
         return None
     residual = _relative(start.P[0] + X - P[0], P[0])
     return PeriodicRiccati(P=frozen_copy(P), gains=frozen_copy(gains), residual=residual, steps=0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ExcessStep:
-    """One sample of the recursion of the excess over the Kalman covariance."""
+def _excess_triple(problem: PeriodicProblem, t: int, gamma: float, P: FloatArray) -> Triple | None:
+    """Return one sample of the recursion of the excess over the Kalman covariance.
 
-    triple: Triple
-
-    @classmethod
-    def of(
-        cls, problem: PeriodicProblem, t: int, gamma: float, P: FloatArray
-    ) -> _ExcessStep | None:
-        """Return the sample; None where the level is not met even by the filtered estimate."""
-        L, (A, information, _) = problem.L, _kalman_triple(problem, t)
-        keep = np.linalg.solve(np.eye(len(A)) + P @ information, np.eye(len(A)))
-        filtered = symmetrise(keep @ P)
-        seen = L @ filtered
-        room = np.eye(len(L)) - seen @ L.T / gamma**2
-        if np.linalg.eigvalsh(room)[0] <= 0:
-            return None
-        spread = np.linalg.solve(room, L) / gamma**2
-        widened = (np.eye(len(A)) + seen.T @ spread) @ keep
-        A1, G1 = A @ widened, (information - L.T @ L / gamma**2) @ widened
-        H1 = A @ (seen.T @ spread @ filtered) @ A.T
-        return cls((A1, symmetrise(G1), symmetrise(H1)))
+    None where the level is not met even by the filtered estimate.
+    """
+    L, (A, information, _) = problem.L, _kalman_triple(problem, t)
+    keep = np.linalg.solve(np.eye(len(A)) + P @ information, np.eye(len(A)))
+    filtered = symmetrise(keep @ P)
+    seen = L @ filtered
+    room = np.eye(len(L)) - seen @ L.T / gamma**2
+    if np.linalg.eigvalsh(room)[0] <= 0:
+        return None
+    spread = np.linalg.solve(room, L) / gamma**2
+    widened = (np.eye(len(A)) + seen.T @ spread) @ keep
+    A1, G1 = A @ widened, (information - L.T @ L / gamma**2) @ widened
+    H1 = A @ (seen.T @ spread @ filtered) @ A.T
+    return A1, symmetrise(G1), symmetrise(H1)
 
 
 def _central_gain(problem: PeriodicProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:

@@ -112,6 +112,15 @@ class PeriodicSystem:
             inputs[:, own] = self.B[t]
         return StateSpace(A=reach, B=inputs, C=C, D=D, dt_s=N * self.dt_s)
 
+    def lifted_compactly(self) -> StateSpace:
+        """Return the lifted system with its inputs turned so that few remain.
+
+        Norm and variances are the same, as white noise is turned to white noise.
+        """
+        system = self.lifted()
+        turned = np.linalg.qr(np.vstack([system.B, system.D]).T)[1].T
+        return replace(system, B=turned[: self.n_states], D=turned[self.n_states :])
+
     def covariances(self) -> FloatArray:
         """Return the stationary covariance of x at each phase, for white w of unit variance.
 
@@ -120,12 +129,14 @@ class PeriodicSystem:
         (N, n, n) ndarray
             Covariances; the system has to be stable.
         """
-        system = self.lifted()
-        out = np.empty_like(self.A)
-        P = stationary_covariance(system.A, system.B @ system.B.T)
+        drives = self.B @ self.B.transpose(0, 2, 1)
+        whole = np.zeros_like(drives[0])  # of what a period adds
+        for A, drive in zip(self.A, drives, strict=True):
+            whole = A @ whole @ A.T + drive
+        out, P = np.empty_like(self.A), stationary_covariance(self.monodromy, whole)
         for t in range(self.period):
             out[t] = P
-            P = self.A[t] @ P @ self.A[t].T + self.B[t] @ self.B[t].T
+            P = self.A[t] @ P @ self.A[t].T + drives[t]
         return out
 
     def output_covariances(self) -> FloatArray:
@@ -151,7 +162,7 @@ class PeriodicSystem:
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         (N, p, m), n = self.D.shape, self.n_states
-        # with w(k) = z^k, x(t) = reach x(0) + forced(t): solve for the x(0) that repeats as z^N x(0)
+        # with w(k) = z^k, a period takes x(0) to M x(0) + forced; it must be z^N x(0)
         forced = np.zeros((z.size, n, m), dtype=np.complex128)
         for t in range(N):
             forced = self.A[t] @ forced + self.B[t] * (z**t)[:, None, None]

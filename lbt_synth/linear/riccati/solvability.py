@@ -54,7 +54,7 @@ def unstable_hidden_mode(
 def require_stabilising(equations: Equations, index: int, name: str = "") -> None:
     """Raise if an equation has no stabilising solution for a reason that can be named."""
     A, B, Q, R, S = (getattr(equations, key)[index] for key in "ABQRS")
-    hidden = unstable_hidden_mode(A.T, B.T, drive=_root(Q))
+    hidden = unstable_hidden_mode(A.T, B.T, drive=weight_root(Q))
     if hidden is not None:
         raise DetectabilityError(
             f"{name}(A, B) must be stabilisable; the mode of A at {hidden:.6g} does not decay and "
@@ -71,7 +71,7 @@ def require_stabilising(equations: Equations, index: int, name: str = "") -> Non
         feedback = np.linalg.solve(R, S.T)
         weight = Q - S @ feedback
         hidden = unstable_hidden_mode(
-            A - B @ feedback, _root((weight + weight.T) / 2).T, drive=B, only_unit_circle=True
+            A - B @ feedback, weight_root((weight + weight.T) / 2).T, drive=B, only_unit_circle=True
         )
         if hidden is not None:
             raise DetectabilityError(
@@ -89,7 +89,7 @@ def require_stabilising(equations: Equations, index: int, name: str = "") -> Non
         )
 
 
-def _root(weight: FloatArray) -> FloatArray:
+def weight_root(weight: FloatArray) -> FloatArray:
     """Columns whose squares add up to the absolute value of a symmetric matrix."""
     values, vectors = np.linalg.eigh(weight)
     size = np.abs(values)

@@ -158,7 +158,7 @@ def _draw_others(
     """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q)."""
     parts = []
     moving = checked_motions(truth.motions, suite, len(motions))
-    for sensor in (*suite.wavefront, *suite.accelerometers):
+    for sensor in suite.ordered:
         factor = sensor.noise_factor(hardware.modes)
         drawn = rng.standard_normal((cases, frames, len(factor))) @ factor.T
         if isinstance(sensor, Accelerometer):

@@ -91,4 +91,4 @@ def _exposure_memory(
     C[:, -modes:] = exposure.response
     each = np.eye(modes)
     stack = np.broadcast_to(C, (period, *C.shape))
-    return np.kron(A, each), np.kron(B[:, :, None], each), stack
+    return np.asarray(np.kron(A, each)), np.asarray(np.kron(B[:, :, None], each)), stack

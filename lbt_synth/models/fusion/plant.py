@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.periodic.problem import PeriodicProblem
@@ -26,7 +25,7 @@ from lbt_synth.models.plant.parts import held_frames
 from lbt_synth.models.plant.tip_tilt import TipTiltPlant
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summarised, Summary, count_text
-from lbt_synth.validation import BoolArray, FloatArray
+from lbt_synth.validation import BoolArray, FloatArray, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,10 +64,7 @@ class FusedPlant(PeriodicProblem, Summarised):
 
     def unit_rows(self, units: tuple[str, ...]) -> BoolArray:
         """Return which measurements some sensors or channels give, (q,)."""
-        out = np.zeros(self.n_measurements, dtype=np.bool_)
-        for unit in units:
-            out[self.suite.rows(self.own.hardware)[unit]] = True
-        return out
+        return self.suite.marked(units, self.own.hardware)
 
     def controller(self, gains: FloatArray) -> PeriodicController:
         """Return the controller from all measurements to u(k), in new-state form.
@@ -149,10 +145,11 @@ def fused_plant(own: TipTiltPlant, suite: SensorSuite, motions: Motions = ()) ->
     >>> plant.period, plant.n_states, plant.n_measurements
     (1, 4, 2)
     """
+    require_instance(own, TipTiltPlant, "own")
+    require_instance(suite, SensorSuite, "suite")
     hardware = own.hardware
     motions = checked_motions(motions or ({},) * len(own.vibrations), suite, len(own.vibrations))
     period, n0 = suite.period(hardware), own.n_states
-    own.parts()  # refuses a plant that holds the memory of a filter
     # the plant's state is that of the frame in which u(k) acts: older readings by so many frames
     ahead = held_frames(hardware) - 1
     readings = _channel_readings(own, suite, motions, ahead)
@@ -171,14 +168,11 @@ def fused_plant(own: TipTiltPlant, suite: SensorSuite, motions: Motions = ()) ->
     C = np.zeros((period, q0 + q1 + q2, size))
     C[:, :q0, :n0], C[:, q0 : q0 + q1, n0 + lags :] = own.C, waiting.C
     C[:, q0 + q1 :, : n0 + lags] = readings.C
-    noises = [s.noise_factor(hardware.modes) for s in (*suite.wavefront, *suite.accelerometers)]
-    extra = block_diag(*noises)
-    drives = own.B.shape[1]
-    B = np.zeros((size, drives + len(extra)))
-    B[:n0, :drives] = own.B
-    D = np.zeros((q0 + q1 + q2, drives + len(extra)))
-    D[:q0, :drives], D[q0:, drives:] = own.D, extra
-    D[q0 + q1 :, : len(own.vibrations)] += readings.drive
+    noise = suite.noise_factor(own.parts().noise_factor, hardware.modes)
+    drives = own.B.shape[1] - q0
+    B, D = np.zeros((size, drives + len(noise))), np.zeros((len(noise), drives + len(noise)))
+    B[:n0, :drives], D[:, drives:] = own.B[:, :drives], noise
+    D[q0 + q1 :, : len(own.vibrations)] = readings.drive
     L = np.hstack([own.L, np.zeros((len(own.L), size - n0))])
     A_known, B_known, C_known, D_known = _known_part(own, corrections, q2)
     return FusedPlant(

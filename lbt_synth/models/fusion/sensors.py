@@ -13,18 +13,18 @@ from dataclasses import dataclass, field
 from typing import Annotated, TypeAlias
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.parts import noise_factor
 from lbt_synth.validation import (
+    BoolArray,
     FloatArray,
     Positive,
     check_fields,
     frozen_copy,
     matrix,
-    number,
-    real_array,
     set_fields,
 )
 
@@ -281,6 +281,11 @@ class SensorSuite:
         return tuple(s for s in self.sensors if isinstance(s, Accelerometer))
 
     @property
+    def ordered(self) -> tuple[Sensor, ...]:
+        """The sensors in the order of their measurements."""
+        return (*self.wavefront, *self.accelerometers)
+
+    @property
     def channels(self) -> tuple[str, ...]:
         """Names of all accelerometer channels."""
         return tuple(name for each in self.accelerometers for name in each.channels)
@@ -303,11 +308,26 @@ class SensorSuite:
         ends = np.cumsum([0, *sizes.values()]).tolist()
         return {name: slice(ends[i], ends[i + 1]) for i, name in enumerate(sizes)}
 
-    def read(self, hardware: LoopHardware) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+    def marked(self, units: tuple[str, ...], hardware: LoopHardware) -> BoolArray:
+        """Return which measurements some sensors or channels give, (q,)."""
+        rows = self.rows(hardware)
+        out = np.zeros(max(own.stop for own in rows.values()), dtype=np.bool_)
+        for unit in units:
+            if unit not in rows:
+                raise ProblemError(
+                    f"no sensor or channel is called {unit!r}; there are {', '.join(self.units)}."
+                )
+            out[rows[unit]] = True
+        return out
+
+    def noise_factor(self, own: FloatArray, modes: int) -> FloatArray:
+        """Return the square root of all noise, from that of the loop's own sensor, (q, q)."""
+        return np.asarray(block_diag(own, *(each.noise_factor(modes) for each in self.ordered)))
+
+    def read(self, hardware: LoopHardware) -> BoolArray:
         """Return which measurements are read in each frame of the common period, (N, q)."""
         rows, period = self.rows(hardware), self.period(hardware)
-        out = np.zeros((period, max(own.stop for own in rows.values())), dtype=np.bool_)
-        out[:, rows[OWN_SENSOR]] = True
+        out = np.tile(self.marked((OWN_SENSOR,), hardware), (period, 1))
         for sensor in self.sensors:
             for unit in sensor.units:
                 out[:: period_frames(sensor, hardware), rows[unit]] = True

@@ -1,0 +1,177 @@
+"""Loops of several sensors, run frame by frame from their equations, without the package's."""
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.signal import lfilter
+
+import lbt_synth as lbt
+from lbt_synth.models.fusion.plant import fused_plant
+from lbt_synth.models.fusion.sensors import Accelerometer, Motion, SensorSuite, WavefrontSensor
+
+RATE_HZ = 1000.0
+AIR = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=40, frame_rate_hz=RATE_HZ)
+LINES = (
+    lbt.Vibration(frequency_hz=60, damping=0.02, rms_nm=300, direction=(1, 0)),
+    lbt.Vibration(frequency_hz=95, damping=0.03, rms_nm=100, direction=(1, 1)),
+)
+MOTIONS = ({"m1": Motion(size=2.0), "m2": Motion(size=0.5, phase_deg=150)}, {"m2": Motion(size=1)})
+FAST = Accelerometer(
+    name="mirror",
+    rate_hz=RATE_HZ,
+    delay_frames=2,
+    channels=("m1", "m2"),
+    noise_m_s2=[[4e-6, 1e-6], [1e-6, 9e-6]],
+    highpass_hz=3.0,
+)
+SLOW = WavefrontSensor(
+    name="truth",
+    rate_hz=RATE_HZ / 4,
+    delay_frames=3,
+    noise_nm=[[16, 6], [6, 9]],
+    sensor_matrix=[[1.0, 0.2], [0.0, 0.9]],
+)
+
+
+def example_plant(sensors=(FAST, SLOW), *, lines=LINES, motions=MOTIONS, **changes):
+    """Return a plant of two modes at 1 kHz; only the channels of its sensors move."""
+    facts = {"turbulence": AIR, "noise_nm": 75.0, "delay_frames": 2} | changes
+    own = lbt.tip_tilt_plant(frame_rate_hz=RATE_HZ, vibrations=lines or None, **facts)
+    suite = SensorSuite(sensors=sensors)
+    moved = [{name: each[name] for name in each if name in suite.channels} for each in motions]
+    return fused_plant(own, suite, tuple(moved))
+
+
+def frames_per_reading(hardware, sensor):
+    """Return the frames of the loop between two readings."""
+    return round(hardware.frame_rate_hz / sensor.rate_hz)
+
+
+def age_frames(hardware, sensor):
+    """Return how long before a frame its reading began, by the definition of the delays."""
+    return sensor.delay_frames * frames_per_reading(hardware, sensor) - hardware.delay_frames + 1
+
+
+def held_mean(history, k, age, frames):
+    """Return the mean over ``frames`` frames from ``k - age`` on of a signal held in each frame."""
+    start, out = k - age, np.zeros_like(history[0])
+    for i in range(int(np.floor(start)), int(np.ceil(start + frames))):
+        share = min(i + 1, start + frames) - max(i, start)
+        if i >= 0 and share > 1e-9:
+            out = out + share * history[i]
+    return out / frames
+
+
+def acceleration(hardware, sensor, motion, frequency_hz, signal):
+    """Return what a channel reads in each frame of a vibration (frames, ...), in m/s^2."""
+    age, step = age_frames(hardware, sensor), 2 * np.pi * frequency_hz / hardware.frame_rate_hz
+    whole = int(np.floor(age + 1e-9))
+    factor = motion.size * np.exp(1j * (np.deg2rad(motion.phase_deg) - step * (age - whole)))
+    if sensor.highpass_hz:
+        factor = factor / (1 + sensor.highpass_hz / (1j * frequency_hz))
+    # two successive samples have this factor at the frequency of the vibration
+    turn = np.exp(-1j * step)
+    first, second = np.linalg.solve([[1, turn.real], [0, turn.imag]], [factor.real, factor.imag])
+    v = np.concatenate([np.zeros((whole + 3, *signal.shape[1:])), signal, 0 * signal[:1]])
+    bend = (v[2:] - 2 * v[1:-1] + v[:-2]) * hardware.frame_rate_hz**2 * 1e-9
+    k = np.arange(len(signal)) + whole + 2  # bend[i] is that at sample i + 1 of v
+    return first * bend[k - whole] + second * bend[k - whole - 1]
+
+
+def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=()):
+    """Return the residual (frames, runs, n) of a loop that starts at rest.
+
+    ``total`` is the phase (frames, runs, n), ``added`` what each reading has beside it: noise, and
+    the acceleration of channels (frames, runs, q). A reading that is not new is a large number.
+    """
+    hardware, suite = plant.own.hardware, plant.suite
+    taps, frames, runs = hardware.mirror_taps, *total.shape[:2]
+    rows = suite.rows(hardware)
+    sources = [("wavefront", hardware.sensor, 1.0, 1, sensor_gain)]
+    for sensor in suite.wavefront:
+        age, period = age_frames(hardware, sensor), frames_per_reading(hardware, sensor)
+        response = np.eye(hardware.modes) if sensor.sensor_matrix is None else sensor.sensor_matrix
+        sources.append((sensor.name, response, age, period, 1.0))
+    periods = dict.fromkeys(rows, 1)
+    for sensor in suite.sensors:
+        periods |= dict.fromkeys(sensor.units, frames_per_reading(hardware, sensor))
+    state = np.zeros((runs, controller.n_states))
+    command = np.zeros((frames, runs, hardware.n_commands))
+    residual = np.zeros_like(total)
+    for k in range(frames):
+        y = added[k].copy()
+        for name, response, age, period, gain in sources:
+            if k % period == 0:
+                y[:, rows[name]] += gain * held_mean(residual, k, age, period) @ response.T
+        for name, own in rows.items():
+            if name in blind:
+                y[:, own] = 0.0
+            if k % periods[name]:
+                y[:, own] = 1e9
+        now = controller.phase(k)
+        state = state @ now.A.T + y @ now.B.T
+        command[k] = state @ now.C.T + y @ now.D.T
+        correction = sum(taps[i] * command[k - i] for i in range(min(len(taps), k + 1)))
+        residual[k] = total[k] - correction @ hardware.influence.T
+    return residual
+
+
+def impulse(frames, runs, size, entries):
+    """Return a signal (frames, runs, size) of unit impulses: (run, frame, column) each."""
+    out = np.zeros((frames, runs, size))
+    for run, frame, column in entries:
+        out[frame, run, column] = 1.0
+    return out
+
+
+def simulated_covariances(plant, controller, *, frames=1000, **loop):
+    """Return the residual's covariances (n, n) by origin: turbulence, vibrations, noise.
+
+    White noise leaves the sum of the squares of what an impulse leaves, mean over the phases in
+    which it may come.
+    """
+    hardware, suite, N = plant.own.hardware, plant.suite, plant.period
+    n, rows = hardware.modes, suite.rows(hardware)
+    q = max(own.stop for own in rows.values())
+    begin = 4 * N if N > 1 else 8
+    length = begin + N + frames
+
+    def power(entries):
+        """Sum over the sources; entries(t) gives total (frames, n) and added (frames, q)."""
+        signals = [entries(begin + t) for t in range(N)]
+        total, added = (np.stack(part, axis=1) for part in zip(*signals, strict=True))
+        out = run_loop(plant, controller, total, added, **loop)
+        return np.einsum("fri,frj->ij", out, out) / N
+
+    def coloured(model, direction, motion, frequency_hz):
+        def entries(frame):
+            drive = np.zeros(length)
+            drive[frame] = model.driving_rms_nm
+            signal = lfilter([1.0], [1.0, *-np.asarray(model.coefficients)], drive)
+            added = np.zeros((length, q))
+            for sensor in suite.accelerometers:
+                for channel in motion.keys() & set(sensor.channels):
+                    own = acceleration(hardware, sensor, motion[channel], frequency_hz, signal)
+                    added[:, rows[channel].start] = own
+            return signal[:, None] * direction, added
+
+        return power(entries)
+
+    def noise(column):
+        def entries(frame):
+            added = np.zeros((length, q))
+            added[frame] = column
+            return np.zeros((length, n)), added
+
+        return power(entries)
+
+    turbulence = sum(
+        coloured(model, np.eye(n)[i], {}, 0.0) for i, model in enumerate(plant.own.turbulence)
+    )
+    vibration = sum(
+        coloured(line.ar_model(RATE_HZ), np.array(line.direction), motion, line.frequency_hz)
+        for line, motion in zip(plant.own.vibrations, plant.motions, strict=True)
+    )
+    factors = [plant.own.D[:, -hardware.n_measurements :]]
+    factors += [each.noise_factor(n) for each in suite.ordered]
+    columns = block_diag(*factors).T
+    return turbulence, vibration, sum(noise(column) for column in columns)
