@@ -8,6 +8,7 @@ import hypothesis
 import matplotlib as mpl
 import pytest
 from support.plants import LBT_YAML, lbt_axis_plant
+from support.several_sensors import write_config
 
 import lbt_synth as lbt
 
@@ -70,3 +71,21 @@ def cluster():
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as made:
         yield made
+
+
+@pytest.fixture(scope="session")
+def fused_config(tmp_path_factory):
+    """A loop of several sensors."""
+    return lbt.load_config(write_config(tmp_path_factory.mktemp("fused")))
+
+
+@pytest.fixture(scope="session")
+def fused(fused_config):
+    """Its Kalman filter."""
+    return fused_config.design("kalman")
+
+
+@pytest.fixture(scope="session")
+def fused_file(fused, tmp_path_factory):
+    """The gain file of that filter."""
+    return lbt.save_gain(tmp_path_factory.mktemp("fused_gain") / "fused.fits", fused)

@@ -9,13 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from lbt_synth.cli.display import choose_wavefront_unit
-from lbt_synth.cli.loop_inputs import given_options
+from lbt_synth.cli.loop_inputs import given_options, load_design
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
-from lbt_synth.files import Telemetry, load_gain, save_telemetry
+from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import Calibration, EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.interop.specula.simulation import summarise_run
@@ -59,7 +59,7 @@ def run(arguments: Namespace) -> Report:
     refuse_replacing(outputs, [arguments.config, arguments.gain])
     choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
-    design = load_gain(arguments.gain)
+    design = load_design(arguments.gain)
     setup.controller(design)  # refuses a filter of another loop before any work
     version = specula_version()
     make_directory(arguments.output)

@@ -12,6 +12,7 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
+from lbt_synth.linear import Controller
 from lbt_synth.models import Truth
 from lbt_synth.models.loop_hardware import loop_differences
 
@@ -21,13 +22,27 @@ def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
     return {name: value for name in names if (value := getattr(arguments, name)) is not None}
 
 
-def load_designs(paths: list[str]) -> dict[str, Design]:
+def load_design(path: str, *, several_sensors: bool = False) -> Design:
+    """Load a design; refuse one of several sensors unless the command takes it."""
+    design = load_gain(path)
+    if several_sensors or isinstance(design.controller, Controller):
+        return design
+    raise ProblemError(
+        f"{path} is a design of several sensors; this command takes designs of the loop's own "
+        "sensor alone. Try show, verify, limits, simulate, or export --for c."
+    )
+
+
+def load_designs(paths: list[str], *, several_sensors: bool = False) -> dict[str, Design]:
     """Load designs, named by the stems of their files or, where these repeat, by longer tails."""
     if len({Path(path).resolve() for path in paths}) != len(paths):
         raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
     stems = [printable(Path(path).stem) for path in paths]
     names = stems if len(set(stems)) == len(stems) else _distinct_tails(paths)
-    return {name: load_gain(path) for name, path in zip(names, paths, strict=True)}
+    return {
+        name: load_design(path, several_sensors=several_sensors)
+        for name, path in zip(names, paths, strict=True)
+    }
 
 
 def _distinct_tails(paths: list[str]) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.cli.display import choose_config_unit, choose_unit
+from lbt_synth.cli.loop_inputs import load_design
 from lbt_synth.cli.loop_records import load_series, record_imaging
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure
@@ -16,7 +17,6 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import load_gain
 from lbt_synth.identification import LoopRecord, require_length
 from lbt_synth.interop import rehearse
 from lbt_synth.loop import Imaging, Simulation, series_strehl
@@ -73,7 +73,7 @@ def run(arguments: Namespace) -> Report:
     given = [path for path in (arguments.gain, arguments.file) if path is not None]
     if arguments.output is not None:
         require_figure(arguments.output, inputs=given)
-    design = load_gain(arguments.gain)
+    design = load_design(arguments.gain)
     with show_spinner("rehearsing", quiet=arguments.json):
         series = _drawn(arguments, design) if arguments.file is None else _recorded(arguments)
         found = rehearse(

@@ -18,7 +18,10 @@ from support.shaping import shaped_design
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
+from lbt_synth.design.fusion.fused_filter import fused_hinf, fused_kalman
 from lbt_synth.files.gain_file.store import _READERS
+from lbt_synth.models.fusion.plant import fused_plant
+from lbt_synth.models.fusion.sensors import Accelerometer, Motion, SensorSuite, WavefrontSensor
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes
 
 ENDINGS = ("fits", "npz", "json")
@@ -54,6 +57,23 @@ def bare_problem():
     )
 
 
+def fused_original(*, bounded):
+    """A filter of a slow sensor and an accelerometer beside the loop's own sensor."""
+    slow = WavefrontSensor(name="slow", rate_hz=400, delay_frames=2, noise_nm=9.0)
+    shaken = Accelerometer(
+        name="mirror",
+        rate_hz=800,
+        delay_frames=1.5,
+        channels=("m1",),
+        noise_m_s2=2e-3,
+        highpass_hz=1.0,
+    )
+    own = odd_plant()
+    motions = ({"m1": Motion(size=2.0, phase_deg=20.0)},) * len(own.vibrations)
+    plant = fused_plant(own, SensorSuite(sensors=(slow, shaken)), motions)
+    return fused_hinf(plant, gamma_ratio=1.2) if bounded else fused_kalman(plant)
+
+
 ORIGINALS = {
     "kalman": lambda: lbt.kalman(odd_plant()),
     "full": lambda: lbt.kalman(odd_plant().full()),
@@ -64,6 +84,8 @@ ORIGINALS = {
     "lqg": lambda: lbt.lqg(slow_plant(2.0, shell(), modes=2), command_weight=0.01),
     "polytopic": lambda: lbt.design.polytopic(lbt_axis_plant(), half_width_hz=1.0),
     "shaped": shaped_design,
+    "fused": lambda: fused_original(bounded=False),
+    "fused_hinf": lambda: fused_original(bounded=True),
     "integrator": lambda: lbt.integrator(odd_plant().hardware, gain=0.3),
     "mirror": lambda: lbt.integrator(slow_plant(2.0, shell(), modes=2).hardware, gain=0.1),
 }

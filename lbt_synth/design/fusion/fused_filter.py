@@ -37,7 +37,11 @@ from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.validation import ComplexArray, FloatArray, require_instance, set_fields
 
-FUSED = "fused "  # before the name of the method, in the name of its designs
+
+
+def fused_name(*, bounded: bool) -> str:
+    """Return ``Design.method`` of a filter of several sensors, with or without a bound."""
+    return "fused hinf" if bounded else "fused kalman"
 
 
 @table_row
@@ -286,7 +290,7 @@ def fused_kalman(plant: FusedPlant) -> FusedFilter:
     True
     """
     require_instance(plant, FusedPlant, "plant")
-    return _design(plant, periodic_kalman(plant), "kalman")
+    return _design(plant, periodic_kalman(plant))
 
 
 def fused_hinf(
@@ -341,14 +345,14 @@ def fused_hinf(
             "Try a larger gamma.",
             gamma=requested,
         )
-    return _design(plant, found, "hinf", gamma_requested=max(requested, least), gamma_least=least)
+    return _design(plant, found, gamma_requested=max(requested, least), gamma_least=least)
 
 
 def _design(
-    plant: FusedPlant, solution: PeriodicRiccati, method: str, **claims: Any
+    plant: FusedPlant, solution: PeriodicRiccati, **claims: Any
 ) -> FusedFilter:
     design = FusedFilter(
-        method=FUSED + method,
+        method=fused_name(bounded=bool(claims)),
         certificate=UNCERTIFIED,
         solver=SolverReport(route="riccati", status="cyclic doubling", iterations=solution.steps),
         problem=plant,

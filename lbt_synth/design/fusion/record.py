@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design.fusion.failures import Fallback, failure_sets
-from lbt_synth.design.fusion.fused_filter import FusedFilter
+from lbt_synth.design.fusion.fused_filter import FusedFilter, fused_name
 from lbt_synth.design.record import DesignRecord, Meta, record_hardware, record_problem
 from lbt_synth.models.fusion.plant import FusedPlant, fused_plant
 from lbt_synth.models.fusion.sensors import (
@@ -63,6 +63,8 @@ def rebuild_fused(record: DesignRecord) -> FusedFilter:
     claims: dict[str, Any] = {
         k: number(meta[k], k, above=0) for k in _CLAIMS if meta.get(k) is not None
     }
+    if meta["method"] != fused_name(bounded="gamma_requested" in claims):
+        raise ValueError("the method must be that of its bound, or of none")
     return FusedFilter(
         **record.common(),
         **claims,

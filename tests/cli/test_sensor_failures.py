@@ -1,0 +1,96 @@
+"""The commands with a design of several sensors."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from support.commands import run
+from support.several_sensors import write_config
+
+from lbt_synth.cli.sensor_failures import parse_drop
+
+
+@pytest.fixture
+def config_file(tmp_path):
+    return write_config(tmp_path)
+
+
+def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, fused_file):
+    figure = tmp_path / "drops.png"
+    status, text, _ = run(
+        capsys,
+        *("simulate", config_file, fused_file, "--drop", "m2@0.5s", "-o", figure),
+        *("--drop", "wavefront@1s..1.2s", "--frames", 2000),
+    )
+    assert status == 0
+    assert "m2, wavefront" in text
+    assert figure.stat().st_size > 10_000
+
+
+def test_the_run_reaches_beyond_the_last_event(capsys, config_file, fused_file):
+    arguments = ("simulate", config_file, fused_file, "--drop", "m2@0.5s", "--cases", 1, "--json")
+    data = json.loads(run(capsys, *arguments)[1])
+    assert data["frames"] == 5500
+    assert [row["sensors"] for row in data["segments"]] == ["none", "m2"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--drop", "m3@1s"), "must be one of wavefront, slow, m1, m2"),
+        (("--drop", "m2"), "--drop takes SENSOR@START..END"),
+        (("--drop", "m2@1.2.3s"), "times in seconds"),
+        (("--drop", "m2@5s", "--frames", 1000), "--frames must reach beyond"),
+        (("--stroke", 100), "--stroke goes with"),
+        (("--telemetry", "t.fits"), "--telemetry goes with"),
+        (("--sensor-gain", 30), "must be stable"),
+    ],
+)
+def test_what_it_refuses(capsys, config_file, fused_file, arguments, said):
+    status, out, error = run(capsys, "simulate", config_file, fused_file, *arguments)
+    assert status != 0
+    assert out == ""
+    assert said in error
+
+
+def test_a_design_of_one_sensor_has_nothing_to_drop(capsys, config_file, gains):
+    status, _, error = run(capsys, "simulate", config_file, gains["kalman"], "--drop", "m2@1s")
+    assert status == 2
+    assert "--drop goes with a design of several sensors" in error
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("sigma",),
+        ("bode",),
+        ("step",),
+        ("rehearse", "--for", "c"),
+    ],
+)
+def test_commands_for_one_sensor_say_so(capsys, fused_file, command):
+    status, out, error = run(capsys, command[0], fused_file, *command[1:])
+    assert (status, out) == (2, "")
+    assert "is a design of several sensors" in error
+
+
+def test_show_prints_what_failures_do(capsys, fused_file):
+    status, text, _ = run(capsys, "show", fused_file)
+    assert status == 0
+    assert "When sensors fail" in text
+    assert "wavefront + slow + m1 + m2" in text
+    assert "of the loop's own sensor in the truth" in text
+
+
+def test_verify_and_limits_take_it(capsys, config_file, fused_file):
+    assert "verified" in run(capsys, "verify", fused_file)[1]
+    status, text, _ = run(capsys, "limits", config_file, fused_file)
+    assert status == 0
+    assert "fused" in text
+
+
+def test_what_a_drop_says():
+    drop = parse_drop("wavefront@20s..20.2s:frozen")
+    assert (drop.unit, drop.start_s, drop.end_s) == ("wavefront", 20, 20.2)
+    assert drop.reading == "frozen"

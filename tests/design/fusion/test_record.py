@@ -1,0 +1,91 @@
+"""Gain files of filters of several sensors: what they hold, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.errors import GainFileError
+from lbt_synth.storage.array_file import digest
+
+
+@pytest.mark.parametrize("ending", ["fits", "npz", "json"])
+def test_a_file_gives_the_design_back(fused, tmp_path, ending):
+    again = lbt.load_gain(lbt.save_gain(tmp_path / f"fused.{ending}", fused))
+    assert np.array_equal(again.gains, fused.gains)
+    assert again.problem.suite.units == fused.problem.suite.units
+    assert again.certificate.passed
+    assert [f.missing for f in again.fallbacks] == [f.missing for f in fused.fallbacks]
+    assert again.rms == pytest.approx(fused.rms, rel=1e-9)
+
+
+def test_an_h_infinity_filter_too(fused_config, tmp_path):
+    design = fused_config.design("hinf", gamma_ratio=1.3)
+    again = lbt.load_gain(lbt.save_gain(tmp_path / "fused.json", design))
+    assert again.gamma <= again.gamma_requested * (1 + 1e-6)
+    assert again.gamma_requested == pytest.approx(1.3 * again.gamma_least, rel=1e-9)
+
+
+def altered(path, change):
+    """A JSON gain file with its content changed, and its digest written again."""
+    document = json.loads(path.read_text())
+    change(document)
+    meta, arrays = document["meta"], {k: np.array(v) for k, v in document["arrays"].items()}
+    meta.pop("digest")
+    meta["digest"] = digest(arrays, meta)
+    path.write_text(json.dumps(document))
+    return path
+
+
+def scale_array(name):
+    def change(document):
+        document["arrays"][name] = (1.01 * np.array(document["arrays"][name])).tolist()
+
+    return change
+
+
+def set_meta(*keys, value):
+    def change(document):
+        place = document["meta"]
+        for key in keys[:-1]:
+            place = place[key]
+        place[keys[-1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        scale_array("GAINS"),
+        scale_array("FALLBACKS"),
+        scale_array("A"),
+        scale_array("PLANT_A"),
+        set_meta("sensors", 0, "noise_nm", value=10.0),
+        set_meta("sensors", 0, "delay_frames", value=3.0),
+        set_meta("sensors", 1, "highpass_hz", value=2.0),
+        set_meta("sensors", 1, "kind", value="thermometer"),
+        set_meta("motions", 0, "m1", "size", value=1.9),
+        set_meta("motions", 0, value={}),
+        set_meta("fallbacks", 0, value=["m1"]),
+        set_meta("vibrations", 0, "frequency_hz", value=21.0),
+        set_meta("frame_rate_hz", value=999.0),
+        set_meta("method", value="fused hinf"),
+    ],
+)
+def test_an_altered_file_is_refused(fused, tmp_path, change):
+    path = lbt.save_gain(tmp_path / "fused.json", fused)
+    with pytest.raises(GainFileError):
+        lbt.load_gain(altered(path, change))
+
+
+def test_gains_of_readings_that_are_not_due_are_refused(fused, tmp_path):
+    def change(document):
+        document["arrays"]["GAINS"][1][0][2] = 1e-3  # the slow sensor is not read at phase 1
+
+    path = lbt.save_gain(tmp_path / "fused.json", fused)
+    with pytest.raises(GainFileError, match="not read"):
+        lbt.load_gain(altered(path, change))
