@@ -9,10 +9,10 @@ from lbt_synth.models.fusion.plant import fused_plant
 from lbt_synth.models.fusion.sensors import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 RATE_HZ = 1000.0
-AIR = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=40, frame_rate_hz=RATE_HZ)
+AIR = lbt.models.ARModel(coefficients=[0.95], driving_rms_nm=60, frame_rate_hz=RATE_HZ)
 LINES = (
-    lbt.Vibration(frequency_hz=60, damping=0.02, rms_nm=300, direction=(1, 0)),
-    lbt.Vibration(frequency_hz=95, damping=0.03, rms_nm=100, direction=(1, 1)),
+    lbt.Vibration(frequency_hz=60, damping=0.1, rms_nm=300, direction=(1, 0)),
+    lbt.Vibration(frequency_hz=95, damping=0.08, rms_nm=100, direction=(1, 1)),
 )
 MOTIONS = ({"m1": Motion(size=2.0), "m2": Motion(size=0.5, phase_deg=150)}, {"m2": Motion(size=1)})
 FAST = Accelerometer(
@@ -123,55 +123,46 @@ def impulse(frames, runs, size, entries):
     return out
 
 
-def simulated_covariances(plant, controller, *, frames=1000, **loop):
+def simulated_covariances(plant, controller, *, frames=300, **loop):
     """Return the residual's covariances (n, n) by origin: turbulence, vibrations, noise.
 
     White noise leaves the sum of the squares of what an impulse leaves, mean over the phases in
-    which it may come.
+    which it may come. All impulses run side by side.
     """
     hardware, suite, N = plant.own.hardware, plant.suite, plant.period
     n, rows = hardware.modes, suite.rows(hardware)
     q = max(own.stop for own in rows.values())
     begin = 4 * N if N > 1 else 8
-    length = begin + N + frames
+    total, added, origins = [], [], []
 
-    def power(entries):
-        """Sum over the sources; entries(t) gives total (frames, n) and added (frames, q)."""
-        signals = [entries(begin + t) for t in range(N)]
-        total, added = (np.stack(part, axis=1) for part in zip(*signals, strict=True))
-        out = run_loop(plant, controller, total, added, **loop)
-        return np.einsum("fri,frj->ij", out, out) / N
-
-    def coloured(model, direction, motion, frequency_hz):
-        def entries(frame):
-            drive = np.zeros(length)
-            drive[frame] = model.driving_rms_nm
-            signal = lfilter([1.0], [1.0, *-np.asarray(model.coefficients)], drive)
-            added = np.zeros((length, q))
+    def drive(origin, model, direction, motion, frequency_hz):
+        for t in range(N):
+            white = np.zeros(begin + N + frames)
+            white[begin + t] = model.driving_rms_nm
+            signal = lfilter([1.0], [1.0, *-np.asarray(model.coefficients)], white)
+            read = np.zeros((len(white), q))
             for sensor in suite.accelerometers:
                 for channel in motion.keys() & set(sensor.channels):
                     own = acceleration(hardware, sensor, motion[channel], frequency_hz, signal)
-                    added[:, rows[channel].start] = own
-            return signal[:, None] * direction, added
+                    read[:, rows[channel].start] = own
+            total.append(signal[:, None] * direction)
+            added.append(read)
+            origins.append(origin)
 
-        return power(entries)
-
-    def noise(column):
-        def entries(frame):
-            added = np.zeros((length, q))
-            added[frame] = column
-            return np.zeros((length, n)), added
-
-        return power(entries)
-
-    turbulence = sum(
-        coloured(model, np.eye(n)[i], {}, 0.0) for i, model in enumerate(plant.own.turbulence)
-    )
-    vibration = sum(
-        coloured(line.ar_model(RATE_HZ), np.array(line.direction), motion, line.frequency_hz)
-        for line, motion in zip(plant.own.vibrations, plant.motions, strict=True)
-    )
+    for mode, model in enumerate(plant.own.turbulence):
+        drive(0, model, np.eye(n)[mode], {}, 0.0)
+    for line, motion in zip(plant.own.vibrations, plant.motions, strict=True):
+        model, direction = line.ar_model(RATE_HZ), np.array(line.direction)
+        drive(1, model, direction, motion, line.frequency_hz)
     factors = [plant.own.D[:, -hardware.n_measurements :]]
     factors += [each.noise_factor(n) for each in suite.ordered]
-    columns = block_diag(*factors).T
-    return turbulence, vibration, sum(noise(column) for column in columns)
+    for column in block_diag(*factors).T:
+        for t in range(N):
+            read = np.zeros((begin + N + frames, q))
+            read[begin + t] = column
+            total.append(np.zeros((len(read), n)))
+            added.append(read)
+            origins.append(2)
+    left = run_loop(plant, controller, np.stack(total, axis=1), np.stack(added, axis=1), **loop)
+    powers = np.einsum("fri,frj->rij", left, left) / N
+    return [powers[np.array(origins) == origin].sum(axis=0) for origin in range(3)]

@@ -235,20 +235,20 @@ def _least_variance_check(
 def stable_gains(stable: Callable[[float], bool]) -> tuple[float, float]:
     """Return the interval of sensor gains around 1 at which a loop is stable, to 1e-4.
 
-    A loop that is stable down to a gain of 0.001 counts as stable from 0.
+    Its ends are 0 and inf where it reaches beyond a factor of 1000.
     """
     ends = []
-    for factor, far in ((0.8, 1e-3), (1.25, 1e3)):
+    for factor, open_end in ((0.8, 0.0), (1.25, np.inf)):
         inside, outside = 1.0, factor
-        while stable(outside):
+        while 1e-3 < outside < 1e3 and stable(outside):
             inside, outside = outside, outside * factor
-            if (outside < far) if factor < 1 else (outside > far):
-                break
-        else:
-            while abs(outside - inside) > 1e-4 * inside:
-                middle = (inside + outside) / 2
-                inside, outside = (middle, outside) if stable(middle) else (inside, middle)
-        ends.append(inside if inside > 2e-3 else 0.0)
+        if not 1e-3 < outside < 1e3:
+            ends.append(open_end)
+            continue
+        while abs(outside - inside) > 1e-4 * inside:
+            middle = (inside + outside) / 2
+            inside, outside = (middle, outside) if stable(middle) else (inside, middle)
+        ends.append(inside)
     return ends[0], ends[1]
 
 

@@ -1,0 +1,79 @@
+"""Loops in which sensors fail, against runs in which they read zero."""
+
+import numpy as np
+import pytest
+from support.fused_loops import FAST, SLOW, example_plant, simulated_covariances
+
+from lbt_synth.design import failure_rows
+from lbt_synth.design.fusion.failures import (
+    failed_loop,
+    failure_sets,
+    fallback_gains,
+    make_fallbacks,
+)
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import periodic_kalman
+
+
+def test_every_set_of_sensors_may_fail():
+    assert failure_sets(("a", "b", "c")) == [
+        ("a",),
+        ("b",),
+        ("c",),
+        ("a", "b"),
+        ("a", "c"),
+        ("b", "c"),
+        ("a", "b", "c"),
+    ]
+    with pytest.raises(ProblemError, match="there may be 6; got 7: a, b, c, d, e, f, g"):
+        failure_sets(tuple("abcdefg"))
+
+
+def test_rows_are_what_runs_leave():
+    plant = example_plant((FAST, SLOW))
+    gains, fallbacks = periodic_kalman(plant).gains, make_fallbacks(plant)
+    rows = failure_rows(plant, gains, fallbacks)
+    assert " ".join(row.missing for row in rows[:5]) == "wavefront m1 m2 truth wavefront + m1"
+    for row, fallback in zip(rows[:4], fallbacks, strict=False):
+        pairs = [(fallback.gains, row.fallback_nm)]
+        if not row.must_switch:
+            pairs.append((gains, row.unseen_nm))
+        for used, residual_nm in pairs:
+            left = simulated_covariances(plant, plant.controller(used), blind=fallback.missing)
+            assert residual_nm == pytest.approx(np.sqrt(np.trace(sum(left))), rel=1e-7)
+            assert row.fallback_nm <= residual_nm * (1 + 1e-9)
+
+
+def test_what_is_missing_is_not_used():
+    plant = example_plant((FAST, SLOW))
+    gains = fallback_gains(plant, ("m1", "truth"))
+    marked = plant.unit_rows(("m1", "truth"))
+    assert not gains[:, :, marked].any()
+    assert gains[:, :, ~marked].any()
+    alone = example_plant((FAST,))  # nothing but the other sensors
+    assert fallback_gains(plant, ("truth",))[0][: alone.n_states, :2] == pytest.approx(
+        periodic_kalman(alone).gains[0][:, :2], rel=1e-7, abs=1e-9
+    )
+
+
+def test_without_any_reading_the_mirror_stays():
+    plant = example_plant((SLOW,))
+    gains = fallback_gains(plant, plant.suite.units)
+    assert not gains.any()
+    loop = failed_loop(plant, gains, plant.suite.units)
+    assert loop.is_stable
+    row = failure_rows(plant, gains, make_fallbacks(plant)[-1:])[0]
+    powers = [line.rms_nm**2 for line in plant.own.vibrations]
+    powers += [model.rms_nm**2 for model in plant.own.turbulence]
+    assert row.fallback_nm == pytest.approx(np.sqrt(sum(powers)), rel=1e-6)
+
+
+def test_a_failure_that_must_be_seen():
+    # the estimator of an unstable controller believes readings of zero
+    plant = example_plant((SLOW,), noise_nm=15)
+    rows = failure_rows(plant, periodic_kalman(plant).gains, make_fallbacks(plant))
+    for row in rows:
+        assert row.must_switch == (row.unseen_radius >= 1)
+        assert (row.unseen_nm is None) == row.must_switch
+        assert row.fallback_radius < 1
+    assert [row.must_switch for row in rows] == [True, False, True]

@@ -1,0 +1,156 @@
+"""Certified filters of several sensors, and claims that their certificates refuse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.fused_loops import FAST, SLOW, example_plant
+
+import lbt_synth as lbt
+from lbt_synth.design import fused_hinf, fused_kalman
+from lbt_synth.design.fusion.fused_filter import stable_gains
+from lbt_synth.errors import CertificateError, InfeasibleError, LbtSynthError, ProblemError
+from lbt_synth.models import Accelerometer, WavefrontSensor
+
+
+@pytest.fixture(scope="module")
+def kalman():
+    return fused_kalman(example_plant((FAST, SLOW)))
+
+
+@pytest.fixture(scope="module")
+def hinf():
+    return fused_hinf(example_plant((SLOW,)), gamma_ratio=1.1)
+
+
+def failed(design):
+    """Return the names of the checks that a design fails."""
+    return {check.name for check in design.recertify().checks if not check.passed}
+
+
+def test_a_certified_filter(kalman):
+    assert kalman.certificate.passed
+    plant = kalman.problem
+    P = lbt.linear.periodic_kalman(plant).P
+    per_output = np.mean([np.diag(plant.L @ one @ plant.L.T) for one in P], axis=0)
+    np.testing.assert_allclose(kalman.certificate.rms_per_output**2, per_output, rtol=1e-9)
+    assert kalman.rms == pytest.approx(np.sqrt(per_output.sum()))
+    assert kalman.gamma > kalman.rms / np.sqrt(2)
+    assert kalman.method == "fused kalman"
+    assert len(kalman.fallbacks) == 15
+    assert np.abs(kalman.poles).max() < 1
+
+
+def test_each_sensor_helps(kalman):
+    alone = lbt.kalman(kalman.problem.own).rms
+    two = fused_kalman(example_plant((FAST,))).rms
+    assert kalman.rms < two < alone
+
+
+def test_gains_that_are_not_the_least(kalman):
+    worse = replace(kalman, gains=1.001 * kalman.gains)
+    assert failed(worse) == {"distance from the least-variance gains"}
+    assert "spectral radius over a period" in failed(replace(kalman, gains=3 * kalman.gains))
+
+
+def test_a_fallback_that_is_not_the_least(kalman):
+    first, *others = kalman.fallbacks
+    for gains in (1.001 * first.gains, kalman.gains):
+        design = replace(kalman, fallbacks=(replace(first, gains=gains), *others))
+        assert failed(design) == {"distance from the least-variance gains of any fall-back"}
+    last = replace(kalman.fallbacks[-1], gains=1e-3 * kalman.gains)
+    assert failed(replace(kalman, fallbacks=(*kalman.fallbacks[:-1], last)))
+
+
+def test_a_fallback_that_diverges(kalman):
+    first, *others = kalman.fallbacks
+    design = replace(kalman, fallbacks=(replace(first, gains=20 * first.gains), *others))
+    assert failed(design) >= {"spectral radius of any loop with sensors missing"}
+
+
+def test_an_hinf_filter(hinf):
+    assert hinf.certificate.passed
+    assert hinf.gamma_requested == pytest.approx(1.1 * hinf.gamma_least)
+    assert hinf.gamma_least < hinf.gamma < hinf.gamma_requested
+    kalman = fused_kalman(hinf.problem)
+    assert kalman.rms < hinf.rms
+    assert hinf.gamma < kalman.gamma
+    assert fused_hinf(hinf.problem, gamma=hinf.gamma_requested).gains == pytest.approx(hinf.gains)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_least_gamma_that_is_wrong(hinf, factor):
+    design = replace(hinf, gamma_least=factor * hinf.gamma_least)
+    assert failed(design) == {"least norm of any filter, error"}
+
+
+def test_a_bound_that_is_not_met(hinf):
+    found = failed(replace(hinf, gamma_requested=0.99 * hinf.gamma))
+    assert found == {"norm of the estimation error", "distance from its Riccati filter"}
+    kalman = lbt.linear.periodic_kalman(hinf.problem).gains
+    assert "distance from its Riccati filter" in failed(replace(hinf, gains=kalman))
+
+
+def test_a_design_that_fails_is_not_returned(monkeypatch):
+    from lbt_synth.design.fusion import fused_filter
+
+    solve = fused_filter.periodic_kalman
+    monkeypatch.setattr(
+        fused_filter,
+        "periodic_kalman",
+        lambda plant: replace(solve(plant), gains=1.01 * solve(plant).gains),
+    )
+    with pytest.raises(CertificateError, match="failed its certificate"):
+        fused_kalman(example_plant((SLOW,)))
+
+
+def test_the_loop_of_one_rate_is_that_of_the_filter():
+    fast = WavefrontSensor(name="other", rate_hz=1000, delay_frames=2, noise_nm=1e7)
+    design = fused_kalman(example_plant((fast,)))
+    alone = lbt.kalman(design.problem.own)
+    hardware = design.loop_hardware
+    loop = lbt.close_loop(hardware, alone)
+    assert design.rms == pytest.approx(alone.rms, rel=1e-6)
+    facts = design.facts()
+    assert facts.loop_radius == pytest.approx(loop.spectral_radius, rel=1e-6)
+    gains = lbt.loop.stable_sensor_gains(hardware, alone)
+    assert (facts.gain_low, facts.gain_high) == pytest.approx(gains, rel=1e-3, abs=2e-3)
+    assert design.close(hardware, sensor_gain=0.5).sensor_gain == 0.5
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.35, 1.9), (0.0, 1.2), (0.97, np.inf)])
+def test_intervals_of_stable_gains(low, high):
+    found = stable_gains(lambda gain: low < gain < high)
+    assert found == pytest.approx((low, high), rel=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: fused_kalman(example_plant().own), ProblemError, "plant must be a"),
+        (lambda: fused_hinf(example_plant().own), ProblemError, "plant must be a"),
+        (lambda: fused_hinf(example_plant((SLOW,)), gamma=1.0), InfeasibleError, "least"),
+        (lambda: fused_hinf(example_plant((SLOW,)), gamma_ratio=0.5), LbtSynthError, "gamma_ratio"),
+        (
+            lambda: fused_kalman(
+                example_plant(
+                    (
+                        Accelerometer(
+                            name="many",
+                            rate_hz=1000,
+                            delay_frames=2,
+                            channels=tuple("abcdef"),
+                            noise_m_s2=1e-3,
+                        ),
+                    ),
+                    motions=({}, {}),
+                )
+            ),
+            ProblemError,
+            "there may be 6; got 7",
+        ),
+    ],
+)
+def test_refusals(make, error, words):
+    with pytest.raises(error, match=words):
+        make()

@@ -1,0 +1,87 @@
+"""Plants of several sensors: what they hold, and where they are plants of one."""
+
+import numpy as np
+import pytest
+from support.fused_loops import AIR, FAST, LINES, SLOW, example_plant
+from support.periodic_problems import relative_distance
+
+import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models import Accelerometer, SensorSuite, fused_plant
+
+
+@pytest.mark.parametrize("delay", [1, 2, 2.4, 3])
+def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
+    fast = Accelerometer(
+        name="mirror", rate_hz=500, delay_frames=2, channels=("m1",), noise_m_s2=1.0
+    )
+    plant = example_plant((fast,), motions=({}, {}), delay_frames=delay)
+    alone, n = lbt.kalman(plant.own), plant.own.n_states
+    solution = lbt.linear.periodic_kalman(plant)
+    assert plant.period == 2
+    for P, gains in zip(solution.P, solution.gains, strict=True):
+        assert relative_distance(gains[:n, :2], alone.gain_predictor) < 1e-9
+        assert not gains[:, 2:].any()
+        power = np.trace(plant.L @ P @ plant.L.T)
+        assert power == pytest.approx(alone.rms**2, rel=1e-9)
+    # and so does its controller
+    own, fused = alone.controller, plant.controller(solution.gains)
+    y = np.random.default_rng(0).standard_normal((50, 3))
+    states, commands = [np.zeros(own.n_states), np.zeros(fused.n_states)], np.zeros((2, 50, 2))
+    for k in range(50):
+        for i, (c, used) in enumerate(((own, y[k, :2]), (fused.phase(k), y[k]))):
+            states[i] = c.A @ states[i] + c.B @ used
+            commands[i, k] = c.C @ states[i] + c.D @ used
+    np.testing.assert_allclose(commands[1], commands[0], atol=1e-9)
+
+
+def test_what_a_plant_holds():
+    plant = example_plant()
+    assert plant.period == 4
+    assert plant.n_measurements == 6
+    assert plant.unit_rows(("m2", "wavefront")).tolist() == [1, 1, 0, 0, 0, 1]
+    # two older samples of each line; a sum and two readings that wait, of two modes
+    assert plant.n_states == plant.own.n_states + 2 * 2 + 3 * 2
+    assert plant.n_known == 2 + 3 * 2
+    assert "4 sensors, period 4" in plant._brief()
+
+
+def test_an_accelerometer_without_an_age_sees_the_drive():
+    fast = Accelerometer(
+        name="mirror", rate_hz=1000, delay_frames=1, channels=("m1",), noise_m_s2=1e-3
+    )
+    plant = example_plant((fast,))
+    drive = plant.D[0, 2, 0]
+    rms = LINES[0].ar_model(1000).driving_rms_nm
+    assert drive == pytest.approx(2.0 * 1e-9 * 1e6 * rms)
+    assert (plant.B @ plant.D.transpose(0, 2, 1))[0, 0, 2] == pytest.approx(rms * drive)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: fused_plant(1, SensorSuite(sensors=(SLOW,))), ProblemError, "own must be a"),
+        (lambda: fused_plant(example_plant().own, (SLOW,)), ProblemError, "suite must be a"),
+        (
+            lambda: fused_plant(example_plant().own, SensorSuite(sensors=(FAST,)), ({},)),
+            DimensionError,
+            "one mapping per vibration",
+        ),
+        (lambda: example_plant().controller(np.zeros((1, 2, 3))), DimensionError, "gains must be"),
+        (lambda: example_plant().unit_rows(("m9",)), ProblemError, "called 'm9'"),
+        (
+            lambda: example_plant(delay_frames=4, sensors=(FAST,)),
+            ProblemError,
+            "at least that of the commands, 3 frames",
+        ),
+    ],
+)
+def test_refusals(make, error, words):
+    with pytest.raises(error, match=words):
+        make()
+
+
+def test_a_plant_of_turbulence_alone():
+    plant = example_plant((SLOW,), lines=(), motions=())
+    assert plant.own.turbulence == (AIR, AIR)
+    assert plant.n_measurements == 4

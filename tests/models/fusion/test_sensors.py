@@ -1,0 +1,163 @@
+"""Sensors beside the loop's own: ages, schedules, accelerations, refusals."""
+
+import numpy as np
+import pytest
+from support.fused_loops import FAST, SLOW, acceleration
+
+import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
+from lbt_synth.models import Accelerometer, LoopHardware, Motion, SensorSuite, WavefrontSensor
+from lbt_synth.models.fusion.sensors import acceleration_taps, checked_motions, period_frames
+
+PATH = LoopHardware(frame_rate_hz=1000, delay_frames=2, modes=2)
+
+
+def wavefront(**changes):
+    return WavefrontSensor(
+        **({"name": "truth", "rate_hz": 250, "delay_frames": 3, "noise_nm": 4.0} | changes)
+    )
+
+
+def accelerometer(**changes):
+    facts = {"name": "mirror", "rate_hz": 1000, "delay_frames": 2, "channels": ("m1", "m2")}
+    return Accelerometer(**(facts | {"noise_m_s2": 2e-4} | changes))
+
+
+@pytest.mark.parametrize("frequency_hz", [0.3, 20.0, 333.0, 480.0])
+@pytest.mark.parametrize("age", [0.0, 0.4, 1.0, 2.0, 3.75])
+@pytest.mark.parametrize("factor", [2.0, -1.0, 1j, 0.5 - 1.5j])
+def test_taps_have_the_factor_and_the_delay_at_the_line(frequency_hz, age, factor):
+    newest, taps = acceleration_taps(factor, frequency_hz, 1000.0, age)
+    angle = 2 * np.pi * frequency_hz / 1000
+    response = np.sum(taps * np.exp(-1j * angle * (newest + np.arange(len(taps)))))
+    second = -4e-9 * np.sin(angle / 2) ** 2 * 1000**2
+    expected = factor * second * np.exp(-1j * angle * age)
+    tolerance = 1e-9 * abs(expected) + 1e-15 * np.abs(taps).sum()
+    assert abs(response - expected) < tolerance
+    assert newest == int(age) - 1
+
+
+def test_a_slow_sinusoid_has_the_acceleration_of_physics():
+    newest, taps = acceleration_taps(1.0, 2.0, 1000.0, 0.0)
+    wave = 500 * np.cos(2 * np.pi * 2.0 * np.arange(-1, 2) / 1000)  # nm
+    assert newest == -1
+    assert taps @ wave == pytest.approx(-((2 * np.pi * 2) ** 2) * 500e-9, rel=1e-4)
+
+
+def test_the_support_of_these_tests_reads_the_same():
+    signal = np.random.default_rng(0).standard_normal(50)
+    motion = Motion(size=0.7, phase_deg=110)
+    factor = motion.factor * FAST.band(60.0)
+    newest, taps = acceleration_taps(factor, 60.0, 1000.0, FAST.age_frames(PATH))
+    read = acceleration(PATH, FAST, motion, 60.0, signal)
+    expected = np.convolve(signal, taps)[: len(signal) - newest]
+    np.testing.assert_allclose(read[10:], expected[10 - newest : len(read) - newest], rtol=1e-9)
+
+
+def test_the_high_pass_turns_and_weakens():
+    assert accelerometer(highpass_hz=20.0).band(20.0) == pytest.approx(0.5 + 0.5j)
+    assert accelerometer().band(20.0) == 1
+
+
+@pytest.mark.parametrize(
+    ("delay", "sensor", "age"),
+    [
+        (2, wavefront(), 11),
+        (2.5, wavefront(delay_frames=1.5), 4.5),
+        (1, wavefront(rate_hz=1000, delay_frames=1), 1),
+        (2, accelerometer(), 1),
+        (2, accelerometer(delay_frames=1), 0),
+        (3, accelerometer(rate_hz=500, delay_frames=1.25), 0.5),
+    ],
+)
+def test_ages(delay, sensor, age):
+    path = LoopHardware(frame_rate_hz=1000, delay_frames=delay, modes=2)
+    assert sensor.age_frames(path) == pytest.approx(age)
+
+
+def test_the_schedule_of_rates_that_do_not_divide_each_other():
+    suite = SensorSuite(
+        sensors=(accelerometer(rate_hz=1000 / 3), wavefront(rate_hz=50), SLOW_OTHER)
+    )
+    assert suite.period(PATH) == 60
+    assert suite.units == ("wavefront", "m1", "m2", "truth", "other")
+    assert {name: (own.start, own.stop) for name, own in suite.rows(PATH).items()} == {
+        "wavefront": (0, 2),
+        "truth": (2, 4),
+        "other": (4, 5),
+        "m1": (5, 6),
+        "m2": (6, 7),
+    }
+    read = suite.read(PATH)
+    assert read.shape == (60, 7)
+    assert np.flatnonzero(read[:, 2]).tolist() == [0, 20, 40]
+    assert np.flatnonzero(read[:, 5]).tolist() == list(range(0, 60, 3))
+    assert read[:, 0].all()
+    assert suite.marked(("m2", "truth"), PATH).tolist() == [0, 0, 1, 1, 0, 0, 1]
+
+
+SLOW_OTHER = wavefront(name="other", rate_hz=100, sensor_matrix=[[1.0, 1.0]])
+
+
+def test_the_noise_of_all_sensors():
+    suite = SensorSuite(sensors=(FAST, SLOW))
+    factor = suite.noise_factor(np.diag([15.0, 15.0]), 2)
+    covariance = factor @ factor.T
+    np.testing.assert_allclose(covariance[:2, :2], 225 * np.eye(2))
+    np.testing.assert_allclose(covariance[2:4, 2:4], SLOW.noise_nm)
+    np.testing.assert_allclose(covariance[4:, 4:], FAST.noise_m_s2)
+    assert not covariance[:2, 2:].any()
+    assert not covariance[2:4, 4:].any()
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Motion(size=0.0), "size"),
+        (lambda: wavefront(delay_frames=0.5), "delay_frames.* at least 1"),
+        (lambda: wavefront(rate_hz=-1), "rate_hz"),
+        (lambda: wavefront(noise_nm=0.0).noise_factor(2), "noise_nm.* positive|above 0"),
+        (lambda: accelerometer(channels=()), r"channels of mirror .* at least one; got \(\)"),
+        (lambda: accelerometer(channels=("m1", "m1")), "channels of mirror must be different"),
+        (lambda: wavefront(sensor_matrix=np.eye(3)).response(2), "must have 2 columns"),
+        (lambda: wavefront(delay_frames=1).age_frames(PATH), "at least 1.25 of its frames.*got 1"),
+        (
+            lambda: accelerometer(delay_frames=0.5).age_frames(PATH),
+            "delay of mirror must be at least that of the commands, 1 frames of the loop; got 0.5",
+        ),
+        (lambda: period_frames(wavefront(rate_hz=300), PATH), "whole multiple .*got 300 Hz"),
+        (lambda: period_frames(wavefront(rate_hz=2000), PATH), "whole multiple"),
+        (lambda: period_frames(wavefront(rate_hz=0.5), PATH), "up to 1000"),
+        (lambda: SensorSuite(sensors=()), "got no sensor"),
+        (lambda: SensorSuite(sensors=(wavefront(name="wavefront"),)), "none of them 'wavefront'"),
+        (lambda: SensorSuite(sensors=(accelerometer(), wavefront(name="m1"))), "different names"),
+        (
+            lambda: SensorSuite(
+                sensors=(wavefront(rate_hz=1000 / 7), accelerometer(rate_hz=1000 / 211))
+            ).period(PATH),
+            "at most 1000 frames; got 1477",
+        ),
+        (
+            lambda: SensorSuite(sensors=(wavefront(),)).marked(("m9",), PATH),
+            "no sensor or channel is called 'm9'; there are wavefront, truth",
+        ),
+        (
+            lambda: checked_motions(({"m9": Motion(size=1)},), SensorSuite(sensors=(FAST,)), 1),
+            "names the channel 'm9'; the channels are m1, m2",
+        ),
+        (
+            lambda: checked_motions(({"m1": Motion(size=1)},), SensorSuite(sensors=(SLOW,)), 1),
+            "the channels are none",
+        ),
+    ],
+)
+def test_refusals(make, words):
+    with pytest.raises(LbtSynthError, match=words) as refused:
+        make()
+    assert isinstance(refused.value, ProblemError)
+
+
+def test_motions_are_one_mapping_per_vibration():
+    with pytest.raises(DimensionError, match=r"one mapping per vibration \(2\); got 1"):
+        checked_motions(({},), SensorSuite(sensors=(FAST,)), 2)
+    assert lbt.models.Motion(size=3.0).factor == 3

@@ -1,0 +1,35 @@
+"""Random problems whose measurements are not all read in every sample."""
+
+import numpy as np
+
+from lbt_synth.linear import PeriodicProblem
+
+
+def random_periodic_problem(seed, *, varying=True, radius=1.1):
+    """Return up to 8 states, 3 measurements and 12 phases, some of which may read nothing.
+
+    Measurement noise acts on the states, too, and is correlated. A may be unstable.
+    """
+    rng = np.random.default_rng(seed)
+    n, q, N = int(rng.integers(1, 9)), int(rng.integers(1, 4)), int(rng.integers(2, 13))
+    phases = N if varying and seed % 2 else 1
+    A = rng.standard_normal((phases, n, n))
+    A *= rng.uniform(0.5, radius) / np.abs(np.linalg.eigvals(A)).max()
+    read = rng.random((N, q)) < 0.4
+    read[0] = True
+    units = 10.0 ** rng.uniform(-5, 2, (q, 1))
+    return PeriodicProblem(
+        A=A,
+        B=rng.standard_normal((1, n, n + q)),
+        C=units * rng.standard_normal((1, q, n)),
+        D=(units * np.hstack([0.3 * rng.standard_normal((q, n)), np.diag(rng.uniform(0.3, 3, q))]))[
+            None
+        ],
+        L=rng.standard_normal((2, n)),
+        read=read,
+    )
+
+
+def relative_distance(own, expected):
+    """Return the norm of a difference over that of what is expected."""
+    return np.linalg.norm(np.asarray(own) - expected) / np.linalg.norm(expected)
