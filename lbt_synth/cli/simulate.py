@@ -17,8 +17,8 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.sensor_failures import run_fused
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
-from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.design.fusion.fused_filter import FusedFilter
+from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name

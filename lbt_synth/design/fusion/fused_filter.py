@@ -38,7 +38,6 @@ from lbt_synth.storage.summaries import Summary
 from lbt_synth.validation import ComplexArray, FloatArray, require_instance, set_fields
 
 
-
 def fused_name(*, bounded: bool) -> str:
     """Return ``Design.method`` of a filter of several sensors, with or without a bound."""
     return "fused hinf" if bounded else "fused kalman"
@@ -348,9 +347,7 @@ def fused_hinf(
     return _design(plant, found, gamma_requested=max(requested, least), gamma_least=least)
 
 
-def _design(
-    plant: FusedPlant, solution: PeriodicRiccati, **claims: Any
-) -> FusedFilter:
+def _design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> FusedFilter:
     design = FusedFilter(
         method=fused_name(bounded=bool(claims)),
         certificate=UNCERTIFIED,
