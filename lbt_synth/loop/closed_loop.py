@@ -73,6 +73,11 @@ class ClosedLoop(Summarised):
         return self.system.spectral_radius
 
     @property
+    def radius_per_frame(self) -> float:
+        """The same: what the slowest mode keeps from one frame to the next."""
+        return self.spectral_radius
+
+    @property
     def is_stable(self) -> bool:
         """Whether every pole lies inside the unit circle, by more than 1e-9."""
         return self.spectral_radius < 1 - STABILITY_MARGIN

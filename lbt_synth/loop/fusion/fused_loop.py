@@ -40,6 +40,8 @@ class FusedLoop:
         Mirror, delay and own sensor.
     suite : SensorSuite
         The other sensors.
+    controller : PeriodicController
+        The controller.
     sensor_gain : float
         Real gain of the loop's own sensor, relative to its matrix.
     blind : tuple of str
@@ -49,6 +51,7 @@ class FusedLoop:
     system: PeriodicSystem
     hardware: LoopHardware
     suite: SensorSuite
+    controller: PeriodicController
     sensor_gain: float
     blind: tuple[str, ...] = ()
 
@@ -58,9 +61,14 @@ class FusedLoop:
         return self.system.spectral_radius
 
     @property
+    def radius_per_frame(self) -> float:
+        """What the slowest mode keeps from one frame to the next."""
+        return self.system.radius_per_frame
+
+    @property
     def is_stable(self) -> bool:
         """Whether the spectral radius is below 1 by more than 1e-9 per frame."""
-        return self.system.radius_per_frame < 1 - STABILITY_MARGIN
+        return self.radius_per_frame < 1 - STABILITY_MARGIN
 
     def require_stable(self) -> None:
         """Raise an UnstableLoopError if the loop is not stable."""
@@ -166,7 +174,12 @@ def close_fused_loop(
     C = np.concatenate([residual, command, measured], axis=1)
     system = PeriodicSystem(A=A, B=B, C=C, D=D, dt_s=hardware.dt_s)
     return FusedLoop(
-        system=system, hardware=hardware, suite=suite, sensor_gain=gain, blind=tuple(blind)
+        controller=controller,
+        system=system,
+        hardware=hardware,
+        suite=suite,
+        sensor_gain=gain,
+        blind=tuple(blind),
     )
 
 

@@ -19,7 +19,8 @@ from lbt_synth.config.samples import Keys
 from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, refuse_config
-from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, simulate, strehl
+from lbt_synth.loop import AnyLoop, ClosedLoop, residual_budget, simulate, strehl
+from lbt_synth.loop.fusion.simulation import simulate_fused
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
 from lbt_synth.models import LoopHardware, Truth
@@ -192,7 +193,7 @@ def evaluate_row(
 ) -> tuple[dict[str, float], tuple[Failure, ...]]:
     """Evaluate one sample, and return its results by column and its failures."""
     failures: list[Failure] = []
-    loops: dict[str, ClosedLoop] = {}
+    loops: dict[str, AnyLoop] = {}
     out: dict[str, float] = {}
     with _note_failure(failures, row, study.controllers):
         sample = make_sample(study, values)
@@ -201,7 +202,7 @@ def evaluate_row(
                 design = design_for_sample(controller, sample)
                 loops[controller.name] = close_sample_loop(sample, design)
         # frames to drop: the same for all controllers, which meet the same disturbances
-        radii = [loop.spectral_radius for loop in loops.values() if loop.is_stable]
+        radii = [loop.radius_per_frame for loop in loops.values() if loop.is_stable]
         least = study.config.settings.simulation.settle_frames
         settle = max([least, *map(settling_frames, radii)])
         for controller in study.controllers:
@@ -238,12 +239,12 @@ def design_for_sample(controller: StudyController, sample: Sample) -> Design:
     return sample.config.design(controller.request)
 
 
-def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
+def close_sample_loop(sample: Sample, design: Design) -> AnyLoop:
     """Close the real loop of a sample with a design."""
-    return close_loop(sample.hardware, design.controller, sensor_gain=sample.truth.sensor_gain)
+    return design.close(sample.hardware, sensor_gain=sample.truth.sensor_gain)
 
 
-def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
+def _evaluate_exactly(loop: AnyLoop, sample: Sample) -> dict[str, float]:
     """Return the exact residual of a stable loop by origin, and its Strehl ratio."""
     budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
     spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
@@ -252,18 +253,15 @@ def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
     return {"strehl": ratio} | {name: getattr(budget, part) for name, part in RESIDUALS.items()}
 
 
-def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
+def _simulate(loop: AnyLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
     """Return the mean Strehl ratio and the residual of a stable loop, simulated as configured."""
     section = sample.config.settings.simulation
-    run = simulate(
-        loop.controller,
-        sample.truth,
-        hardware=sample.hardware,
-        frames=section.frames,
-        cases=section.cases,
-        seed=seed,
-        settle_frames=settle,
-    )
+    sizes = {"frames": section.frames, "cases": section.cases, "settle_frames": settle}
+    own = {"truth": sample.truth, "hardware": sample.hardware, "seed": seed, **sizes}
+    if isinstance(loop, ClosedLoop):
+        run = simulate(loop.controller, **own)
+    else:
+        run = simulate_fused({frozenset(): loop.controller}, loop.suite, **own)
     return {
         "strehl": float(np.mean(run.strehl(sample.config.imaging))),
         "residual_nm": float(np.sqrt(np.mean(run.rms_nm**2))),
