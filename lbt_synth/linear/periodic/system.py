@@ -13,8 +13,12 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.linear.state_space import Controller, StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray, number, real_array, set_fields
+
+
+_CHUNK = 2_000_000  # complex numbers that a frequency response computes at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,26 +165,29 @@ class PeriodicSystem:
         """
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
-        (N, p, m), n = self.D.shape, self.n_states
-        # with w(k) = z^k, a period takes x(0) to M x(0) + forced; it must be z^N x(0)
-        forced = np.zeros((z.size, n, m), dtype=np.complex128)
-        for t in range(N):
-            forced = self.A[t] @ forced + self.B[t] * (z**t)[:, None, None]
-        x = np.linalg.solve((z**N)[:, None, None] * np.eye(n) - self.monodromy, forced)
+        (N, p, m), whole = self.D.shape, self.lifted()
+        schur = complex_schur(whole.A)
+        step = max(1, _CHUNK // (N * max(p, self.n_states)))
         out = np.empty((z.size, N, p, m), dtype=np.complex128)
-        for t in range(N):
-            out[:, t] = self.C[t] @ x + self.D[t]  # x is x(t) z^-t
-            x = (self.A[t] @ x + self.B[t]) / z[:, None, None]
+        for j in range(m):  # the input of a period is one of its columns times z^0, z^1, ...
+            own = replace(whole, B=whole.B[:, j::m], D=whole.D[:, j::m])
+            for start in range(0, z.size, step):
+                part = slice(start, start + step)
+                out[part, :, :, j] = _repeating_response(own, schur, z[part], N)
         return out
 
-    def select(self, outputs: slice, inputs: slice) -> PeriodicSystem:
-        """Return the system of some outputs and inputs."""
-        return replace(
-            self,
-            B=self.B[:, :, inputs],
-            C=self.C[:, outputs],
-            D=self.D[:, outputs, inputs],
-        )
+
+def _repeating_response(
+    whole: StateSpace, schur: tuple[ComplexArray, ComplexArray], z: ComplexArray, N: int
+) -> ComplexArray:
+    """Return y(t) z^-t of each phase for the input z^k of a system over a period, (f, N, p)."""
+    T, U = schur
+    turns = z[:, None] ** np.arange(N)
+    x = (turns @ whole.B.T) @ U.conj()  # the state at phase 0 repeats as z^N: solve for it
+    for i in range(whole.n_states - 1, -1, -1):
+        x[:, i] = (x[:, i] + x[:, i + 1 :] @ T[i, i + 1 :]) / (z**N - T[i, i])
+    out = (x @ U.T) @ whole.C.T + turns @ whole.D.T
+    return np.asarray(out.reshape(len(z), N, -1) / turns[:, :, None])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -308,9 +308,10 @@ def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray
 def _line_response(loop: FusedLoop, entry: FloatArray, frequency_hz: FloatArray) -> ComplexArray:
     """Return the residual at each phase for a process ``exp(2 pi i f k dt)``, (f, N, n)."""
     angle = 2j * np.pi * np.asarray(frequency_hz) * loop.hardware.dt_s
-    turned = np.exp(-angle[:, None] * (np.arange(entry.shape[1]) - 1)) @ entry.T
-    n = loop.hardware.modes
-    residual = loop.system.select(slice(n), slice(None))
+    used = np.flatnonzero(np.any(entry != 0, axis=1))
+    turned = np.exp(-angle[:, None] * (np.arange(entry.shape[1]) - 1)) @ entry[used].T
+    s, n = loop.system, loop.hardware.modes
+    residual = replace(s, B=s.B[:, :, used], C=s.C[:, :n], D=s.D[:, :n, used])
     return np.asarray(np.einsum("ftij,fj->fti", residual.frequency_response(frequency_hz), turned))
 
 
