@@ -13,7 +13,8 @@ def describe_fused(design: FusedFilter) -> Description:
     rows = failure_rows(plant, design.gains, design.fallbacks)
     unseen = [row.missing for row in rows if row.must_switch]
     notes = [
-        "unseen: the readings are zero, or frozen, and the filter believes them. Not read: the "
+        "unseen: the readings are zero, or frozen, and the filter believes them: a reading that "
+        "stays leaves an offset, which counts to the residual. Not read: the "
         "fall-back filter of this file for the remaining sensors, with the same state.",
     ]
     if unseen:

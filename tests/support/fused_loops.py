@@ -77,11 +77,12 @@ def acceleration(hardware, sensor, motion, frequency_hz, signal):
     return first * bend[k - whole] + second * bend[k - whole - 1]
 
 
-def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=()):
+def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuck=0.0):
     """Return the residual (frames, runs, n) of a loop that starts at rest.
 
     ``total`` is the phase (frames, runs, n), ``added`` what each reading has beside it: noise, and
     the acceleration of channels (frames, runs, q). A reading that is not new is a large number.
+    Sensors that are blind read what is stuck (runs, q), or zero.
     """
     hardware, suite = plant.own.hardware, plant.suite
     taps, frames, runs = hardware.mirror_taps, *total.shape[:2]
@@ -104,7 +105,7 @@ def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=()):
                 y[:, rows[name]] += gain * held_mean(residual, k, age, period) @ response.T
         for name, own in rows.items():
             if name in blind:
-                y[:, own] = 0.0
+                y[:, own] = (stuck + 0 * y)[:, own]
             if k % periods[name]:
                 y[:, own] = 1e9
         now = controller.phase(k)

@@ -15,7 +15,12 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.periodic.riccati import periodic_kalman
-from lbt_synth.loop.fusion.fused_loop import FusedLoop, close_fused_loop, fused_model_budget
+from lbt_synth.loop.fusion.fused_loop import (
+    FusedLoop,
+    close_fused_loop,
+    fused_model_budget,
+    model_readings,
+)
 from lbt_synth.models.fusion.plant import FusedPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy
@@ -45,7 +50,8 @@ class FailureRow:
 
     missing: str = column("sensors that fail")
     unseen_radius: float = column("radius, unseen", format=".6f")
-    unseen_nm: float | None = nm_column("residual, unseen", unit="nm rms", format=".1f")
+    zero_nm: float | None = nm_column("residual, zeros", unit="nm rms", format=".1f")
+    frozen_nm: float | None = nm_column("residual, frozen", unit="nm rms", format=".1f")
     fallback_radius: float = column("radius, not read", format=".6f")
     fallback_nm: float = nm_column("residual, not read", unit="nm rms", format=".1f")
     must_switch: bool = column("must be seen")
@@ -86,7 +92,8 @@ def failure_rows(
 ) -> tuple[FailureRow, ...]:
     """Return stability and residual of the loop for every set of sensors that fail.
 
-    The residual is the exact one of the loop where the plant's model is the truth.
+    The residual is the exact one of the loop where the plant's model is the truth. A frozen reading
+    is that of a frame in which all sensors are read, and stays for ever.
 
     Parameters
     ----------
@@ -115,20 +122,34 @@ def failure_rows(
     [False, False, False]
     """
     rows = []
+    readings = model_readings(failed_loop(plant, gains, ()), plant)
     for fallback in fallbacks:
         unseen = failed_loop(plant, gains, fallback.missing)
+        zero_nm = frozen_nm = None
+        if unseen.is_stable:
+            zero_nm = fused_model_budget(unseen, plant).rms_nm
+            frozen_nm = float(np.hypot(zero_nm, _offset_nm(unseen, readings)))
         switched = failed_loop(plant, fallback.gains, fallback.missing)
         rows.append(
             FailureRow(
                 missing=" + ".join(fallback.missing),
                 unseen_radius=unseen.spectral_radius,
-                unseen_nm=fused_model_budget(unseen, plant).rms_nm if unseen.is_stable else None,
+                zero_nm=zero_nm,
+                frozen_nm=frozen_nm,
                 fallback_radius=switched.spectral_radius,
                 fallback_nm=fused_model_budget(switched, plant).rms_nm,
                 must_switch=not unseen.is_stable,
             )
         )
     return tuple(rows)
+
+
+def _offset_nm(loop: FusedLoop, readings: FloatArray) -> float:
+    """Return what readings (q, q) that stay for ever leave of themselves [nm rms]."""
+    n, rows = loop.hardware.modes, loop.suite.marked(loop.blind, loop.hardware)
+    response = np.real(loop.system.frequency_response(0.0)[0, :, :n, n:][:, :, rows])
+    power = np.einsum("tij,jk,tik->t", response, readings[np.ix_(rows, rows)], response)
+    return float(np.sqrt(np.mean(power)))
 
 
 def failed_loop(plant: FusedPlant, gains: FloatArray, missing: tuple[str, ...]) -> FusedLoop:

@@ -17,7 +17,6 @@ from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.linear.state_space import Controller, StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray, number, real_array, set_fields
 
-
 _CHUNK = 2_000_000  # complex numbers that a frequency response computes at once
 
 

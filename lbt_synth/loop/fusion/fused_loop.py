@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
@@ -233,15 +234,29 @@ def fused_model_budget(loop: FusedLoop, plant: FusedPlant) -> ResidualBudget:
     return _budget(loop, truth, own.parts().noise_factor)
 
 
+def model_readings(loop: FusedLoop, plant: FusedPlant) -> FloatArray:
+    """Return the covariance of all readings in the first frame of a period, (q, q).
+
+    A plant's model is the truth. In that frame every sensor is read.
+    """
+    own, rate, each = plant.own, plant.own.hardware.frame_rate_hz, np.eye(loop.hardware.modes)
+    systems = [_noise_system(loop, own.parts().noise_factor)]
+    for direction, model in zip(each, own.turbulence, strict=True):
+        systems.append(_ar_system(loop, model, line_entry(loop, direction)))
+    for line, motion in zip(own.vibrations, plant.motions, strict=True):
+        entry = line_entry(loop, np.array(line.direction), motion, line.frequency_hz)
+        systems.append(_ar_system(loop, line.ar_model(rate), entry))
+    first = -plant.n_measurements
+    return np.asarray(sum(s.output_covariances()[0, first:, first:] for s in systems))
+
+
 def _budget(loop: FusedLoop, truth: Truth, noise_factor: FloatArray) -> ResidualBudget:
     loop.require_stable()
     hardware, n = loop.hardware, loop.hardware.modes
     turbulence, vibration = np.zeros((2, n, n))
     for spectrum, modes in truth.turbulence_groups(n):
         for mode in modes:
-            entry = np.zeros((loop.system.B.shape[2], 2))
-            entry[mode, 1] = 1.0
-            turbulence += _power(loop, spectrum, entry)
+            turbulence += _power(loop, spectrum, line_entry(loop, np.eye(n)[mode]))
     lines = stationary_vibrations(truth.vibrations)
     moving = checked_motions(truth.motions, loop.suite, len(lines))
     amplitudes: list[ComplexArray] = []
@@ -255,16 +270,19 @@ def _budget(loop: FusedLoop, truth: Truth, noise_factor: FloatArray) -> Residual
             amplitudes += list(line.amplitude_nm * np.fft.fft(response, axis=0) / len(response))
     return ResidualBudget(
         turbulence_nm2=frozen_copy(turbulence),
-        noise_nm2=frozen_copy(_noise_power(loop, noise_factor)),
+        noise_nm2=frozen_copy(residual_power(loop, _noise_system(loop, noise_factor))),
         random_vibration_nm2=frozen_copy(vibration),
         line_amplitudes_nm=np.array(amplitudes, dtype=np.complex128).reshape(len(amplitudes), n),
     )
 
 
 def line_entry(
-    loop: FusedLoop, direction: FloatArray, motion: Mapping[str, Motion], frequency_hz: float
+    loop: FusedLoop,
+    direction: FloatArray,
+    motion: Mapping[str, Motion] = MappingProxyType({}),
+    frequency_hz: float = 0.0,
 ) -> FloatArray:
-    """Return how the samples v(k+1), v(k), v(k-1), ... of a vibration enter a loop, (n + q, t)."""
+    """Return how the samples v(k+1), v(k), v(k-1), ... of a process enter a loop, (n + q, t)."""
     hardware, suite, n = loop.hardware, loop.suite, loop.hardware.modes
     rows, rate = suite.rows(hardware), hardware.frame_rate_hz
     columns: list[tuple[int, int, FloatArray]] = []
@@ -286,7 +304,7 @@ def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray
     """Return the residual's covariance for a process whose samples enter as given, (n, n)."""
     if isinstance(spectrum, ARModel):
         require_loop_rate(spectrum.frame_rate_hz, loop.hardware)
-        return _ar_power(loop, spectrum, entry)
+        return residual_power(loop, _ar_system(loop, spectrum, entry))
 
     def density(frequency: FloatArray) -> FloatArray:
         response = _line_response(loop, entry, frequency)
@@ -315,8 +333,9 @@ def _line_response(loop: FusedLoop, entry: FloatArray, frequency_hz: FloatArray)
     return np.asarray(np.einsum("ftij,fj->fti", residual.frequency_response(frequency_hz), turned))
 
 
-def _ar_power(loop: FusedLoop, model: ARModel, entry: FloatArray) -> FloatArray:
-    s, n, order = loop.system, loop.hardware.modes, max(model.order, entry.shape[1])
+def _ar_system(loop: FusedLoop, model: ARModel, entry: FloatArray) -> PeriodicSystem:
+    """Return the system from the white drive of a process to all outputs of a loop."""
+    s, order = loop.system, max(model.order, entry.shape[1])
     samples = np.zeros((entry.shape[0], order))
     samples[:, : entry.shape[1]] = entry
     chain = np.eye(order, k=-1)
@@ -326,21 +345,21 @@ def _ar_power(loop: FusedLoop, model: ARModel, entry: FloatArray) -> FloatArray:
     A[:, : s.n_states, : s.n_states], A[:, : s.n_states, s.n_states :] = s.A, s.B @ samples
     A[:, s.n_states :, s.n_states :] = chain
     B[0, s.n_states] = model.driving_rms_nm
-    C = np.concatenate([s.C[:, :n], s.D[:, :n] @ samples], axis=2)
-    return mean_power(PeriodicSystem(A=A, B=B, C=C, D=np.zeros((1, n, 1)), dt_s=s.dt_s))
+    C = np.concatenate([s.C, s.D @ samples], axis=2)
+    return PeriodicSystem(A=A, B=B, C=C, D=np.zeros((1, C.shape[1], 1)), dt_s=s.dt_s)
 
 
-def _noise_power(loop: FusedLoop, own: FloatArray) -> FloatArray:
-    n = loop.hardware.modes
-    noise, s = loop.suite.noise_factor(own, n), loop.system
+def _noise_system(loop: FusedLoop, own: FloatArray) -> PeriodicSystem:
+    """Return the system from white noise to all outputs of a loop."""
+    n, s = loop.hardware.modes, loop.system
+    noise = loop.suite.noise_factor(own, n)
     noise[loop.suite.marked(loop.blind, loop.hardware)] = 0.0
-    return mean_power(
-        PeriodicSystem(
-            A=s.A, B=s.B[:, :, n:] @ noise, C=s.C[:, :n], D=s.D[:, :n, n:] @ noise, dt_s=s.dt_s
-        )
+    return PeriodicSystem(
+        A=s.A, B=s.B[:, :, n:] @ noise, C=s.C, D=s.D[:, :, n:] @ noise, dt_s=s.dt_s
     )
 
 
-def mean_power(system: PeriodicSystem) -> FloatArray:
-    """Return the covariance of a system's outputs for white inputs, mean over the phases."""
-    return np.asarray(np.mean(system.output_covariances(), axis=0))
+def residual_power(loop: FusedLoop, system: PeriodicSystem) -> FloatArray:
+    """Return the residual's covariance from white noise to a loop's outputs, mean over phases."""
+    n = loop.hardware.modes
+    return np.asarray(np.mean(system.output_covariances()[:, :n, :n], axis=0))

@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from support.fused_loops import FAST, SLOW, example_plant, simulated_covariances
+from scipy.signal import lfilter
+from support.fused_loops import (
+    FAST,
+    SLOW,
+    acceleration,
+    example_plant,
+    run_loop,
+    simulated_covariances,
+)
 
 from lbt_synth.design import failure_rows
 from lbt_synth.design.fusion.failures import (
@@ -13,6 +21,7 @@ from lbt_synth.design.fusion.failures import (
 )
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import periodic_kalman
+from lbt_synth.loop.fusion.fused_loop import fused_model_budget, model_readings
 
 
 def test_every_set_of_sensors_may_fail():
@@ -37,11 +46,49 @@ def test_rows_are_what_runs_leave():
     for row, fallback in zip(rows[:4], fallbacks, strict=False):
         pairs = [(fallback.gains, row.fallback_nm)]
         if not row.must_switch:
-            pairs.append((gains, row.unseen_nm))
+            pairs.append((gains, row.zero_nm))
         for used, residual_nm in pairs:
             left = simulated_covariances(plant, plant.controller(used), blind=fallback.missing)
             assert residual_nm == pytest.approx(np.sqrt(np.trace(sum(left))), rel=1e-7)
             assert row.fallback_nm <= residual_nm * (1 + 1e-9)
+
+
+def test_a_reading_that_stays_leaves_an_offset():
+    plant = example_plant((FAST, SLOW))
+    gains, fallbacks = periodic_kalman(plant).gains, make_fallbacks(plant)
+    controller = plant.controller(gains)
+    readings = model_readings(failed_loop(plant, gains, ()), plant)
+    for row, fallback in list(zip(failure_rows(plant, gains, fallbacks), fallbacks, strict=True))[
+        :5
+    ]:
+        # a run for each independent part of the readings, without any disturbance
+        stuck = np.linalg.cholesky(readings).T
+        still = np.zeros((400, len(stuck), 2)), np.zeros((400, *stuck.shape))
+        left = run_loop(plant, controller, *still, blind=fallback.missing, stuck=stuck)[-4:]
+        expected = np.sqrt(row.zero_nm**2 + np.sum(left**2) / 4)
+        assert row.frozen_nm == pytest.approx(expected, rel=1e-6)
+        assert row.frozen_nm > row.zero_nm
+
+
+def test_readings_are_residual_and_noise():
+    plant = example_plant((FAST,))
+    loop = failed_loop(plant, periodic_kalman(plant).gains, ())
+    readings = model_readings(loop, plant)
+    left = fused_model_budget(loop, plant).total_nm2
+    np.testing.assert_allclose(readings[:2, :2], left + 75**2 * np.eye(2), rtol=1e-9)
+    drive = np.zeros(4000)
+    drive[8] = 1.0
+    power = np.diag(FAST.noise_m_s2).copy()
+    for line, motion in zip(plant.own.vibrations, plant.motions, strict=True):
+        model = line.ar_model(1000.0)
+        shape = lfilter([model.driving_rms_nm], [1.0, *-np.asarray(model.coefficients)], drive)
+        for i, channel in enumerate(FAST.channels):
+            if channel in motion:
+                read = acceleration(
+                    plant.own.hardware, FAST, motion[channel], line.frequency_hz, shape
+                )
+                power[i] += read @ read
+    np.testing.assert_allclose(np.diag(readings)[2:], power, rtol=1e-9)
 
 
 def test_what_is_missing_is_not_used():
@@ -74,6 +121,6 @@ def test_a_failure_that_must_be_seen():
     rows = failure_rows(plant, periodic_kalman(plant).gains, make_fallbacks(plant))
     for row in rows:
         assert row.must_switch == (row.unseen_radius >= 1)
-        assert (row.unseen_nm is None) == row.must_switch
+        assert (row.zero_nm is None) == (row.frozen_nm is None) == row.must_switch
         assert row.fallback_radius < 1
     assert [row.must_switch for row in rows] == [True, False, True]

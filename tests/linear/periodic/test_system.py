@@ -83,14 +83,6 @@ def test_the_radius_of_a_period_and_of_a_frame():
     assert system.radius_per_frame == pytest.approx(0.15 ** (1 / 3))
 
 
-def test_some_outputs_and_inputs():
-    system = random_system()
-    part = system.select(slice(1, 2), slice(1))
-    inputs = np.random.default_rng(2).standard_normal((20, 1))
-    whole = steps(system, np.hstack([inputs, 0 * inputs]))
-    np.testing.assert_allclose(steps(part, inputs), whole[:, 1:])
-
-
 def test_a_controller_reads_its_new_state():
     controller = random_system(kind=PeriodicController)
     inputs, x, out = np.random.default_rng(3).standard_normal((20, 2)), np.zeros(3), []

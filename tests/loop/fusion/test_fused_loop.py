@@ -132,7 +132,7 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
     entries = [(t, first + t, 0) for t in range(N)]
     total = impulse(first + N + frames, N, 2, entries)
     left = run_loop(plant, controller, total, np.zeros((len(total), N, 6)))
-    hertz = (np.arange(4000) + 0.5) * RATE_HZ / 2 / 4000
+    hertz = (np.arange(1000) + 0.5) * RATE_HZ / 2 / 1000
     powers = np.zeros((len(hertz), 2, 2))
     for phase in range(N):  # of the residual: at lag j it answers an impulse at phase - j
         response = np.zeros((len(hertz), 2), dtype=complex)
@@ -142,7 +142,7 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
                 -2j * np.pi * hertz[:, None] * j / RATE_HZ
             )
         powers += np.real(response[:, :, None] * response.conj()[:, None, :]) / N
-    expected = np.sum(Broad().psd(hertz)[:, None, None] * powers, axis=0) * RATE_HZ / 2 / 4000
+    expected = np.sum(Broad().psd(hertz)[:, None, None] * powers, axis=0) * RATE_HZ / 2 / 1000
     np.testing.assert_allclose(budget.turbulence_nm2, expected, rtol=1e-5, atol=1e-6)
 
 
