@@ -24,7 +24,7 @@ from lbt_synth.validation import FloatArray, frozen_copy
 
 _NEWTON_STEPS = 6
 _SETTLED = 1e-13  # relative change of a Newton step at which no further is made
-_CLOSED = 1e-8  # and that of the last, beyond which the solution is refused
+_CLOSED = 1e-6  # and that of the last, beyond which the solution is refused
 _GAMMA_TOLERANCE = 1e-9
 
 Triple = tuple[FloatArray, FloatArray, FloatArray]
