@@ -17,6 +17,7 @@ from lbt_synth.design.certificate import (
     certify_error,
 )
 from lbt_synth.design.fusion.failures import Fallback, failed_loop, make_fallbacks
+from lbt_synth.design.fusion.switching import dwell_frames
 from lbt_synth.design.hinf import checked_bounds, require_reachable
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError
@@ -56,6 +57,11 @@ class FusedFacts:
     loop_radius: float = column("spectral radius of the loop, over a period", format=".6f")
     gain_low: float = column("stable sensor gains, from", format=".4g")
     gain_high: float = column("stable sensor gains, to", format=".4g")
+    dwell_frames: int | None = column(
+        "stable if sensors fail or return no sooner than after",
+        unit="frames",
+        help="Whatever the order: a proof, where the plant is its model; sooner may be stable, too",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -144,6 +150,7 @@ class FusedFilter(Design):
             loop_radius=self.loop().spectral_radius,
             gain_low=low,
             gain_high=high,
+            dwell_frames=dwell_frames(self.problem, self.gains, self.fallbacks),
         )
 
     def _brief(self) -> str:
