@@ -20,6 +20,7 @@ from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
+from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -240,7 +241,9 @@ def sigma_sparkline(system: StateSpace, caption: str) -> Sparkline:
 def balancing_scales(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> FloatArray:
     """Powers of two that balance ``[[|A|, entry], [leaving', 0]]``, (n + 1,)."""
     border = np.block([[np.abs(A), entry[:, None]], [leaving[None, :], np.zeros((1, 1))]])
-    _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
+    # scipy makes a permutation of the scales, which nobody asks for and large ones do not fit
+    with ignore_warnings(RuntimeWarning, message="invalid value encountered in cast"):
+        _, (scaling, _) = matrix_balance(border, permute=False, separate=True)
     return np.asarray(scaling, dtype=np.float64)
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from support.systems import random_system
 
 import lbt_synth as lbt
+from lbt_synth.linear.state_space import balancing_scales
 
 
 def test_round_trip_through_python_control():
@@ -69,3 +70,8 @@ def test_a_measurement_that_is_not_finite_is_refused_and_leaves_the_state(bad):
     with pytest.raises(lbt.errors.NonFiniteError, match="Hold the last command"):
         run.step([0.0, bad])
     assert run.step([1.0, 0.0]) == 1.0
+
+
+def test_states_of_very_different_sizes_are_balanced_without_a_warning():
+    state, outside = balancing_scales(np.array([[0.5]]), np.array([1e60]), np.array([1e-60]))
+    assert 0.1e60 < state / outside < 10e60
