@@ -1,8 +1,8 @@
 """What an accelerometer buys: one line at 20 Hz, a star whose noise is five times that of the LBT.
 
 Run ``python benchmarks/several_sensors_value.py``. It prints, over the seeing, the exact residual
-of tip with the Kalman filter of the wavefront alone and with an accelerometer whose noise is a tenth of what
-the line moves, and the same of a simulation.
+of tip with the Kalman filter of the wavefront alone and with an accelerometer whose noise is a
+tenth of what the line moves, and the same of a simulation.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ FRAMES, CASES = 20_000, 4
 
 def main() -> int:
     """Print the table."""
-    print("| air | own sensor [nm] | of it the line | with accelerometer | of it the line |", end="")
-    print(" ratio | in a run |\n|---|---:|---:|---:|---:|---:|---:|")
+    print("| air | own sensor [nm] | of it the line ", end="")
+    print("| with accelerometer | of it the line | ratio | in a run |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
     for seeing, wind in AIR:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "loop.yaml"

@@ -12,7 +12,6 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.linear import Controller
 from lbt_synth.models import Truth
 from lbt_synth.models.loop_hardware import loop_differences
 
@@ -25,7 +24,7 @@ def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
 def load_design(path: str, *, several_sensors: bool = False) -> Design:
     """Load a design; refuse one of several sensors unless the command takes it."""
     design = load_gain(path)
-    if several_sensors or isinstance(design.controller, Controller):
+    if several_sensors or not design.several_sensors:
         return design
     raise ProblemError(
         f"{path} is a design of several sensors; this command takes designs of the loop's own "

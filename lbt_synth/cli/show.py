@@ -13,7 +13,6 @@ from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config.load import config_from_text
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.interop import frame_cost
-from lbt_synth.linear import Controller
 from lbt_synth.storage.rows import fact_table, json_record
 
 
@@ -32,7 +31,7 @@ def run(arguments: Namespace) -> Report:
         f"proved: the certificate, computed again from this file of digest {digest}.",
         f"not proved, the file's word: {'; '.join(unproved)}.",
     ]
-    if isinstance(design.controller, Controller):
+    if not design.several_sensors:
         cost = frame_cost(design)
         report.data["frame_cost"] = json_record(cost)
         report.tables.append(fact_table("Cost per frame, as exported to C", cost))

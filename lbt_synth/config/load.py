@@ -32,7 +32,6 @@ from lbt_synth.config.several_sensors import build_fused_plant, build_true_motio
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.interop import EndToEndSetup
-from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
@@ -161,7 +160,7 @@ class Config(Summarised):
         with name_file(self.source):
             design = request.build(self)
         said = design.assumptions
-        if self.fused_plant is not None and isinstance(design.controller, Controller):
+        if self.fused_plant is not None and not design.several_sensors:
             others = ", ".join(self.fused_plant.suite.units[1:])
             said = (*said, f"the loop's own sensor is read alone, without {others}")
         return replace(design, configuration=self.text, assumptions=said)

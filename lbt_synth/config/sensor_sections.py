@@ -63,7 +63,9 @@ class OtherSensorSection(Section):
         default="wavefront", description="wavefront or accelerometer"
     )
     rate_hz: q.Hertz = Field(description="readings per second, a fraction of the frame rate [Hz]")
-    delay_frames: float = Field(gt=0, le=20, description="total delay [its own frames]")
+    delay_frames: float = Field(
+        gt=0, le=20, description="total delay, in periods of the sensor [frames]"
+    )
     noise_nm: q.NanometresOrEach | None = Field(
         default=None, description="noise of a reading of a wavefront sensor [nm rms]"
     )
@@ -79,7 +81,7 @@ class OtherSensorSection(Section):
     highpass_hz: q.Hertz | None = Field(
         default=None, description="corner of an accelerometer's high pass [Hz]"
     )
-    covariance: list[list[float]] | None = Field(
+    covariance: list[list[q.Entry]] | None = Field(
         default=None, description="covariance of the noise, in place of its size [nm^2, (m/s^2)^2]"
     )
 
@@ -102,9 +104,9 @@ class OtherSensorSection(Section):
 def with_own_sensor(raw: Any) -> Any:
     """Return a file in which ``sensors.wavefront``, the loop's own sensor, is loop and sensor."""
     sensors = raw.get("sensors") if isinstance(raw, Mapping) else None
-    own = sensors.get(OWN_SENSOR) if isinstance(sensors, Mapping) else None
-    if not isinstance(own, Mapping):
+    if not isinstance(sensors, Mapping) or not isinstance(sensors.get(OWN_SENSOR), Mapping):
         return raw
+    own = sensors[OWN_SENSOR]
     loop, sensor = dict(raw.get("loop") or {}), dict(raw.get("sensor") or {})
     for name, value in own.items():
         section, key = (loop, _LOOP_KEYS[name]) if name in _LOOP_KEYS else (sensor, name)

@@ -96,6 +96,11 @@ class Design(Summarised):
         """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
         return True
 
+    @property
+    def several_sensors(self) -> bool:
+        """Whether the design reads other sensors beside the loop's own, by a periodic filter."""
+        return False
+
     def facts(self) -> Any:
         """Return the numbers that this kind of design has, a row; None if there are none."""
         return None

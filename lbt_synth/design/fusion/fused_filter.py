@@ -93,6 +93,11 @@ class FusedFilter(Design):
         set_fields(self, controller=self.problem.controller(self.gains))
 
     @property
+    def several_sensors(self) -> bool:
+        """Whether the design reads other sensors beside the loop's own: it does."""
+        return True
+
+    @property
     def loop_hardware(self) -> LoopHardware:
         """Mirror, delay and own sensor of the loop."""
         return self.problem.own.hardware

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -88,5 +89,7 @@ def sensor_failure_figure(
     ]
     seen = Curve(name=f"in the run, over {_WINDOW_S:g} s", x=centres, y=size, look=0)
     x, y = Axis(label="time", unit="s"), Axis(label="residual, both axes", unit="nm rms", log=True)
-    panels = (series_panel([*spans, *series]), Panel(x=x, y=y, marks=(*spans, seen, *steps)))
+    above = series_panel(series)
+    above = replace(above, marks=(*spans, *above.marks))
+    panels = (above, Panel(x=x, y=y, marks=(*spans, seen, *steps)))
     return draw_figure(panels, title=title)

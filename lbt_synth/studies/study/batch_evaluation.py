@@ -12,7 +12,6 @@ from lbt_synth.config.ensemble import AssumedAxis, Samples
 from lbt_synth.config.samples import Reads
 from lbt_synth.design.modal import ModalFilters, modal_filters
 from lbt_synth.errors import CertificateError
-from lbt_synth.linear import Controller
 from lbt_synth.loop import EnsembleResiduals
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.models import PositionLoop, Vibration
@@ -98,8 +97,8 @@ def _evaluate_groups(
     for_sample = _is_kalman_for_sample(controller) and study.config.fused_plant is None
     if study.settings.evaluation != "exact" or (design is None and not for_sample):
         return
-    if design is not None and not isinstance(design.controller, Controller):
-        return  # of several sensors
+    if design is not None and design.several_sensors:
+        return
     matrices = None if design is None else textbook_matrices([design.controller])
     reads = ensemble.read_config(study.config, designs=for_sample)
     for rows in _find_groups(study, values, reads):

@@ -257,11 +257,21 @@ def _simulate(loop: AnyLoop, sample: Sample, *, seed: int, settle: int) -> dict[
     """Return the mean Strehl ratio and the residual of a stable loop, simulated as configured."""
     section = sample.config.settings.simulation
     sizes = {"frames": section.frames, "cases": section.cases, "settle_frames": settle}
-    own = {"truth": sample.truth, "hardware": sample.hardware, "seed": seed, **sizes}
+    truth, hardware = sample.truth, sample.hardware
     if isinstance(loop, ClosedLoop):
-        run = simulate(loop.controller, **own)
+        run = simulate(loop.controller, truth, hardware=hardware, seed=seed, **sizes)
     else:
-        run = simulate_fused({frozenset(): loop.controller}, loop.suite, **own)
+        own = {frozenset[str](): loop.controller}
+        run = simulate_fused(
+            own,
+            loop.suite,
+            truth,
+            hardware=hardware,
+            frames=section.frames,
+            cases=section.cases,
+            settle_frames=settle,
+            seed=seed,
+        )
     return {
         "strehl": float(np.mean(run.strehl(sample.config.imaging))),
         "residual_nm": float(np.sqrt(np.mean(run.rms_nm**2))),
