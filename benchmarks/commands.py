@@ -333,12 +333,32 @@ def page(found: dict[str, object]) -> str:
     return f"{body}\n\n{listing}\n"
 
 
+def save(rows: dict[str, dict[str, object]], before: str) -> dict[str, object]:
+    """Write the rows that are there, with the growth of each series, and their page."""
+    order = [work for work in works() if work.name in rows]
+    for series in ("identify", "study", "hinf"):
+        same = [work for work in order if work.series == series]
+        if len(same) > 1:
+            times = [rows[work.name]["now"]["processor_s"] for work in same]
+            rows[same[-1].name]["growth"] = growth([work.size for work in same], times)
+    found = {
+        "before": before,
+        "machine": machine(),
+        "rows": [rows[work.name] for work in order],
+    }
+    RESULTS.write_text(json.dumps(found, indent=1) + "\n")
+    PAGE.write_text(page(found))
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--before", default=BEFORE, help="commit, tag or none")
     parser.add_argument("--only", nargs="*", default=[], help="words of the rows to run")
     chosen = parser.parse_args()
     table = [w for w in works() if not chosen.only or any(x in w.name for x in chosen.only)]
+    if not table:
+        parser.error(f"no row has one of {', '.join(chosen.only)}")
     known = json.loads(RESULTS.read_text())["rows"] if chosen.only and RESULTS.exists() else []
     rows = {row["work"]: row for row in known}
     with tempfile.TemporaryDirectory() as name:
@@ -350,19 +370,7 @@ def main() -> None:
         for work in table:
             print(f"... {work.name}", file=sys.stderr, flush=True)
             rows[work.name] = asdict(run_row(work, now, before, folder))
-    for series in ("identify", "study", "hinf"):
-        same = [w for w in works() if w.series == series and w.name in rows]
-        if len(same) > 1:
-            times = [rows[w.name]["now"]["processor_s"] for w in same]
-            rows[same[-1].name]["growth"] = growth([w.size for w in same], times)
-    order = [w.name for w in works() if w.name in rows]
-    found = {
-        "before": chosen.before,
-        "machine": machine(),
-        "rows": [rows[name] for name in order],
-    }
-    RESULTS.write_text(json.dumps(found, indent=1) + "\n")
-    PAGE.write_text(page(found))
+            found = save(rows, chosen.before)
     lines = [list(HEADINGS), *map(cells, found["rows"])]
     widths = np.max([[len(cell) for cell in line] for line in lines], axis=0)
     for line in lines:

@@ -7,6 +7,7 @@ are known, so that a rule of fixed order is enough.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -34,6 +35,9 @@ _NARROWEST = 1e-10  # pole width that panels are still refined to, as a fraction
 _PANEL = 2.0  # length of a panel over its distance from a pole, or over the pole's width
 _PROBES = 5  # frequencies at which partial fractions are checked by solving linear systems
 _AGREEMENT = 1e-9
+_IN_CACHE = 32  # loops whose spectra are integrated at once: more do not fit the processor's cache
+
+_Array = TypeVar("_Array", FloatArray, ComplexArray)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,23 +181,28 @@ def _scalar_covariances(
     group: LoopGroup, samples: _Samples, noise_nm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """One mode, in real numbers: ``|S|^2 = 1 / |1 + g L|^2`` with the loop L at unit gain."""
-    subloop, g = group.subloop, group.sensor_gains[:, None]
+    subloop, gains, share = group.subloop, group.sensor_gains[:, None], group.fraction[:, None]
     size = subloop.influence[0, 0] * subloop.sensor[0, 0]
     unit = size * samples.controller[..., 0, 0] * samples.delay
-    first, second = unit * samples.first, unit * samples.second
-    real, imaginary = first.real, first.imag
-    if group.fraction.any():
-        share = group.fraction[:, None]
-        real = real + share * (second.real - real)
-        imaginary = imaginary + share * (second.imag - imaginary)
-    # not 1 + 2 g Re L + g^2 |L|^2, which cancels next to instability
-    rejection = 1 / ((1 + g * real) ** 2 + (g * imaginary) ** 2)
-    square = (real**2 + imaginary**2) / subloop.sensor[0, 0] ** 2
-    turbulence = np.zeros(len(g))
-    for density, _ in samples.densities:  # each is of the one mode
-        turbulence += _integrate(rejection, density)
-    noise = noise_nm[:, 0] ** 2 * _integrate(rejection * square, samples.white)
+    first, second = unit * samples.first, unit * (samples.second - samples.first)
+    turbulence, noise = np.zeros((2, len(gains)))
+    for start in range(0, len(gains), _IN_CACHE):
+        rows = slice(start, start + _IN_CACHE)
+        g, s, one, other = gains[rows], share[rows], _rows(first, rows), _rows(second, rows)
+        real, imaginary = one.real + s * other.real, one.imag + s * other.imag
+        square = real**2 + imaginary**2
+        # not 1 + 2 g Re L + g^2 |L|^2, which cancels next to instability
+        rejection = 1 / ((1 + g * real) ** 2 + (g * imaginary) ** 2)
+        for density, _ in samples.densities:  # each is of the one mode
+            turbulence[rows] += _integrate(rejection, _rows(density, rows))
+        noise[rows] = _integrate(rejection * square, samples.white)
+    noise *= (noise_nm[:, 0] / subloop.sensor[0, 0]) ** 2
     return turbulence[:, None, None], noise[:, None, None]
+
+
+def _rows(values: _Array, rows: slice) -> _Array:
+    """Return some rows of values per loop (k, f), or values of all loops (f,) as they are."""
+    return values if values.ndim == 1 else values[rows]
 
 
 def _integrate(values: FloatArray, density: FloatArray) -> FloatArray:
