@@ -52,7 +52,7 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return knots of log g (w,), a grid of distances (d,), and log K between both.
 
     The last has the coefficients of polynomials in two variables, cubic in the part of a step of
-    the grid and in log g beyond its knot, the highest power of the latter first: (w, d, 4, 4).
+    the grid and in log g beyond its knot, the highest power of the latter first: (4, 4, w, d).
     """
     from scipy.interpolate import CubicSpline
 
@@ -75,35 +75,35 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     blend = np.clip((grid - _LOBES / 2) / (_LOBES / 2), 0, 1)
     k = np.maximum(at * (1 - blend) + mean * blend, 1e-14)
     knots = np.log(widths)
-    value = np.asarray(CubicSpline(knots, np.log(k)).c).transpose(1, 2, 0)  # (w, d, 4)
-    slope = np.gradient(value, axis=1)
-    rise, (m0, m1) = np.diff(value, axis=1), (slope[:, :-1], slope[:, 1:])
-    powers = [value[:, :-1], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise]
-    return knots, grid, np.stack(powers, axis=2)
+    value = np.asarray(CubicSpline(knots, np.log(k)).c)  # (4, w, d)
+    slope = np.gradient(value, axis=2)
+    rise, (m0, m1) = np.diff(value, axis=2), (slope[..., :-1], slope[..., 1:])
+    powers = [value[..., :-1], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise]
+    return knots, grid, np.stack(powers, axis=1)
 
 
 def log_smearing(
-    half_width: float, distance: FloatArray
+    half_width: FloatArray | float, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the logarithm of the smeared line over the line itself, (f,).
+    """Return the logarithm of smeared lines over the lines themselves, (f,).
 
-    Its derivatives by the logarithm of the width and by the distance follow.
+    The half width is one for all, or (f,) as the distance. The derivatives by the logarithm of the
+    width and by the distance follow.
     """
     knots, grid, table = _table()
-    log_width = np.log(max(half_width, _NARROWEST))
-    row = min(int(np.searchsorted(knots, log_width, side="right")) - 1, len(table) - 1)
+    g, size = np.broadcast_to(half_width, distance.shape), np.abs(distance)
+    log_width = np.log(np.maximum(g, _NARROWEST))
+    row = np.minimum(np.searchsorted(knots, log_width, side="right") - 1, knots.size - 2)
     w = log_width - knots[row]
-    size = np.abs(distance)
     left = np.minimum(np.searchsorted(grid, size, side="right") - 1, grid.size - 2)
     step = grid[left + 1] - grid[left]
     x = (size - grid[left]) / step
-    by_log_width = [3 * w**2, 2 * w, 1.0, 0.0] if half_width > _NARROWEST else [0.0] * 4
-    both = table[row, left] @ np.array([[w**3, w**2, w, 1.0], by_log_width]).T  # (f, 4, 2)
-    (y0, y1, y2, y3), (v0, v1, v2, v3) = both.T
-    g = half_width
+    c3, c2, c1, c0 = table.reshape(4, 4, -1).take(row * (grid.size - 1) + left, axis=2)
+    y0, y1, y2, y3 = ((c3 * w + c2) * w + c1) * w + c0
+    v0, v1, v2, v3 = ((3 * c3 * w + 2 * c2) * w + c1) * (g > _NARROWEST)
     square = g**2 + distance**2
     return (
-        y0 + x * (y1 + x * (y2 + x * y3)) + np.log((np.pi / g) * square),
+        y0 + x * (y1 + x * (y2 + x * y3)) + np.log(np.pi / g * square),
         v0 + x * (v1 + x * (v2 + x * v3)) + (2 * g**2 / square - 1),
         (y1 + x * (2 * y2 + 3 * x * y3)) / step * np.sign(distance) + 2 * distance / square,
     )

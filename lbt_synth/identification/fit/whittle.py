@@ -216,11 +216,10 @@ def densities(
     unit, slopes = unit_densities(frequency, ratio, s)
     np.multiply(unit, white * power[:, None], out=density[1:])
     fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
-    for c, own, by_shape in zip(components, density[1:], slopes, strict=True):
+    for c, own in zip(components, density[1:], strict=True):
         if c.kind == "turbulence":
             own *= np.exp(fall)
-        else:
-            _smear(data, c, own, by_shape)
+    _smear(data, components, density[1:], slopes)
     slopes[:, 1] *= slope[:, None]
     return density, slopes, np.array([by_colour, by_corner])
 
@@ -235,24 +234,38 @@ def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _smear(
-    data: LoopPeriodogram, line: Component, own: FloatArray, slope: FloatArray | None = None
+    data: LoopPeriodogram,
+    components: Sequence[Component],
+    density: FloatArray,
+    slopes: FloatArray | None = None,
 ) -> None:
-    """Let the taper smear a narrow line, in place; ``slope`` is by log f and log damping."""
+    """Let the taper smear narrow lines, in place.
+
+    The densities are (c, f), the slopes by log frequency and log damping (c, 2, f).
+    """
     if data.duration_s is None:
         return
-    centre = line.frequency * data.frame_rate_hz / (2 * np.pi)
-    half_width = line.damping_ratio * centre * data.duration_s
-    if half_width > WIDE:
+    narrow = []
+    for i, c in enumerate(components):
+        place = c.frequency * data.frame_rate_hz / (2 * np.pi) * data.duration_s
+        if c.kind != "turbulence" and c.damping_ratio * place <= WIDE:
+            narrow.append((i, place, c.damping_ratio * place))
+    if not narrow:
         return
-    reach = FAR / data.duration_s
-    start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
-    distance = (data.frequency_hz[start:stop] - centre) * data.duration_s
-    more, by_width, by_distance = log_smearing(half_width, distance)
-    own[start:stop] *= np.exp(more)
-    if slope is None:
-        return
-    slope[0, start:stop] += by_width - by_distance * centre * data.duration_s
-    slope[1, start:stop] += by_width
+    centres, half_widths = np.array(narrow).T[1:]
+    at = data.frequency_hz * data.duration_s
+    starts, stops = np.searchsorted(at, [centres - FAR, centres + FAR])
+    inside = np.concatenate([at[a:b] for a, b in zip(starts, stops, strict=True)])
+    centre, half_width = np.repeat([centres, half_widths], stops - starts, axis=1)
+    more, by_width, by_distance = log_smearing(half_width, inside - centre)
+    factor, by_frequency = np.exp(more), by_width - by_distance * centre
+    end = 0
+    for (i, *_), start, stop in zip(narrow, starts, stops, strict=True):
+        part = slice(end, end := end + stop - start)
+        density[i, start:stop] *= factor[part]
+        if slopes is not None:
+            slopes[i, 0, start:stop] += by_frequency[part]
+            slopes[i, 1, start:stop] += by_width[part]
 
 
 @lru_cache(maxsize=64)
@@ -264,8 +277,7 @@ def _component_density(
     own = unit_density(c.frequency, c.damping_ratio, s)
     if c.kind == "turbulence":
         own *= np.exp(log_roll_off(float(np.exp(corner)), order, s)[0])
-    else:
-        _smear(data, c, own)
+    _smear(data, [c], own[None])
     return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * own)
 
 

@@ -1,0 +1,133 @@
+"""Processor time of identification, and how it grows with frames and lines.
+
+    python benchmarks/speed_identification.py [--auto]
+
+Two axes at 1 kHz, each with lines of 5 to 100 nm rms, 5 to 150 Hz and damping 0.002 to 0.01, and
+wide resonances of 20 to 80 nm, 15 to 200 Hz and damping 0.1 to 0.4, in frozen flow. Each time is
+the median of three records. The last column says how many densities of a spectrum the fits
+evaluated, and how much of the time that took. ``--auto`` designs from one record, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from unittest import mock
+
+import numpy as np
+from harness import Row, with_growth
+
+import lbt_synth as lbt
+from lbt_synth.identification.fit import whittle
+
+RATE = 1000.0
+SEEDS = (2, 3, 4)
+SECONDS = (15, 60, 240, 600)
+LINES = (1, 2, 4, 8)
+
+
+def record(
+    seed: int, *, seconds: int = 60, lines: int = 5, wide: int = 2
+) -> lbt.identification.LoopRecord:
+    """Draw a loop and run it."""
+    rng = np.random.default_rng([seed, 77])
+    found = []
+    for direction in ((1.0, 0.0), (0.0, 1.0)):
+        for place, damping, rms, count in (
+            ((5, 150), np.log([0.002, 0.01]), (5, 100), lines),
+            ((15, 200), np.log([0.1, 0.4]), (20, 80), wide),
+        ):
+            found += [
+                lbt.Vibration(
+                    frequency_hz=float(rng.uniform(*place)),
+                    damping=float(np.exp(rng.uniform(*damping))),
+                    rms_nm=float(rng.uniform(*rms)),
+                    direction=direction,
+                )
+                for _ in range(count)
+            ]
+    air = lbt.Atmosphere(
+        seeing_arcsec=float(rng.uniform(0.5, 1.5)),
+        outer_scale_m=22,
+        wind_speed_m_s=float(rng.uniform(5, 25)),
+        diameter_m=8.22,
+    )
+    truth = lbt.Truth(
+        turbulence=air,
+        vibrations=tuple(found),
+        noise_nm=float(np.exp(rng.uniform(np.log(2), np.log(30)))),
+        sensor_gain=float(rng.uniform(0.4, 1)),
+    )
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2)
+    law = lbt.integrator(path, gain=float(rng.uniform(0.2, 0.5))).controller
+    run = lbt.simulate(law, truth, hardware=path, frames=seconds * int(RATE), seed=seed)
+    return lbt.identification.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+    )
+
+
+def identify(**options: int) -> Row:
+    """Return the median time of records of a kind, and what the densities took of it."""
+    times, inside, evaluations = [], 0.0, 0
+    density = whittle.densities
+
+    def timed(*arguments: object) -> object:
+        nonlocal inside, evaluations
+        begin = time.process_time()
+        out = density(*arguments)  # type: ignore[arg-type]
+        inside += time.process_time() - begin
+        evaluations += 1
+        return out
+
+    for seed in SEEDS:
+        given = record(seed, **options)
+        begin = time.process_time()
+        with mock.patch.object(whittle, "densities", timed):
+            lbt.identify(given)
+        times.append(time.process_time() - begin)
+    return {
+        "ours_s": statistics.median(times),
+        "evaluations": evaluations // len(SEEDS),
+        "share": inside / sum(times),
+    }
+
+
+def by_seconds() -> dict[int, Row]:
+    """Return the rows of records of several lengths."""
+    return with_growth({seconds: identify(seconds=seconds) for seconds in SECONDS})
+
+
+def by_lines() -> dict[int, Row]:
+    """Return the rows of records of several numbers of lines, without wide resonances."""
+    return with_growth({lines: identify(lines=lines, wide=0) for lines in LINES})
+
+
+IDENTIFICATION = (
+    ("identification of two axes, 5 lines and 2 wide resonances each", "seconds", by_seconds),
+    ("the same of a minute, without wide resonances", "lines", by_lines),
+)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--auto", action="store_true")
+    given = parser.parse_args()
+    lbt.identify(record(0, seconds=10, lines=1, wide=0))  # imports
+    for title, first, case in IDENTIFICATION:
+        print(title)
+        for size, row in case().items():
+            growth = f", grows with power {row['growth']:.2f}" if "growth" in row else ""
+            print(
+                f"  {size:4d} {first}: {row['ours_s']:.2f} s, {row['evaluations']} densities take "
+                f"{100 * row['share']:.0f} %{growth}"
+            )
+    if given.auto:
+        begin = time.process_time()
+        lbt.design_from_record(record(SEEDS[0]))
+        print(f"auto: {time.process_time() - begin:.2f} s")
+
+
+if __name__ == "__main__":
+    main()
