@@ -84,8 +84,9 @@ class TargetChoice(Action):
         setattr(namespace, self.dest, values)
 
 
-def add_drops(parser: ArgumentParser) -> None:
-    """Add the option of sensors that fail in a run, which may be repeated."""
+def add_faults(parser: ArgumentParser) -> None:
+    """Add the options of a mirror of little stroke, and of sensors that fail, in a run."""
+    add_option(parser, "--stroke", float, "largest command that the mirror applies [nm]")
     parser.add_argument(
         "--drop",
         action="append",

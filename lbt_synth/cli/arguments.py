@@ -12,7 +12,7 @@ from lbt_synth.cli.argument_kinds import (
     GAIN_FILE,
     TargetChoice,
     add_config,
-    add_drops,
+    add_faults,
     add_gain,
     add_gains,
     add_option,
@@ -200,12 +200,10 @@ def simulate(parser: ArgumentParser) -> None:
     add_option(parser, "--cases", int, "independent runs")
     add_option(parser, "--seed", int, "seed of the random series")
     add_option(parser, "--sensor-gain", float, "real sensor gain")
-    add_option(parser, "--stroke", float, "largest command that the mirror applies [nm]")
-    add_drops(parser)
+    add_faults(parser)
     _add_form(parser, "of the controller")
     add_output(parser, FIGURE, required=False)
-    text = "write the series of the first run (.fits, .npz or .aot.fits)"
-    add_option(parser, "--telemetry", str, text, metavar="FILE")
+    add_option(parser, "--telemetry", str, "write the first run (.fits, .npz)", metavar="FILE")
 
 
 def telemetry(parser: ArgumentParser) -> None:

@@ -39,13 +39,15 @@ def fits(value, schema):
 def fits_one(value, one):
     """Whether one of its alternatives does."""
     if isinstance(value, dict):
-        known = one.get("properties", {})
+        others = one.get("additionalProperties")  # of names that the file chooses
+        known = one.get("properties", {}) if not others else dict.fromkeys(value, others)
         there = value.keys() <= known.keys() and set(one.get("required", ())) <= value.keys()
         return there and all(fits(inner, known[key]) for key, inner in value.items())
     if isinstance(value, list):
         return one.get("type") == "array" and all(fits(inner, one["items"]) for inner in value)
     if isinstance(value, str):
-        return value in one.get("enum", [one.get("const")])
+        choice = one.get("enum", [one.get("const")])
+        return value in choice or (choice == [None] and one.get("type") == "string")
     if value is None:
         return one.get("type") == "null"
     return one.get("type") in ("number", "integer") and value >= one.get("minimum", value)

@@ -230,7 +230,8 @@ def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         return np.zeros_like(s), 2 - s
     a = np.tanh(colour)
     below = (1 - a) ** 2 + a * s
-    return np.log1p(-(a**2)) - np.log(below), -2 * a + (1 - a**2) * (2 * (1 - a) - s) / below
+    power = 2 * (np.log(2) - np.logaddexp(colour, -colour))  # of a^2 from 1, as a logarithm
+    return power - np.log(below), -2 * a + (1 - a**2) * (2 * (1 - a) - s) / below
 
 
 def _smear(
