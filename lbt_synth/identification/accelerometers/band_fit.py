@@ -26,6 +26,7 @@ _FLOOR = 1e-9  # of a channel's power
 class BandFit:
     """Factors of one channel for the lines of a band."""
 
+    readings: ComplexArray  # (f,): without the lines of other bands
     factors: ComplexArray  # (lines,)
     variances: FloatArray  # (lines,): of the complex factors
     chances: FloatArray  # (lines,): that a channel without a line would show as much
@@ -34,10 +35,12 @@ class BandFit:
     weights: FloatArray  # (f,): inverse variances
 
 
-def fit_band(band: LineBand, channel: int) -> BandFit:
-    """Fit the factors of a channel for the lines of a band."""
-    a, x = band.readings[:, channel], band.expected
-    factors = np.zeros(x.shape[1], dtype=complex)
+def fit_band(band: LineBand, channel: int, others: ComplexArray) -> BandFit:
+    """Fit the factors of a channel for the lines of a band, given those of all other lines."""
+    own, whole = list(band.lines), others.copy()
+    whole[own] = 0
+    a, x = band.readings[:, channel] - band.expected @ whole, band.expected[:, own]
+    factors = whole[own]
     power = float(np.mean(np.abs(a) ** 2))
     noise, open_part = power, np.zeros(len(a))
     for _ in range(_STEPS):
@@ -45,12 +48,14 @@ def fit_band(band: LineBand, channel: int) -> BandFit:
         noise = max(noise * float(level), _FLOOR * power)
         weights = 1 / (noise + open_part)
         info = x.conj().T @ (weights[:, None] * x)
-        factors = np.linalg.lstsq(info, x.conj().T @ (weights * a))[0]
-        open_part = np.einsum("j,fjk,k->f", factors.conj(), band.unseen, factors).real
-    error = a - x @ factors
+        factors = np.asarray(
+            np.linalg.lstsq(info, x.conj().T @ (weights * a))[0], dtype=np.complex128
+        )
+        whole[own] = factors
+        open_part = np.einsum("j,fjk,k->f", whole.conj(), band.unseen, whole).real
     inverse = np.linalg.pinv(info)
     variances = np.diag(inverse @ _spread(np.sqrt(weights)[:, None] * x, band) @ inverse).real
-    return _judge(band, a, factors, variances, noise, weights, error)
+    return _judge(band, a, factors, variances, noise, weights)
 
 
 def _spread(rows: ComplexArray, band: LineBand) -> ComplexArray:
@@ -66,12 +71,12 @@ def _judge(
     variances: FloatArray,
     noise: float,
     weights: FloatArray,
-    error: ComplexArray,
 ) -> BandFit:
     """Test each line, with larger errors where the channel moves in its own way there."""
     from scipy.special import gammaincc
 
-    x, lines = band.expected, len(factors)
+    x, lines = band.expected[:, list(band.lines)], len(factors)
+    error = a - x @ factors
     variances, own = variances.copy(), np.full(lines, noise)
     chances, coherences = np.ones(lines), np.zeros(lines)
     for j in range(lines):
@@ -92,6 +97,7 @@ def _judge(
         powers = np.sum(np.abs(alone) ** 2) * np.sum(np.abs(x[core, j]) ** 2)
         coherences[j] = abs(np.vdot(x[core, j], alone)) ** 2 / max(powers, np.finfo(float).tiny)
     return BandFit(
+        readings=a,
         factors=factors,
         variances=variances,
         chances=chances,

@@ -51,8 +51,8 @@ def likeliest_lag(bands: Sequence[LineBand], largest: int) -> int:
     total = np.zeros(lags.size)
     for band in bands:
         turns = np.exp(1j * lags[:, None] * band.angle)
-        for j in range(len(band.lines)):
-            products = band.expected[:, j, None].conj() * band.readings
+        for line in band.lines:
+            products = band.expected[:, line, None].conj() * band.readings
             power = np.sum(np.abs(products) ** 2, axis=0)
             seen = power > 0
             total += np.sum(np.abs(turns @ products[:, seen]) ** 2 / power[seen], axis=1)
@@ -83,22 +83,20 @@ def clock_shift(pairs: Sequence[Pair], largest: float) -> ClockShift:
 def _evidence(pairs: Sequence[Pair], lags: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return log-likelihoods over lags, for factors of any phase and for real ones."""
     free, real = np.zeros(lags.size), np.zeros(lags.size)
-    for band, fit, j, channel in pairs:
-        sums, size = _matched(band, fit, j, channel, lags)
+    for band, fit, j, _ in pairs:
+        sums, size = _matched(band, fit, j, lags)
         free += np.abs(sums) ** 2 / size
         real += sums.real**2 / size
     return free, real
 
 
-def _matched(
-    band: LineBand, fit: BandFit, j: int, channel: int, lags: FloatArray
-) -> tuple[ComplexArray, float]:
+def _matched(band: LineBand, fit: BandFit, j: int, lags: FloatArray) -> tuple[ComplexArray, float]:
     """Return products of readings and expectation over lags, and the size of the latter.
 
     The other lines of the band are taken away.
     """
-    core, x = band.core[:, j], band.expected
-    alone = band.readings[:, channel] - x @ fit.factors + x[:, j] * fit.factors[j]
+    core, x = band.core[:, j], band.expected[:, list(band.lines)]
+    alone = fit.readings - x @ fit.factors + x[:, j] * fit.factors[j]
     seen = (x[:, j].conj() * fit.weights)[core]
     turns = np.exp(1j * lags[:, None] * band.angle[core])
     scale = abs(fit.factors[j]) ** 2 / max(fit.variances[j], np.finfo(float).tiny)

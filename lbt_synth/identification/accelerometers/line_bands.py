@@ -30,11 +30,11 @@ _PART = 0.25  # of the frequency of a line, to which its band reaches at most
 class LineBand:
     """A band around one line, or around lines whose bands overlap."""
 
-    lines: tuple[int, ...]  # indices of the lines
+    lines: tuple[int, ...]  # indices of its lines among all
     angle: FloatArray  # (f,) [rad per frame]
     readings: ComplexArray  # (f, channels) [m/s^2 per sqrt(Hz)]
-    expected: ComplexArray  # (f, lines): of a motion of 1 nm per nm [m/s^2 per sqrt(Hz)]
-    unseen: FloatArray  # (f, lines, lines): covariance that the wavefront leaves of it
+    expected: ComplexArray  # (f, all lines): of a motion of 1 nm per nm [m/s^2 per sqrt(Hz)]
+    unseen: FloatArray  # (f, all lines, all lines): covariance that the wavefront leaves of it
     core: BoolArray  # (f, lines): frequencies of the lines themselves
     follows: BoolArray  # (f - 1,): whether a value is a neighbour of the one before
 
@@ -66,14 +66,11 @@ def line_bands(
     for group, low, high in _groups(lines, resolution):
         inside = np.flatnonzero((frequency >= low) & (frequency <= high))
         f = frequency[inside]
-        estimate, unseen = _wiener(
-            model, [lines[j] for j in group], shapes[inside][:, group], f, z[inside]
-        )
+        own = [lines[j] for j in group]
+        estimate, unseen = _wiener(model, lines, shapes[inside], f, z[inside])
         second = -NM * (2 * rate * np.sin(np.pi * f / rate)) ** 2
-        reach = np.array(
-            [_reach(lines[j], resolution, _CORE_HALF_WIDTHS, _CORE_BINS) for j in group]
-        )
-        centres = np.array([lines[j].frequency_hz for j in group])
+        reach = [_reach(line, resolution, _CORE_HALF_WIDTHS, _CORE_BINS) for line in own]
+        centres = np.array([line.frequency_hz for line in own])
         out.append(
             LineBand(
                 lines=tuple(group),

@@ -31,6 +31,7 @@ _SHORTEST = 256  # frames side by side
 _ERRORS = 5.0  # between the shifts of two channels that differ
 _LEAST_SHIFT = 0.2  # frames, that are worth a word
 _PASSES = 3
+_ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
 LEFT_OUT = ("dead", "saturated")
 
 
@@ -299,10 +300,17 @@ def _lay_and_fit(
 def fit_pairs(bands: Sequence[LineBand]) -> list[Pair]:
     """Return the fit of every channel with every line."""
     out: list[Pair] = []
-    for band in bands:
-        for channel in range(band.readings.shape[1]):
-            fit = fit_band(band, channel)
-            out += [(band, fit, j, channel) for j in range(len(band.lines))]
+    for channel in range(bands[0].readings.shape[1]):
+        factors = np.zeros(bands[0].expected.shape[1], dtype=complex)
+        for _ in range(_ROUNDS):
+            fits = [fit_band(band, channel, factors) for band in bands]
+            for band, fit in zip(bands, fits, strict=True):
+                factors[list(band.lines)] = fit.factors
+        out += [
+            (band, fit, j, channel)
+            for band, fit in zip(bands, fits, strict=True)
+            for j in range(len(band.lines))
+        ]
     return out
 
 
