@@ -9,6 +9,7 @@ from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.identification import (
+    AccelerometerTransfers,
     LoopRecord,
     SpectrumRecord,
     accelerometer_transfers,
@@ -32,10 +33,17 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, model)
+    found: AccelerometerTransfers | None = None
     if arguments.accelerometers is not None and isinstance(record, LoopRecord):
         readings = loop_records.read_accelerations(arguments, record)
-        found = accelerometer_transfers(model, record, readings.values, channels=readings.channels)
+        found = accelerometer_transfers(
+            model,
+            record,
+            readings.values,
+            channels=readings.channels,
+            earlier=loop_records.earlier_lines(arguments.earlier_model),
+        )
         loop_records.add_accelerometers(report, found)
     report.notes += [loop_records.marked_note(note) for note in notes]
-    loop_records.write_files(report, places, arguments, record, model)
+    loop_records.write_files(report, places, arguments, record, model, accelerometers=found)
     return report

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -11,7 +13,7 @@ from typing import Any
 from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.loop_inputs import given_options
 from lbt_synth.cli.output import Report
-from lbt_synth.config import identified_config
+from lbt_synth.config import identified_config, load_config
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
@@ -168,6 +170,21 @@ def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
     )
 
 
+def earlier_lines(path: str | None) -> list[tuple[float, dict[str, complex]]]:
+    """Return how channels moved with each line of an earlier configuration, if there is one."""
+    vibrations = [] if path is None else load_config(path).settings.model.vibrations or []
+    return [
+        (
+            line.frequency_hz,
+            {
+                name: cmath.rect(each.motion_nm_per_nm, math.radians(each.phase_deg))
+                for name, each in (line.accelerometers or {}).items()
+            },
+        )
+        for line in vibrations
+    ]
+
+
 def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
     """Add how the channels of accelerometers move with the lines, and what each is worth."""
     if found.transfers:
@@ -205,9 +222,10 @@ def write_files(
     record: LoopRecord | SpectrumRecord,
     model: IdentifiedModel,
     made: RecordedDesign | None = None,
+    accelerometers: AccelerometerTransfers | None = None,
 ) -> None:
     """Write gain file, model and figure, once all of them are computed."""
-    text = _model_text(model, arguments, record)
+    text = _model_text(model, arguments, record, accelerometers)
     figure = None
     if "figure" in places:
         designs = None if made is None else {made.name: made.design}
@@ -220,7 +238,10 @@ def write_files(
 
 
 def _model_text(
-    model: IdentifiedModel, arguments: Namespace, record: LoopRecord | SpectrumRecord
+    model: IdentifiedModel,
+    arguments: Namespace,
+    record: LoopRecord | SpectrumRecord,
+    accelerometers: AccelerometerTransfers | None,
 ) -> bytes:
     """Return the text of a configuration for an identified model."""
     obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
@@ -233,6 +254,7 @@ def _model_text(
         obstruction=obstruction,
         wavelength_um=imaging_wavelength_um(arguments, record),
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
+        accelerometers=accelerometers,
     )
     return config_text(settings, comments).encode()
 

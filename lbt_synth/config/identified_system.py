@@ -13,10 +13,12 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import IdentifiedModel
+from lbt_synth.identification import AccelerometerTransfers, IdentifiedModel
 from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")
+_NAME = "accelerometer"  # of the instrument that all channels make
+_LONGEST_DELAY = 20  # frames, in a configuration
 _DIRECTIONS = {(1.0, 0.0): "tip", (0.0, 1.0): "tilt"}
 _KIND_COMMENTS = {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}
 
@@ -29,6 +31,7 @@ def identified_config(
     wavelength_um: float = 2.2,
     other_modes_strehl: float = 1.0,
     title: str = "An identified system.",
+    accelerometers: AccelerometerTransfers | None = None,
 ) -> tuple[FileSection, dict[str, str]]:
     """Return the configuration of an identified system, the truth being the model.
 
@@ -46,6 +49,8 @@ def identified_config(
         Strehl ratio that all other modes leave.
     title : str, optional
         Comment at the top of the file.
+    accelerometers : AccelerometerTransfers, optional
+        How accelerometers move with the lines of the model; channels that show none are left out.
 
     Returns
     -------
@@ -94,6 +99,10 @@ def identified_config(
         "delay_frames": number(model.delay_frames, "delay_frames", at_least=1),
     }
     vibrations = _vibration_sections(model, comments)
+    if accelerometers is not None and accelerometers.used:
+        delay = model.delay_frames
+        content["sensors"] = {_NAME: _accelerometer_section(accelerometers, delay, comments)}
+        _add_motions(vibrations, accelerometers, comments)
     content["model"] = {"turbulence": []}
     for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
         turbulence = axis.turbulence
@@ -141,6 +150,39 @@ def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> lis
             entry[key] = float(getattr(part, key))
         sections.append(entry)
     return sections
+
+
+def _accelerometer_section(
+    found: AccelerometerTransfers, delay_frames: float, comments: dict[str, str]
+) -> dict[str, Any]:
+    """Return the section of the channels that are used, and comment on their delay."""
+    age, path = found.age_frames, f"sensors.{_NAME}.delay_frames"
+    comments[path] = f"readings come {age - 1} frames after the wavefront's"
+    if age < 0 or not 0 < age + delay_frames - 1 <= _LONGEST_DELAY:
+        comments[path] = f"not known: the clocks were {age - 1} frames apart; give the real delay"
+        age = 1
+    return {
+        "kind": "accelerometer",
+        "rate_hz": float(found.rate_hz),
+        "delay_frames": float(age + delay_frames - 1),
+        "channels": [row.channel for row in found.used],
+        "noise_m_s2": [float(row.noise_m_s2) for row in found.used],
+    }
+
+
+def _add_motions(
+    vibrations: list[dict[str, Any]], found: AccelerometerTransfers, comments: dict[str, str]
+) -> None:
+    """Add to each vibration how the channels that show it move with it, with errors."""
+    for row in found.transfers:
+        if not row.useful:
+            continue
+        moving = vibrations[row.line].setdefault("accelerometers", {})
+        values = {"motion_nm_per_nm": row.motion_nm_per_nm, "phase_deg": row.phase_deg}
+        moving[row.channel] = values
+        path = f"model.vibrations[{row.line}].accelerometers.{row.channel}"
+        comments[f"{path}.motion_nm_per_nm"] = _error_comment("", [row.motion_error_nm_per_nm])
+        comments[f"{path}.phase_deg"] = _error_comment("degrees", [row.phase_error_deg])
 
 
 def _error_comment(unit: str, errors: Sequence[float]) -> str:

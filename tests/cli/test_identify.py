@@ -161,6 +161,10 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
         "used for 31.1 Hz",
         "dead; adds nothing",
     ]
+    settings = lbt.load_config(tmp_path / "m.yaml").settings
+    assert settings.sensors["accelerometer"].channels == ["m1"]
+    (moving,) = [each.accelerometers for each in settings.model.vibrations if each.accelerometers]
+    assert moving["m1"].motion_nm_per_nm == line["motion_nm_per_nm"]
     status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 1500)
     assert status == 2
     assert "whole multiple of the frame rate" in error

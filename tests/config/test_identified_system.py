@@ -135,3 +135,42 @@ def test_quiet_axes_have_no_vibrations(tmp_path):
 def test_models_that_no_configuration_can_hold(model, options, text):
     with pytest.raises(lbt.errors.ProblemError, match=text):
         lbt.config.identified_config(model, **options)
+
+
+@pytest.mark.parametrize(("age", "delay"), [(0, 1.0), (4, 5.0), (-3, 2.0), (500, 2.0)])
+def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
+    """One channel shows the second line; the other adds nothing. A clock that is off gets age 1."""
+    row = lbt.identification.TransferRow(
+        channel="m1",
+        line=1,
+        frequency_hz=47.0,
+        motion_nm_per_nm=1.5,
+        motion_error_nm_per_nm=0.02,
+        phase_deg=-170.25,
+        phase_error_deg=0.5,
+        coherence=0.9,
+        chance=1e-9,
+        useful=True,
+    )
+    names = ("m1", "m2")
+    found = lbt.identification.AccelerometerTransfers(
+        transfers=(row, replace(row, channel="m2", line=0, useful=False)),
+        channels=tuple(
+            lbt.identification.ChannelRow(channel=name, noise_m_s2=2e-4, verdict="")
+            for name in names
+        ),
+        shift=lbt.identification.ClockShift(frames=age - 1, error_frames=0.1, by_phases=True),
+        age_frames=age,
+        rate_hz=1000.0,
+    )
+    path = save_identified(tmp_path, TWO, accelerometers=found)
+    fused = lbt.load_config(path).fused_plant
+    (sensor,) = fused.suite.sensors
+    assert (sensor.channels, sensor.delay_frames) == (("m1",), delay)
+    assert sensor.noise_m_s2.tolist() == [2e-4]
+    motions = [
+        {name: (each.size, each.phase_deg) for name, each in m.items()} for m in fused.motions
+    ]
+    assert motions == [{}, {"m1": (1.5, -170.25)}, *[{}] * (len(motions) - 2)]
+    assert "standard error 0.02" in path.read_text()
+    assert ("give the real delay" in path.read_text()) == (age in (-3, 500))
