@@ -22,6 +22,7 @@ import numpy as np
 from harness import Row, machine, paired, seconds
 from speed_ensemble import ENSEMBLE
 from speed_export import REALTIME
+from speed_identification import IDENTIFICATION
 from speed_linear import SIZED
 from speed_modal import MODAL
 
@@ -190,7 +191,7 @@ def main() -> None:
     pages = []
     everyday = {**imports(), **time_domain(), **synthesis(), **maps()}
     tables = [("everyday operations", "operation", everyday)]
-    for title, first, case in (*SIZED, *MODAL, *ENSEMBLE, *REALTIME):
+    for title, first, case in (*SIZED, *MODAL, *ENSEMBLE, *IDENTIFICATION, *REALTIME):
         print(f"... {title}", file=sys.stderr)
         tables.append((title, first, {str(size): row for size, row in case().items()}))
     for title, first, rows in tables:

@@ -55,9 +55,14 @@ def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
 
 
 def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
-    """Return what two lines of like damping in the place of line i add to the log-likelihood."""
+    """Return what two lines of like damping in the place of line i add to the log-likelihood.
+
+    Nothing beside zero frequency, where there is no place for two.
+    """
     line = spectrum.components[i]
     centre, half = search.place(line)
+    if centre < 2 * half:
+        return 0.0
     data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
     best = single = contrast(data, spectrum)
     for share in _SHARES:

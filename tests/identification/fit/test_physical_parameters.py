@@ -12,7 +12,9 @@ from lbt_synth.identification.fit.order_search import search_model
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
+    hold_gain,
     parameter_covariance,
+    standard_errors,
     whiteness,
 )
 
@@ -96,3 +98,23 @@ def test_errors_at_a_held_gain_are_those_of_a_free_one() -> None:
     (one,), (other,) = free.lines, held.lines
     assert other.rms_error_nm == pytest.approx(one.rms_error_nm, rel=0.01)
     assert held.sensor_gain_error == pytest.approx(free.sensor_gain_error)
+
+
+def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
+    y, c = integrator_loop(lines=((40, 0.01, 30),))
+    axis = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    search, model = Search(data=axis.data), axis.fitted_model
+    errors = standard_errors(model.spectrum, parameter_covariance(model))
+    more = hold_gain(search, model, 0.2)
+    wider = standard_errors(model.spectrum, parameter_covariance(more))
+    assert wider.log_gain == pytest.approx(0.2, rel=1e-6)
+    assert wider.components[1].log_power > errors.components[1].log_power
+
+
+def test_white_noise_says_how_well_its_colour_shows() -> None:
+    frames = 8192
+    axis = lbt.identification.identify_axis(
+        np.random.default_rng(1).standard_normal(frames), frame_rate_hz=RATE
+    )
+    assert axis.noise_correlation == 0
+    assert axis.noise_correlation_error == pytest.approx(1 / np.sqrt(frames), rel=0.25)
