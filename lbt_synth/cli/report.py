@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Mapping
 from typing import Any
 
 from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import count_progress
-from lbt_synth.config import load_config
+from lbt_synth.cli.progress import count_progress, show_spinner
+from lbt_synth.config import Config, load_config
+from lbt_synth.design import Design
+from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import DesignAssessment, design_report, write_report
 from lbt_synth.report.designs.assessment_row import AssessmentRow, assessment_row
@@ -17,6 +20,7 @@ from lbt_synth.report.designs.report import count_steps
 from lbt_synth.report.designs.verdict import good_range, verdict
 from lbt_synth.report.page.page_files import require_page_names
 from lbt_synth.report.provenance import require_letters, time_text
+from lbt_synth.report.several_sensors import write_fused_report
 from lbt_synth.storage.rows import json_record, json_units, row_table
 
 _IN_MARGINS = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz")
@@ -31,7 +35,10 @@ def run(arguments: Namespace) -> Report:
     require_letters(arguments.title or "", "--title")
     config = load_config(arguments.config)
     choose_config_unit(arguments, config)
-    designs = load_designs(arguments.gains)
+    designs = load_designs(arguments.gains, several_sensors=True)
+    fused = {name: each for name, each in designs.items() if isinstance(each, FusedFilter)}
+    if fused:
+        return _report_several_sensors(arguments, config, designs, fused)
     files = dict(zip(designs, arguments.gains, strict=True))
     total = count_steps(len(designs)) + 1
     with count_progress(total=total, what="report", quiet=arguments.json) as count:
@@ -58,6 +65,31 @@ def run(arguments: Namespace) -> Report:
             *(f"note: {one.name}: {note}" for one in found.assessments for note in one.notes),
         ],
     )
+    report.note_files(written)
+    return report
+
+
+def _report_several_sensors(
+    arguments: Namespace,
+    config: Config,
+    designs: Mapping[str, Design],
+    fused: Mapping[str, FusedFilter],
+) -> Report:
+    """Write the page of designs of several sensors, which have no one transfer function."""
+    if len(fused) < len(designs):
+        own = ", ".join(name for name in designs if name not in fused)
+        raise ProblemError(
+            f"a page is of designs of several sensors, or of the loop's own sensor alone; got "
+            f"{', '.join(fused)} of the first kind and {own} of the second. lbt-synth limits takes "
+            "both."
+        )
+    with show_spinner("report", quiet=arguments.json):
+        written, found = write_fused_report(
+            config, fused, arguments.output, pdf=arguments.pdf, title=arguments.title
+        )
+    report = Report()
+    caption = f"Designs in the loop of {config.source.name}; {config.imaging.label}"
+    report.add_rows("rows", caption, found.rows, hidden=("worst_nm", "above_band_limit_percent"))
     report.note_files(written)
     return report
 

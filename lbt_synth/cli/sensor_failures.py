@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from argparse import Namespace
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,34 +12,17 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design.fusion.fused_filter import FusedFilter
-from lbt_synth.errors import ProblemError, UnstableLoopError
-from lbt_synth.loop import Simulation, residual_budget, strehl
-from lbt_synth.loop.fusion.fused_loop import close_fused_loop
-from lbt_synth.loop.fusion.simulation import READINGS, Drop, Segment, run_segments, simulate_fused
-from lbt_synth.loop.strehl import series_strehl
-from lbt_synth.models import Truth
+from lbt_synth.errors import ProblemError
+from lbt_synth.loop import residual_budget, strehl
+from lbt_synth.loop.fusion.simulation import READINGS, Drop
 from lbt_synth.report.figures import sensor_failure_figure
 from lbt_synth.report.figures.style import save_figure
-from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.studies.sensor_failures import run_failures
 
 _DROP = re.compile(
     rf"(?P<unit>[^@]+)@(?P<start>[\d.]+)s?(\.\.(?P<end>[\d.]+)s?)?(:(?P<reading>{'|'.join(READINGS)}))?$"
 )
 _AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
-
-
-@table_row
-class SegmentRow:
-    """The residual between two events."""
-
-    start_s: float = column("from", unit="s", format="g")
-    end_s: float = column("to", unit="s", format="g")
-    sensors: str = column("sensors that fail")
-    residual_nm: float = nm_column("simulated", unit="nm rms", format=".2f")
-    exact_nm: float = nm_column(
-        "exact, once settled", unit="nm rms", format=".2f", missing="unstable"
-    )
-    strehl: float = percent_column("Strehl")
 
 
 def parse_drop(text: str) -> Drop:
@@ -79,74 +61,26 @@ def run_fused(arguments: Namespace, config: Config, design: FusedFilter) -> Repo
             f"--frames must reach beyond the last --drop, {last_s:g} s or {last_s * rate:.0f} "
             f"frames; got {sizes['frames']}."
         )
-    segments = run_segments(drops, sizes["frames"] / rate)
     with show_spinner("closing the loop", quiet=arguments.json):
-        simulation = simulate_fused(
-            design.controllers,
-            design.problem.suite,
-            truth,
-            hardware=config.hardware,
-            **sizes,
-            settle_frames=settings.settle_frames,
-            drops=drops,
-        )
-    exact = [_exact_nm(design, config, truth, segment) for segment in segments]
-    rows = [
-        _segment_row(simulation, segment, own, config)
-        for segment, own in zip(segments, exact, strict=True)
-    ]
+        found = run_failures(design, config, truth, drops, **sizes)
     report = Report(
         data={
-            "residual_nm": simulation.rms_nm,
+            "residual_nm": found.simulation.rms_nm,
             "frames": sizes["frames"],
             "cases": sizes["cases"],
-            "seed": simulation.seed,
+            "seed": sizes["seed"],
             "wavelength_um": config.imaging.wavelength_um,
         }
     )
     caption = f"{design.method} in the loop: {sizes['cases']} runs; {config.imaging.label}"
-    report.add_rows("segments", caption, rows)
+    report.add_rows("segments", caption, found.rows(config.imaging))
     if not truth.drifts:
         ratio = strehl(residual_budget(loop, truth), config.imaging)
         report.data["strehl_exact"] = ratio
         report.notes.append(f"Strehl ratio with all sensors, exact: {100 * ratio:.2f} %")
     if arguments.output is not None:
-        figure = sensor_failure_figure(simulation, segments, exact, title=design.method)
+        figure = sensor_failure_figure(
+            found.simulation, found.segments, found.exact_nm, title=design.method
+        )
         report.note_written(save_figure(figure, arguments.output))
     return report
-
-
-def _exact_nm(design: FusedFilter, config: Config, truth: Truth, segment: Segment) -> float:
-    """Return the stationary residual of a segment; nan if it is unstable or a vibration drifts."""
-    away = (*segment.missing, *segment.wrong)
-    loop = close_fused_loop(
-        config.hardware,
-        design.problem.suite,
-        design.controllers[frozenset(segment.missing)],
-        sensor_gain=truth.sensor_gain,
-        blind=away,
-    )
-    if truth.drifts:
-        return np.nan
-    try:
-        return residual_budget(loop, truth).rms_nm
-    except UnstableLoopError:
-        return np.nan
-
-
-def _segment_row(
-    simulation: Simulation, segment: Segment, exact_nm: float, config: Config
-) -> SegmentRow:
-    rate = simulation.frame_rate_hz
-    frames = slice(
-        int(np.ceil(segment.start_s * rate - 1e-6)), int(np.ceil(segment.end_s * rate - 1e-6))
-    )
-    part = replace(simulation, residual_nm=simulation.residual_nm[:, frames])
-    return SegmentRow(
-        start_s=segment.start_s,
-        end_s=segment.end_s,
-        sensors=segment.text or "none",
-        residual_nm=float(np.sqrt(np.mean(part.rms_nm**2))),
-        exact_nm=exact_nm,
-        strehl=float(np.mean([series_strehl(case, config.imaging) for case in part.residual_nm])),
-    )

@@ -54,6 +54,13 @@ def sensor_failure_figure(
     >>> len(figure.axes)
     2
     """
+    return draw_figure(sensor_failure_panels(run, segments, exact_nm), title=title)
+
+
+def sensor_failure_panels(
+    run: Simulation, segments: Sequence[Segment], exact_nm: Sequence[float]
+) -> tuple[Panel, Panel]:
+    """Return the panels of :func:`sensor_failure_figure`."""
     _, frames, n = run.residual_nm.shape
     time, names = np.arange(frames) / run.frame_rate_hz, ("tip", "tilt")
     window = max(int(_WINDOW_S * run.frame_rate_hz), 1)
@@ -91,5 +98,4 @@ def sensor_failure_figure(
     x, y = Axis(label="time", unit="s"), Axis(label="residual, both axes", unit="nm rms", log=True)
     above = series_panel(series)
     above = replace(above, marks=(*spans, *above.marks))
-    panels = (above, Panel(x=x, y=y, marks=(*spans, seen, *steps)))
-    return draw_figure(panels, title=title)
+    return above, Panel(x=x, y=y, marks=(*spans, seen, *steps))

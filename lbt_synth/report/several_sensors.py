@@ -1,0 +1,141 @@
+"""The page of designs of several sensors: what they leave, what failures do, and the proofs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from lbt_synth.config import Config
+from lbt_synth.design.fusion.failures import failure_rows
+from lbt_synth.design.fusion.fused_filter import FusedFilter
+from lbt_synth.loop.fusion.simulation import Drop
+from lbt_synth.report.charts.description import Chart
+from lbt_synth.report.figures.sensor_failures import sensor_failure_panels
+from lbt_synth.report.number_text import listing_text
+from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.page.words import chart
+from lbt_synth.report.provenance import (
+    creation_time,
+    creator_name,
+    program_versions,
+    time_text,
+    versions_table,
+)
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import fact_table, row_table
+from lbt_synth.studies import TruthComparison, compare_in_truth
+from lbt_synth.studies.sensor_failures import run_failures
+
+_AWAY_S = 1.0  # that each sensor is missing, and that all are there again
+
+
+def write_fused_report(
+    config: Config,
+    designs: Mapping[str, FusedFilter],
+    path: str | os.PathLike[str],
+    *,
+    pdf: str | os.PathLike[str] | None = None,
+    title: str | None = None,
+) -> tuple[tuple[Path, ...], TruthComparison]:
+    """Write the page of designs of several sensors, and as a PDF if that is wanted.
+
+    Parameters
+    ----------
+    config : Config
+        The loop; its truth must be stationary.
+    designs : mapping of str to FusedFilter
+        The designs by name.
+    path, pdf : path-like
+        Files to write, that end in .html and .pdf.
+    title : str, optional
+        Heading of the page.
+
+    Returns
+    -------
+    tuple of pathlib.Path, TruthComparison
+        The files, and the designs in the truth of the configuration.
+
+    Raises
+    ------
+    OutputError
+        If a name ends in something else, or a file cannot be written.
+    ProblemError
+        If a design does not fit the loop, or a vibration drifts.
+    """
+    require_page_names(path, pdf)
+    found = compare_in_truth(designs, config)
+    sections = [_summary_section(config, designs, found)]
+    for number, (name, design) in enumerate(designs.items(), start=1):
+        rows = failure_rows(design.problem, design.gains, design.fallbacks)
+        blocks: tuple[Block, ...] = (
+            fact_table(name, design.facts()),
+            row_table("When sensors fail", rows),
+            _failure_chart(config, name, design, f"failures-{number}"),
+            row_table("Certificate, computed again", design.recertify().checks),
+        )
+        sections.append(Section(key=f"design-{number}", title=name, blocks=blocks))
+    sections.append(
+        Section(
+            key="sources",
+            title="Configuration and versions",
+            blocks=(
+                versions_table(program_versions()),
+                Listing(caption=config.source.name, text=config.source.read_text("utf-8")),
+            ),
+        )
+    )
+    page = Page(
+        title=title or f"Several sensors for {config.source.name}",
+        subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
+        sections=tuple(sections),
+        creator=creator_name(),
+    )
+    return write_page(page, path, pdf), found
+
+
+def _summary_section(
+    config: Config, designs: Mapping[str, FusedFilter], found: TruthComparison
+) -> Section:
+    """Open with what each design leaves in the truth, beside references."""
+    blocks: list[Block] = []
+    for name, design in designs.items():
+        own = next(row for row in found.rows if row.design == name)
+        others = listing_text(list(design.problem.suite.units[1:]))
+        text = f"{name} reads {others} beside the loop's own sensor, and leaves "
+        text += nm_text(own.residual_nm, ".1f", unit="nm rms")
+        if found.limit is not None:
+            least = nm_text(found.limit.rms_nm, ".1f", unit="nm rms")
+            text += f"; no controller of the own sensor alone leaves less than {least}"
+        blocks.append(Paragraph(text=f"{text}."))
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    hidden = ("worst_nm", "above_band_limit_percent", "phase_margin_deg")
+    blocks.append(row_table(caption, found.rows, without=hidden))
+    blocks += [Notice(text=note) for note in found.notes]
+    return Section(key="summary", title="Summary", blocks=tuple(blocks))
+
+
+def _failure_chart(config: Config, name: str, design: FusedFilter, key: str) -> Chart:
+    """Draw a run in which each sensor and channel is missing in turn."""
+    units = design.problem.suite.units
+    drops = [
+        Drop(unit=unit, start_s=(2 * i + 1) * _AWAY_S, end_s=(2 * i + 2) * _AWAY_S)
+        for i, unit in enumerate(units)
+    ]
+    seconds = (2 * len(units) + 1) * _AWAY_S
+    frames, seed = int(seconds * config.hardware.frame_rate_hz), config.settings.simulation.seed
+    run = run_failures(design, config, config.truth, drops, frames=frames, cases=1, seed=seed)
+    left = [
+        f"without {segment.text} {nm_text(exact, '.1f', unit='nm rms')}"
+        for segment, exact in zip(run.segments, run.exact_nm, strict=True)
+        if segment.text
+    ]
+    return chart(
+        key,
+        sensor_failure_panels(run.simulation, run.segments, run.exact_nm),
+        words="sensor-failures",
+        name=name,
+        away=f"{_AWAY_S:g}",
+        residuals=listing_text(left),
+    )

@@ -1,0 +1,38 @@
+"""The page of designs of several sensors."""
+
+from __future__ import annotations
+
+import pytest
+from support.commands import run
+from support.several_sensors import write_config
+
+import lbt_synth as lbt
+from lbt_synth.report.several_sensors import write_fused_report
+
+
+def test_a_page_has_the_table_of_failures_and_a_run(fused, fused_config, tmp_path):
+    files, found = write_fused_report(fused_config, {"both": fused}, tmp_path / "page.html")
+    text = files[0].read_text(encoding="utf-8")
+    assert "When sensors fail" in text
+    assert "each sensor missing in turn" in text
+    assert found.rows[0].design == "both"
+    limit = found.limit.rms_nm
+    assert found.rows[0].residual_nm < limit  # of the own sensor alone
+    assert f"alone leaves less than {limit:.1f}" in text
+
+
+def test_the_command_takes_them_alone(fused_file, gains, tmp_path, capsys):
+    config, page = write_config(tmp_path), tmp_path / "page.html"
+    status, text, _ = run(capsys, "report", config, fused_file, "-o", page)
+    assert (status, page.exists()) == (0, True)
+    assert "above the limit" in text
+    page.unlink()
+    status, _, error = run(capsys, "report", config, fused_file, gains["kalman"], "-o", page)
+    assert (status, page.exists()) == (2, False)
+    assert "lbt-synth limits takes both" in error
+
+
+@pytest.fixture
+def gains(tmp_path_factory, config):
+    design = lbt.integrator(config.hardware, gain=0.5)
+    return {"kalman": lbt.save_gain(tmp_path_factory.mktemp("own") / "own.fits", design)}

@@ -1,0 +1,36 @@
+"""A loop in which sensors fail on the way, beside the exact answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.loop.fusion.simulation import Drop
+from lbt_synth.studies.sensor_failures import run_failures
+
+
+def test_each_segment_has_its_exact_residual(fused, fused_config):
+    drops = [Drop(unit="m1", start_s=8), Drop(unit="m2", start_s=16, reading="zero")]
+    found = run_failures(
+        fused, fused_config, fused_config.truth, drops, frames=24_000, cases=6, seed=4
+    )
+    rows = found.rows(fused_config.imaging)
+    assert [row.sensors for row in rows] == ["none", "m1", "m1, m2 (zero)"]
+    assert rows[0].exact_nm == pytest.approx(
+        lbt.residual_budget(fused.loop(), fused_config.truth).rms_nm, rel=1e-9
+    )
+    for row in rows:
+        assert row.residual_nm == pytest.approx(row.exact_nm, rel=0.06)
+    assert rows[0].strehl > rows[1].strehl > rows[2].strehl
+
+
+def test_a_loop_that_a_blind_sensor_destabilises_has_no_exact_answer(fused, fused_config):
+    away = Drop(unit="wavefront", start_s=0.5, reading="zero")
+    slow = Drop(unit="slow", start_s=0.5, reading="missing")
+    found = run_failures(
+        fused, fused_config, fused_config.truth, [away, slow], frames=600, cases=1, seed=4
+    )
+    stable = np.isfinite(found.exact_nm[1])
+    radius = fused.controllers[frozenset({"slow"})].to_statespace().radius_per_frame
+    assert stable == (radius < 1)  # nothing closes the loop: the controller alone decides
