@@ -35,7 +35,7 @@ _KEY = "design.robust"
 _AXES: dict[Axis, int] = {"tip": 0, "tilt": 1}
 _MOST_BANDS = 6  # around lines of a plant
 _BAND = 0.02  # half width of such a band, over its frequency
-_PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes minutes
+_PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes longer
 _GAIN_BAND, _GAIN_MARGIN, _GAIN_FUNCTIONS = 0.003, 0.25, 60  # if only the gain is uncertain
 
 

@@ -25,7 +25,9 @@ from lbt_synth.linear.convex_functions import (
 from lbt_synth.validation import FloatArray
 
 _STEPS = 24
-_DECREASE = 2e-3  # of the objective, below which a step is the last
+_DECREASE = 1e-6  # of the objective, below which a step is the last
+_LEAST_SHARE = 1e-3  # of a step that is tried
+_PENALTY = 10.0  # relative rise of the objective that a relative excess of a bound is worth
 _FINE = 2048
 _WORST = 2e-3  # by which a worst case may exceed that of the programme's own frequencies
 _CLOSE = 0.98  # of a bound, beyond which the neighbourhood is checked more finely
@@ -57,14 +59,14 @@ def solve_sequence(
 
     A convex specification takes one programme, and another for each time that a bound is exceeded
     between its frequencies. One with terms at other sensor gains is solved for unit gain first,
-    until the demands hold at all frequencies, and goes on with upper bounds that touch the
-    objective; none of these steps makes it larger or leaves the demands.
+    until the loop is stable at all of them, and goes on with steps to the optimum of a model of the
+    objective, as far as they lower it, until the demands hold at all frequencies.
     """
     programme = _Programme(spec, channel, fineness)
     convex, values = is_convex(programme.function), []
-    # the upper bounds need coefficients whose loops are stable at all sensor gains
+    # the steps need coefficients whose loops are stable at all sensor gains
     if convex or start is None or not programme.is_stable(start):
-        c = _minimize_at_unit_gain(programme)
+        c = _minimize_at_unit_gain(programme, convex=convex)
         values.append(programme.function.value(c))
     else:
         c = start
@@ -74,20 +76,24 @@ def solve_sequence(
     return SequenceSolution(channel, programme.grid, c, tuple(values), solved, status)
 
 
-def _minimize_at_unit_gain(programme: _Programme) -> FloatArray:
-    """Minimise the objective at unit sensor gain, until the demands hold at all frequencies."""
+def _minimize_at_unit_gain(programme: _Programme, *, convex: bool) -> FloatArray:
+    """Minimise the objective at unit gain, until all demands hold, or the loop is stable."""
     while True:
         c = programme.solve(without_denominators(programme.function))
-        if not programme.refine(c):
+        if not programme.refine(c) or (not convex and programme.is_stable(c)):
             return c
 
 
 def _lower_objective(programme: _Programme, c: FloatArray, values: list[float]) -> FloatArray:
-    """Minimise upper bounds that touch the objective, until it settles; append its values."""
+    """Lower the objective by steps to the optimum of its model at c; append its values."""
     while True:
-        c = programme.solve(programme.function, start=c)
+        step, before = programme.solve(programme.function, start=c) - c, programme.merit(c)
+        share = 1.0
+        while programme.merit(c + share * step) > before and share > _LEAST_SHARE:
+            share /= 2
+        c = c + share * step
         values.append(programme.function.value(c))
-        settled = len(values) > 1 and values[-2] - values[-1] <= _DECREASE * values[-1]
+        settled = before - programme.merit(c) <= _DECREASE * before
         if not programme.refine(c) and settled:
             return c
 
@@ -119,7 +125,7 @@ class _Programme:
                 residual=float(self._excess.size),
             )
         self.solved += 1
-        held = _merged(self.groups)
+        held = merge_groups(self.groups)
         c, self.status = minimize(function, held, size=self.size, scale=self.scale, start=start)
         if c is None:
             raise _infeasibility_error(self)
@@ -129,6 +135,13 @@ class _Programme:
         """Whether the half-planes of the sensor gains hold at all frequencies, without the room."""
         planes = [x for x in self._fine[1] if isinstance(x, HalfPlanes)]
         return all(float(np.max(plane.use(c))) * (1 - ROOM) < 1 for plane in planes)
+
+    def merit(self, c: FloatArray) -> float:
+        """Objective at coefficients c, larger where they exceed bounds."""
+        bounds = [bound for group in self.groups for bound in group]
+        planes = [bound for bound in bounds if isinstance(bound, Discs | HalfPlanes)]
+        excess = max((float(np.max(plane.use(c))) - 1 for plane in planes), default=0.0)
+        return self.function.value(c) * (1 + _PENALTY * max(excess, 0.0))
 
     def refine(self, c: FloatArray) -> bool:
         """Add the frequencies at which coefficients exceed bounds; return whether there are any."""
@@ -166,10 +179,11 @@ class _Programme:
         """Return the objective and the constraints at other points."""
         grid = replace(self.grid, points_hz=points_hz)
         function, groups = self.specification.compile(self.channel, grid)
-        return function, _merged(groups)
+        return function, merge_groups(groups)
 
 
-def _merged(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
+def merge_groups(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
+    """Return the constraints of all demands, as few as possible."""
     return merge_constraints(tuple(constraint for group in groups for constraint in group))
 
 

@@ -24,7 +24,9 @@ from lbt_synth.validation import ComplexArray, FloatArray
 _FLAT = 0.3  # weight of the whole response in the fit of poles, beside the spectra
 _INTEGRAL = 2e-3  # by which the objective over the grid may miss that of the real loop
 _SLOW_HZ = (0.002, 0.004, 0.008)  # where turbulence meets the noise, of the frame rate: starts
-_EVALUATIONS = 60
+_EVALUATIONS = 300
+_DROPPED = 3  # pairs of poles, each of which is tried without
+_SETTLED = 1e-10  # relative change of poles and misfit
 _STEEPEST = 9.0  # largest log(r / (1 - r)) of a modulus r: 1 - 1e-4
 
 
@@ -66,16 +68,13 @@ def reduce_poles(
     spec: Specification, long: ModeSolution, order: int, tolerance: float, *, fewest: bool = True
 ) -> ModeSolution:
     """Find the fewest poles whose programme keeps the objective within a tolerance."""
-    hardware, response = long.sequence.channel.hardware, _response_to_fit(spec, long.sequence)
+    hardware, response = long.sequence.channel.hardware, response_to_fit(spec, long.sequence)
     bands = (
         2 * np.pi * np.array(distinct_bands(leaves(spec.objective))).reshape(-1, 2) * hardware.dt_s
     )
     starts = [starting_poles(order, bands=bands, noise_rad=2 * np.pi * slow) for slow in _SLOW_HZ]
     fits = [fit_poles(response, start) for start in starts]
-    candidates = [min(fits, key=lambda fit: fit[1])[0]]
-    while fewest and candidates[-1].size > 2 and np.any(candidates[-1].imag):
-        fewer = drop_cheapest_pair(response, candidates[-1])
-        candidates.append(fit_poles(response, fewer)[0])
+    poles = min(fits, key=lambda fit: fit[1])[0]
 
     def attempt(poles: ComplexArray) -> tuple[ModeSolution | None, float]:
         """Solve with given poles from the fit of the response, and return the relative loss."""
@@ -87,7 +86,7 @@ def reduce_poles(
             return None, np.inf
         return found, found.objective_nm / long.objective_nm - 1
 
-    accepted, loss = attempt(candidates[0])
+    accepted, loss = attempt(poles)
     if accepted is None or loss > tolerance:
         states = order + hardware.mirror_system.whole.n_states
         best, advice = "none was feasible", f"Try states={2 * states}."
@@ -99,18 +98,16 @@ def reduce_poles(
             f"long parameter's {long.objective_nm:.4g} nm (root of the whole objective): {best}. "
             f"{advice}"
         )
-    kept, failed = 0, len(candidates)
-    while failed - kept > 1:  # fewer poles lose more: bisection
-        middle = (kept + failed) // 2
-        found, loss = attempt(candidates[middle])
-        if found is not None and loss <= tolerance:
-            kept, accepted = middle, found
-        else:
-            failed = middle
+    while fewest and poles.size > 2 and np.any(poles.imag):
+        poles = fit_without_pair(response, poles)
+        found, loss = attempt(poles)
+        if found is None or loss > tolerance:
+            break
+        accepted = found
     return accepted
 
 
-def _response_to_fit(spec: Specification, long: SequenceSolution) -> WeightedResponse:
+def response_to_fit(spec: Specification, long: SequenceSolution) -> WeightedResponse:
     """Response of the long parameter at the nodes, weighted by the spectra and a constant."""
     f, w, nyquist = long.grid.nodes_hz, long.grid.weights_hz, long.channel.nyquist_hz
     cost = w * (frequency_costs(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
@@ -135,34 +132,57 @@ class WeightedResponse:
 
     def residual(self, upper: ComplexArray, single: FloatArray) -> FloatArray:
         """Weighted error of the best fit with poles, real parts first, (2 f,)."""
+        return self._goal - self._fitted(upper, single)[1]
+
+    def slopes(self, upper: ComplexArray, single: FloatArray) -> FloatArray:
+        """Slopes of that error as the poles move, (2 f, k), without those of the coefficients.
+
+        Of a fit N / D only D moves: all changes of N are within the span of the functions (L.
+        Kaufman, BIT Numer. Math. 15, 49 (1975), doi:10.1007/BF01932995).
+        """
+        q, fit = self._fitted(upper, single)
+        each = fit[: self.z.size] + 1j * fit[self.z.size :]
+        changes = _real_rows(each[:, None] * log_slopes(self.z, upper, single))
+        return np.asarray(q @ (q.T @ changes) - changes)
+
+    @property
+    def _goal(self) -> FloatArray:
+        return _real_rows(self.goal)
+
+    def _fitted(self, upper: ComplexArray, single: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Orthonormal columns that span the fits with poles, and the best fit, (2 f,)."""
         functions = _basis_responses(self.z, upper, single)
         q, _ = np.linalg.qr(_real_rows(self.weight[:, None] * functions))
-        goal = _real_rows(self.goal)
-        return np.asarray(goal - q @ (q.T @ goal))
+        return q, q @ (q.T @ self._goal)
 
 
 def fit_poles(response: WeightedResponse, start: ComplexArray) -> tuple[ComplexArray, float]:
     """Fit the poles (n,) of functions ``z (z I - A)^-1 B`` to a response, with the misfit."""
-    pairs, real = start[start.imag > 0], start[start.imag == 0].real
+    x0, count = vector_from_poles(start)
     size = float(np.linalg.norm(response.goal))
-    x0 = [np.log(np.abs(pairs) / (1 - np.abs(pairs))), np.angle(pairs), np.arctanh(real)]
 
     def each(modulus: float, angle: float, single: float) -> FloatArray:
-        return np.repeat([modulus, angle, single], [pairs.size, pairs.size, real.size])
+        return np.repeat([modulus, angle, single], [count, count, start.size - 2 * count])
 
     low, high = each(-3.0, 0.0, -4.0), each(_STEEPEST, np.pi, 4.0)
 
     def misfit(x: FloatArray) -> FloatArray:
-        return response.residual(*_poles_from_vector(x, pairs.size)) / size
+        return response.residual(*poles_from_vector(x, count)) / size
+
+    def slopes(x: FloatArray) -> FloatArray:
+        return response.slopes(*poles_from_vector(x, count)) / size
 
     found = least_squares(
         misfit,
-        np.clip(np.concatenate(x0), low + 1e-6, high - 1e-6),
+        np.clip(x0, low + 1e-6, high - 1e-6),
+        jac=slopes,
         bounds=(low, high),
+        xtol=_SETTLED,
+        ftol=_SETTLED,
         max_nfev=_EVALUATIONS,
         x_scale=each(1.0, 0.02, 1.0),
     )
-    upper, single = _poles_from_vector(found.x, pairs.size)
+    upper, single = poles_from_vector(found.x, count)
     return np.concatenate([upper, upper.conj(), single]), float(np.linalg.norm(found.fun))
 
 
@@ -183,13 +203,17 @@ def starting_poles(count: int, *, bands: FloatArray, noise_rad: float) -> Comple
     return np.concatenate([upper, upper.conj(), single])
 
 
-def drop_cheapest_pair(response: WeightedResponse, poles: ComplexArray) -> ComplexArray:
-    """Return the poles without the pair whose loss costs the fit least."""
+def fit_without_pair(response: WeightedResponse, poles: ComplexArray) -> ComplexArray:
+    """Fit the poles without a pair: the best of the fits without each of the cheapest pairs.
+
+    One start alone may end at a local minimum, and rounding would choose which.
+    """
     upper, single = poles[poles.imag > 0], poles[poles.imag == 0]
     fewer = [np.delete(upper, i) for i in range(upper.size)]
     costs = [np.linalg.norm(response.residual(each, single.real)) for each in fewer]
-    kept = fewer[int(np.argmin(costs))]
-    return np.concatenate([kept, kept.conj(), single])
+    starts = [fewer[int(i)] for i in np.argsort(costs)[:_DROPPED]]
+    fits = [fit_poles(response, np.concatenate([p, p.conj(), single])) for p in starts]
+    return min(fits, key=lambda fit: fit[1])[0]
 
 
 def _real_rows(rows: ComplexArray) -> FloatArray:
@@ -197,10 +221,32 @@ def _real_rows(rows: ComplexArray) -> FloatArray:
     return np.concatenate([rows.real, rows.imag])
 
 
-def _poles_from_vector(x: FloatArray, pairs: int) -> tuple[ComplexArray, FloatArray]:
+def vector_from_poles(poles: ComplexArray) -> tuple[FloatArray, int]:
+    """Return log-odds of the moduli and angles of the pairs, and of real poles; count the pairs."""
+    upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
+    modulus = np.abs(upper)
+    x = [np.log(modulus / (1 - modulus)), np.angle(upper), np.arctanh(real)]
+    return np.concatenate(x), upper.size
+
+
+def poles_from_vector(x: FloatArray, pairs: int) -> tuple[ComplexArray, FloatArray]:
+    """Return the upper poles of the pairs, and the real poles."""
     modulus = 1 / (1 + np.exp(-x[:pairs]))
     upper = modulus * np.exp(1j * x[pairs : 2 * pairs])
     return upper.astype(np.complex128), np.tanh(x[2 * pairs :])
+
+
+def log_slopes(z: ComplexArray, upper: ComplexArray, single: FloatArray) -> ComplexArray:
+    """Slopes of minus the log of ``prod (z - p)`` in the vector of poles, (f, k)."""
+    modulus, at = np.abs(upper), z[:, None]
+    above, below = upper / (at - upper), upper.conj() / (at - upper.conj())
+    return np.hstack(
+        [
+            (1 - modulus) * (above + below),
+            1j * (above - below),
+            (1 - single**2) / (at - single),
+        ]
+    )
 
 
 def _basis_responses(z: ComplexArray, upper: ComplexArray, single: FloatArray) -> ComplexArray:

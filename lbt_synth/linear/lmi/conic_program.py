@@ -1,21 +1,25 @@
 """Conic programmes that minimise functions of the coefficients of a Youla parameter.
 
 A function with denominators (at another gain of the loop than the nominal one) is not convex.
-It is replaced by a convex function that lies above it and touches it at the current
-coefficients c0. With ``b = 1 - steering c`` and its value b0 at c0::
+At the current coefficients it is replaced by a convex model: to second order where squares are
+summed, with ``r = a / b``, slopes ``J`` of r and ``beta`` of ``log b``::
 
-    |b|^2 >= l(b) = 2 Re(conj(b0) b) - |b0|^2,    so    |a|^2 / |b|^2 <= |a|^2 / l(b)
+    |r|^2 ~ |r0|^2 + 2 Re(conj(r0) J d) + |J d|^2 - 2 Re(conj(r0) (beta d) (J d))
 
-Minimising the right-hand side lowers the function, and its domain keeps b in the half-plane
-of b0 at every frequency of the programme, so the loop does not leave its stable set (the
-convex-concave procedure; A. L. Yuille, A. Rangarajan, Neural Comput. 15, 915 (2003),
-doi:10.1162/08997660360581958).
+to first order, ``|r0 + J d|``, where the largest counts. Directions in which the sum of squares
+bends down keep a part of ``|J d|^2``. Demands are imposed as they are: they are convex, and keep
+the loop in its stable set. A step along the model's minimum that lowers the function itself, and
+Newton's method with it, ends at a local minimum (sequential convex programming: Q. Tran Dinh,
+M. Diehl, in "Recent Advances in Optimization and its Applications in Engineering" (2010),
+doi:10.1007/978-3-642-12598-0_9).
 """
 
 from __future__ import annotations
 
-import cvxpy as cp
+from dataclasses import fields, replace
+
 import numpy as np
+from scipy.linalg import eigh
 
 from lbt_synth.linear.convex_functions import (
     CombinedFunction,
@@ -26,9 +30,13 @@ from lbt_synth.linear.convex_functions import (
     FunctionBound,
     HalfPlanes,
 )
-from lbt_synth.linear.lmi.conic_data import USABLE, require_optimum
-from lbt_synth.linear.lmi.solver import solve
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.linear.lmi.conic_data import USABLE, ConicProgramme, require_optimum
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
+
+_LEAST_CURVATURE = 0.03  # of that of the slopes alone
+_CLOSE, _EVERY = 0.8, 8  # share of a bound, and which others: what a programme starts with
+_EXCEEDED = 1e-7  # relative
+_FLAT = 1e-12  # part of the largest curvature below which a direction is flat
 
 
 def minimize(
@@ -39,17 +47,46 @@ def minimize(
     scale: float,
     start: FloatArray | None = None,
 ) -> tuple[FloatArray | None, str]:
-    """Minimise a function; one with denominators by its convex majorant at ``start``, (size,).
+    """Minimise a function; one with denominators by its convex model at ``start``, (size,).
 
     Return the coefficients, None if the constraints cannot hold together, and the solver's status.
     """
-    c = cp.Variable(size)
-    objective = _Objective(c, scale, start)
-    goal = cp.Minimize(objective.expression(function))
-    for constraint in constraints:
-        objective.needs += _as_constraints(constraint, c, 0.0)
-    status, _ = solve(goal, objective.needs)
-    return (np.asarray(c.value, dtype=np.float64) if status in USABLE else None), status
+    origin = np.zeros(size) if start is None else start
+    chosen = [_is_close(constraint, origin) for constraint in constraints]
+    while True:
+        programme = ConicProgramme(size + _count_levels(function))
+        for constraint, places in zip(constraints, chosen, strict=True):
+            _constrain(programme, _part(constraint, places), origin)
+        linear, roots = _Model(programme, origin, scale).expression(function)
+        found = programme.minimize(linear, 2 * roots.T @ roots)
+        if found.status not in USABLE:
+            return None, found.status
+        c = origin + found.x[:size]
+        exceeded = [_use(constraint, c) > 1 + _EXCEEDED for constraint in constraints]
+        if not any(np.any(new & ~old) for new, old in zip(exceeded, chosen, strict=True)):
+            return c, found.status
+        chosen = [new | old for new, old in zip(exceeded, chosen, strict=True)]
+
+
+def _use(constraint: Constraint, c: FloatArray) -> FloatArray:
+    """Share of each bound that is used; that of a function is always imposed."""
+    return np.ones(1) if isinstance(constraint, FunctionBound) else constraint.use(c)
+
+
+def _is_close(constraint: Constraint, c: FloatArray) -> BoolArray:
+    """Which of the bounds a programme starts with: those that are nearly used, and some others."""
+    use = _use(constraint, c)
+    close = use > _CLOSE
+    close[::_EVERY] = True
+    return close
+
+
+def _part(constraint: Constraint, chosen: BoolArray) -> Constraint:
+    """Return some of the bounds of a constraint."""
+    if isinstance(constraint, FunctionBound):
+        return constraint
+    values = {field.name: getattr(constraint, field.name)[chosen] for field in fields(constraint)}
+    return replace(constraint, **values)
 
 
 def minimize_relaxation(
@@ -59,107 +96,161 @@ def minimize_relaxation(
 
     Each bound is multiplied by 1 plus the number of its group, which is 0 for ``rigid`` groups.
     """
-    c, slack = cp.Variable(size), cp.Variable(len(groups), nonneg=True)
-    held: list[cp.Constraint] = []
+    count = len(groups)
+    programme, origin = ConicProgramme(size + count), np.zeros(size)
+    slack = np.r_[np.zeros(size), np.ones(count)]
+    programme.add_nonnegative(np.eye(size + count)[size:], np.zeros(count))
     for i, group in enumerate(groups):
         for constraint in group:
-            held += _as_constraints(constraint, c, 0.0 if rigid[i] else slack[i])
-    run = solve(cp.Minimize(cp.sum(slack)), held)
-    if "infeasible" in run[0]:
-        return np.full(len(groups), np.inf)
+            _constrain(programme, constraint, origin, None if rigid[i] else size + i)
+    found = programme.minimize(slack)
+    if "infeasible" in found.status:
+        return np.full(count, np.inf)
     require_optimum(
-        run,
+        (found.status, found.iterations),
         "the search for constraints that clash",
         "They may be close to what can be met, or very far from it; relax them, or try another "
         "number of functions.",
     )
-    return np.asarray(np.where(rigid, 0.0, slack.value), dtype=np.float64)
+    return np.where(rigid, 0.0, found.x[size:])
 
 
-class _Objective:
-    """Convex expressions of functions over their scale, and the constraints that they need."""
+def _count_levels(function: Function) -> int:
+    """Count the largest values of a function: each is one more unknown."""
+    parts = function.parts if isinstance(function, CombinedFunction) else ()
+    return int(function.worst) + sum(_count_levels(part) for part in parts)
 
-    def __init__(self, c: cp.Variable, scale: float, start: FloatArray | None) -> None:
-        self.c, self.scale, self.start = c, scale, start
-        self.needs: list[cp.Constraint] = []
 
-    def expression(self, function: Function) -> cp.Expression:
-        """Return the expression of a function."""
+class _Model:
+    """Convex models of functions of a step from an origin, over their scale.
+
+    Each is ``linear x + |roots x|^2`` plus a constant, in all unknowns x: step, then levels.
+    """
+
+    def __init__(self, programme: ConicProgramme, origin: FloatArray, scale: float) -> None:
+        self.programme, self.origin, self.scale = programme, origin, scale
+        self.level = origin.size  # the next unknown
+
+    def expression(self, function: Function) -> tuple[FloatArray, FloatArray]:
+        """Return the linear part, (x,), and the roots, (k, x), of a function."""
         if isinstance(function, CombinedFunction):
-            pairs = zip(function.weights, function.parts, strict=True)
-            parts = [weight * self.expression(part) for weight, part in pairs]
-            return cp.maximum(*parts) if function.worst and len(parts) > 1 else cp.sum(parts)
-        if function.steering is not None:
-            return self._majorant(function, function.steering)
+            weighted = list(zip(function.weights, function.parts, strict=True))
+            if function.worst:
+                return self._largest(weighted)
+            found = [(w, self.expression(part)) for w, part in weighted]
+            linear = np.sum([w * line for w, (line, _) in found], axis=0)
+            return linear, np.concatenate([np.sqrt(w) * roots for w, (_, roots) in found])
+        if function.worst:
+            return self._worst(function)
+        gradient, hessian = _second_order(function, self.origin)
+        pad = self.programme.size - self.origin.size
+        root = _root(hessian / self.scale)
+        return np.pad(gradient / self.scale, (0, pad)), np.pad(root, ((0, 0), (0, pad)))
+
+    def _worst(self, function: Fractions) -> tuple[FloatArray, FloatArray]:
+        """Bound all fractions by the square of a level, a new unknown."""
+        level = self._next_level()
+        values, slopes, _ = _expand(function, self.origin)
         unit = 1 / np.sqrt(self.scale)
-        if function.worst:
-            level = cp.Variable(nonneg=True)
-            centres, rows = function.centres * unit, function.rows * unit
-            self.needs.append(_norm_bounds(level, centres, rows, self.c))
-            return cp.square(level)
-        root, target = _least_squares_form(function)
-        return cp.sum_squares(unit * root @ self.c - unit * target)
+        _bound_norms(self.programme, values * unit, slopes * unit, level, 0.0)
+        return np.zeros(self.programme.size), level[None]
 
-    def _majorant(self, function: Fractions, steering: ComplexArray) -> cp.Expression:
-        """Convex upper bound of a function with denominators that touches it at the start."""
-        assert self.start is not None  # such a function is minimised from a start
-        b0, a0 = function.denominators(self.start), np.sqrt(function.numerators(self.start))
-        values = a0**2 / np.abs(b0) ** 2
-        # 2 Re(conj(b0) b) - |b0|^2 over |b0|^2: one at the start
-        slopes = np.real(-2 * b0.conj()[:, None] * steering) / np.abs(b0[:, None]) ** 2
-        denominators = (1 - slopes @ self.start) + slopes @ self.c
-        # each fraction in units of its own value, but not of a vanishing one
-        sizes = np.maximum(values, max(1e-9 * float(np.max(values)), 1e-12 * self.scale))
-        largest = float(np.max(sizes))
-        unit = np.sqrt(sizes) * np.abs(b0)
-        centres, rows = function.centres / unit[:, None], function.rows / unit[:, None, None]
-        stacked = _real_parts(centres, rows, self.c)
-        if function.worst:
-            level: cp.Expression = cp.Variable(nonneg=True)
-            # in units of the largest value
-            ratio = np.sqrt(sizes / largest)
-            stacked = cp.multiply(stacked, np.broadcast_to(ratio, stacked.shape))
-            levels: cp.Expression = level * np.ones(len(b0))
-            total = level * (largest / self.scale)
-        else:
-            levels = cp.Variable(len(b0), nonneg=True)
-            total = (sizes / self.scale) @ levels
-        difference = cp.reshape(levels - denominators, (1, len(b0)), order="C")
-        self.needs.append(cp.SOC(levels + denominators, cp.vstack([2 * stacked, difference])))
-        return total
+    def _largest(self, weighted: list[tuple[float, Function]]) -> tuple[FloatArray, FloatArray]:
+        """Bound all weighted parts by a level, a new unknown."""
+        level = self._next_level()
+        for weight, part in weighted:
+            linear, roots = self.expression(part)
+            # weight (value + linear x + |roots x|^2) <= level, as |(2 v, 1 - u)| <= 1 + u
+            room = level / weight - linear
+            value = part.value(self.origin) / self.scale if not part.worst else 0.0
+            rows = np.concatenate([room[None], 2 * roots, -room[None]])
+            offsets = np.concatenate([[1 - value], np.zeros(len(roots)), [1 + value]])
+            self.programme.add_second_order(rows, offsets[None])
+        return level, np.zeros((0, self.programme.size))
+
+    def _next_level(self) -> FloatArray:
+        level = np.zeros(self.programme.size)
+        level[self.level] = 1.0
+        self.level += 1
+        return level
 
 
-def _as_constraints(
-    constraint: Constraint, c: cp.Variable, slack: float | cp.Expression
-) -> list[cp.Constraint]:
-    """Constraints of the programme, with the bound times ``1 + slack``."""
+def _expand(
+    function: Fractions, c: FloatArray
+) -> tuple[ComplexArray, ComplexArray, ComplexArray | None]:
+    """Quotients (F, r) of a function at c, their slopes (F, r, n), and those of log b (F, n)."""
+    b = function.denominators(c)
+    values = (function.centres + function.rows @ c) / b[:, None]
+    slopes = function.rows / b[:, None, None]
+    if function.steering is None:
+        return values, slopes, None
+    turn = -function.steering / b[:, None]
+    return values, slopes - values[..., None] * turn[:, None], turn
+
+
+def _second_order(function: Fractions, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradient, and half the Hessian made positive, of a sum of squares at c."""
+    values, slopes, turn = _expand(function, c)
+    n = c.size
+    J, r = slopes.reshape(-1, n), values.ravel()
+    gradient = 2 * np.real(r.conj() @ J)
+    whole = np.concatenate([J.real, J.imag])
+    hessian = whole.T @ whole
+    if turn is None:
+        return gradient, hessian
+    steered = np.einsum("fr,frn->fn", values.conj(), slopes)
+    bend = -np.real(turn.T @ steered)
+    bend = bend + bend.T
+    # relative to the slopes alone, so that units do not matter
+    floor = _FLAT * float(np.trace(hessian))
+    parts, basis = eigh(bend, hessian + floor * np.eye(n))
+    back = (hessian + floor * np.eye(n)) @ basis
+    return gradient, np.asarray((back * np.maximum(1 + parts, _LEAST_CURVATURE)) @ back.T)
+
+
+def _root(hessian: FloatArray) -> FloatArray:
+    """Root R with ``R'R`` the given matrix, (n, n)."""
+    parts, basis = np.linalg.eigh((hessian + hessian.T) / 2)
+    return np.asarray(np.sqrt(np.maximum(parts, 0.0))[:, None] * basis.T)
+
+
+def _constrain(
+    programme: ConicProgramme, constraint: Constraint, origin: FloatArray, slack: int | None = None
+) -> None:
+    """Require a constraint of ``origin + step``, its bound times 1 plus an unknown if given."""
+    more = np.zeros(programme.size)
+    if slack is not None:
+        more[slack] = 1.0
     if isinstance(constraint, HalfPlanes):
-        unit = 1 / constraint.bounds
-        return [cp.multiply(unit, constraint.rows @ c) <= 1 + slack]
-    if isinstance(constraint, Discs):
-        unit = (1 / constraint.radii)[:, None]
-        rows = constraint.rows[:, None, :] * unit[..., None]
-        return [_norm_bounds(1 + slack, constraint.centres[:, None] * unit, rows, c)]
-    assert isinstance(constraint, FunctionBound)
-    root, target = _least_squares_form(constraint.function)
-    unit = 1 / np.sqrt(constraint.limit)
-    return [cp.norm(unit * root @ c - unit * target) <= 1 + slack]
+        rows = constraint.rows / constraint.bounds[:, None]
+        held = more - np.pad(rows, ((0, 0), (0, programme.size - origin.size)))
+        programme.add_nonnegative(held, 1 - rows @ origin)
+    elif isinstance(constraint, Discs):
+        turns = constraint.rows / constraint.radii[:, None]
+        centres = constraint.centres / constraint.radii + turns @ origin
+        _bound_norms(programme, centres[:, None], turns[:, None], more, 1.0)
+    else:
+        assert isinstance(constraint, FunctionBound)
+        root, target = _least_squares_form(constraint.function)
+        unit = 1 / np.sqrt(constraint.limit)
+        _bound_norms(programme, unit * (root @ origin - target)[None], unit * root[None], more, 1.0)
 
 
-def _norm_bounds(
-    level: float | cp.Expression, centres: ComplexArray, rows: ComplexArray, c: cp.Variable
-) -> cp.Constraint:
-    """``sqrt(sum over r |centres + rows c|^2) <= level`` at each frequency."""
-    return cp.SOC(level * np.ones(len(centres)), _real_parts(centres, rows, c))
-
-
-def _real_parts(centres: ComplexArray, rows: ComplexArray, c: cp.Variable) -> cp.Expression:
-    """Real and imaginary parts of the responses, (2 r, F)."""
-    parts = []
-    for i in range(centres.shape[1]):
-        centre, row = centres[:, i], rows[:, i]
-        parts += [centre.real + row.real @ c, centre.imag + row.imag @ c]
-    return cp.vstack(parts)
+def _bound_norms(
+    programme: ConicProgramme,
+    centres: ComplexArray | FloatArray,
+    rows: ComplexArray | FloatArray,
+    slopes: FloatArray,
+    offset: float,
+) -> None:
+    """``sqrt(sum over r |centres + rows step|^2) <= offset + slopes x`` at each frequency."""
+    n = rows.shape[-1]
+    parts = np.concatenate([rows.real, rows.imag], axis=1)
+    inner = np.pad(parts, ((0, 0), (1, 0), (0, slopes.size - n))).astype(np.float64)
+    inner[:, 0] = slopes
+    values = np.concatenate([centres.real, centres.imag], axis=1)
+    offsets = np.pad(values, ((0, 0), (1, 0)), constant_values=offset).astype(np.float64)
+    programme.add_second_order(inner.reshape(-1, slopes.size), offsets)
 
 
 def _least_squares_form(function: Fractions) -> tuple[FloatArray, FloatArray]:
