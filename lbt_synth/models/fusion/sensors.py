@@ -30,6 +30,7 @@ from lbt_synth.validation import (
 
 OWN_SENSOR = "wavefront"
 LONGEST_PERIOD = 1000  # frames of the loop per reading
+LONGEST_DELAY = 100  # of a sensor [its periods]
 _WHOLE = 1e-9
 
 
@@ -96,7 +97,7 @@ class WavefrontSensor:
 
     name: str
     rate_hz: Positive
-    delay_frames: Annotated[float, ("at_least", 1), ("at_most", 20)]
+    delay_frames: Annotated[float, ("at_least", 1), ("at_most", LONGEST_DELAY)]
     noise_nm: float | FloatArray
     sensor_matrix: FloatArray | None = None
 
@@ -177,7 +178,7 @@ class Accelerometer:
 
     name: str
     rate_hz: Positive
-    delay_frames: Annotated[float, ("above", 0), ("at_most", 20)]
+    delay_frames: Annotated[float, ("above", 0), ("at_most", LONGEST_DELAY)]
     channels: tuple[str, ...]
     noise_m_s2: float | FloatArray
     highpass_hz: Positive | None = None
