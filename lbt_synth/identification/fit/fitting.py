@@ -117,6 +117,11 @@ class Search:
         centre = component.frequency / self.data.angle_s
         return centre, max(centre * component.damping_ratio, self.data.step_hz)
 
+    def has_in_band(self, component: Component) -> bool:
+        """Whether a component lies between the first bin and the Nyquist frequency."""
+        lowest = self.log_angle(_LOWEST * self.data.step_hz)
+        return bool(lowest < component.log_frequency < _HIGHEST)
+
     def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
         return self.data.merge(self.groups(spectrum))
@@ -153,8 +158,7 @@ def fit(
     found = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
     if found is None:
         return None
-    lowest = search.log_angle(_LOWEST * search.data.step_hz)
-    inside = found.spectrum.keep(lambda c: lowest < c.log_frequency < _HIGHEST)
+    inside = found.spectrum.keep(search.has_in_band)
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(found, contrast=contrast(search.data, found.spectrum))

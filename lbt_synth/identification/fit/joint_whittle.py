@@ -256,14 +256,18 @@ class JointSearch:
         first, second = joint.axes
         return self.data.merge(self.searches[0].groups(first.add(*second.components)))
 
-    def fit(self, start: JointSpectrum, *, exact: bool = False) -> JointFit | None:
+    def fit(
+        self, start: JointSpectrum, *, exact: bool = False, held: frozenset[int] = frozenset()
+    ) -> JointFit | None:
         """Fit all parameters but gains and phases; None if no fit settles.
 
-        With ``exact``, errors are those of the second derivatives, not of their expectation.
+        With ``exact``, errors are those of the second derivatives, not of their expectation. A
+        component that would leave the band keeps its frequency, one of those held.
         """
         data, columns = self.merge(start), start.columns()
         first = np.unique(columns, return_index=True)[1]
         distinct, priors = start.pack()[first], self._priors(start, first)
+        priors.width[columns[list(held)]] = 0.0
         apart = start.pack() - distinct[columns]  # of tied parameters, which stays
         free, phases = priors.free, columns[columns.size - len(start.ties) :]
         owner = np.zeros((first.size, columns.size))  # adds the slopes of tied parameters
@@ -285,6 +289,9 @@ class JointSearch:
             return None
         at, information = found
         _, slope, expected = differentiate(at)
+        left = self._outside(start.unpack(distinct[columns] + apart)) - held
+        if left:
+            return self.fit(start, exact=exact, held=held | left)
         moving = np.append(free, phases)
         score = invert_information(expected[np.ix_(moving, moving)])[free.size :, free.size :]
         if exact:
@@ -301,6 +308,16 @@ class JointSearch:
             data=data,
             covariance=covariance[np.ix_(columns, columns)],
             by_phase=0.5 * slope[phases] ** 2 * np.diag(score),
+        )
+
+    def _outside(self, joint: JointSpectrum) -> frozenset[int]:
+        """Return where the frequencies of components beyond the band stand in the vector."""
+        each = enumerate(zip(self.searches, joint.axes, strict=True))
+        return frozenset(
+            joint.place(axis, part)
+            for axis, (search, model) in each
+            for part, component in enumerate(model.components)
+            if not search.has_in_band(component)
         )
 
     def _priors(self, start: JointSpectrum, first: IntArray) -> Priors:

@@ -9,8 +9,10 @@ import pytest
 from support.recorded_loops import RATE, open_record
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.joint_whittle import (
     JointPeriodogram,
+    JointSearch,
     JointSpectrum,
     Tie,
     joint_contrast,
@@ -117,3 +119,14 @@ def test_what_is_tied_and_what_is_left_when_a_part_goes(tied):
     kept = replace(tied, ties=(replace(tied.ties[0], before=(before, None)),)).untie(0)
     assert kept.axes[0].components[2] == before
     assert len(kept.axes[1].components) == 1
+
+
+def test_a_component_that_would_leave_the_band_keeps_its_frequency(data):
+    """Noise that falls towards the Nyquist frequency draws a wide component beyond it."""
+    searches = tuple(Search(data=each, gain=1.0) for each in data.axes)
+    wide = Component("line", np.log(3.1), 0.0, 2 * np.log(20.0))
+    start = JointSpectrum(axes=(spectrum(wide), spectrum()), ties=())
+    fit = JointSearch(searches=searches, data=data).fit(start)
+    assert fit is not None
+    found = fit.joint.axes[0].components[-1]
+    assert found.frequency < np.pi
