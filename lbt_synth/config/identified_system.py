@@ -14,11 +14,11 @@ from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import AccelerometerTransfers, IdentifiedModel
+from lbt_synth.models.fusion.sensors import LONGEST_DELAY
 from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")
 _NAME = "accelerometer"  # of the instrument that all channels make
-_LONGEST_DELAY = 20  # frames, in a configuration
 _DIRECTIONS = {(1.0, 0.0): "tip", (0.0, 1.0): "tilt"}
 _KIND_COMMENTS = {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}
 
@@ -158,7 +158,7 @@ def _accelerometer_section(
     """Return the section of the channels that are used, and comment on their delay."""
     age, path = found.age_frames, f"sensors.{_NAME}.delay_frames"
     comments[path] = f"readings come {age - 1} frames after the wavefront's"
-    if age < 0 or not 0 < age + delay_frames - 1 <= _LONGEST_DELAY:
+    if age < 0 or not 0 < age + delay_frames - 1 <= LONGEST_DELAY:
         comments[path] = f"not known: the clocks were {age - 1} frames apart; give the real delay"
         age = 1
     return {

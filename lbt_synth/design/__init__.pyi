@@ -11,6 +11,7 @@ from .fusion.failures import failure_rows as failure_rows
 from .fusion.fused_filter import FusedFilter as FusedFilter
 from .fusion.fused_filter import fused_hinf as fused_hinf
 from .fusion.fused_filter import fused_kalman as fused_kalman
+from .fusion.mixed import fused_mixed as fused_mixed
 from .hinf import hinf as hinf
 from .integrator import IntegratorDesign as IntegratorDesign
 from .integrator import integrator as integrator

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from lbt_synth.errors import ProblemError
 from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method
 from lbt_synth.methods.method import DesignInputs
 
 if TYPE_CHECKING:
+    from lbt_synth.design.fusion.fused_filter import FusedFilter
     from lbt_synth.design.result import FilterDesign
 
 
@@ -27,7 +29,16 @@ class MixedOptions(BoundOptions):
     )
 
 
-def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign:
+def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign | FusedFilter:
+    if inputs.fused_plant is not None:
+        from lbt_synth.design.fusion.mixed import fused_mixed
+
+        if options.rms is not None:
+            raise ProblemError(
+                "rms bounds a filter of the loop's own sensor alone; with several sensors give "
+                "gamma or gamma_ratio."
+            )
+        return fused_mixed(inputs.fused_plant, **options.bound())
     from lbt_synth.design.mixed import mixed
 
     bound = options.bound() if options.rms is None else {"rms": options.rms}
@@ -38,6 +49,7 @@ METHOD = filter_method(
     name="mixed",
     title="mixed filter",
     label="mixed",
+    design_names=("mixed", "fused mixed"),
     options=MixedOptions,
     build=_build,
     exclusive=BOUNDS,

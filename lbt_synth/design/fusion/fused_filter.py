@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -39,9 +39,11 @@ from lbt_synth.storage.summaries import Summary
 from lbt_synth.validation import ComplexArray, FloatArray, require_instance, set_fields
 
 
-def fused_name(*, bounded: bool) -> str:
-    """Return ``Design.method`` of a filter of several sensors, with or without a bound."""
-    return "fused hinf" if bounded else "fused kalman"
+def fused_name(claims: Collection[str]) -> str:
+    """Return ``Design.method`` of a filter of several sensors, by what it claims."""
+    if "gamma_central" in claims:
+        return "fused mixed"
+    return "fused hinf" if "gamma_requested" in claims else "fused kalman"
 
 
 @table_row
@@ -80,6 +82,8 @@ class FusedFilter(Design):
         Bound that an H-infinity design was given.
     gamma_least : float or None
         Norm that a filter of the problem achieves, the least one to 1e-9.
+    gamma_central : float or None
+        Level of the central filter that just meets the bound, of a mixed design.
     """
 
     controller: PeriodicController = field(init=False)  # type: ignore[assignment]
@@ -88,6 +92,7 @@ class FusedFilter(Design):
     fallbacks: tuple[Fallback, ...] = ()
     gamma_requested: float | None = None
     gamma_least: float | None = None
+    gamma_central: float | None = None
 
     def __post_init__(self) -> None:
         set_fields(self, controller=self.problem.controller(self.gains))
@@ -210,7 +215,8 @@ class FusedFilter(Design):
             off = 0.0 if meets == [False, True] else np.inf
             how = "gamma-Riccati equation on both sides"
             checks.append(Check("least norm of any filter, error", off, NORM_TOLERANCE, how))
-        central = periodic_hinf(self.problem, self.gamma_requested or 0.0, start)
+        level = self.gamma_central or self.gamma_requested or 0.0
+        central = periodic_hinf(self.problem, level, start)
         apart = np.inf if central is None else _apart(self.gains, central.gains)
         name, how = "distance from its Riccati filter", "relative"
         checks.append(Check(name, apart, 1e-5, how))
@@ -301,7 +307,7 @@ def fused_kalman(plant: FusedPlant) -> FusedFilter:
     True
     """
     require_instance(plant, FusedPlant, "plant")
-    return _design(plant, periodic_kalman(plant))
+    return make_design(plant, periodic_kalman(plant))
 
 
 def fused_hinf(
@@ -345,23 +351,34 @@ def fused_hinf(
         gamma, gamma_ratio, far_above="the filter is the Kalman filter"
     )
     start = periodic_kalman(plant)
-    upper = hinf_norm(plant.error_system(start.gains).lifted_compactly()).upper
-    _, least = least_periodic_gamma(plant, start, upper)
+    least = least_periodic_gamma(plant, start, error_norm(plant, start))[1]
     requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
     require_reachable(requested, least)
-    found = periodic_hinf(plant, max(requested, least), start)
+    found = central_filter(plant, max(requested, least), start)
+    return make_design(plant, found, gamma_requested=max(requested, least), gamma_least=least)
+
+
+def error_norm(plant: FusedPlant, solution: PeriodicRiccati) -> float:
+    """Return the norm of a filter's estimation error over a period."""
+    return hinf_norm(plant.error_system(solution.gains).lifted_compactly()).upper
+
+
+def central_filter(plant: FusedPlant, gamma: float, start: PeriodicRiccati) -> PeriodicRiccati:
+    """Return the central filter of a level; InfeasibleError if there is none."""
+    found = periodic_hinf(plant, gamma, start)
     if found is None:
         raise InfeasibleError(
-            f"the gamma-Riccati equation has no stabilising solution at gamma = {requested:.9g}. "
+            f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
             "Try a larger gamma.",
-            gamma=requested,
+            gamma=gamma,
         )
-    return _design(plant, found, gamma_requested=max(requested, least), gamma_least=least)
+    return found
 
 
-def _design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> FusedFilter:
+def make_design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> FusedFilter:
+    """Make a design with its fall-backs, and certify it; CertificateError if it fails."""
     design = FusedFilter(
-        method=fused_name(bounded=bool(claims)),
+        method=fused_name(claims),
         certificate=UNCERTIFIED,
         solver=SolverReport(route="riccati", status="cyclic doubling", iterations=solution.steps),
         problem=plant,

@@ -20,7 +20,7 @@ from lbt_synth.models.fusion.sensors import (
 )
 from lbt_synth.validation import float_array, number
 
-_CLAIMS = ("gamma_requested", "gamma_least")
+_CLAIMS = ("gamma_requested", "gamma_least", "gamma_central")
 _KINDS: dict[str, type[Sensor]] = {"wavefront": WavefrontSensor, "accelerometer": Accelerometer}
 _ARRAYS = ("noise_nm", "sensor_matrix", "noise_m_s2")
 
@@ -63,7 +63,7 @@ def rebuild_fused(record: DesignRecord) -> FusedFilter:
     claims: dict[str, Any] = {
         k: number(meta[k], k, above=0) for k in _CLAIMS if meta.get(k) is not None
     }
-    if meta["method"] != fused_name(bounded="gamma_requested" in claims):
+    if meta["method"] != fused_name(claims):
         raise ValueError("the method must be that of its bound, or of none")
     return FusedFilter(
         **record.common(),

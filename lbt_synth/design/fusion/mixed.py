@@ -1,0 +1,85 @@
+"""The mixed filter of several sensors: the central filter that just meets a bound of the norm."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import brentq
+
+from lbt_synth.design.fusion.fused_filter import (
+    FusedFilter,
+    central_filter,
+    error_norm,
+    make_design,
+)
+from lbt_synth.design.hinf import checked_bounds, require_reachable
+from lbt_synth.linear.periodic.riccati import least_periodic_gamma, periodic_kalman
+from lbt_synth.models.fusion.plant import FusedPlant
+from lbt_synth.validation import require_instance
+
+_DECADES = 4.0  # of gamma, over which a central filter is searched
+_INSIDE = 1e-7  # by which the norm stays below its bound
+
+
+def fused_mixed(
+    plant: FusedPlant, *, gamma: float | None = None, gamma_ratio: float | None = None
+) -> FusedFilter:
+    """Design the filter of several sensors that trades variance for a bound of the norm.
+
+    A central H-infinity filter stays below its level. The level is raised until the norm of the
+    error is the bound itself: the variance falls with each step. It is the least among central
+    filters, not among all.
+
+    Parameters
+    ----------
+    plant : FusedPlant
+        Loop, disturbances and sensors.
+    gamma, gamma_ratio : float, optional
+        Bound of the norm of the error over a period, or the bound as a multiple of the least one;
+        by default 1.2 times the least.
+
+    Returns
+    -------
+    FusedFilter
+        Certified design; the Kalman filter where that meets the bound.
+
+    Raises
+    ------
+    InfeasibleError
+        If the bound is below the least gamma; the message names the least.
+    SynthesisError
+        As :func:`fused_kalman`.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
+    >>> own = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=75, modes=1)
+    >>> second = lbt.models.WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
+    >>> plant = lbt.models.fused_plant(own, lbt.models.SensorSuite(sensors=(second,)))
+    >>> both = lbt.design.fused_mixed(plant, gamma_ratio=1.01)
+    >>> both.rms < lbt.design.fused_hinf(plant, gamma_ratio=1.01).rms
+    True
+    """
+    require_instance(plant, FusedPlant, "plant")
+    gamma, gamma_ratio = checked_bounds(
+        gamma, gamma_ratio, far_above="the filter is the Kalman filter"
+    )
+    start = periodic_kalman(plant)
+    upper = error_norm(plant, start)
+    least = least_periodic_gamma(plant, start, upper)[1]
+    requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
+    require_reachable(requested, least)
+    if upper <= requested:
+        return make_design(plant, start)
+    bound = max(requested, least)
+
+    def excess(decades: float) -> float:
+        found = central_filter(plant, bound * 10**decades, start)
+        return float(np.log(error_norm(plant, found) / bound)) + _INSIDE
+
+    decades = 0.0
+    if excess(0.0) < 0 < excess(_DECADES):
+        decades = brentq(excess, 0.0, _DECADES, xtol=1e-9, rtol=1e-12)
+    level = bound * 10**decades
+    found = central_filter(plant, level, start)
+    return make_design(plant, found, gamma_requested=bound, gamma_least=least, gamma_central=level)
