@@ -19,7 +19,6 @@ from lbt_synth.design.shaping.channel import (
     mode_loop,
 )
 from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.pole_steps import settle_poles
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
@@ -134,7 +133,7 @@ def shape(
             basis = laguerre_basis(size, common, dt_s=single.dt_s)
             chosen = long = solve_mode(spec, Channel(hardware=single, basis=basis))
             if order is not None and order < size:
-                chosen = settle_poles(spec, reduce_poles(spec, long, order, tolerance))
+                chosen = reduce_poles(spec, long, order, tolerance)
             solved[spec.key] = long, chosen
     longs, modes = zip(*(solved[spec.key] for spec in specifications), strict=True)
     parameters = tuple(mode.parameter for mode in modes)
