@@ -103,7 +103,7 @@ def test_coefficients_of_the_gain_file_are_kept_where_they_pass(tmp_path, design
 @pytest.mark.study
 def test_the_robust_example_runs_in_single_precision(tmp_path):
     """Twelve states per axis, whose own coefficients reach a spectral radius of 1.126."""
-    design = lbt.robust(lbt.load_config("examples/lbt_robust.yaml"))
+    design = lbt.load_config("examples/lbt_robust.yaml").design("robust")
     written = lbt.interop.export_dao(tmp_path / "k.npy", design)
     losses = [check.value for check in written.checks if "residual" in check.name]
     assert len(losses) == 4
