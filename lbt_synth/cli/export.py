@@ -57,12 +57,13 @@ def run(arguments: Namespace) -> Report:
     report = Report(
         data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
     )
+    commands, measurements = design.controller.D.shape[-2:]
     facts = fill_row(
         ExportFacts,
         written,
         design,
-        measurements=design.controller.B.shape[1],
-        commands=len(design.controller.C),
+        measurements=measurements,
+        commands=commands,
         n_states=design.controller.n_states,
         stable_single=math.isfinite(written.error_single),
     )

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth
-from lbt_synth.design import Check, Design, certify_loop
+from lbt_synth.design import Check, Design, FusedFilter, certify_loop
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.arithmetic_cost import FrameCost
 from lbt_synth.linear import Controller
@@ -27,14 +27,28 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 _POLE = 0.99  # of the random phase that disturbs the rehearsed loop
 
 
-def require_exportable(design: Design, written: Controller | None = None) -> None:
-    """Refuse a design that is not certified, or whose loop is unstable with the written numbers."""
+def require_certified(design: Design) -> None:
+    """Refuse a design that is not certified."""
     require_instance(design, Design)
     if not design.certificate.passed:
         failed = tuple(check.name for check in design.certificate.checks if not check.passed)
         raise CertificateError(
             f"only a certified design is exported; this one failed: {'; '.join(failed)}.",
             failed=failed,
+        )
+
+
+def require_exportable(design: Design, written: Controller | None = None) -> None:
+    """Refuse a design that is not certified, or whose loop is unstable with the written numbers.
+
+    A design of several sensors is refused, too: only C source has an input for each of them.
+    """
+    require_certified(design)
+    if isinstance(design, FusedFilter):
+        raise ProblemError(
+            f"this design reads several sensors ({', '.join(design.problem.suite.units)}), each "
+            "when it is due; what this target loads has one matrix, for a loop of one sensor. "
+            "Export it to C."
         )
     if design.hardware is None:
         return
@@ -185,16 +199,24 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
         ("method", f"{design.method} ({design.solver.route})"),
         ("gain file", "not named" if gain_digest is None else f"SHA-256 {gain_digest}"),
     ]
-    if design.hardware is None:
+    hardware = design.loop_hardware if isinstance(design, FusedFilter) else design.hardware
+    if hardware is None:
         lines += [("sampling", f"{design.controller.dt_s!r} s"), ("units", "those of the problem")]
     else:
         lines += [
-            ("frame rate", f"{design.hardware.frame_rate_hz!r} Hz"),
-            ("delay", f"{design.hardware.delay_frames!r} frames in total"),
+            ("frame rate", f"{hardware.frame_rate_hz!r} Hz"),
+            ("delay", f"{hardware.delay_frames!r} frames in total"),
             ("units", "y: nm rms wavefront where the sensor matrix is the identity;"),
             ("", "u: nm rms wavefront where the influence matrix is"),
         ]
+    if isinstance(design, FusedFilter) and design.problem.suite.channels:
+        lines.append(("", "channels of accelerometers: metres per second squared"))
     checks = design.certificate.checks
     lines.append(("certificate", f"{len(checks)} checks passed"))
     lines += [("", f"{c.name}: {c.value:.6g} (limit {c.limit:.6g})") for c in checks]
-    return [(label, _UNSAFE.sub("_", text)) for label, text in lines]
+    return [(label, comment_text(text)) for label, text in lines]
+
+
+def comment_text(text: str) -> str:
+    """Return text without what could end a comment of C."""
+    return _UNSAFE.sub("_", text)

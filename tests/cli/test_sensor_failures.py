@@ -94,3 +94,26 @@ def test_what_a_drop_says():
     drop = parse_drop("wavefront@20s..20.2s:frozen")
     assert (drop.unit, drop.start_s, drop.end_s) == ("wavefront", 20, 20.2)
     assert drop.reading == "frozen"
+
+
+def test_it_is_exported_to_c(tmp_path, capsys, fused_file):
+    out = tmp_path / "k.c"
+    status, text, error = run(capsys, "export", fused_file, "--for", "c", "-o", out)
+    assert (status, error) == (0, "")
+    assert "spectral radius with any sensors missing" in text
+    data = json.loads(run(capsys, "export", fused_file, "--for", "c", "-o", out, "--json")[1])
+    assert (data["measurements"], data["commands"]) == (6, 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--for", "c", "--form", "plain", "-o", "k.c"), "in estimator form alone"),
+        (("--for", "dao", "-o", "k.npy"), "reads several sensors (wavefront, slow, m1, m2)"),
+    ],
+)
+def test_exports_that_cannot_hold_it(tmp_path, capsys, fused_file, options, said):
+    status, out, error = run(capsys, "export", fused_file, *options[:-1], tmp_path / options[-1])
+    assert (status, out) == (2, "")
+    assert said in error
+    assert not list(tmp_path.iterdir())

@@ -5,24 +5,31 @@ from __future__ import annotations
 import math
 import os
 import re
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lbt_synth.design import Design
+from lbt_synth.design import Design, FusedFilter
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.interop.arithmetic_cost import frame_cost, has_straight_line_form
 from lbt_synth.interop.c.arithmetic import SourceTerms, prove_source
+from lbt_synth.interop.c.fused_export import export_fused
 from lbt_synth.interop.c.reading import read_source
+from lbt_synth.interop.c.source_text import (
+    exact_constant,
+    render_source,
+    round_to_single,
+    wrap_sum,
+)
 from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
     FRAMES,
     Exported,
     provenance_lines,
     rehearsal_error,
+    require_certified,
     require_exportable,
 )
 from lbt_synth.interop.target import Arithmetic, Target
@@ -33,14 +40,13 @@ from lbt_synth.validation import FloatArray, choice
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
 _LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_reset"
-_LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 def export_c(
     path: str | os.PathLike[str],
     design: Design,
     *,
-    form: str = "plain",
+    form: str | None = None,
     precision: str = "double",
     name: str | None = None,
     gain_digest: str | None = None,
@@ -57,6 +63,10 @@ def export_c(
     those of the design: nm rms of wavefront for a loop whose sensor and influence matrices are the
     identity.
 
+    A design of several sensors has the estimator form, with all its fall-backs:
+    ``<name>_step(&state, y, fresh, applied, u)``, where ``fresh`` says for each sensor or channel
+    whether its reading is new and good. It returns flags on what it did not read.
+
     Parameters
     ----------
     path : path-like
@@ -65,7 +75,8 @@ def export_c(
         The design.
     form : {"plain", "estimator"}, optional
         Whether the controller assumes that its commands were applied, or is given those that
-        were (:func:`~lbt_synth.linear.estimator_form`).
+        were (:func:`~lbt_synth.linear.estimator_form`). The default is ``estimator`` for a design
+        of several sensors, which has no other form, and ``plain`` for others.
     precision : {"double", "single"}, optional
         Type of all numbers, ``double`` or ``float``. Coefficients are rounded to it.
     name : str, optional
@@ -110,7 +121,17 @@ def export_c(
     header = target.with_suffix(".h")
     choice(precision, "precision", ("double", "single"))
     prefix = require_identifier(target.stem if name is None else name)
-    choice(form, "form", ("plain", "estimator"))
+    form = _checked_form(design, form)
+    if isinstance(design, FusedFilter):
+        require_certified(design)
+        return export_fused(
+            target,
+            design,
+            name=prefix,
+            precision=precision,
+            gain_digest=gain_digest,
+            arithmetic=TARGET.arithmetic,
+        )
     single = precision == "single"
     require_exportable(design)
     written, applied = _form_of(design, form)
@@ -158,6 +179,20 @@ def export_c(
     )
 
 
+def _checked_form(design: Design, form: str | None) -> str:
+    """Return the form of the source; a filter of several sensors has one."""
+    several = isinstance(design, FusedFilter)
+    if form is None:
+        return "estimator" if several else "plain"
+    choice(form, "form", ("plain", "estimator"))
+    if several and form == "plain":
+        raise ProblemError(
+            "a design of several sensors is exported in estimator form alone, which is given the "
+            "applied commands; got form plain. Leave the form out."
+        )
+    return form
+
+
 def _require_finite(error: float, precision: str) -> None:
     """Refuse commands that grow beyond all numbers of a precision."""
     if not math.isfinite(error):
@@ -203,20 +238,7 @@ def require_identifier(name: str) -> str:
 def _round_to_single(controller: Controller) -> Controller:
     """Round the coefficients to single precision."""
     matrices = {name: getattr(controller, name) for name in "ABCD"}
-    for name, values in matrices.items():
-        largest = float(np.max(np.abs(values)))
-        if largest > _LARGEST_SINGLE:
-            raise ProblemError(
-                f"the coefficients must be below {_LARGEST_SINGLE:.3g} in single precision; got "
-                f"{largest:.3g} in {name}. Try double precision, or scale the states."
-            )
-    return Controller(
-        **{name: values.astype(np.float32) for name, values in matrices.items()},
-        dt_s=controller.dt_s,
-    )
-
-
-_WIDTH = 96
+    return Controller(**round_to_single(matrices), dt_s=controller.dt_s)
 
 
 def render_code(
@@ -233,19 +255,6 @@ def render_code(
 
     The last ``applied`` inputs of the controller are the commands that were applied.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    def constant(value: float) -> str:
-        """Exact constant of the type; a value of single precision is already rounded."""
-        return (value.hex() if value else "0.0") + ("f" if single else "")
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"constant": constant, "count": _count}
     values = {
         "p": prefix,
         "P": prefix.upper(),
@@ -253,22 +262,19 @@ def render_code(
         "q": controller.B.shape[1] - applied,
         "m": len(controller.C),
         "applied": applied,
-        "type": "float" if single else "double",
-        "largest": "FLT_MAX" if single else "DBL_MAX",
         "controller": controller,
         "matrices": _split_inputs(controller, applied),
         "provenance": provenance,
         "cost": frame_cost(controller),
         "header_name": header_name,
         "gain_digest": gain_digest,
-        "straight_line": _write_out(prefix, controller, applied, zero=constant(0.0))
+        "straight_line": _write_out(
+            prefix, controller, applied, zero=exact_constant(0.0, single=single)
+        )
         if has_straight_line_form(controller)
         else None,
     }
-    source, header = (
-        environment.get_template(f"controller.{ending}.jinja").render(values) for ending in "ch"
-    )
-    return source, header
+    return render_source("controller", single=single, **values)
 
 
 def _split_inputs(controller: Controller, applied: int) -> dict[str, FloatArray]:
@@ -300,7 +306,7 @@ def _write_out(prefix: str, controller: Controller, applied: int, *, zero: str) 
                     coefficients.append((place, row[j]))
                 terms.append(("-" if row[j] == -1 else "+", factor + name))
             start = f"    const {prefix}_real {result}{i} ="
-            sums[f"{result}{i}"] = _wrap(terms or [("+", zero)], len(start))
+            sums[f"{result}{i}"] = wrap_sum(terms or [("+", zero)], len(start))
     used = np.flatnonzero(np.vstack([controller.B, controller.D]).any(axis=0)).tolist()
     return {
         "states": np.flatnonzero(controller.A.any(axis=0)).tolist(),
@@ -309,21 +315,6 @@ def _write_out(prefix: str, controller: Controller, applied: int, *, zero: str) 
         "coefficients": coefficients,
         "sums": sums,
     }
-
-
-def _wrap(terms: list[tuple[str, str]], column: int) -> str:
-    """Return a sum that begins at a column, its terms wrapped over lines."""
-    text = " ".join(f"{sign} {term}".replace(" ", "\0") for sign, term in terms)
-    text = text.removeprefix("+\0").replace("-\0", "-", text.startswith("-"))
-    begin, more = " " * (column + 1), " " * 8
-    wrapped = textwrap.fill(
-        text, _WIDTH - 1, initial_indent=begin, subsequent_indent=more, break_long_words=False
-    )
-    return wrapped[column:].replace("\0", " ")
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}" + ("" if number == 1 else "s")
 
 
 TARGET = Target(
