@@ -111,13 +111,7 @@ def export_c(
     ...     [file.name for file in written.files]
     ['slow.c', 'slow.h', 'slow.certificate.json']
     """
-    target = Path(path)
-    if not _SOURCE.fullmatch(target.name):
-        raise OutputError(
-            "C source must end in .c, and its name have letters, digits and . _ + - only; got "
-            f"{target.name!r}.",
-            path=target,
-        )
+    target = _source_path(path)
     header = target.with_suffix(".h")
     choice(precision, "precision", ("double", "single"))
     prefix = require_identifier(target.stem if name is None else name)
@@ -177,6 +171,18 @@ def export_c(
         checks=checks,
         cost=frame_cost(written),
     )
+
+
+def _source_path(path: str | os.PathLike[str]) -> Path:
+    """Return the path of the source, whose name compilers must take."""
+    target = Path(path)
+    if not _SOURCE.fullmatch(target.name):
+        raise OutputError(
+            "C source must end in .c, and its name have letters, digits and . _ + - only; got "
+            f"{target.name!r}.",
+            path=target,
+        )
+    return target
 
 
 def _checked_form(design: Design, form: str | None) -> str:
