@@ -21,7 +21,6 @@ from lbt_synth.models.fusion.sensors import (
     OWN_SENSOR,
     Motion,
     SensorSuite,
-    acceleration_taps,
     checked_motions,
 )
 from lbt_synth.models.spectra import breakpoints_below
@@ -284,13 +283,11 @@ def line_entry(
 ) -> FloatArray:
     """Return how the samples v(k+1), v(k), v(k-1), ... of a process enter a loop, (n + q, t)."""
     hardware, suite, n = loop.hardware, loop.suite, loop.hardware.modes
-    rows, rate = suite.rows(hardware), hardware.frame_rate_hz
+    rows = suite.rows(hardware)
     columns: list[tuple[int, int, FloatArray]] = []
     for sensor in suite.accelerometers:
-        age = sensor.age_frames(hardware)
         for channel in motion.keys() & set(sensor.channels) - set(loop.blind):
-            factor = motion[channel].factor * sensor.band(frequency_hz)
-            newest, taps = acceleration_taps(factor, frequency_hz, rate, age)
+            newest, taps = sensor.taps(motion[channel], frequency_hz, hardware)
             columns.append((n + rows[channel].start, newest + 1, taps))
     width = max([2, *(first + len(taps) for _, first, taps in columns)])
     entry = np.zeros((loop.system.B.shape[2], width))

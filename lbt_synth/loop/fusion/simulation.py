@@ -17,7 +17,6 @@ from lbt_synth.models.fusion.sensors import (
     Accelerometer,
     Motion,
     SensorSuite,
-    acceleration_taps,
     checked_motions,
 )
 from lbt_synth.models.vibration.drifting import DriftingVibration
@@ -181,9 +180,7 @@ def _acceleration(
 ) -> FloatArray:
     """Return what a channel reads of a vibration, (cases, frames) [m/s^2]."""
     frequency_hz = line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
-    factor = moved.factor * sensor.band(frequency_hz)
-    age = sensor.age_frames(hardware)
-    newest, taps = acceleration_taps(factor, frequency_hz, hardware.frame_rate_hz, age)
+    newest, taps = sensor.taps(moved, frequency_hz, hardware)
     frames, before = motion.shape[1], max(newest + len(taps) - 1, 0)
     # beyond its ends the motion counts as still: the first readings are in the settling
     still = np.pad(motion, ((0, 0), (before, 1)), mode="edge")

@@ -18,7 +18,6 @@ from lbt_synth.models.fusion.memory import memory, suite_exposures
 from lbt_synth.models.fusion.sensors import (
     Motions,
     SensorSuite,
-    acceleration_taps,
     checked_motions,
 )
 from lbt_synth.models.plant.parts import held_frames
@@ -212,18 +211,18 @@ class _ChannelReadings:
 def _channel_readings(
     own: TipTiltPlant, suite: SensorSuite, motions: Motions, ahead: int
 ) -> _ChannelReadings:
-    p, n0, rate = len(own.vibrations), own.n_states, own.hardware.frame_rate_hz
+    p, n0 = len(own.vibrations), own.n_states
     taps: dict[tuple[int, int], tuple[int, FloatArray]] = {}
     oldest = [1] * p  # age of the oldest sample of each vibration that is a state
     row = 0
     for sensor in suite.accelerometers:
-        age = sensor.age_frames(own.hardware) + ahead
         for channel in sensor.channels:
             for j, line in enumerate(own.vibrations):
                 if channel not in motions[j]:
                     continue
-                factor = motions[j][channel].factor * sensor.band(line.frequency_hz)
-                newest, weights = acceleration_taps(factor, line.frequency_hz, rate, age)
+                newest, weights = sensor.taps(
+                    motions[j][channel], line.frequency_hz, own.hardware, ahead=ahead
+                )
                 taps[row, j] = newest, weights
                 oldest[j] = max(oldest[j], newest + len(weights) - 1)
             row += 1

@@ -218,6 +218,17 @@ class Accelerometer:
         ratio = 1j * frequency_hz / self.highpass_hz
         return complex(ratio / (1 + ratio))
 
+    def taps(
+        self, motion: Motion, frequency_hz: float, hardware: LoopHardware, *, ahead: int = 0
+    ) -> tuple[int, FloatArray]:
+        """Return :func:`acceleration_taps` of a channel that moves with a vibration.
+
+        Ages count from ``ahead`` frames after that of the reading.
+        """
+        factor = motion.factor * self.band(frequency_hz)
+        age = self.age_frames(hardware) + ahead
+        return acceleration_taps(factor, frequency_hz, hardware.frame_rate_hz, age)
+
 
 Sensor: TypeAlias = WavefrontSensor | Accelerometer
 Motions: TypeAlias = tuple[Mapping[str, Motion], ...]  # of each vibration, by channel
