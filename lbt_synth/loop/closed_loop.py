@@ -250,8 +250,7 @@ def loop_matrices(
     x = slice(order)  # state of the controller
     v = slice(order, states - n)  # state of the mirror, one response per command
     r = slice(states - n, states)  # phi_res(k-1)
-    identity = np.eye(m)
-    mirror_A, mirror_B = np.kron(mirror.A, identity), np.kron(mirror.B[:, None], identity)
+    mirror_A, mirror_B, mirror_C = mirror.repeated(m)
     direct_influence = mirror.D * influence  # from u(k) to phi_cor(k) without a delay
 
     # with s the whole state: y = g measured s + noise
@@ -263,7 +262,7 @@ def loop_matrices(
     command1 = D @ measured
     # phi_res = (residual0 + g residual1) s + phi_tot - direct_influence D noise
     residual0 = -direct_influence @ command0
-    residual0[..., v] -= influence @ np.kron(mirror.C, identity)
+    residual0[..., v] -= influence @ mirror_C
     residual1 = -direct_influence @ command1
 
     A0, A1 = np.zeros((2, *stack, states, states))

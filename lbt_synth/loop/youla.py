@@ -56,20 +56,21 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
             f"{parameter.B.shape[1]} to {len(parameter.C)}."
         )
     A, B, C, D = parameter.A, parameter.B, parameter.C, parameter.D
-    mirror, each, n = hardware.mirror_system.whole, np.eye(m), len(A)
+    mirror, n = hardware.mirror_system.whole, len(A)
+    A_mirror, B_mirror, C_mirror = mirror.repeated(m)
     # Without feedthrough the last command is read from the state: u(k-1) = C x(k)
     stored = m if np.any(D) else 0
     size = n + stored + mirror.n_states * m
     last = np.zeros((m, size))  # reads u(k-1) from the state [x, u(k-1) if stored, mirror]
     if stored:
-        last[:, n : n + m] = each
+        last[:, n : n + m] = np.eye(m)
     else:
         last[:, :n] = C
     position = mirror.D * last
-    position[:, n + stored :] += np.kron(mirror.C, each)
+    position[:, n + stored :] += C_mirror
     correction = hardware.sensor @ hardware.influence @ position  # ybar = y + correction s
-    next_mirror = np.kron(mirror.B[:, None], each) @ last
-    next_mirror[:, n + stored :] += np.kron(mirror.A, each)
+    next_mirror = B_mirror @ last
+    next_mirror[:, n + stored :] += A_mirror
     next_filter = np.hstack([A, np.zeros((n, size - n))]) + B @ correction
     rows, entry = [next_filter], np.zeros((size, q))
     entry[:n] = B
@@ -77,7 +78,7 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
         rows.append(C @ next_filter + D @ correction)
         entry[n : n + m] = C @ B + D
     applied = entry @ (mirror.D * hardware.sensor @ hardware.influence)
-    applied[n + stored :] += np.kron(mirror.B[:, None], each)
+    applied[n + stored :] += B_mirror
     # the rows that read u(k-1) from the old state read u(k) from the new one
     whole, D = np.vstack([*rows, next_mirror]), np.zeros((m, q))
     return Controller(A=whole, B=entry, C=last, D=D, dt_s=hardware.dt_s, applied=applied)

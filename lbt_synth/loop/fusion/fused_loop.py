@@ -142,9 +142,9 @@ def close_fused_loop(
         )
     exposures = [own_exposure(hardware), *suite_exposures(suite, hardware)]
     held, k = memory(exposures, n, period, hardware.dt_s), controller.to_statespace()
-    mirror, each = hardware.mirror_system.whole, np.eye(m)
-    A_m, B_m = np.kron(mirror.A, each), np.kron(mirror.B[:, None], each)
-    position, direct = hardware.influence @ np.kron(mirror.C, each), mirror.D * hardware.influence
+    mirror = hardware.mirror_system.whole
+    A_m, B_m, C_m = mirror.repeated(m)
+    position, direct = hardware.influence @ C_m, mirror.D * hardware.influence
     nk, nv, nh = k.n_states, len(A_m), held.n_states
     x, v, h = slice(nk), slice(nk, nk + nv), slice(nk + nv, nk + nv + nh)
     size = nk + nv + nh

@@ -257,9 +257,9 @@ def _known_part(
     k - 1, and the reading adds the one of k - 1.
     """
     hardware = own.hardware
-    mirror, each = hardware.mirror_system.whole, np.eye(hardware.n_commands)
-    A_m, B_m = np.kron(mirror.A, each), np.kron(mirror.B[:, None], each)
-    seen, direct = hardware.influence @ np.kron(mirror.C, each), mirror.D * hardware.influence
+    mirror = hardware.mirror_system.whole
+    A_m, B_m, C_m = mirror.repeated(hardware.n_commands)
+    seen, direct = hardware.influence @ C_m, mirror.D * hardware.influence
     period, v, w = len(waiting.A), len(A_m), waiting.n_states
     last = np.roll(np.arange(period), 1)  # the phase before
     A, B = np.zeros((period, v + w, v + w)), np.zeros((period, v + w, hardware.n_commands))

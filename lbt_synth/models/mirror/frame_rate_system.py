@@ -45,6 +45,11 @@ class Response:
         """Number of states."""
         return len(self.B)
 
+    def repeated(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return A, B, C of as many equal systems, each state of all of them side by side."""
+        each = np.eye(count)
+        return np.kron(self.A, each), np.kron(self.B[:, None], each), np.kron(self.C, each)
+
     @property
     def zeros(self) -> ComplexArray:
         """Zeros in z, those at the origin included; D must not vanish."""

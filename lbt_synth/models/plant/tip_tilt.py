@@ -85,14 +85,15 @@ class TipTiltPlant(EstimationProblem):
         (8, 8)
         """
         hw = self.hardware
-        mirror, each = hw.mirror_system.whole, np.eye(hw.n_commands)
+        mirror = hw.mirror_system.whole
+        A_mirror, B_mirror, C_mirror = mirror.repeated(hw.n_commands)
         n, past = self.A.shape[0], mirror.n_states * hw.n_commands
         A = np.zeros((n + past, n + past))
-        A[:n, :n], A[n:, n:] = self.A, np.kron(mirror.A, each)
+        A[:n, :n], A[n:, n:] = self.A, A_mirror
         B_known = np.zeros((n + past, hw.n_commands))  # u(k-1) is the input
-        B_known[n:] = np.kron(mirror.B[:, None], each)
+        B_known[n:] = B_mirror
         response = -hw.sensor @ hw.influence
-        C = np.hstack([self.C, response @ np.kron(mirror.C, each)])
+        C = np.hstack([self.C, response @ C_mirror])
         pad = np.zeros((past, self.B.shape[1]))
         return FullStatePlant(
             A=A,
