@@ -25,6 +25,7 @@ from lbt_synth.design.facts import FilterFacts, model_facts, summarise_design
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
 from lbt_synth.linear.estimation_problem import decorrelate
+from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.riccati.filtering import (
     FilterRiccati,
     GammaEquation,
@@ -334,17 +335,12 @@ class FilterDesign(EstimatorDesign):
                 origins += [] if central is None else [central]
         own = np.vstack([self.gain_predictor, self.gain_filter])
         value = min(
-            _apart(own, np.vstack([origin.gain_predictor, origin.gain_filter]))
+            relative_distance(own, np.vstack([origin.gain_predictor, origin.gain_filter]))
             for origin in origins
         )
         if self.is_bounded and value > ORIGIN_TOLERANCE:
             return []
         return [Check(ORIGIN, value, ORIGIN_TOLERANCE, "relative")]
-
-
-def _apart(own: FloatArray, other: FloatArray) -> float:
-    """Relative distance of two gains."""
-    return float(np.linalg.norm(own - other)) / max(float(np.linalg.norm(other)), 1e-300)
 
 
 UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))

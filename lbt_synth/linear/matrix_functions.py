@@ -13,6 +13,11 @@ def is_stable(A: FloatArray) -> bool:
     return bool(np.max(np.abs(np.linalg.eigvals(A))) < 1)
 
 
+def relative_distance(own: FloatArray, other: FloatArray) -> float:
+    """Return the norm of the difference of two arrays over that of the other."""
+    return float(np.linalg.norm(own - other)) / max(float(np.linalg.norm(other)), 1e-300)
+
+
 def semidefinite_root(M: FloatArray) -> FloatArray:
     """Return R (n, n) with ``R R' = M``, for a semidefinite M but for rounding.
 

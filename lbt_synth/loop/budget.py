@@ -146,11 +146,7 @@ def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
         return fused_budget(loop, truth)
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
-    if loop.sensor_gain != truth.sensor_gain:
-        raise ProblemError(
-            f"the loop must be closed with the truth's sensor gain {truth.sensor_gain:.6g}; "
-            f"got {loop.sensor_gain:.6g}."
-        )
+    require_true_gain(loop.sensor_gain, truth)
     n = loop.hardware.modes
     turbulence = np.zeros((n, n))
     for spectrum, modes in truth.turbulence_groups(n):
@@ -171,6 +167,15 @@ def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
             lines.append(vibration.amplitude_nm * response @ direction)
     noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
     return _make_budget(loop, turbulence, np.diag(noise_nm), random_vibration, lines)
+
+
+def require_true_gain(sensor_gain: float, truth: Truth) -> None:
+    """Refuse a loop that is closed with another sensor gain than that of the truth."""
+    if sensor_gain != truth.sensor_gain:
+        raise ProblemError(
+            f"the loop must be closed with the truth's sensor gain {truth.sensor_gain:.6g}; "
+            f"got {sensor_gain:.6g}."
+        )
 
 
 def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
@@ -295,10 +300,14 @@ def _spectrum_covariance(
 
 
 def resonance_edges(loop: ClosedLoop) -> FloatArray:
+    """Panels of (0, Nyquist) [Hz] for a loop."""
+    return panel_edges(loop.system.poles, loop.hardware.frame_rate_hz)
+
+
+def panel_edges(poles: ComplexArray, frame_rate_hz: float) -> FloatArray:
     """Panels of (0, Nyquist) [Hz]: geometric, and more of them around each pole."""
-    nyquist = loop.hardware.frame_rate_hz / 2
-    edges = [np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(loop.system.poles)]
-    return frozen_copy(distinct_edges(np.concatenate(edges)) * nyquist)
+    edges = [np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(poles)]
+    return frozen_copy(distinct_edges(np.concatenate(edges)) * (frame_rate_hz / 2))
 
 
 def pole_edges(poles: ComplexArray) -> FloatArray:

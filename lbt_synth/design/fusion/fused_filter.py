@@ -22,6 +22,7 @@ from lbt_synth.design.hinf import checked_bounds, require_reachable
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError
 from lbt_synth.linear import hinf_norm
+from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.periodic.riccati import (
     PeriodicRiccati,
     kalman_gain,
@@ -217,7 +218,7 @@ class FusedFilter(Design):
             checks.append(Check("least norm of any filter, error", off, NORM_TOLERANCE, how))
         level = self.gamma_central or self.gamma_requested or 0.0
         central = periodic_hinf(self.problem, level, start)
-        apart = np.inf if central is None else _apart(self.gains, central.gains)
+        apart = np.inf if central is None else relative_distance(self.gains, central.gains)
         name, how = "distance from its Riccati filter", "relative"
         checks.append(Check(name, apart, 1e-5, how))
         return checks
@@ -226,10 +227,6 @@ class FusedFilter(Design):
 def _stable(name: str, loop: FusedLoop) -> Check:
     how = "eigenvalues of the monodromy, per frame"
     return Check(name, loop.system.radius_per_frame, 1 - STABILITY_MARGIN, how)
-
-
-def _apart(own: FloatArray, other: FloatArray) -> float:
-    return float(np.linalg.norm(own - other)) / max(float(np.linalg.norm(other)), 1e-300)
 
 
 def _least_variance_check(
@@ -246,7 +243,7 @@ def _least_variance_check(
         return Check(name, np.inf, GAIN_TOLERANCE, how)
     own = problem.restricted(remaining)
     optimal = [kalman_gain(own, t, P) for t, P in enumerate(error.covariances())]
-    return Check(name, _apart(gains, np.stack(optimal)), GAIN_TOLERANCE, how)
+    return Check(name, relative_distance(gains, np.stack(optimal)), GAIN_TOLERANCE, how)
 
 
 def stable_gains(stable: Callable[[float], bool]) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import numpy as np
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.batched import symmetrise
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.matrix_functions import is_stable
+from lbt_synth.linear.matrix_functions import is_stable, relative_distance
 from lbt_synth.linear.periodic.problem import PeriodicProblem
 from lbt_synth.linear.riccati.filtering import require_detectable
 from lbt_synth.linear.riccati.routes import doubling
@@ -115,7 +115,7 @@ def periodic_kalman(problem: PeriodicProblem) -> PeriodicRiccati:
         if not error.spectral_radius < 1:
             break
         refined = error.covariances()
-        last, change = change, _relative(refined - covariances, refined)
+        last, change = change, relative_distance(covariances, refined)
         covariances, steps = refined, steps + 1
         if change < _SETTLED or change > last / 2:
             break
@@ -169,10 +169,6 @@ def _problem_of_triple(triple: Triple) -> EstimationProblem:
     zero, identity = np.zeros_like(A), np.eye(len(A))
     B, D = np.hstack([weight_root(H), zero]), np.hstack([zero, identity])
     return EstimationProblem(A=A, B=B, C=weight_root(G).T, D=D, L=identity)
-
-
-def _relative(difference: FloatArray, whole: FloatArray) -> float:
-    return float(np.linalg.norm(difference)) / max(float(np.linalg.norm(whole)), 1e-300)
 
 
 def periodic_hinf(
@@ -232,7 +228,7 @@ def periodic_hinf(
         X = symmetrise(onward @ X @ A1.T + H1)
     if not is_stable(transition) or not problem.error_system(gains).spectral_radius < 1:
         return None
-    residual = _relative(start.P[0] + X - P[0], P[0])
+    residual = relative_distance(start.P[0] + X, P[0])
     return PeriodicRiccati(P=frozen_copy(P), gains=frozen_copy(gains), residual=residual, steps=0)
 
 

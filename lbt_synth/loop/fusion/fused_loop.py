@@ -12,7 +12,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
 from lbt_synth.linear.quadrature import adaptive_integral
-from lbt_synth.loop.budget import ResidualBudget, distinct_edges, pole_edges
+from lbt_synth.loop.budget import ResidualBudget, panel_edges, require_true_gain
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, ClosedLoop, require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, Truth, Vibration
 from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
@@ -217,11 +217,7 @@ def fused_budget(loop: FusedLoop, truth: Truth) -> ResidualBudget:
     >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-9)
     True
     """
-    if loop.sensor_gain != truth.sensor_gain:
-        raise ProblemError(
-            f"the loop must be closed with the truth's sensor gain {truth.sensor_gain:.6g}; got "
-            f"{loop.sensor_gain:.6g}."
-        )
+    require_true_gain(loop.sensor_gain, truth)
     noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
     return _budget(loop, truth, np.diag(noise_nm))
 
@@ -308,16 +304,13 @@ def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray
         power = np.real(np.einsum("fti,ftj->fij", response, response.conj())) / response.shape[1]
         return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
 
-    nyquist = loop.hardware.frame_rate_hz / 2
+    rate = loop.hardware.frame_rate_hz
     poles = np.linalg.eigvals(loop.system.monodromy).astype(np.complex128)
     N = loop.system.period  # a pole of the period shows at each of its roots
     turns = np.exp(2j * np.pi * np.arange(N) / N)
     roots = (np.abs(poles) ** (1 / N) * np.exp(1j * np.angle(poles) / N))[:, None] * turns
-    grid = np.concatenate([np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(roots)])
-    edges = distinct_edges(grid) * nyquist
-    return adaptive_integral(
-        density, np.unique(np.concatenate([edges, breakpoints_below(spectrum, nyquist)]))
-    )
+    edges = [panel_edges(roots, rate), breakpoints_below(spectrum, rate / 2)]
+    return adaptive_integral(density, np.unique(np.concatenate(edges)))
 
 
 def _line_response(loop: FusedLoop, entry: FloatArray, frequency_hz: FloatArray) -> ComplexArray:

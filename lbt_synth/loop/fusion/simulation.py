@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.periodic.system import PeriodicController
 from lbt_synth.loop.simulation.disturbances import draw_noise, draw_parts
-from lbt_synth.loop.simulation.run import Simulation
+from lbt_synth.loop.simulation.run import Simulation, record_run
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
 from lbt_synth.models.fusion.sensors import (
@@ -21,7 +21,7 @@ from lbt_synth.models.fusion.sensors import (
 )
 from lbt_synth.models.vibration.drifting import DriftingVibration
 from lbt_synth.models.vibration.in_a_loop import TrueVibration, checked_direction
-from lbt_synth.validation import FloatArray, choice, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, choice, integer, number
 
 READINGS = ("missing", "zero", "frozen")
 
@@ -132,16 +132,7 @@ def simulate_fused(
         for segment in run_segments(drops, frames / rate)
     }
     out = _run(filters, suite, hardware, total, added, truth.sensor_gain, events)
-    n, m = hardware.modes, hardware.n_commands
-    kept = out[:, settle:]
-    return Simulation(
-        total_nm=frozen_copy(total[:, settle:]),
-        residual_nm=frozen_copy(kept[:, :, :n]),
-        commands=frozen_copy(kept[:, :, n : n + m]),
-        measurements=frozen_copy(kept[:, :, n + m :]),
-        frame_rate_hz=hardware.frame_rate_hz,
-        seed=seed,
-    )
+    return record_run(total, out, hardware, settle=settle, seed=seed)
 
 
 def _draw_others(

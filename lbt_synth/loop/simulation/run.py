@@ -182,6 +182,13 @@ def simulate(
     else:
         own = controller.start() if isinstance(controller, Controller) else controller
         outputs = step_loop(own, gains, hardware, total, noise, stroke=limit)
+    return record_run(total, outputs, hardware, settle=settle, seed=seed)
+
+
+def record_run(
+    total: FloatArray, outputs: FloatArray, hardware: LoopHardware, *, settle: int, seed: int
+) -> Simulation:
+    """Return the series of a loop after it has settled, from ``phi_res, u, y`` side by side."""
     n, m = hardware.modes, hardware.n_commands
     kept = outputs[:, settle:]
     return Simulation(

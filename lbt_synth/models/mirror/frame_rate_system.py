@@ -47,8 +47,9 @@ class Response:
 
     def repeated(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return A, B, C of as many equal systems, each state of all of them side by side."""
-        each = np.eye(count)
-        return np.kron(self.A, each), np.kron(self.B[:, None], each), np.kron(self.C, each)
+        parts = (self.A, self.B[:, None], self.C)
+        A, B, C = (np.asarray(np.kron(part, np.eye(count)), dtype=np.float64) for part in parts)
+        return A, B, C
 
     @property
     def zeros(self) -> ComplexArray:
