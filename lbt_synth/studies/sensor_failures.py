@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.errors import UnstableLoopError
+from lbt_synth.linear import PeriodicController
 from lbt_synth.loop import Imaging, Simulation, residual_budget
 from lbt_synth.loop.fusion.fused_loop import close_fused_loop
 from lbt_synth.loop.fusion.simulation import Drop, Segment, run_segments, simulate_fused
@@ -106,8 +107,9 @@ def run_failures(
     ProblemError
         If a sensor that fails is not there.
     """
+    filters = design.controllers
     simulation = simulate_fused(
-        design.controllers,
+        filters,
         design.problem.suite,
         truth,
         hardware=config.hardware,
@@ -118,17 +120,23 @@ def run_failures(
         drops=drops,
     )
     segments = run_segments(drops, frames / config.hardware.frame_rate_hz)
-    exact = tuple(_exact_nm(design, config, truth, segment) for segment in segments)
+    exact = tuple(_exact_nm(design, filters, config, truth, segment) for segment in segments)
     return FailureRun(simulation=simulation, segments=segments, exact_nm=exact)
 
 
-def _exact_nm(design: FusedFilter, config: Config, truth: Truth, segment: Segment) -> float:
+def _exact_nm(
+    design: FusedFilter,
+    filters: Mapping[frozenset[str], PeriodicController],
+    config: Config,
+    truth: Truth,
+    segment: Segment,
+) -> float:
     if truth.drifts:
         return np.nan
     loop = close_fused_loop(
         config.hardware,
         design.problem.suite,
-        design.controllers[frozenset(segment.missing)],
+        filters[frozenset(segment.missing)],
         sensor_gain=truth.sensor_gain,
         blind=(*segment.missing, *segment.wrong),
     )

@@ -17,16 +17,13 @@ from lbt_synth.design.certificate import (
     certify_error,
 )
 from lbt_synth.design.fusion.failures import Fallback, failed_loop, make_fallbacks
+from lbt_synth.design.fusion.levels import central_filter, find_level
 from lbt_synth.design.fusion.switching import dwell_frames
-from lbt_synth.design.hinf import checked_bounds, require_reachable
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
-from lbt_synth.errors import InfeasibleError
-from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.periodic.riccati import (
     PeriodicRiccati,
     kalman_gain,
-    least_periodic_gamma,
     periodic_hinf,
     periodic_kalman,
 )
@@ -343,33 +340,9 @@ def fused_hinf(
     >>> design.gamma_least < design.gamma < design.gamma_requested
     True
     """
-    require_instance(plant, FusedPlant, "plant")
-    gamma, gamma_ratio = checked_bounds(
-        gamma, gamma_ratio, far_above="the filter is the Kalman filter"
-    )
-    start = periodic_kalman(plant)
-    least = least_periodic_gamma(plant, start, error_norm(plant, start))[1]
-    requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
-    require_reachable(requested, least)
-    found = central_filter(plant, max(requested, least), start)
-    return make_design(plant, found, gamma_requested=max(requested, least), gamma_least=least)
-
-
-def error_norm(plant: FusedPlant, solution: PeriodicRiccati) -> float:
-    """Return the norm of a filter's estimation error over a period."""
-    return hinf_norm(plant.error_system(solution.gains).lifted_compactly()).upper
-
-
-def central_filter(plant: FusedPlant, gamma: float, start: PeriodicRiccati) -> PeriodicRiccati:
-    """Return the central filter of a level; InfeasibleError if there is none."""
-    found = periodic_hinf(plant, gamma, start)
-    if found is None:
-        raise InfeasibleError(
-            f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
-            "Try a larger gamma.",
-            gamma=gamma,
-        )
-    return found
+    level = find_level(plant, gamma, gamma_ratio)
+    found = central_filter(plant, level.bound, level.start)
+    return make_design(plant, found, gamma_requested=level.bound, gamma_least=level.least)
 
 
 def make_design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> FusedFilter:

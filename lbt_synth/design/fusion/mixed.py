@@ -5,16 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 
-from lbt_synth.design.fusion.fused_filter import (
-    FusedFilter,
-    central_filter,
-    error_norm,
-    make_design,
-)
-from lbt_synth.design.hinf import checked_bounds, require_reachable
-from lbt_synth.linear.periodic.riccati import least_periodic_gamma, periodic_kalman
+from lbt_synth.design.fusion.fused_filter import FusedFilter, make_design
+from lbt_synth.design.fusion.levels import central_filter, error_norm, find_level
 from lbt_synth.models.fusion.plant import FusedPlant
-from lbt_synth.validation import require_instance
 
 _DECADES = 4.0  # of gamma, over which a central filter is searched
 _INSIDE = 1e-7  # by which the norm stays below its bound
@@ -60,26 +53,22 @@ def fused_mixed(
     >>> both.rms < lbt.design.fused_hinf(plant, gamma_ratio=1.01).rms
     True
     """
-    require_instance(plant, FusedPlant, "plant")
-    gamma, gamma_ratio = checked_bounds(
-        gamma, gamma_ratio, far_above="the filter is the Kalman filter"
-    )
-    start = periodic_kalman(plant)
-    upper = error_norm(plant, start)
-    least = least_periodic_gamma(plant, start, upper)[1]
-    requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
-    require_reachable(requested, least)
-    if upper <= requested:
-        return make_design(plant, start)
-    bound = max(requested, least)
+    level = find_level(plant, gamma, gamma_ratio)
+    if level.kalman <= level.bound:
+        return make_design(plant, level.start)
 
     def excess(decades: float) -> float:
-        found = central_filter(plant, bound * 10**decades, start)
-        return float(np.log(error_norm(plant, found) / bound)) + _INSIDE
+        found = central_filter(plant, level.bound * 10**decades, level.start)
+        return float(np.log(error_norm(plant, found) / level.bound)) + _INSIDE
 
     decades = 0.0
     if excess(0.0) < 0 < excess(_DECADES):
         decades = brentq(excess, 0.0, _DECADES, xtol=1e-9, rtol=1e-12)
-    level = bound * 10**decades
-    found = central_filter(plant, level, start)
-    return make_design(plant, found, gamma_requested=bound, gamma_least=least, gamma_central=level)
+    central = level.bound * 10**decades
+    return make_design(
+        plant,
+        central_filter(plant, central, level.start),
+        gamma_requested=level.bound,
+        gamma_least=level.least,
+        gamma_central=central,
+    )

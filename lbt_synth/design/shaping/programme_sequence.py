@@ -125,7 +125,7 @@ class _Programme:
                 residual=float(self._excess.size),
             )
         self.solved += 1
-        held = merge_groups(self.groups)
+        held = _merge_groups(self.groups)
         c, self.status = minimize(function, held, size=self.size, scale=self.scale, start=start)
         if c is None:
             raise _infeasibility_error(self)
@@ -179,10 +179,10 @@ class _Programme:
         """Return the objective and the constraints at other points."""
         grid = replace(self.grid, points_hz=points_hz)
         function, groups = self.specification.compile(self.channel, grid)
-        return function, merge_groups(groups)
+        return function, _merge_groups(groups)
 
 
-def merge_groups(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
+def _merge_groups(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
     """Return the constraints of all demands, as few as possible."""
     return merge_constraints(tuple(constraint for group in groups for constraint in group))
 

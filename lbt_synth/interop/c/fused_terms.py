@@ -193,7 +193,7 @@ def prove_fused(design: FusedFilter, terms: FusedTerms) -> tuple[Check, ...]:
     limit = 1 - STABILITY_MARGIN
     name = "spectral radius of the estimator alone"
     checks = [Check(name, still.radius_per_frame, limit, how)]
-    plant = design.problem
+    plant, controllers = design.problem, design.controllers
     for name, sets in (
         ("all sensors", [frozenset[str]()]),
         ("any sensors missing", [some for some in terms.gains if some]),
@@ -202,7 +202,7 @@ def prove_fused(design: FusedFilter, terms: FusedTerms) -> tuple[Check, ...]:
         for some in sets:
             loops = [
                 close_fused_loop(plant.own.hardware, plant.suite, k, blind=tuple(some))
-                for k in (terms.controller(some), design.controllers[some])
+                for k in (terms.controller(some), controllers[some])
             ]
             radii.append(loops[0].system.radius_per_frame)
             if not loops[0].is_stable:
