@@ -18,6 +18,7 @@ from types import FrameType
 
 from lbt_synth.cli.streams import discard, print_error, reopen_closed
 from lbt_synth.errors import LbtSynthError, SynthesisError
+from lbt_synth.storage.thread_limits import limit_threads
 
 DONE, FAILED, WRONG = 0, 1, 2
 INTERRUPTED, BROKEN_PIPE, TERMINATED = 130, 141, 143  # as shells count signals
@@ -98,7 +99,8 @@ def entry_point() -> None:
     reopen_closed()
     try:
         try:
-            status: int | str | None = main()
+            with limit_threads():  # numpy is loaded by the commands
+                status: int | str | None = main()
         except SystemExit as stop:  # of the parser
             status = stop.code
         sys.stdout.flush()

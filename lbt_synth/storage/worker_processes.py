@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.process import BaseProcess
 
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _ORPHAN_SECONDS = 1.0
 
 
 class WorkerPool(ProcessPoolExecutor):
     """Fresh processes that end with their parent, however it ends.
 
-    Start it within :func:`limit_threads`, whose limit the processes inherit. An error in its
-    ``with`` block ends them at once, without waiting for what is running.
+    Start it within :func:`~lbt_synth.storage.thread_limits.limit_threads`, whose limit the
+    processes inherit. An error in its ``with`` block ends them at once, without waiting for what is
+    running.
     """
 
     def __init__(self, workers: int) -> None:
@@ -37,18 +35,6 @@ class WorkerPool(ProcessPoolExecutor):
             for worker in set(multiprocessing.active_children()) - self._others:
                 worker.terminate()
         self.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def limit_threads() -> Iterator[None]:
-    """Limit the processes that are started in the block to one thread of linear algebra."""
-    free = [name for name in _THREADS if name not in os.environ]
-    os.environ.update(dict.fromkeys(free, "1"))
-    try:
-        yield
-    finally:
-        for name in free:
-            del os.environ[name]
 
 
 def _watch_parent(parent: int) -> None:

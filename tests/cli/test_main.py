@@ -16,6 +16,7 @@ from support.identified_models import ONE_AXIS, TWO, save_identified
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
+from lbt_synth.cli import main as command_line
 from lbt_synth.cli.main import main
 from lbt_synth.cli.parser import COMMANDS, build_parser
 from lbt_synth.config.schema import FileSection
@@ -185,6 +186,21 @@ def test_designing_needs_no_solver_that_it_does_not_use():
         "lbt.kalman(p)"
     )
     assert not {"cvxpy", "control", "matplotlib", "astropy"} & loaded_after(code)
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
+def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(monkeypatch, given, expected):
+    """Two threads on two busy cores made a design of 5 s take a minute."""
+    name = "OPENBLAS_NUM_THREADS"
+    monkeypatch.delenv(name, raising=False)
+    if given is not None:
+        monkeypatch.setenv(name, given)
+    seen = []
+    monkeypatch.setattr(command_line, "main", lambda: seen.append(os.environ[name]) or 0)
+    with pytest.raises(SystemExit):
+        command_line.entry_point()
+    assert seen == [expected]
+    assert os.environ.get(name) == given
 
 
 def test_the_console_script_survives_a_closed_pipe():

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import LbtSynthError, NumericalError
-from lbt_synth.storage.worker_processes import WorkerPool, limit_threads
+from lbt_synth.storage.thread_limits import limit_threads
+from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.studies.study.store import RowRange
 from lbt_synth.studies.study.study import BatchResult, Failure, Study
 from lbt_synth.validation import FloatArray
