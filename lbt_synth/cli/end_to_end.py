@@ -14,13 +14,15 @@ from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
-from lbt_synth.design import Design
+from lbt_synth.design import Design, FusedFilter
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import Calibration, EndToEndRun, EndToEndSetup, calibrate
+from lbt_synth.interop.specula.cases import summarise_run
+from lbt_synth.interop.specula.fused_filter import unread_sensors
 from lbt_synth.interop.specula.optics import specula_version
-from lbt_synth.interop.specula.simulation import summarise_run
 from lbt_synth.report.figures import end_to_end_figure
 from lbt_synth.report.figures.style import save_figure
+from lbt_synth.report.number_text import listing_text
 from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
 from lbt_synth.storage.rows import column, fill_row, percent_column, table_row
 
@@ -59,7 +61,7 @@ def run(arguments: Namespace) -> Report:
     refuse_replacing(outputs, [arguments.config, arguments.gain])
     choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
-    design = load_design(arguments.gain)
+    design = load_design(arguments.gain, several_sensors=True)
     setup.controller(design)  # refuses a filter of another loop before any work
     version = specula_version()
     make_directory(arguments.output)
@@ -84,6 +86,11 @@ def run(arguments: Namespace) -> Report:
         f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
         facts,
     )
+    if isinstance(design, FusedFilter) and (unread := unread_sensors(design)):
+        report.notes.append(
+            "note: the pyramid is the only wavefront sensor of the simulation: the fall-back "
+            f"filter of the gain file runs, without {listing_text(unread)}."
+        )
     summary = json.dumps(json_value(report.data), indent=1).encode() + b"\n"
     recorded = _telemetry(loop_run, design, calibration, arguments)
     report.note_files(

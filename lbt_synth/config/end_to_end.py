@@ -60,6 +60,7 @@ def build_end_to_end_setup(
         return EndToEndSetup(
             system=system,
             vibrations=truth.vibrations,
+            motions=truth.motions,
             seed=settings.simulation.seed,
             **section.model_dump(exclude=_OF_SYSTEM),
         )

@@ -21,7 +21,7 @@ from support.small_telescope import needs_specula, small_config
 import lbt_synth as lbt
 from lbt_synth.cli import end_to_end as end_to_end_commands
 from lbt_synth.cli.main import main
-from lbt_synth.errors import ConfigError, MissingExtraError
+from lbt_synth.errors import ConfigError, MissingExtraError, ProblemError
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +148,37 @@ def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
     assert np.sum(y * phase) / np.sum(phase**2) == pytest.approx(telemetry.sensor_gain)
     assert main(arguments[:-1]) == 0
     assert "Strehl ratio at 2.2 um" in capsys.readouterr().out
+
+
+SENSORS = """
+sensors:
+  truth: {rate_hz: 100, delay_frames: 2, noise_nm: 10}
+  mirror:
+    {kind: accelerometer, rate_hz: 800, delay_frames: 1, channels: [m1], noise_m_s2: 2.0e-3}
+"""
+
+
+@needs_specula
+def test_a_design_of_several_sensors_runs_without_those_that_are_not_simulated(
+    tmp_path, cache, capsys
+):
+    file = small_config(tmp_path)
+    text = file.read_text()
+    for old in ("{axis: both, frequency_hz: 20.0", "{kind: sinusoid, axis: tip"):
+        assert old in text
+        moved = "{accelerometers: {m1: {motion_nm_per_nm: 2}}, "
+        text = text.replace(old, moved + old[1:])
+    file.write_text(text + SENSORS)
+    gain, out = tmp_path / "fused.fits", tmp_path / "run"
+    lbt.save_gain(gain, lbt.load_config(file).design("kalman"))
+    arguments = ["end-to-end", str(file), str(gain), "-o", str(out), "--cache", str(cache)]
+    assert main(arguments) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "the fall-back filter of the gain file runs, without truth." in printed
+    assert json.loads((out / "summary.json").read_text())["method"] == "fused kalman"
+    alone = lbt.load_config(small_config(tmp_path)).end_to_end
+    with pytest.raises(ProblemError, match=r"moves a channel of the design \(m1\)"):
+        alone.controller(lbt.files.load_gain(gain))
 
 
 @needs_specula

@@ -6,6 +6,7 @@ import json
 
 import pytest
 from support.commands import run
+from support.plants import LBT_YAML
 from support.several_sensors import write_config
 
 from lbt_synth.cli.sensor_failures import parse_drop
@@ -73,6 +74,14 @@ def test_commands_for_one_sensor_say_so(capsys, fused_file, command):
     status, out, error = run(capsys, command[0], fused_file, *command[1:])
     assert (status, out) == (2, "")
     assert "is a design of several sensors" in error
+
+
+def test_the_table_of_the_paper_has_no_channels(capsys, fused_file, tmp_path):
+    out = tmp_path / "table"
+    status, _, error = run(capsys, "end-to-end-table", LBT_YAML, fused_file, "-o", out)
+    assert status == 2
+    assert "is a design of several sensors" in error
+    assert not out.exists()
 
 
 def test_show_prints_what_failures_do(capsys, fused_file):

@@ -1,37 +1,27 @@
-"""The end-to-end simulation: its set-up, and a controller in closed loop with SPECULA's optics.
-
-A run can be described in JSON, so that a study of many can be interrupted and resumed.
-"""
+"""The end-to-end simulation: its set-up, and a controller in closed loop with SPECULA's optics."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
+from lbt_synth.design import FusedFilter
 from lbt_synth.design.modal import MixedController
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.specula.calibration import Calibration, cache_directory, calibrate
 from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
+from lbt_synth.interop.specula.fused_filter import accompany_filter
 from lbt_synth.interop.specula.optics import Modes, Optics
 from lbt_synth.interop.specula.system import EndToEndSystem
-from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.loop.simulation.run import SteppedController, step_controller
-from lbt_synth.models import (
-    DriftingVibration,
-    LoopHardware,
-    PositionLoop,
-    SinusoidalVibration,
-    Truth,
-    Vibration,
-)
+from lbt_synth.models import Truth
+from lbt_synth.models.fusion.sensors import Motions
 from lbt_synth.models.vibration.in_a_loop import TrueVibration
 from lbt_synth.validation import (
     FloatArray,
@@ -56,6 +46,9 @@ class EndToEndSetup:
         Telescope, air, pyramid, mirror and camera.
     vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration
         Vibrations of tip and tilt.
+    motions : tuple of mapping
+        For each vibration, how channels of accelerometers move with it; only designs of several
+        sensors read them.
     frames, settle_frames, seed : int
         Length of a run, and its seed.
     gain : float
@@ -82,6 +75,7 @@ class EndToEndSetup:
 
     system: EndToEndSystem
     vibrations: tuple[TrueVibration, ...] = ()
+    motions: Motions = ()
     frames: Annotated[int, ("at_least", 2)] = 1600
     settle_frames: Annotated[int, ("at_least", RAMP_FRAMES)] = 400
     seed: Annotated[int, ("at_least", 0), ("at_most", LARGEST_SEED)] = 0
@@ -106,10 +100,15 @@ class EndToEndSetup:
         ----------
         filter : Design, Controller, object with ``step(y)`` and ``reset()``, or None
             Controller of tip and tilt, two measurements and two commands; None for
-            integrators, as classical control has them. One of another loop is refused.
+            integrators, as classical control has them. One of another loop is refused. A design
+            of several sensors has accelerometers that follow the vibrations of a run with the
+            frames and the seed of this set-up; further wavefront sensors are not read.
         tip_tilt_gain : float, optional
             Integrator gain of tip and tilt where there is no filter.
         """
+        if isinstance(filter, FusedFilter):
+            shaken = Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
+            filter = accompany_filter(filter, shaken, **self._length)  # noqa: A001
         hardware = getattr(filter, "hardware", None)
         mine = self.system.hardware
         if hardware is not None and (hardware.frame_rate_hz, hardware.delay_frames) != (
@@ -143,8 +142,14 @@ class EndToEndSetup:
         The options are calibration, cache and progress, as of :func:`run_end_to_end`.
         """
         control = self.controller(filter, tip_tilt_gain=tip_tilt_gain)
-        own = {name: getattr(self, name) for name in ("frames", "settle_frames", "seed")}
-        return run_end_to_end(self.system, control, vibrations=self.vibrations, **own, **options)
+        return run_end_to_end(
+            self.system, control, vibrations=self.vibrations, **self._length, **options
+        )
+
+    @property
+    def _length(self) -> dict[str, Any]:
+        """Length and seed of a run."""
+        return {name: getattr(self, name) for name in ("frames", "settle_frames", "seed")}
 
 
 def run_end_to_end(
@@ -301,83 +306,3 @@ def _measure_residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:
     rest = phase - coefficients[:2].astype(np.float32) @ modes.shapes[:2]
     turn = 2 * np.pi / (1e3 * optics.system.imaging_wavelength_um)
     return coefficients, float(np.abs(np.mean(np.exp(1j * turn * rest))) ** 2)
-
-
-def make_case(
-    setup: EndToEndSetup,
-    controller: Controller | None,
-    *,
-    vibrations: Sequence[TrueVibration] = (),
-    seed: int = 0,
-) -> dict[str, Any]:
-    """Return all that a run depends on, in values that JSON can hold.
-
-    Vibrations and seed replace those of the set-up. Without a controller, integrators control tip
-    and tilt.
-    """
-    settings = asdict(replace(setup, vibrations=tuple(vibrations), seed=seed))
-    lines, system = list(settings.pop("vibrations")), settings.pop("system")
-    hardware = system.pop("hardware")  # its two matrices are the identity
-    matrices = None
-    if controller is not None:
-        matrices = {name: getattr(controller, name).tolist() for name in "ABCD"}
-        matrices["dt_s"] = controller.dt_s
-    return {
-        "versions": {name: _installed_version(name) for name in ("lbt-synth", "specula")},
-        "system": system,
-        "hardware": {name: hardware[name] for name in ("frame_rate_hz", "delay_frames", "mirror")},
-        "setup": settings,
-        "vibrations": lines,
-        "controller": matrices,
-    }
-
-
-def run_case(
-    case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
-) -> dict[str, Any]:
-    """Run a case made by :func:`make_case` and return its summary.
-
-    ``cache`` is the directory of calibrations and phase screens.
-    """
-    system = EndToEndSystem(hardware=_build_hardware(case["hardware"]), **case["system"])
-    lines = tuple(_build_vibration(line) for line in case["vibrations"])
-    setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
-    matrices = case["controller"]
-    controller = None if matrices is None else Controller(**matrices)
-    return summarise_run(setup.run(controller, cache=cache))
-
-
-def summarise_run(run: EndToEndRun) -> dict[str, Any]:
-    """Return the main numbers of a run; None stands for NaN, which JSON does not have."""
-    rms = run.rms_nm
-    return {
-        "strehl": run.strehl,
-        "strehl_error": None if math.isnan(run.strehl_error) else run.strehl_error,
-        "other_modes_strehl": run.other_modes_strehl,
-        "tip_rms_nm": float(rms[0]),
-        "tilt_rms_nm": float(rms[1]),
-        "other_modes_rms_nm": float((rms[2:] ** 2).sum() ** 0.5),
-        "tip_tilt_gain": run.tip_tilt_gain,
-        "tip_tilt_gain_error": run.tip_tilt_gain_error,
-        "tip_tilt_noise_nm": run.tip_tilt_noise_nm,
-    }
-
-
-def _installed_version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _build_hardware(values: Mapping[str, Any]) -> LoopHardware:
-    mirror = values["mirror"]
-    return LoopHardware(**{**values, "mirror": None if mirror is None else PositionLoop(**mirror)})
-
-
-def _build_vibration(line: Mapping[str, Any]) -> TrueVibration:
-    """Rebuild a vibration; its fields tell which of the three types it has."""
-    values = {**line, "direction": tuple(line["direction"])}
-    if "start_hz" in line:
-        return DriftingVibration(**values)
-    return Vibration(**values) if "damping" in line else SinusoidalVibration(**values)

@@ -117,7 +117,7 @@ def simulate_fused(
     total, motions = draw_parts(truth, hardware, rng=rng, zero_frame=settle, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
     added = np.concatenate(
-        [noise, _draw_others(truth, hardware, suite, motions, other_rng, **size)], axis=2
+        [noise, draw_others(truth, hardware, suite, motions, other_rng, **size)], axis=2
     )
     for line, motion in zip(truth.vibrations, motions, strict=True):
         total += motion[:, :, None] * checked_direction(line, hardware)
@@ -135,7 +135,7 @@ def simulate_fused(
     return record_run(total, out, hardware, settle=settle, seed=seed)
 
 
-def _draw_others(
+def draw_others(
     truth: Truth,
     hardware: LoopHardware,
     suite: SensorSuite,
@@ -145,7 +145,10 @@ def _draw_others(
     frames: int,
     cases: int,
 ) -> FloatArray:
-    """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q)."""
+    """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q).
+
+    What a wavefront sensor reads of the residual is no part of them.
+    """
     parts = []
     moving = checked_motions(truth.motions, suite, len(motions))
     for sensor in suite.ordered:

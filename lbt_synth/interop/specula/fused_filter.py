@@ -1,0 +1,115 @@
+"""A filter of several sensors in an end-to-end simulation, whose only optics are the pyramid's.
+
+The readings of accelerometers are computed from the motions that shake the simulated telescope.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.design import FusedFilter
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.loop.fusion.simulation import draw_others
+from lbt_synth.loop.simulation.disturbances import draw_parts
+from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.validation import FloatArray
+
+
+@dataclass(kw_only=True, eq=False)
+class AccompaniedFilter:
+    """A filter of several sensors to step with the pyramid alone: it has the other readings.
+
+    Parameters
+    ----------
+    controller : PeriodicController
+        From the measurements of all sensors to the commands.
+    others : (frames, q) ndarray
+        Readings of the other sensors in each frame.
+    hardware : LoopHardware
+        Loop that the filter is designed for.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, numpy as np
+    >>> from lbt_synth.interop.specula.fused_filter import AccompaniedFilter
+    >>> from lbt_synth.linear import PeriodicController
+    >>> mean = PeriodicController(A=[[[0.0]]], B=[[[0.5, 0.5]]], C=[[[1.0]]], D=[[[0.0, 0.0]]])
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> own = AccompaniedFilter(controller=mean, others=np.array([[4.0], [6.0]]), hardware=path)
+    >>> [own.step(np.array([2.0])).tolist() for _ in range(2)]
+    [[3.0], [4.0]]
+    """
+
+    controller: PeriodicController
+    others: FloatArray
+    hardware: LoopHardware
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to the first frame, with all states zero."""
+        self._frame, self._state = 0, np.zeros(self.controller.n_states)
+
+    def step(self, y: FloatArray) -> FloatArray:
+        """Take the measurements of the loop's own sensor in the next frame, return the commands."""
+        if self._frame >= len(self.others):
+            raise ProblemError(
+                f"the other sensors have readings for {len(self.others)} frames; a frame more was "
+                "asked for. Give the set-up that makes the controller the frames of the run."
+            )
+        now = self.controller.phase(self._frame)
+        measured = np.concatenate([y, self.others[self._frame]])
+        self._state = now.A @ self._state + now.B @ measured
+        self._frame += 1
+        return np.asarray(now.C @ self._state + now.D @ measured)
+
+
+def unread_sensors(design: FusedFilter) -> tuple[str, ...]:
+    """Return the sensors that an end-to-end simulation does not have: further wavefront sensors."""
+    return tuple(sensor.name for sensor in design.problem.suite.wavefront)
+
+
+def accompany_filter(
+    design: FusedFilter, shaken: Truth, *, frames: int, settle_frames: int, seed: int
+) -> AccompaniedFilter:
+    """Return a filter with the readings of its accelerometers in a run.
+
+    Parameters
+    ----------
+    design : FusedFilter
+        The filter; its fall-back runs where it has wavefront sensors beside the pyramid.
+    shaken : Truth
+        Vibrations of the run, and how channels move with them.
+    frames, settle_frames, seed : int
+        As :func:`run_end_to_end` takes them: the readings follow the motions of that run.
+
+    Raises
+    ------
+    DimensionError
+        If the filter is not one of tip and tilt.
+    ProblemError
+        If no vibration moves a channel of the design.
+    """
+    hardware, channels = design.loop_hardware, design.problem.suite.channels
+    if (hardware.n_measurements, hardware.n_commands) != (2, 2):
+        raise DimensionError(
+            "the filter must map two measurements of the loop's own sensor, tip and tilt, to two "
+            f"commands; got {hardware.n_measurements} to {hardware.n_commands}."
+        )
+    if channels and not any(shaken.motions):
+        raise ProblemError(
+            f"no vibration of the simulation moves a channel of the design ({', '.join(channels)})."
+            " Give sensors, and accelerometers of each vibration, in the configuration."
+        )
+    missing = frozenset(unread_sensors(design))
+    rng, size = np.random.default_rng(seed), {"frames": settle_frames + frames, "cases": 1}
+    _, motions = draw_parts(shaken, hardware, rng=rng, zero_frame=settle_frames, **size)
+    (own_rng,) = rng.spawn(1)
+    others = draw_others(shaken, hardware, design.problem.suite, motions, own_rng, **size)
+    return AccompaniedFilter(
+        controller=design.controllers[missing], others=others[0], hardware=hardware
+    )
