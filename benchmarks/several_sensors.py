@@ -16,7 +16,7 @@ import numpy as np
 import lbt_synth as lbt
 
 sys.path.insert(0, "tests")
-from support.periodic_problems import random_periodic_problem, relative_distance
+from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
 
 CASES, LONGEST_SETTLING = 200, 20_000
 SETTLED = 1e-6  # what is left of the first error
@@ -69,7 +69,7 @@ def main() -> None:
     for seed in range(given.plants):
         problem = random_periodic_problem(seed)
         solution = lbt.linear.periodic_kalman(problem)
-        lifted = lbt.linear.kalman_riccati(problem.lifted_problem())
+        lifted = lbt.linear.kalman_riccati(lifted_problem(problem))
         apart.append(relative_distance(solution.P[0], lifted.P))
         found = score(problem, solution, given.frames, seed)
         if found is not None:

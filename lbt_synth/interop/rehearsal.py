@@ -13,6 +13,7 @@ from lbt_synth.design import Check, Design
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.export_checks import Exported
 from lbt_synth.interop.target import target_named
+from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.simulation.run import settling_frames, step_loop
 from lbt_synth.models import LoopHardware
@@ -105,7 +106,7 @@ def rehearse(
     Raises
     ------
     ProblemError
-        If the target cannot hold the design, or sizes clash.
+        If the target cannot hold the design, it reads several sensors, or sizes clash.
     CertificateError
         If the certificate that the design carries has a failed check.
     UnstableLoopError
@@ -122,6 +123,7 @@ def rehearse(
     >>> bool(0 < np.max(np.abs(run.differences)) < 1e-3)
     True
     """
+    controller = as_controller(design)
     path = design.hardware if hardware is None else hardware
     if path is None:
         raise ProblemError("a rehearsal needs the design of a loop; got a bare controller.")
@@ -138,15 +140,15 @@ def rehearse(
         )
     gain = number(sensor_gain, "sensor_gain", above=0)
     limit = np.inf if stroke is None else number(stroke, "stroke", above=0)
-    loop = close_loop(path, design.controller, sensor_gain=gain)
+    loop = close_loop(path, controller, sensor_gain=gain)
     loop.require_stable()
     settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * len(total)))
     exported = _exported(design, target)
     runs = []
-    for controller in (exported.start(limit), design.controller.start()):
+    for running in (exported.start(limit), controller.start()):
         try:
             with np.errstate(all="ignore"):  # what overflows is found to be infinite
-                out = step_loop(controller, gain, path, total[None], seen[None], stroke=limit)
+                out = step_loop(running, gain, path, total[None], seen[None], stroke=limit)
         except ProblemError as error:
             raise NumericalError(
                 f"in the arithmetic of {target} the loop grows beyond all numbers: {error}",

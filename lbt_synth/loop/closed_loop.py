@@ -178,19 +178,30 @@ def close_loop(
 def radii_by_gain(
     hardware: LoopHardware, controller: Controller | HasController
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,).
-
-    The eigenvalues are those of the parts whose states act on one another; equal parts count once.
-    """
+    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
     A0, A1, *_ = checked_loop_matrices(hardware, as_controller(controller))
-    links = csr_matrix((A0 != 0) | (A1 != 0))
+    return affine_radii(A0[None], A1[None])
+
+
+def affine_radii(A0: FloatArray, A1: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the function from gains (g,) to spectral radii (g,) over the phases of a loop.
+
+    The loop's transition at phase t is ``A0[t] + gain A1[t]``, (N, n, n). The eigenvalues are those
+    of the parts whose states act on one another; equal parts count once.
+    """
+    links = csr_matrix(np.any((A0 != 0) | (A1 != 0), axis=0))
     count, label = connected_components(links, connection="strong")
-    parts = (np.ix_(label == part, label == part) for part in range(count))
+    parts = (np.ix_(range(len(A0)), label == i, label == i) for i in range(count))
     different = {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}
 
     def radii(sensor_gains: FloatArray) -> FloatArray:
         gains = np.asarray(sensor_gains)[:, None, None]
-        eigenvalues = [np.linalg.eigvals(A + gains * B) for A, B in different.values()]
+        eigenvalues = []
+        for start, slope in different.values():
+            whole = np.eye(start.shape[1])
+            for A, B in zip(start, slope, strict=True):
+                whole = (A + gains * B) @ whole
+            eigenvalues.append(np.linalg.eigvals(whole))
         return np.asarray(np.max(np.abs(np.concatenate(eigenvalues, axis=1)), axis=1))
 
     return radii

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import number, require_instance
+from lbt_synth.validation import FloatArray, number, require_instance
 
 _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
 _WIDEST = 1e4
@@ -168,19 +169,26 @@ def stable_sensor_gains(
     >>> low, round(high, 6)  # 0.618034 / 0.5
     (0.0, 1.236068)
     """
-    centre = number(nominal, "nominal", above=0)
+    return stable_interval(radii_by_gain(hardware, controller), number(nominal, "nominal", above=0))
 
-    radii = radii_by_gain(hardware, controller)
+
+def stable_interval(
+    radii: Callable[[FloatArray], FloatArray], nominal: float = 1.0
+) -> tuple[float, float]:
+    """Return the interval around a gain in which radii (g,) of gains (g,) are below 1.
+
+    It is sought as :func:`stable_sensor_gains` says.
+    """
 
     def is_stable(gain: float) -> bool:
         return float(radii(np.array([gain]))[0]) < 1
 
-    if not is_stable(centre):
+    if not is_stable(nominal):
         return float("nan"), float("nan")
     ends = []
     for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
         count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
-        gains = np.asarray(centre * ratio ** np.arange(count + 1), dtype=np.float64)
+        gains = np.asarray(nominal * ratio ** np.arange(count + 1), dtype=np.float64)
         parts = (range(i, min(i + _AT_ONCE, count + 1)) for i in range(0, count + 1, _AT_ONCE))
         outside = (part[i] for part in parts for i in np.flatnonzero(radii(gains[part]) >= 1))
         first = next(outside, None)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from lbt_synth.methods.method import Description, Method, Section
-from lbt_synth.validation import number
 
 if TYPE_CHECKING:
-    from lbt_synth.design.fusion.fused_filter import FusedFilter
     from lbt_synth.design.record import DesignRecord
-    from lbt_synth.design.result import FilterDesign
-
-_CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
+    from lbt_synth.design.result import Design
 
 Horizon = Annotated[
     int,
@@ -50,57 +48,36 @@ class BoundOptions(Section):
         return {"gamma_ratio": self.gamma_ratio} if self.gamma is None else {"gamma": self.gamma}
 
 
-def _describe_filter(design: FilterDesign | FusedFilter) -> Description:
-    """Describe a filter."""
-    from lbt_synth.design.fusion.fused_filter import FusedFilter
+@dataclass(frozen=True, slots=True)
+class FilterKind:
+    """What filters of one sensor, or of several, are described, recorded and rebuilt with."""
 
-    if isinstance(design, FusedFilter):
-        from lbt_synth.methods.fused import describe_fused
-
-        return describe_fused(design)
-    return Description(
-        facts=design.facts(),
-        matrices={"gain_predictor": design.gain_predictor, "gain_filter": design.gain_filter},
-    )
+    describe: Callable[[Any], Description]
+    pack: Callable[[Any], DesignRecord]
+    unpack: Callable[[DesignRecord], Design]
 
 
-def _pack_filter(design: FilterDesign | FusedFilter) -> DesignRecord:
-    """Record the gains and claims of a filter, with its problem."""
-    from lbt_synth.design.fusion.fused_filter import FusedFilter
-    from lbt_synth.design.record import DesignRecord, record_problem
+def _kind(*, several_sensors: bool) -> FilterKind:
+    """Return the kind of a filter; its module is imported when a design is at hand."""
+    if several_sensors:
+        from lbt_synth.methods.fused import FUSED
 
-    if isinstance(design, FusedFilter):
-        from lbt_synth.design.fusion.record import record_fused
+        return FUSED
+    from lbt_synth.methods.one_sensor import ONE_SENSOR
 
-        return record_fused(design)
-
-    arrays = {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
-    if design.witness is not None:
-        arrays |= {"WITNESS_X": design.witness.states, "WITNESS_W": design.witness.disturbances}
-    meta = {name: getattr(design, name) for name in _CLAIMS}
-    return DesignRecord(arrays, meta) | record_problem(design.problem)
+    return ONE_SENSOR
 
 
-def _unpack_filter(record: DesignRecord) -> FilterDesign | FusedFilter:
-    """Rebuild a filter."""
-    from lbt_synth.design import FilterDesign
-    from lbt_synth.linear import Witness
+def _describe_filter(design: Design) -> Description:
+    return _kind(several_sensors=design.several_sensors).describe(design)
 
-    if record.meta["problem"] == "fused plant":
-        from lbt_synth.design.fusion.record import rebuild_fused
 
-        return rebuild_fused(record)
-    problem, arrays = record.problem(), record.arrays
-    rows_cols = (problem.A.shape[0], problem.C.shape[0])
-    said = {name: record.meta.get(name) for name in _CLAIMS}  # files of 0.1 have fewer
-    claims: dict[str, Any] = {k: number(v, k, above=0) for k, v in said.items() if v is not None}
-    for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
-        if arrays[name].shape != rows_cols:
-            raise ValueError(f"{name} must be {rows_cols} to match the plant")
-        claims[name.lower()] = arrays[name]
-    if "WITNESS_X" in arrays:
-        claims["witness"] = Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
-    return FilterDesign(**record.common(), **claims, problem=problem)
+def _pack_filter(design: Design) -> DesignRecord:
+    return _kind(several_sensors=design.several_sensors).pack(design)
+
+
+def _unpack_filter(record: DesignRecord) -> Design:
+    return _kind(several_sensors=record.meta["problem"] == "fused plant").unpack(record)
 
 
 filter_method = partial(Method, pack=_pack_filter, unpack=_unpack_filter, describe=_describe_filter)

@@ -1,13 +1,15 @@
-"""What ``show`` says of a filter of several sensors."""
+"""What ``show`` says of a filter of several sensors, and what a gain file holds of it."""
 
 from __future__ import annotations
 
 from lbt_synth.design.fusion.failures import failure_rows
 from lbt_synth.design.fusion.fused_filter import FusedFilter
+from lbt_synth.design.fusion.record import rebuild_fused, record_fused
+from lbt_synth.methods.filters import FilterKind
 from lbt_synth.methods.method import Description, RowTable
 
 
-def describe_fused(design: FusedFilter) -> Description:
+def _describe(design: FusedFilter) -> Description:
     """Describe a filter of several sensors, and its loop when some fail."""
     plant = design.problem
     rows = failure_rows(plant, design.gains, design.fallbacks)
@@ -28,3 +30,6 @@ def describe_fused(design: FusedFilter) -> Description:
         notes=notes,
         matrices={"gains": design.gains},
     )
+
+
+FUSED = FilterKind(describe=_describe, pack=record_fused, unpack=rebuild_fused)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.fused_loops import SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.interop.cacao.truncation import predictive_filter
@@ -103,3 +104,6 @@ def test_what_cannot_be_rehearsed_is_refused(slow):
     bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
     with pytest.raises(problem, match="bare controller"):
         lbt.interop.rehearse(bare, "dao", PHASE)
+    fused = lbt.design.fused_kalman(example_plant((SLOW,)))
+    with pytest.raises(problem, match="got one of several sensors"):
+        lbt.interop.rehearse(fused, "c", PHASE)

@@ -156,7 +156,7 @@ def simulated_covariances(plant, controller, *, frames=300, **loop):
         model, direction = line.ar_model(RATE_HZ), np.array(line.direction)
         drive(1, model, direction, motion, line.frequency_hz)
     factors = [plant.own.D[:, -hardware.n_measurements :]]
-    factors += [each.noise_factor(n) for each in suite.ordered]
+    factors += [each.noise_factor(n) for each in suite.sensors]
     for column in block_diag(*factors).T:
         for t in range(N):
             read = np.zeros((begin + N + frames, q))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lbt_synth.linear import PeriodicProblem
+from lbt_synth.linear import EstimationProblem, PeriodicProblem
 
 
 def random_periodic_problem(seed, *, varying=True, radius=1.1):
@@ -33,3 +33,15 @@ def random_periodic_problem(seed, *, varying=True, radius=1.1):
 def relative_distance(own, expected):
     """Return the norm of a difference over that of what is expected."""
     return np.linalg.norm(np.asarray(own) - expected) / np.linalg.norm(expected)
+
+
+def lifted_problem(problem):
+    """Return the problem over a period, its measurements in units of the noise of a reading.
+
+    Its one-step predictor knows the measurements of whole periods only, so its covariance is that
+    of the periodic problem's filter at phase 0.
+    """
+    system, rows = problem.lifted(), problem.read.reshape(-1)
+    size = np.linalg.norm(problem.D, axis=2).reshape(-1, 1)[rows]
+    C, D = system.C[rows] / size, system.D[rows] / size
+    return EstimationProblem(A=system.A, B=system.B, C=C, D=D, L=problem.L, dt_s=system.dt_s)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,7 +29,12 @@ from lbt_synth.linear.periodic.riccati import (
 )
 from lbt_synth.linear.periodic.system import PeriodicController
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.loop.fusion.fused_loop import FusedLoop, close_fused_loop
+from lbt_synth.loop.fusion.fused_loop import (
+    FusedLoop,
+    close_fused_loop,
+    fused_radii_by_gain,
+)
+from lbt_synth.loop.margins import stable_interval
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.fusion.plant import FusedPlant
 from lbt_synth.storage.rows import column, fact_table, table_row
@@ -147,9 +152,10 @@ class FusedFilter(Design):
 
     def facts(self) -> FusedFacts:
         """Return what the filter achieves."""
-        low, high = stable_gains(lambda gain: self.loop(gain).is_stable)
+        suite = self.problem.suite
+        low, high = stable_interval(fused_radii_by_gain(self.loop_hardware, suite, self.controller))
         return FusedFacts(
-            sensors=", ".join(self.problem.suite.units),
+            sensors=", ".join(suite.units),
             period=self.problem.period,
             rms=self.rms,
             gamma=self.gamma,
@@ -241,26 +247,6 @@ def _least_variance_check(
     own = problem.restricted(remaining)
     optimal = [kalman_gain(own, t, P) for t, P in enumerate(error.covariances())]
     return Check(name, relative_distance(gains, np.stack(optimal)), GAIN_TOLERANCE, how)
-
-
-def stable_gains(stable: Callable[[float], bool]) -> tuple[float, float]:
-    """Return the interval of sensor gains around 1 at which a loop is stable, to 1e-4.
-
-    Its ends are 0 and inf where it reaches beyond a factor of 1000.
-    """
-    ends = []
-    for factor, open_end in ((0.8, 0.0), (1.25, np.inf)):
-        inside, outside = 1.0, factor
-        while 1e-3 < outside < 1e3 and stable(outside):
-            inside, outside = outside, outside * factor
-        if not 1e-3 < outside < 1e3:
-            ends.append(open_end)
-            continue
-        while abs(outside - inside) > 1e-4 * inside:
-            middle = (inside + outside) / 2
-            inside, outside = (middle, outside) if stable(middle) else (inside, middle)
-        ends.append(inside)
-    return ends[0], ends[1]
 
 
 def fused_kalman(plant: FusedPlant) -> FusedFilter:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import DefinitenessError, DimensionError
-from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.periodic.system import PeriodicSystem
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, read_only, set_fields
 
@@ -106,17 +105,6 @@ class PeriodicProblem(PeriodicSystem):
             D=np.zeros((N, p, m)),
             dt_s=self.dt_s,
         )
-
-    def lifted_problem(self) -> EstimationProblem:
-        """Return the problem over a period, its measurements in units of the noise of a reading.
-
-        Its one-step predictor knows the measurements of whole periods only, so its covariance is
-        that of this problem's filter at phase 0.
-        """
-        system, rows = self.lifted(), self.read.reshape(-1)
-        size = self._noise_sizes.reshape(-1, 1)[rows]
-        C, D = system.C[rows] / size, system.D[rows] / size
-        return EstimationProblem(A=system.A, B=system.B, C=C, D=D, L=self.L, dt_s=system.dt_s)
 
     @property
     def _noise_sizes(self) -> FloatArray:

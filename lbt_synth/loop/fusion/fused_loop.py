@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TypeAlias
@@ -13,7 +13,12 @@ from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import ResidualBudget, panel_edges, require_true_gain
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, ClosedLoop, require_loop_rate
+from lbt_synth.loop.closed_loop import (
+    STABILITY_MARGIN,
+    ClosedLoop,
+    affine_radii,
+    require_loop_rate,
+)
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, Truth, Vibration
 from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
 from lbt_synth.models.fusion.plant import FusedPlant
@@ -181,6 +186,20 @@ def close_fused_loop(
         sensor_gain=gain,
         blind=tuple(blind),
     )
+
+
+def fused_radii_by_gain(
+    hardware: LoopHardware, suite: SensorSuite, controller: PeriodicController
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the function from gains of the own sensor (g,) to spectral radii over a period (g,).
+
+    Each phase of a loop is affine in this gain, so that two loops give all.
+    """
+    one, two = (
+        close_fused_loop(hardware, suite, controller, sensor_gain=gain).system.A
+        for gain in (1.0, 2.0)
+    )
+    return affine_radii(2 * one - two, two - one)
 
 
 def fused_budget(loop: FusedLoop, truth: Truth) -> ResidualBudget:

@@ -151,7 +151,7 @@ def draw_others(
     """
     parts = []
     moving = checked_motions(truth.motions, suite, len(motions))
-    for sensor in suite.ordered:
+    for sensor in suite.sensors:
         factor = sensor.noise_factor(hardware.modes)
         drawn = rng.standard_normal((cases, frames, len(factor))) @ factor.T
         if isinstance(sensor, Accelerometer):

@@ -259,7 +259,7 @@ class SensorSuite:
     Parameters
     ----------
     sensors : tuple of WavefrontSensor and Accelerometer
-        At least one.
+        At least one; wavefront sensors become the first, as their measurements are.
 
     Examples
     --------
@@ -273,7 +273,8 @@ class SensorSuite:
     units: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        sensors = tuple(self.sensors)
+        # in the order of their measurements
+        sensors = tuple(sorted(self.sensors, key=lambda each: isinstance(each, Accelerometer)))
         units = (OWN_SENSOR, *(unit for sensor in sensors for unit in sensor.units))
         if not sensors or len(set(units)) < len(units):
             raise ProblemError(
@@ -291,11 +292,6 @@ class SensorSuite:
     def accelerometers(self) -> tuple[Accelerometer, ...]:
         """The accelerometers."""
         return tuple(s for s in self.sensors if isinstance(s, Accelerometer))
-
-    @property
-    def ordered(self) -> tuple[Sensor, ...]:
-        """The sensors in the order of their measurements."""
-        return (*self.wavefront, *self.accelerometers)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -334,7 +330,7 @@ class SensorSuite:
 
     def noise_factor(self, own: FloatArray, modes: int) -> FloatArray:
         """Return the square root of all noise, from that of the loop's own sensor, (q, q)."""
-        return np.asarray(block_diag(own, *(each.noise_factor(modes) for each in self.ordered)))
+        return np.asarray(block_diag(own, *(each.noise_factor(modes) for each in self.sensors)))
 
     def read(self, hardware: LoopHardware) -> BoolArray:
         """Return which measurements are read in each frame of the common period, (N, q)."""

@@ -42,7 +42,7 @@ def test_rows_are_what_runs_leave():
     plant = example_plant((FAST, SLOW))
     gains, fallbacks = periodic_kalman(plant).gains, make_fallbacks(plant)
     rows = failure_rows(plant, gains, fallbacks)
-    assert " ".join(row.missing for row in rows[:5]) == "wavefront m1 m2 truth wavefront + m1"
+    assert " ".join(row.missing for row in rows[:5]) == "wavefront truth m1 m2 wavefront + truth"
     for row, fallback in zip(rows[:4], fallbacks, strict=False):
         pairs = [(fallback.gains, row.fallback_nm)]
         if not row.must_switch:

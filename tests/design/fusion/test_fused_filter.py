@@ -8,7 +8,6 @@ from support.fused_loops import FAST, SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.design import fused_hinf, fused_kalman
-from lbt_synth.design.fusion.fused_filter import stable_gains
 from lbt_synth.errors import CertificateError, InfeasibleError, LbtSynthError, ProblemError
 from lbt_synth.models import Accelerometer, WavefrontSensor
 
@@ -116,12 +115,6 @@ def test_the_loop_of_one_rate_is_that_of_the_filter():
     gains = lbt.loop.stable_sensor_gains(hardware, alone)
     assert (facts.gain_low, facts.gain_high) == pytest.approx(gains, rel=1e-3, abs=2e-3)
     assert design.close(hardware, sensor_gain=0.5).sensor_gain == 0.5
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.35, 1.9), (0.0, 1.2), (0.97, np.inf)])
-def test_intervals_of_stable_gains(low, high):
-    found = stable_gains(lambda gain: low < gain < high)
-    assert found == pytest.approx((low, high), rel=2e-4)
 
 
 @pytest.mark.parametrize(

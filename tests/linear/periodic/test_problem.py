@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.periodic_problems import random_periodic_problem, relative_distance
+from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
 
 from lbt_synth.errors import DefinitenessError, DimensionError
 from lbt_synth.linear import PeriodicProblem, kalman_riccati, periodic_kalman
@@ -49,12 +49,12 @@ def test_the_unit_of_a_measurement_does_not_matter(factor):
     solved = periodic_kalman(other)
     assert relative_distance(solved.P, own.P) < 1e-12
     assert relative_distance(solved.gains * units[:, 0], own.gains) < 1e-12
-    assert relative_distance(kalman_riccati(other.lifted_problem()).P, own.P[0]) < 1e-12
+    assert relative_distance(kalman_riccati(lifted_problem(other)).P, own.P[0]) < 1e-12
 
 
 def test_the_problem_over_a_period_has_the_readings_of_a_period():
     problem = random_periodic_problem(3)
-    lifted = problem.lifted_problem()
+    lifted = lifted_problem(problem)
     assert len(lifted.C) == problem.read.sum()
     np.testing.assert_allclose(lifted.A, problem.monodromy)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.periodic_problems import random_periodic_problem, relative_distance
+from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
 from support.plants import random_problem
 
 import lbt_synth as lbt
@@ -32,7 +32,7 @@ def of_one_rate(problem, period=1):
 def test_kalman_filter_of_the_lifted_problem(seed):
     problem = random_periodic_problem(seed)
     solution = periodic_kalman(problem)
-    lifted = lbt.linear.kalman_riccati(problem.lifted_problem())
+    lifted = lbt.linear.kalman_riccati(lifted_problem(problem))
     assert relative_distance(solution.P[0], lifted.P) < 1e-9
     assert not np.any(solution.gains.transpose(0, 2, 1)[~problem.read])
 

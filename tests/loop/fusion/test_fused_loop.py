@@ -19,7 +19,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import periodic_kalman
 from lbt_synth.loop import close_fused_loop, fused_budget
-from lbt_synth.loop.fusion.fused_loop import fused_model_budget
+from lbt_synth.loop.fusion.fused_loop import fused_model_budget, fused_radii_by_gain
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
 AGELESS = Accelerometer(
@@ -198,3 +198,12 @@ def test_refusals():
     )
     with pytest.raises(ProblemError, match="stationary"):
         fused_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
+
+
+def test_radii_of_many_gains_are_those_of_their_loops():
+    plant = example_plant(influence_matrix=[[2.0, 0.1], [0.3, 1.0]])
+    controller, _ = closed(plant)
+    gains = np.array([0.2, 0.7, 1.0, 1.7])
+    found = fused_radii_by_gain(plant.own.hardware, plant.suite, controller)(gains)
+    loops = [closed(plant, sensor_gain=gain)[1].spectral_radius for gain in gains]
+    np.testing.assert_allclose(found, loops, rtol=1e-9)
