@@ -4,6 +4,7 @@ From the repository, with the extra ``pyrtc``::
 
     python benchmarks/pyrtc_loop.py [GAIN.fits...]
     python benchmarks/pyrtc_loop.py arithmetic GAIN.fits...
+    python benchmarks/pyrtc_loop.py draws GAIN.fits...
 
 Each predictor runs in a system of pyRTC that is started from the exported folder: its loop, its
 shared memory. The truth is that of examples/lbt.yaml, 16 000 frames; those of pyRTC and the row
@@ -14,6 +15,9 @@ in our simulation and that of its twin in numpy, over the largest command, and t
 The second form runs the twin, without pyRTC, for a million frames in all, beside the controller in
 double precision: their residuals at four sensor gains, and the rms of the difference, which is the
 noise of the arithmetic.
+
+The third form replays six other draws, each after a draw to which ``least_squares`` is fitted, and
+prints the residual of each [nm rms], and their mean.
 """
 
 from __future__ import annotations
@@ -42,8 +46,32 @@ def main() -> None:
     if sys.argv[1:2] == ["arithmetic"]:
         for file in sys.argv[2:]:
             compare_arithmetic(file)
+    elif sys.argv[1:2] == ["draws"]:
+        compare_draws({Path(file).stem: lbt.load_gain(file) for file in sys.argv[2:]})
     else:
         compare_predictors()
+
+
+def compare_draws(designs: dict[str, lbt.Design]) -> None:
+    """Print a line per draw, and the means."""
+    config = lbt.load_config("examples/lbt.yaml")
+    truth, path = config.truth, config.hardware
+    rows = []
+    print("  ".join(f"{name:13}" for name in (*designs, "least_squares")))
+    for seed in range(3, 9):
+        total, noise = drawn(truth, path, frames=FRAMES, seed=seed)
+        runs = [
+            step_loop(design.controller.start(), 1.0, path, total, noise)[..., :2]
+            for design in designs.values()
+        ]
+        training = pol_series(truth, path, frames=FRAMES, seed=100 + seed)
+        series = np.zeros_like(total[0])
+        series[1:] = total[0, :-1] + noise[0, 1:]  # the phase of a frame is measured in the next
+        commands = lbt.interop.pyrtc_commands("least_squares", training, series)
+        runs.append(total - np.vstack([np.zeros((1, 2)), commands[:-1]]))
+        rows.append([residual_rms(run[:, SETTLE:]) for run in runs])
+        print("  ".join(f"{value:<13.2f}" for value in rows[-1]), flush=True)
+    print("  ".join(f"{value:<13.2f}" for value in np.mean(rows, axis=0)) + "  mean")
 
 
 def compare_arithmetic(file: str) -> None:

@@ -82,9 +82,9 @@ def export(parser: ArgumentParser) -> None:
     text = "c: prefix of the C names (default: the output's name without its ending)"
     add_option(parser, "--name", str, text)
     add_option(parser, "--order", int, "dao: M of the RTC's configuration (default 20)")
-    text = "dao, pyrtc: modes of the RTC (default: those of the design)"
+    text = "c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)"
     add_option(parser, "--modes", int, text)
-    text = "dao: gain of an integrator for each further mode (default: no command)"
+    text = "the same: gain of an integrator for each further mode (default: no command)"
     add_option(parser, "--other-gain", float, text)
     text = "cacao: frames of history (default: as many as the loss needs)"
     add_option(parser, "--steps", int, text)

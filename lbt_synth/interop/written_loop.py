@@ -8,16 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design, ShapedDesign
 from lbt_synth.design.result import EstimatorDesign
+from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.uncertainty import SensorGainRange
-from lbt_synth.errors import NumericalError
+from lbt_synth.design.shaping.specification import Demand
+from lbt_synth.design.shaping.uncertainty import (
+    DelayError,
+    MirrorUncertainty,
+    MovingSensorGain,
+    SensorGainRange,
+)
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
@@ -115,8 +123,21 @@ def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> Non
             )
 
 
+class LeftOut(Protocol):
+    """What is written less than the controller, by bounds on what it changes."""
+
+    def residual_nm(self, gain: float) -> float:
+        """Bound the rms of the residual's change at a sensor gain [nm]."""
+
+    def response(self, gain: float) -> float:
+        """Bound the change of the sensitivities at a sensor gain."""
+
+
 def prove_written(
-    design: Design, written: Controller, rounding: Rounding | None = None
+    design: Design,
+    written: Controller,
+    rounding: Rounding | None = None,
+    left_out: LeftOut | None = None,
 ) -> tuple[Check, ...]:
     """Check the loop around a controller as it is written, against that of its design.
 
@@ -128,6 +149,8 @@ def prove_written(
         The controller with the numbers of the file.
     rounding : Rounding, optional
         What the arithmetic adds.
+    left_out : LeftOut, optional
+        What the file lacks of that controller.
 
     Returns
     -------
@@ -145,13 +168,14 @@ def prove_written(
     checks = [Check(name, radius, 1 - STABILITY_MARGIN, f"eigenvalues at {gains.size} gains")]
     if not checks[0].passed:
         return tuple(checks)
-    inside = (gain for gain in _scenarios(design) if low <= gain <= high)
-    checks += (_residual_check(design, written, rounding, gain) for gain in inside)
+    inside = (gain for gain in scenario_gains(design) if low <= gain <= high)
+    checks += (_residual_check(design, written, rounding, left_out, gain) for gain in inside)
     own, other = (close_loop(hardware, c) for c in (design.controller, written))
-    lost = hinf_norm(other.output_sensitivity()).value / hinf_norm(own.output_sensitivity()).value
-    checks.append(Check("modulus margin, loss", float(lost) - 1, _LOSS, "level sets"))
+    before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (own, other))
+    after += left_out.response(1.0) if left_out else 0.0
+    checks.append(Check("modulus margin, loss", float(after / before) - 1, _LOSS, "level sets"))
     if isinstance(design, ShapedDesign):
-        checks += _demand_checks(design, other)
+        checks += _demand_checks(design, other, left_out)
     return tuple(checks)
 
 
@@ -165,7 +189,8 @@ def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
     return min(max(low * _STEP, 1 / _WIDEST), 1.0), max(min(high / _STEP, _WIDEST), 1.0)
 
 
-def _scenarios(design: Design) -> tuple[float, ...]:
+def scenario_gains(design: Design) -> tuple[float, ...]:
+    """Return the sensor gains at which the residual is compared."""
     if not isinstance(design, ShapedDesign):
         return _SCENARIOS
     terms = [leaf for spec in design.specifications for leaf in leaves(spec.objective)]
@@ -173,15 +198,19 @@ def _scenarios(design: Design) -> tuple[float, ...]:
 
 
 def _residual_check(
-    design: Design, written: Controller, rounding: Rounding | None, gain: float
+    design: Design,
+    written: Controller,
+    rounding: Rounding | None,
+    left_out: LeftOut | None,
+    gain: float,
 ) -> Check:
-    """Compare the residual, with what the rounding of the arithmetic adds."""
+    """Compare the residual, with what the rounding of the arithmetic and what is left out add."""
     hardware = design.hardware
     assert hardware is not None
     n, m = hardware.modes, hardware.n_commands
     loops = [close_loop(hardware, c, sensor_gain=gain) for c in (design.controller, written)]
     before = mode_variances(design, loops[0], slice(n))
-    how = "Lyapunov equations, level sets"
+    how = "Lyapunov equations, level sets" + (", and what is left out" if left_out else "")
     if rounding is None:
         after = mode_variances(design, loops[1], slice(n))
     else:
@@ -193,7 +222,8 @@ def _residual_check(
         after = found[:n] + left
         how += f"; rounding at most {np.sqrt(np.max(left / before)):.1e} of it"
     with np.errstate(invalid="ignore"):  # not a number: no accuracy, and the check fails
-        loss = float(np.max(np.sqrt(after / before))) - 1
+        after_nm = np.sqrt(after) + (left_out.residual_nm(gain) if left_out else 0.0)
+        loss = float(np.max(after_nm / np.sqrt(before))) - 1
     return Check(f"residual at sensor gain {gain:g}, loss", loss, _LOSS, how)
 
 
@@ -288,7 +318,7 @@ def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:
     return SingleModeLoop(hardware=one, controller=loop.controller, _loops={loop.sensor_gain: own})
 
 
-def _demand_checks(design: ShapedDesign, loop: ClosedLoop) -> list[Check]:
+def _demand_checks(design: ShapedDesign, loop: ClosedLoop, left_out: LeftOut | None) -> list[Check]:
     """Check the demands of each mode in the loop as written; equal modes once."""
     hardware, s = loop.hardware, loop.system
     n, m = hardware.modes, hardware.n_commands
@@ -300,7 +330,24 @@ def _demand_checks(design: ShapedDesign, loop: ClosedLoop) -> list[Check]:
     checks = []
     for mode in sorted(set(design.first_equal_modes)):
         own = _mode_of(modal, mode, slice(mode, None, n))
-        for check in design.specifications[mode].checks(own):
-            limit = check.limit + _LOSS * abs(check.limit)
-            checks.append(replace(check, name=f"mode {mode + 1}: {check.name}", limit=limit))
+        for demand in design.specifications[mode].demands:
+            more = _demand_change(demand, left_out) if left_out else 0.0
+            for check in demand.checks(own):
+                name, value = f"mode {mode + 1}: {check.name}", check.value + more
+                limit = check.limit + _LOSS * abs(check.limit)
+                checks.append(replace(check, name=name, value=value, limit=limit))
     return checks
+
+
+def _demand_change(demand: Demand, left_out: LeftOut) -> float:
+    """Bound how much what is left out moves the value of a demand."""
+    if isinstance(demand, CommandRms | MovingSensorGain):  # no bound on a response
+        raise ProblemError(
+            "a filter that is cut is proved for demands on responses of the loop; got "
+            f"{demand.label}. Use a target with states, such as c or pyrtc."
+        )
+    if isinstance(demand, Attenuation):
+        return left_out.response(demand.sensor_gain)
+    factor = demand.relative if isinstance(demand, MirrorUncertainty) else 1.0
+    factor = 2.0 if isinstance(demand, DelayError) else factor  # the taps of two delays
+    return factor * left_out.response(1.0)

@@ -252,7 +252,7 @@ def spectral_norms(matrices: ComplexArray) -> FloatArray:
     if matrices.shape[-2] > matrices.shape[-1]:
         matrices = matrices.swapaxes(-1, -2)
     size = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
-    scale = np.where(size > 0, size, 1.0)
+    scale = np.maximum(size, np.finfo(np.float64).tiny)  # by less, a quotient may overflow
     scaled = matrices / scale[:, None, None]
     if scaled.shape[-2] == 1:
         largest = np.einsum("nij,nij->n", scaled, scaled.conj()).real

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.systems import random_system
 
 import lbt_synth as lbt
-from lbt_synth.linear.norms import _independent_parts, band_norm, largest_real_part
+from lbt_synth.linear.norms import _independent_parts, band_norm, largest_real_part, spectral_norms
 
 
 @given(
@@ -113,6 +113,11 @@ def test_what_python_control_cannot_do():
         [[0.0], [2.0]],
     )
     assert float(lbt.hinf_norm(delay)) == pytest.approx(np.sqrt(5), rel=1e-12)
+
+
+@pytest.mark.parametrize("size", [5e-324, 1e-310, 1e-150, 1e300])
+def test_norms_of_matrices_of_any_size(size):
+    assert spectral_norms(np.full((1, 2, 2), complex(size)))[0] == 2 * size
 
 
 def test_the_bracket_is_narrow_and_holds():

@@ -18,11 +18,11 @@ from lbt_synth.validation import FloatArray
 class SourceTerms(WrittenTerms):
     """The terms of a source, which is given its own commands as the applied ones.
 
-    The last ``applied`` inputs of the controller take them: none in the plain form.
+    Where they are ``given``, the last inputs of the controller take them.
     """
 
-    def __init__(self, written: Controller, applied: int, dtype: Any) -> None:
-        self._last = np.zeros(applied)
+    def __init__(self, written: Controller, dtype: Any, *, given: bool) -> None:
+        self._last = np.zeros(len(written.C) if given else 0)
         super().__init__(written, dtype)
 
     def reset(self) -> None:

@@ -14,8 +14,9 @@ import numpy as np
 from lbt_synth.design import Design, FusedFilter
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.interop.arithmetic_cost import frame_cost, has_straight_line_form
-from lbt_synth.interop.c.arithmetic import SourceTerms, prove_source
+from lbt_synth.interop.c.arithmetic import SourceTerms
 from lbt_synth.interop.c.fused_export import export_fused
+from lbt_synth.interop.c.joined import join
 from lbt_synth.interop.c.reading import read_source
 from lbt_synth.interop.c.source_text import (
     exact_constant,
@@ -32,9 +33,11 @@ from lbt_synth.interop.export_checks import (
     require_certified,
     require_exportable,
 )
+from lbt_synth.interop.modes import ModalDesign, all_modes
 from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.interop.written_loop import ROUNDOFF, require_proved
 from lbt_synth.linear import Controller, estimator_form
+from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray, choice
 
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
@@ -44,11 +47,14 @@ _LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_r
 
 def export_c(
     path: str | os.PathLike[str],
-    design: Design,
+    design: ModalDesign,
     *,
     form: str | None = None,
     precision: str = "double",
     name: str | None = None,
+    modes: int | None = None,
+    other_gain: float | None = None,
+    hardware: LoopHardware | None = None,
     gain_digest: str | None = None,
 ) -> Exported:
     """Write a controller as a C99 source file and its header, both or none.
@@ -71,8 +77,9 @@ def export_c(
     ----------
     path : path-like
         Source file to write, ending in ``.c``; the header, ending in ``.h``, goes beside it.
-    design : Design
-        The design.
+    design : Design, MixedController or ModalFilters
+        The design; or, for unit sensor and influence matrices, a design with integrators for the
+        other modes, or a filter for each mode.
     form : {"plain", "estimator"}, optional
         Whether the controller assumes that its commands were applied, or is given those that
         were (:func:`~lbt_synth.linear.estimator_form`). The default is ``estimator`` for a design
@@ -81,6 +88,13 @@ def export_c(
         Type of all numbers, ``double`` or ``float``. Coefficients are rounded to it.
     name : str, optional
         Prefix of the C names; by default the name of the file without its ending.
+    modes : int, optional
+        Measurements and commands of the source; by default those of the design. Further modes get
+        the command 0, without ``other_gain``.
+    other_gain : float, optional
+        Gain of an integrator for each further mode.
+    hardware : LoopHardware, optional
+        Loop of the integrators, where no filter says which.
     gain_digest : str, optional
         SHA-256 of the gain file, for the comment (64 hexadecimal digits).
 
@@ -117,6 +131,11 @@ def export_c(
     prefix = require_identifier(target.stem if name is None else name)
     form = _checked_form(design, form)
     if isinstance(design, FusedFilter):
+        if modes is not None or other_gain is not None:
+            raise ProblemError(
+                "modes and other_gain go with a design of one sensor; got one of several. Leave "
+                "them out."
+            )
         require_certified(design)
         return export_fused(
             target,
@@ -127,31 +146,39 @@ def export_c(
             arithmetic=TARGET.arithmetic,
         )
     single = precision == "single"
-    require_exportable(design)
-    written, applied = _form_of(design, form)
-    if single:
-        written = _round_to_single(written)
-    if not applied:
-        require_exportable(design, written)
+    whole = all_modes(
+        design,
+        "C source of all modes",
+        modes=modes,
+        other_gain=other_gain,
+        hardware=hardware,
+        modal=modes is not None,
+    )
+    given = form == "estimator"  # the applied commands
+    parts = [_written_part(part.design, given=given, single=single) for part in whole.parts]
+    joined = join(whole, parts, applied=given)
     error_double, error_single = (
-        rehearsal_error(design, SourceTerms(written, applied, dtype))
-        for dtype in (np.float64, np.float32)
+        max(
+            rehearsal_error(own.design, SourceTerms(written, kind, given=given))
+            for own, written in zip(whole.parts, parts, strict=True)
+        )
+        for kind in (np.float64, np.float32)
     )
     error = error_single if single else error_double
     _require_finite(error, precision)
-    lines = provenance_lines(design, gain_digest)
+    lines = provenance_lines(whole.parts[0].design, gain_digest)
     if single:  # in double precision the figure would depend on this machine's matrix products
         lines.append(("precision", f"single: commands within {error:.1e} of the largest one"))
     texts = render_code(
         prefix,
         header.name,
-        written,
+        joined.controller,
         lines,
-        applied=applied,
+        applied=joined.applied,
         single=single,
         gain_digest=gain_digest,
     )
-    checks = prove_source(design, *read_source(*texts), ROUNDOFF[precision])
+    checks = joined.prove(*read_source(*texts), ROUNDOFF[precision])
     require_proved(checks, f"{precision} precision", "Try double precision.")
     source, declarations = (text.encode("ascii") for text in texts)
     files = write_certified(
@@ -163,13 +190,14 @@ def export_c(
         form=form,
         precision=precision,
     )
+    dtype = np.float32 if single else np.float64
     return Exported(
         files=files,
         error=error,
         error_single=error_single,
-        start=lambda _: SourceTerms(written, applied, np.float32 if single else np.float64),
+        start=lambda _: SourceTerms(joined.controller, dtype, given=given),
         checks=checks,
-        cost=frame_cost(written),
+        cost=frame_cost(joined.controller),
     )
 
 
@@ -185,7 +213,7 @@ def _source_path(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def _checked_form(design: Design, form: str | None) -> str:
+def _checked_form(design: ModalDesign, form: str | None) -> str:
     """Return the form of the source; a filter of several sensors has one."""
     several = isinstance(design, FusedFilter)
     if form is None:
@@ -215,19 +243,25 @@ def _require_finite(error: float, precision: str) -> None:
         )
 
 
-def _form_of(design: Design, form: str) -> tuple[Controller, int]:
-    """Return what is written, and its number of inputs that are applied commands, the last ones."""
-    if form == "plain":
-        return design.controller, 0
-    if design.hardware is None:
-        raise ProblemError(
-            "the estimator form needs the design of a loop: a bare filter has no commands to be "
-            "applied. Export it with form plain."
-        )
-    own = estimator_form(design)
-    inputs, m = np.hstack([own.B, own.applied]), len(own.C)
-    D = np.zeros((m, inputs.shape[1]))
-    return Controller(A=own.A, B=inputs, C=own.C, D=D, dt_s=own.dt_s), m
+def _written_part(design: Design, *, given: bool, single: bool) -> Controller:
+    """Return what is written; in estimator form its last inputs are the applied commands."""
+    written = design.controller
+    if given:
+        if design.hardware is None:
+            raise ProblemError(
+                "the estimator form needs the design of a loop: a bare filter has no commands to "
+                "be applied. Export it with form plain."
+            )
+        own = estimator_form(design)
+        inputs = np.hstack([own.B, own.applied])
+        D = np.zeros((len(own.C), inputs.shape[1]))
+        written = Controller(A=own.A, B=inputs, C=own.C, D=D, dt_s=own.dt_s)
+    if single:
+        matrices = {name: getattr(written, name) for name in "ABCD"}
+        written = Controller(**round_to_single(matrices), dt_s=written.dt_s)
+    if not given:
+        require_exportable(design, written)
+    return written
 
 
 def require_identifier(name: str) -> str:
@@ -239,12 +273,6 @@ def require_identifier(name: str) -> str:
             "Give another name."
         )
     return name
-
-
-def _round_to_single(controller: Controller) -> Controller:
-    """Round the coefficients to single precision."""
-    matrices = {name: getattr(controller, name) for name in "ABCD"}
-    return Controller(**round_to_single(matrices), dt_s=controller.dt_s)
 
 
 def render_code(

@@ -9,61 +9,68 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lbt_synth.design import Design
+from lbt_synth.design import Check, Design
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.cacao.applied_filter import LONGEST_DELAY, AppliedFilter
-from lbt_synth.interop.cacao.truncation import (
-    predictive_filter,
-    small_gain_check,
-    written_filter,
-)
+from lbt_synth.interop.cacao.truncation import CutFilter, predictive_filter
 from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
     provenance_lines,
     rehearsal_error,
-    require_exportable,
     require_modal,
 )
+from lbt_synth.interop.modes import ModalDesign, all_modes
 from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.interop.written_loop import prove_written, require_proved
+from lbt_synth.interop.written_loop import require_proved
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.validation import integer, number
 
-_MOST_COLUMNS = 600  # steps times modes of a loop that is proved
+_FILE = "a predictive filter"
+_MOST_NUMBERS = 100_000_000  # of the matrix: 400 MB
 _MOST_LOSS = 0.01
-_HINT = "Give more steps, design with fewer states, or use a target in double precision."
 _SIGN = "mirror = + PFmat history; the matrix holds the controller with its sign changed"
 
 
 def export_cacao(
     path: str | os.PathLike[str],
-    design: Design,
+    design: ModalDesign,
     *,
     steps: int | None = None,
     loss: float = _MOST_LOSS,
+    modes: int | None = None,
+    other_gain: float | None = None,
+    hardware: LoopHardware | None = None,
     gain_digest: str | None = None,
 ) -> Exported:
     """Write a controller as the matrix of cacao's predictive filter, of finite length.
 
     cacao multiplies a matrix by the recent pseudo-open-loop values of its modes. The controller,
-    as a filter of that history, is stable; it is cut after some steps. The loop is closed around
-    the rounded matrix before anything is written.
+    as a filter of that history, is stable; it is cut after some steps. What is cut off and rounded
+    is bounded in the loop before anything is written.
 
     Parameters
     ----------
     path : path-like
         File to write, ending in ``.fits``. The proof goes beside it, with the ending
         ``.certificate.json``.
-    design : Design
-        Design with unit sensor and influence matrices, whose mirror settles at once.
+    design : Design, MixedController or ModalFilters
+        Design with unit sensor and influence matrices, whose mirror settles at once; or a design
+        with integrators for the other modes; or a filter for each mode.
     steps : int, optional
         Steps of the history; by default as many as the loss needs.
     loss : float, optional
-        Relative loss of residual, at unit sensor gain, at which the length is chosen; at most
-        0.01. The check of the loop allows 0.01 at each sensor gain.
+        Relative loss of residual, at each sensor gain of the proof, at which the length is chosen;
+        at most 0.01, which is the limit of the proof.
+    modes : int, optional
+        Modes of a frame; by default those of the design. Further ones get no command, without
+        ``other_gain``.
+    other_gain : float, optional
+        Gain of an integrator for each further mode.
+    hardware : LoopHardware, optional
+        Loop of the integrators, where no filter says which.
     gain_digest : str, optional
         SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
 
@@ -94,38 +101,33 @@ def export_cacao(
     ...     fits.getdata(file).shape
     (2, 128)
     """
-    target = require_ending(path, "a predictive filter", (".fits",))
-    require_exportable(design)
-    hardware = _require_loop(design)
-    modes = hardware.modes
+    target = require_ending(path, _FILE, (".fits",))
+    whole = all_modes(design, _FILE, modes=modes, other_gain=other_gain, hardware=hardware)
     limit = number(loss, "loss", above=0, at_most=_MOST_LOSS)
-    found = predictive_filter(design)
+    delay = _require_loop(whole.parts[0].design).delay_frames
+    filters = [predictive_filter(own, _require_loop(own)) for own, _ in whole.parts]
     if steps is None:
-        # what is cut off adds as power where it is independent of the residual, else as amplitude
-        counts = [found.fewest_steps(bound) for bound in (np.sqrt(limit), limit)]
+        count = max(2, *(found.fewest_steps(limit) for found in filters))
     else:
-        counts = [integer(steps, "steps", at_least=2)]
-    lines = provenance_lines(design, gain_digest)
-    for count in counts:
-        if count * modes > _MOST_COLUMNS:
-            raise NumericalError(
-                f"steps times modes must be at most {_MOST_COLUMNS} for a proof; got {count} steps "
-                f"of {modes} modes. Give fewer steps, or make a robust design that is a filter of "
-                "finite length: pole 0, states null, and as many functions as steps.",
-                status="steps",
-                residual=count,
-            )
-        matrix = filter_matrix(found.taps(count))
-        taps = -matrix.astype(np.float64).reshape(modes, count, modes).swapaxes(0, 1)
-        checks = (
-            *prove_written(design, *written_filter(taps, hardware)),
-            small_gain_check(found, taps),
-        )
-        if all(check.passed for check in checks):
-            break
-    require_proved(checks, f"single precision, cut after {count} steps", _HINT)
-    error = rehearsal_error(design, AppliedFilter(matrix, hardware.delay_frames))
-    content = _matrix_bytes(matrix, design, lines, count)
+        count = integer(steps, "steps", at_least=2)
+    _require_small(count, whole.count)
+    # command, step, mode of the history
+    cube = np.zeros((whole.count, count, whole.count), dtype=np.float32)
+    checks: list[Check] = []
+    error = 0.0
+    for part, found in zip(whole.parts, filters, strict=True):
+        own = -found.taps(count).swapaxes(0, 1).astype(np.float32)
+        taps = -own.swapaxes(0, 1).astype(np.float64)
+        proved = CutFilter(whole=found, steps=count, taps=taps).prove()
+        if not all(check.passed for check in proved):
+            arithmetic = f"single precision, cut after {count} steps"
+            require_proved(proved, arithmetic, _advice(count, found.fewest_steps(_MOST_LOSS)))
+        checks += whole.name_checks(part, proved)
+        error = max(error, rehearsal_error(part.design, AppliedFilter(_flat(own), delay)))
+        for modes_of_copy in part.copies:
+            cube[np.ix_(modes_of_copy, range(count), modes_of_copy)] = own
+    first, matrix = whole.parts[0].design, _flat(cube)
+    content = _matrix_bytes(matrix, first, provenance_lines(first, gain_digest), count)
     files = write_certified(
         {target: content},
         target="cacao",
@@ -133,22 +135,22 @@ def export_cacao(
         checks=checks,
         gain_digest=gain_digest,
         steps=count,
-        modes=modes,
-        latency_frames=hardware.delay_frames + 1,
+        modes=whole.count,
+        latency_frames=delay + 1,
         sign=_SIGN,
     )
     return Exported(
         files=files,
         error=error,
         error_single=error,
-        start=lambda limit: AppliedFilter(matrix, hardware.delay_frames, limit),
-        checks=checks,
+        start=lambda limit: AppliedFilter(matrix, delay, limit),
+        checks=tuple(checks),
     )
 
 
 def _require_loop(design: Design) -> LoopHardware:
     """Return the loop of a design; refuse one that cacao's history does not know."""
-    require_modal(design, "a predictive filter")
+    require_modal(design, _FILE)
     hardware = design.hardware
     assert hardware is not None  # require_modal refuses a design without a loop
     if hardware.mirror is not None or hardware.delay_frames > LONGEST_DELAY:
@@ -159,9 +161,28 @@ def _require_loop(design: Design) -> LoopHardware:
     return hardware
 
 
-def filter_matrix(taps: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the matrix (m, steps * m) of taps (steps, m, m), the newest frame first."""
-    return np.ascontiguousarray(-np.hstack([*taps]), dtype=np.float32)
+def _require_small(steps: int, modes: int) -> None:
+    """Refuse a matrix that no computer multiplies in a frame."""
+    if steps * modes**2 > _MOST_NUMBERS:
+        raise NumericalError(
+            f"the matrix must have at most {_MOST_NUMBERS:,} numbers; got {steps} steps of {modes} "
+            "modes. Give fewer steps or modes, or make a robust design that is a filter of finite "
+            "length: pole 0, states null, and as many functions as steps.",
+            status="steps",
+            residual=steps,
+        )
+
+
+def _advice(steps: int, fewest: int) -> str:
+    """Return what to try for a filter that fails."""
+    if steps < fewest:
+        return f"Give at least {fewest} steps, or none to have them chosen."
+    return "Use a target with states, such as c or pyrtc."
+
+
+def _flat(cube: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the matrix (m, steps * m) of (m, steps, m), the newest frame first."""
+    return cube.reshape(len(cube), -1)
 
 
 def _matrix_bytes(

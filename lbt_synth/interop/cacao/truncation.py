@@ -2,134 +2,227 @@
 
 In the loop that a design believes, the command is a stable filter Q of the pseudo-open-loop
 measurement, whatever the controller (:mod:`lbt_synth.loop.youla`), and every stable Q keeps that
-loop stable. At a sensor gain g, what is left out of Q must meet a small gain as well.
+loop stable. At the sensor gain g, with the path L of norm 1, the commands are
+``Q w / D`` with ``D = 1 - (1 - g) L Q``. Without a part E of Q they change by ``E w / D D'``, where
+``D' = D + (1 - g) L E``: no more than a small gain, ``|1 - g| |E / D| < 1``, allows.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from lbt_synth.design import Check, Design
-from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.interop.written_loop import ROUNDOFF, Rounding, mode_variances, proved_gains
+from lbt_synth.errors import NumericalError
+from lbt_synth.interop.written_loop import (
+    ROUNDOFF,
+    Rounding,
+    mode_variances,
+    prove_written,
+    proved_gains,
+    scenario_gains,
+)
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.validation import FloatArray
 
 _LONGEST = 1 << 17  # steps that are looked for
 _GAINS = 9  # at which the small gain is computed
+_ROOM = 0.98  # of the loss, for what is rounded
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Steering(NamedTuple):
+    """The loop of a design at a sensor gain."""
+
+    loop: ClosedLoop
+    inverse: StateSpace  # 1 / D, from the measurement without correction to pseudo-open loop
+    peak: float  # its norm
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PredictiveFilter:
     """The filter from the pseudo-open-loop measurements to the commands of a design."""
 
     design: Design
-    loop: ClosedLoop
+    hardware: LoopHardware
     system: StateSpace
+    _steering: dict[float, _Steering] = field(default_factory=dict)
 
     def taps(self, steps: int) -> FloatArray:
-        """Return the first values of the impulse response, (steps, m, q)."""
+        """Return the first values of the impulse response, (steps, m, m)."""
         values, x = [self.system.D], self.system.B
         for _ in range(steps - 1):
             values.append(self.system.C @ x)
             x = self.system.A @ x
         return np.array(values)
 
-    def loss_bound(self, steps: int) -> float:
-        """Bound the relative loss of residual, at unit sensor gain, by what is left out."""
-        n, s = self.loop.hardware.modes, self.loop.commanding()
-        B, D = s.B.copy(), s.D.copy()
-        B[:, :n], D[:, :n] = s.A @ s.B[:, :n], s.C @ s.B[:, :n]  # measured a frame later
-        left_out = replace(self.loop, system=_drop_steps(replace(s, B=B, D=D), steps))
-        lost = mode_variances(self.design, left_out, slice(n))
-        return float(np.max(np.sqrt(lost / mode_variances(self.design, self.loop, slice(n)))))
+    def at(self, gain: float) -> _Steering:
+        """Return the loop at a sensor gain, made once."""
+        if gain not in self._steering:
+            loop = close_loop(self.hardware, self.design.controller, sensor_gain=gain)
+            s, each = loop.output_sensitivity(), np.eye(self.hardware.modes)
+            inverse = replace(s, C=(1 - 1 / gain) * s.C, D=(1 - 1 / gain) * s.D + each / gain)
+            self._steering[gain] = _Steering(loop, inverse.balanced(), float(hinf_norm(inverse)))
+        return self._steering[gain]
+
+    @cached_property
+    def gains(self) -> tuple[float, ...]:
+        """Sensor gains at which the small gain is computed."""
+        return tuple(np.geomspace(*proved_gains(self.design, self.hardware), _GAINS).tolist())
+
+    @cached_property
+    def own_nm(self) -> dict[float, FloatArray]:
+        """The rms residual of the design at each sensor gain of its proof, (m,)."""
+        every = slice(self.hardware.modes)
+        return {
+            gain: np.sqrt(mode_variances(self.design, self.at(gain).loop, every))
+            for gain in scenario_gains(self.design)
+            if self.gains[0] <= gain <= self.gains[-1]
+        }
 
     def fewest_steps(self, loss: float) -> int:
-        """Return the steps after which the bound on the loss is met."""
+        """Return the steps after which what is cut off costs at most that part of the residual."""
         high = 1
-        while self.loss_bound(high) > loss:
+        while not self._is_enough(high, loss):
             high *= 2
             if high > _LONGEST:
                 raise NumericalError(
-                    f"cut after {_LONGEST} steps, the filter still loses up to "
-                    f"{100 * self.loss_bound(_LONGEST):.3g} % of residual; the limit is "
-                    f"{100 * loss:.3g} %. Design for wider lines, or use a target with states.",
+                    f"the filter must lose at most {100 * loss:.3g} % of residual; cut after "
+                    f"{_LONGEST} steps it may still lose more. Design for wider lines, or use a "
+                    "target with states.",
                     status="steps",
+                    residual=_LONGEST,
                 )
         low = high // 2
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (middle, high) if self.loss_bound(middle) > loss else (low, middle)
+            low, high = (low, middle) if self._is_enough(middle, loss) else (middle, high)
         return high
 
+    def _is_enough(self, steps: int, loss: float) -> bool:
+        cut = CutFilter(whole=self, steps=steps)
+        if cut.norm > loss or cut.small_gain >= 1:
+            return False
+        return all(
+            np.max(cut.residual_nm(gain) / own) <= _ROOM * loss for gain, own in self.own_nm.items()
+        )
 
-def predictive_filter(design: Design) -> PredictiveFilter:
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CutFilter:
+    """What a filter that is cut after some steps lacks, and the taps that are left, as rounded."""
+
+    whole: PredictiveFilter
+    steps: int
+    taps: FloatArray | None = None  # (steps, m, m)
+
+    @cached_property
+    def _tail(self) -> StateSpace:
+        """The system whose impulse response is that of the filter after the last step."""
+        system = self.whole.system
+        late = system.C @ np.linalg.matrix_power(system.A, self.steps - 1)
+        return replace(system, C=late @ system.A, D=late @ system.B)
+
+    @cached_property
+    def _rounded(self) -> float:
+        """Bound on the norm of what the taps are rounded by."""
+        if self.taps is None:
+            return 0.0
+        off = self.whole.taps(self.steps) - self.taps
+        return float(np.sum(np.linalg.norm(off, ord=2, axis=(1, 2))))
+
+    @cached_property
+    def norm(self) -> float:
+        """Bound on the norm of what is left out."""
+        return float(hinf_norm(self._tail)) + self._rounded
+
+    def _gain_around(self, gain: float) -> float:
+        return abs(1 - gain) * self.whole.at(gain).peak * self.norm
+
+    @cached_property
+    def small_gain(self) -> float:
+        """Largest gain around the loop of what is left out; below 1 the cut filter is stable."""
+        return max(self._gain_around(gain) for gain in self.whole.gains)
+
+    def _peak(self, gain: float) -> float:
+        """Bound on 1 / D' at a sensor gain."""
+        around = self._gain_around(gain)
+        return self.whole.at(gain).peak / (1 - around) if around < 1 else float("inf")
+
+    def response(self, gain: float) -> float:
+        """Bound the change of the sensitivities at a sensor gain."""
+        return max(gain, 1.0) * self.norm * self.whole.at(gain).peak * self._peak(gain)
+
+    def residual_nm(self, gain: float) -> float:
+        """Bound the rms of the residual's change at a sensor gain, over all modes."""
+        loop, pol, _ = self.whole.at(gain)
+        pair = [_follow(pol, self._tail)] + ([pol] if self._rounded else [])
+        left = [
+            replace(s, B=np.hstack([gain * s.B, s.B]), D=np.hstack([gain * s.D, s.D])) for s in pair
+        ]
+        every = slice(self.whole.hardware.modes)
+        rms = [
+            np.sqrt(np.sum(mode_variances(self.whole.design, replace(loop, system=s), every)))
+            for s in left
+        ]
+        return self._peak(gain) * float(np.dot([1.0, self._rounded][: len(rms)], rms))
+
+    def prove(self) -> tuple[Check, ...]:
+        """Check the loop around the filter, in single precision, with products in any order."""
+        assert self.taps is not None  # what is proved has been rounded
+        checks = prove_written(self.whole.design, *self._as_computed(self.taps), left_out=self)
+        low, high = self.whole.gains[0], self.whole.gains[-1]
+        name = f"small gain of what is left out, sensor gains {low:.4g} to {high:.4g}"
+        return (*checks, Check(name, self.small_gain, 1.0, f"level sets at {_GAINS} gains"))
+
+    def _as_computed(self, taps: FloatArray) -> tuple[Controller, Rounding]:
+        """Return the filter of the design as a controller, and the rounding of the taps' sums."""
+        hardware, s = self.whole.hardware, self.whole.system
+        m, n = hardware.modes, s.n_states
+        # the last command is a state
+        parameter = Controller(
+            A=np.block([[s.A, np.zeros((n, m))], [s.C, np.zeros((m, m))]]),
+            B=np.vstack([s.B, s.D]),
+            C=np.eye(m, n + m, k=n),
+            D=np.zeros((m, m)),
+            dt_s=s.dt_s,
+        )
+        written = youla_controller(hardware, parameter)
+        # noise in the product is part of the command; noise in the history comes as a measurement
+        command = np.eye(written.n_states, m, k=-n)
+        entry = replace(written, B=np.hstack([command, written.B]), D=np.zeros((m, 2 * m)))
+        sizes = np.abs(np.hstack([*taps]))
+
+        def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
+            terms = sizes * np.tile(measured + commands, len(taps))
+            largest = np.sum(terms, axis=1)
+            sums = np.sum(terms**2, axis=1) + largest**2 * terms.shape[1]
+            history = 3 * commands**2 + (measured + commands) ** 2
+            return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate([sums, history]))
+
+        return written, Rounding(entry=entry, variance=variance)
+
+
+def predictive_filter(design: Design, hardware: LoopHardware) -> PredictiveFilter:
     """Return the filter of a design, whose loop must have as many commands as modes."""
-    assert design.hardware is not None  # the caller refuses a design without a loop
-    loop = close_loop(design.hardware, design.controller)
+    loop = close_loop(hardware, design.controller)
     loop.require_stable()
-    s, n = loop.commanding(), design.hardware.modes
-    return PredictiveFilter(
-        design=design, loop=loop, system=replace(s, B=s.B[:, n:], D=s.D[:, n:]).balanced()
+    s, n = loop.commanding(), hardware.modes
+    system = replace(s, B=s.B[:, n:], D=s.D[:, n:]).balanced()
+    return PredictiveFilter(design=design, hardware=hardware, system=system)
+
+
+def _follow(first: StateSpace, second: StateSpace) -> StateSpace:
+    """Return a system followed by another one."""
+    none = np.zeros((first.n_states, second.n_states))
+    return StateSpace(
+        A=np.block([[first.A, none], [second.B @ first.C, second.A]]),
+        B=np.vstack([first.B, second.B @ first.D]),
+        C=np.hstack([second.D @ first.C, second.C]),
+        D=second.D @ first.D,
+        dt_s=first.dt_s,
     )
-
-
-def written_filter(taps: FloatArray, hardware: LoopHardware) -> tuple[Controller, Rounding]:
-    """Return the controller of a filter with these taps (steps, m, m), and its rounding.
-
-    The bound on the rounding holds for products that are added up in any order.
-    """
-    steps, m, _ = taps.shape
-    if not np.any(taps[0]):
-        raise ProblemError("the first step of the filter must not be zero. Use another target.")
-    each = np.eye(m)
-    parameter = Controller(
-        A=frozen_copy(np.kron(np.eye(steps, k=-1), each)),
-        B=frozen_copy(np.kron(np.eye(steps, 1), each)),
-        C=np.hstack([np.zeros((m, m)), *taps[1:]]),
-        D=taps[0],
-        dt_s=hardware.dt_s,
-    )
-    written = youla_controller(hardware, parameter)
-    # noise in the product is part of the command; noise in the history comes as a measurement does
-    command = np.eye(written.n_states, m, k=-parameter.n_states)
-    entry = replace(written, B=np.hstack([command, written.B]), D=np.zeros((m, 2 * m)))
-    sizes = np.abs(np.hstack([*taps]))
-
-    def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
-        terms = sizes * np.tile(measured + commands, steps)
-        largest = np.sum(terms, axis=1)
-        sums = np.sum(terms**2, axis=1) + largest**2 * terms.shape[1]
-        history = 3 * commands**2 + (measured + commands) ** 2
-        return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate([sums, history]))
-
-    return written, Rounding(entry=entry, variance=variance)
-
-
-def small_gain_check(found: PredictiveFilter, taps: FloatArray) -> Check:
-    """Check that what taps (steps, m, m) leave out of a filter cannot make its loop unstable.
-
-    At the sensor gain g, with the sensitivity S, it is
-    ``|1 - g| |S + (1 - S) / g| |left out| < 1``: the path is a delay, of norm 1 at most.
-    """
-    design, hardware, system = found.design, found.loop.hardware, found.system
-    rounded = np.sum(np.linalg.norm(found.taps(len(taps)) - taps, ord=2, axis=(1, 2)))
-    left_out = float(hinf_norm(_drop_steps(system, len(taps)))) + float(rounded)
-    low, high = proved_gains(design, hardware)
-    most, each = 0.0, np.eye(hardware.n_measurements)
-    for gain in np.geomspace(low, high, _GAINS):
-        s = close_loop(hardware, design.controller, sensor_gain=gain).output_sensitivity()
-        inverse = replace(s, C=(1 - 1 / gain) * s.C, D=(1 - 1 / gain) * s.D + each / gain)
-        most = max(most, float(abs(1 - gain)) * float(hinf_norm(inverse)) * left_out)
-    name = f"small gain of what is left out, sensor gains {low:.4g} to {high:.4g}"
-    return Check(name, most, 1.0, f"level sets at {_GAINS} gains")
-
-
-def _drop_steps(system: StateSpace, steps: int) -> StateSpace:
-    """Return the system whose impulse response is this one's from a step on."""
-    late = system.C @ np.linalg.matrix_power(system.A, steps - 1)
-    return replace(system, C=late @ system.A, D=late @ system.B)

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import io
 import os
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lbt_synth.design import Check, Design, ShapedDesign
-from lbt_synth.design.modal import MixedController, ModalFilters
-from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.dao.inner_loop import InnerLoop
 from lbt_synth.interop.dao.lattice_rounding import round_together
 from lbt_synth.interop.dao.mode_loop import DirectFormLoop, shaped_mode_loop
-from lbt_synth.interop.dao.modes import ModeDesign, mode_designs
 from lbt_synth.interop.dao.refit import refit
 from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
@@ -25,18 +21,17 @@ from lbt_synth.interop.export_checks import (
     join_labels,
     provenance_lines,
     rehearsal_error,
-    require_exportable,
-    require_modal,
 )
 from lbt_synth.interop.iir.export import axis_polynomials
 from lbt_synth.interop.iir.realisation import build_controller
+from lbt_synth.interop.modes import ModalDesign, all_modes
 from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.interop.written_loop import ROUNDOFF, Rounding, prove_written, require_proved
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.atomic_files import require_ending
-from lbt_synth.validation import FloatArray, integer, number
+from lbt_synth.validation import FloatArray, integer
 
 _HINT = "Design with fewer states or less accurate models, or use a target in double precision."
 _OWN = "of the gain file, rounded"
@@ -46,7 +41,7 @@ _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's
 
 def export_dao(
     path: str | os.PathLike[str],
-    design: Design | MixedController | ModalFilters,
+    design: ModalDesign,
     *,
     order: int = 20,
     modes: int | None = None,
@@ -109,21 +104,18 @@ def export_dao(
     [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
     """
     target = require_ending(path, "a matrix of dao", (".npy", ".fits"))
-    if other_gain is not None:
-        design = _with_integrators(design, modes, other_gain)
-    parts, own = _parts(design, hardware)
-    columns = own if modes is None else integer(modes, "modes", at_least=own)
+    whole = all_modes(design, "a dao matrix", modes=modes, other_gain=other_gain, hardware=hardware)
     order = integer(order, "order", at_least=1)
-    matrix = np.zeros((2 * order + 1, columns), dtype=np.float32)
+    matrix = np.zeros((2 * order + 1, whole.count), dtype=np.float32)
     checks: list[Check] = []
     again, error = False, 0.0
-    for part in parts:
+    for part in whole.parts:
         proved = _proved_columns(part.design, order)
         matrix[:, part.modes] = proved.columns
         again |= proved.made_again
         error = max(error, rehearsal_error(part.design, InnerLoop(proved.columns)))
-        checks += (replace(check, name=_of_modes(check.name, part, own)) for check in proved.checks)
-    first = parts[0].design
+        checks += whole.name_checks(part, proved.checks)
+    first = whole.parts[0].design
     lines = provenance_lines(first, gain_digest)
     content = _matrix_bytes(matrix, first, lines, fits=target.suffix.lower() == ".fits")
     files = write_certified(
@@ -133,7 +125,7 @@ def export_dao(
         checks=checks,
         gain_digest=gain_digest,
         order=order,
-        modes=columns,
+        modes=whole.count,
         sign=_SIGN,
         coefficients=_AGAIN if again else _OWN,
     )
@@ -141,7 +133,7 @@ def export_dao(
         files=files,
         error=error,
         error_single=error,
-        start=lambda limit: InnerLoop(matrix[:, :own], limit=limit),
+        start=lambda limit: InnerLoop(matrix[:, : whole.own], limit=limit),
         checks=tuple(checks),
     )
 
@@ -152,42 +144,6 @@ class _Proved(NamedTuple):
     columns: NDArray[np.float32]
     checks: tuple[Check, ...]
     made_again: bool
-
-
-def _parts(
-    design: Design | MixedController | ModalFilters, hardware: LoopHardware | None
-) -> tuple[list[ModeDesign], int]:
-    """Return the designs of all modes, and the number of modes."""
-    if isinstance(design, MixedController | ModalFilters):
-        parts, own = mode_designs(design, hardware), design.n_modes
-        if not parts:
-            raise ProblemError("at least one mode must have a gain above 0; all are 0.")
-        for part in parts:
-            require_exportable(part.design)
-        if isinstance(design, MixedController) and isinstance(design.filter, Design):
-            require_modal(design.filter, "a dao matrix")
-        return parts, own
-    require_exportable(design)
-    own = require_modal(design, "a dao matrix")
-    return [ModeDesign(design, tuple(range(own)))], own
-
-
-def _with_integrators(
-    design: Design | MixedController | ModalFilters, modes: int | None, gain: float
-) -> MixedController:
-    """Return a design with integrators for all further modes."""
-    if not isinstance(design, Design):
-        raise ProblemError("other_gain goes with a design; a controller of all modes has gains.")
-    own = require_modal(design, "a dao matrix")
-    if modes is None:
-        raise ProblemError("other_gain needs modes, the number of modes of the RTC; got none.")
-    gains = np.full(integer(modes, "modes", at_least=own), number(gain, "other_gain", above=0))
-    return MixedController(filter=design, gains=gains, filtered=range(own))
-
-
-def _of_modes(name: str, part: ModeDesign, own: int) -> str:
-    """Name the modes of a check, where they are not all of them."""
-    return name if len(part.modes) == own else f"{name} ({name_modes(np.array(part.modes))})"
 
 
 def _proved_columns(design: Design, order: int) -> _Proved:

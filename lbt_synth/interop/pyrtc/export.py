@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.design import Design
-from lbt_synth.errors import OutputError
+from lbt_synth.design import Check, Design
+from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.interop.export_certificate import write_certified
 from lbt_synth.interop.export_checks import (
@@ -19,13 +19,13 @@ from lbt_synth.interop.export_checks import (
     join_labels,
     provenance_lines,
     rehearsal_error,
-    require_exportable,
 )
+from lbt_synth.interop.modes import all_modes
 from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
-from lbt_synth.interop.pyrtc.pol_filter import PolFilter, pol_filter
+from lbt_synth.interop.pyrtc.pol_filter import pol_filter
 from lbt_synth.interop.target import CERTIFICATE, Arithmetic, Target
 from lbt_synth.interop.written_loop import prove_written, require_proved
-from lbt_synth.validation import FloatArray, integer
+from lbt_synth.validation import FloatArray
 
 _FIT_SECONDS = 20.0  # of pseudo-open-loop series that fit_predictor identifies
 _CONFIG, _GAIN, _RESPONSE = "config.yaml", "gain.fits", "interaction_matrix.npz"
@@ -58,7 +58,7 @@ loop:
     gain_file: {gain}
     delay_frames: {delay}
     fit_frames: {fit}
-    other_gain: 0.0  # of the integrator of all further modes
+    other_gain: {other_gain!r}  # of the integrator of each further mode
 """
 
 
@@ -67,6 +67,7 @@ def export_pyrtc(
     design: Design,
     *,
     modes: int | None = None,
+    other_gain: float | None = None,
     gain_digest: str | None = None,
 ) -> Exported:
     """Write a folder with a configuration that pyRTC starts, and all that it refers to.
@@ -82,7 +83,10 @@ def export_pyrtc(
     design : Design
         Design with as many measurements as commands.
     modes : int, optional
-        Modes of the loop; by default those of the design. Further ones get no command.
+        Modes of the loop; by default those of the design, which come first. Further ones get no
+        command, without ``other_gain``.
+    other_gain : float, optional
+        Gain of an integrator for each further mode.
     gain_digest : str, optional
         SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
 
@@ -113,14 +117,23 @@ def export_pyrtc(
     ['config.certificate.json', 'config.yaml', 'gain.fits', 'interaction_matrix.npz']
     """
     folder = Path(path)
-    require_exportable(design)
+    if not isinstance(design, Design):
+        raise ProblemError(
+            "pyRTC's configuration names one gain file, for the first modes, and one gain for all "
+            f"others; got {type(design).__name__}. Give a design, modes and other_gain."
+        )
+    whole = all_modes(
+        design, _CONFIG, modes=modes, other_gain=other_gain, hardware=None, modal=False
+    )
     found = pol_filter(design)
-    own = len(found.response)
-    size = own if modes is None else integer(modes, "modes", at_least=own)
     origin = "\n".join(f"# {line}" for line in join_labels(provenance_lines(design, gain_digest)))
-    checks = prove_written(design, *found.as_computed())
-    require_proved(checks, "the arithmetic of pyRTC", _HINT)
-    single = rehearsal_error(design, InnerLoop(design))
+    checks: list[Check] = []
+    worst = 0.0
+    for part in whole.parts:
+        proved = prove_written(part.design, *pol_filter(part.design).as_computed())
+        require_proved(proved, "the arithmetic of pyRTC", _HINT)
+        checks += whole.name_checks(part, proved)
+        worst = max(worst, rehearsal_error(part.design, InnerLoop(part.design)))
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -128,8 +141,16 @@ def export_pyrtc(
             f"cannot make the directory {folder}: {error.strerror}.", path=folder
         ) from error
     contents = {
-        _CONFIG: _write_system(found, origin, size).encode(),
-        _RESPONSE: _response_bytes(block_diag(found.response, np.eye(size - own))),
+        _CONFIG: _SYSTEM.format(
+            origin=origin,
+            size=whole.count,
+            response=_RESPONSE,
+            gain=_GAIN,
+            delay=found.delay_frames,
+            fit=int(_FIT_SECONDS / found.system.dt_s),
+            other_gain=float(other_gain or 0.0),
+        ).encode(),
+        _RESPONSE: _response_bytes(found.response, whole.count),
         _GAIN: save_gain(folder / _GAIN, design).read_bytes(),
     }
     files = write_certified(
@@ -139,34 +160,23 @@ def export_pyrtc(
         checks=checks,
         gain_digest=gain_digest,
         delay_frames=found.delay_frames,
-        modes=size,
+        modes=whole.count,
     )
     return Exported(
         files=files,
-        error=single,
-        error_single=single,
+        error=worst,
+        error_single=worst,
         start=lambda limit: InnerLoop(design, limit),
-        checks=checks,
+        checks=tuple(checks),
     )
 
 
-def _write_system(found: PolFilter, origin: str, size: int) -> str:
-    """Return the configuration of a system of that many modes."""
-    return _SYSTEM.format(
-        origin=origin,
-        size=size,
-        response=_RESPONSE,
-        gain=_GAIN,
-        delay=found.delay_frames,
-        fit=int(_FIT_SECONDS / found.system.dt_s),
-    )
-
-
-def _response_bytes(response: FloatArray) -> bytes:
+def _response_bytes(response: FloatArray, modes: int) -> bytes:
     """Write an interaction matrix as pyRTC does: the matrix, and a record of what it is."""
+    whole = block_diag(response, np.eye(modes - len(response)))
     record = {"format": 2, "kind": "interaction_matrix", "image_axes": "yx"}
     buffer = io.BytesIO()
-    np.savez(buffer, data=response, pyrtc_calibration=np.array(json.dumps(record)))
+    np.savez(buffer, data=whole, pyrtc_calibration=np.array(json.dumps(record)))
     return buffer.getvalue()
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from lbt_synth.design import Design
+from lbt_synth.design import Design, integrator
 from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import design_from_record, loop_record
@@ -31,7 +31,7 @@ class GainFilePredictor:
     gain_file : path-like
         Gain file of the controller.
     other_gain : float, optional
-        Gain of the integrator of all further modes.
+        Gain of the integrator of each further mode, ``u(k) = u(k-1) + gain residual(k)``.
     command_limit : float, optional
         Largest modulus of a command: the loop does not see what a corrector clips.
     """
@@ -48,7 +48,8 @@ class GainFilePredictor:
         self.num_modes = integer(num_modes, "num_modes", at_least=1)
         self.horizon = integer(horizon, "predictor.delay_frames", at_least=1)
         self.fitted = False
-        self._other_gain = number(other_gain, "predictor.other_gain", at_least=0, at_most=1)
+        self._sent: NDArray[np.float32]  # to the further modes, the last command first
+        self._other_gain = number(other_gain, "predictor.other_gain", at_least=0)
         self._limit = np.inf
         if command_limit is not None:
             self._limit = number(command_limit, "predictor.command_limit", above=0)
@@ -73,6 +74,9 @@ class GainFilePredictor:
                 f"the loop must control at least the {self._own} modes of {self._gain_file}; got "
                 f"{self.num_modes}. Lower loop.num_dropped_modes, or raise wfc.num_modes."
             )
+        if self._other_gain > 0:  # refused where its loop is unstable
+            assert design.hardware is not None  # pol_filter refuses others
+            integrator(design.hardware.single_mode(), gain=self._other_gain)
         self._design, self._found, self._filter = design, found, found.start(self._limit)
         self.reset()
 
@@ -110,8 +114,10 @@ class GainFilePredictor:
         flat, own, rest = self._frames < self.horizon, slice(self._own), slice(self._own, None)
         self._command[own] = self._filter.step(now[own], flat=flat)
         if not flat and np.isfinite(now[rest]).all():
-            moved = self._command[rest] + self._other_gain * (now[rest] - self._command[rest])
+            residual = now[rest] - self._sent[-1]
+            moved = self._command[rest] + self._other_gain * residual
             self._command[rest] = np.clip(moved, -self._limit, self._limit)
+        self._sent = np.vstack([self._command[rest].astype(np.float32), self._sent[:-1]])
         self._frames += 1
 
     def predict(self) -> FloatArray:
@@ -122,4 +128,6 @@ class GainFilePredictor:
         """Forget the past."""
         self._filter.reset()
         self._command: FloatArray = np.zeros(self.num_modes)
-        self._frames = 0
+        rest = self.num_modes - self._own
+        self._sent = np.zeros((self.horizon, rest), dtype=np.float32)
+        self._frames: int = 0

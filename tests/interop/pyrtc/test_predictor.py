@@ -56,7 +56,8 @@ def test_a_value_that_is_not_finite_repeats_the_last_command(gains):
 
 def test_further_modes_have_an_integrator_and_all_are_clipped(gains):
     predictor = GainFilePredictor(2, gain_file=gains / "lazy.fits", other_gain=0.25)
-    assert run(predictor, np.ones((4, 2)))[:, 1].tolist() == [0.0, 0.0, 0.25, 0.4375]
+    # the residual is what pyRTC adds less: 1, 1, 1 - 0.25, 1 - 0.5
+    assert run(predictor, np.ones((6, 2)))[:, 1].tolist() == [0, 0, 0.25, 0.5, 0.6875, 0.8125]
     held = GainFilePredictor(2, gain_file=gains / "lazy.fits", command_limit=0.75)
     assert run(held, np.ones((4, 2))).tolist() == [[0, 0], [0, 0], [0.75, 0], [0.75, 0]]
 
@@ -64,7 +65,7 @@ def test_further_modes_have_an_integrator_and_all_are_clipped(gains):
 BAD = [
     ({"horizon": 3}, "predictor.delay_frames must be 2, that of"),
     ({"num_modes": 1}, "must control at least the 2 modes of"),
-    ({"other_gain": 1.5}, "predictor.other_gain must be at most 1"),
+    ({"other_gain": -0.5}, "predictor.other_gain must be at least 0"),
     ({"command_limit": 0}, "predictor.command_limit must be above 0"),
 ]
 
@@ -73,6 +74,28 @@ BAD = [
 def test_what_does_not_fit_is_refused(gains, options, text):
     with pytest.raises(lbt.errors.ProblemError, match=text):
         GainFilePredictor(**{"num_modes": 2, "gain_file": gains / "integrator.fits", **options})
+
+
+def test_an_integrator_that_is_unstable_is_refused(gains):
+    with pytest.raises(lbt.errors.CertificateError, match="closed loop"):
+        GainFilePredictor(3, gain_file=gains / "integrator.fits", other_gain=1.5)
+
+
+def test_further_modes_run_the_integrator_of_other_targets(gains):
+    """In a loop of the same delay: the commands of a design of all modes."""
+    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    whole = lbt.integrator(path, gain=0.4).controller.start()
+    predictor = GainFilePredictor(2, gain_file=gains / "lazy.fits", other_gain=0.4)
+    phase = np.cumsum(np.random.default_rng(0).standard_normal(300))
+    phase[:2] = 0.0
+    ours, theirs = [0.0, 0.0], [0.0, 0.0]  # u(k-1) corrects what frame k + 1 measures
+    for value in phase:
+        ours.append(float(whole.step([value - ours[-2]])[0]))
+        pol = value - theirs[-2] + theirs[-2]
+        predictor.update([0.0, pol])
+        theirs.append(float(np.float32(predictor.predict()[1])))
+    assert np.allclose(theirs, ours, rtol=1e-5, atol=1e-5)
+    assert np.max(np.abs(ours)) > 5
 
 
 def test_a_damaged_gain_file_is_one_sentence(gains, tmp_path):

@@ -1,0 +1,152 @@
+"""All modes of a system in one file: the designs that control them, mode by mode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from lbt_synth.design import Check, Design, IntegratorLaw, integrator, kalman
+from lbt_synth.design.modal import MixedController, ModalFilters
+from lbt_synth.design.modal.reconstructor import name_modes
+from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.interop.export_checks import require_exportable, require_modal
+from lbt_synth.models import LoopHardware, tip_tilt_plant
+from lbt_synth.validation import integer, number
+
+_SAME = 1e-6  # relative difference of a filter designed alone from that of the batch
+ModalDesign: TypeAlias = Design | MixedController | ModalFilters
+
+
+class ModeDesign(NamedTuple):
+    """A design, and the modes that it controls; one of a single mode controls each of them."""
+
+    design: Design
+    modes: tuple[int, ...]
+
+    @property
+    def copies(self) -> list[tuple[int, ...]]:
+        """The modes of each copy of the controller."""
+        single = len(self.design.controller.C) == 1
+        return [(mode,) for mode in self.modes] if single else [self.modes]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AllModes:
+    """The designs of a file, its modes, and how many of them come first and have a design."""
+
+    parts: list[ModeDesign]
+    own: int
+    count: int
+
+    def name_checks(self, part: ModeDesign, checks: Iterable[Check]) -> list[Check]:
+        """Return checks of a part, named after its modes where there are others."""
+        if len(part.modes) == self.own:
+            return list(checks)
+        modes = name_modes(np.array(part.modes))
+        return [replace(check, name=f"{check.name} ({modes})") for check in checks]
+
+
+def all_modes(
+    design: ModalDesign,
+    file: str,
+    *,
+    modes: int | None,
+    other_gain: float | None,
+    hardware: LoopHardware | None,
+    modal: bool = True,
+) -> AllModes:
+    """Return the designs of a file, each certified; ``modal`` requires one of modes."""
+    if other_gain is not None:
+        design = _with_integrators(design, file, modes, other_gain)
+    if isinstance(design, MixedController | ModalFilters):
+        parts, own = _mode_designs(design, file, hardware), design.n_modes
+        if not parts:
+            raise ProblemError("at least one mode must have a gain above 0; all are 0.")
+        for part in parts:
+            require_exportable(part.design)
+    else:
+        require_exportable(design)
+        own = require_modal(design, file) if modal else len(design.controller.C)
+        parts = [ModeDesign(design, tuple(range(own)))]
+    count = own if modes is None else integer(modes, "modes", at_least=own)
+    return AllModes(parts=parts, own=own, count=count)
+
+
+def _with_integrators(
+    design: ModalDesign, file: str, modes: int | None, gain: float
+) -> MixedController:
+    """Return a design with integrators for all further modes."""
+    if not isinstance(design, Design):
+        raise ProblemError("other_gain goes with a design; a controller of all modes has gains.")
+    own = require_modal(design, file)
+    if modes is None:
+        raise ProblemError("other_gain needs modes, the number of modes of the RTC; got none.")
+    gains = np.full(integer(modes, "modes", at_least=own), number(gain, "other_gain", above=0))
+    return MixedController(filter=design, gains=gains, filtered=range(own))
+
+
+def _mode_designs(
+    control: MixedController | ModalFilters, file: str, hardware: LoopHardware | None
+) -> list[ModeDesign]:
+    """Return the design of each mode; modes that get no command have none."""
+    if isinstance(control, ModalFilters):
+        return _filter_designs(control, tuple(range(control.n_modes)))
+    if control.reconstructor is not None:
+        raise ProblemError("the RTC reconstructs modes itself; got a reconstructor.")
+    loop = control.hardware or hardware
+    if loop is None:
+        raise ProblemError("hardware must be given where no filter has a loop; got None.")
+    if control.filter is None:
+        found = []
+    elif isinstance(control.filter, ModalFilters):
+        found = _filter_designs(control.filter, tuple(control.filtered))
+    elif isinstance(control.filter, Design):
+        require_modal(control.filter, file)
+        found = [ModeDesign(control.filter, tuple(control.filtered))]
+    else:
+        kind = type(control.filter).__name__
+        raise ProblemError(f"the filter must be a certified design or ModalFilters; got {kind}.")
+    laws: dict[tuple[float, float], list[int]] = {}
+    for mode in np.setdiff1d(np.arange(control.n_modes), control.filtered):
+        laws.setdefault((float(control.gains[mode]), float(control.leak[mode])), []).append(mode)
+    single = loop.single_mode()
+    for (gain, leak), modes in laws.items():
+        if gain > 0:
+            design = integrator(single, gain=gain, law=IntegratorLaw(leak=leak))
+            found.append(ModeDesign(design, tuple(int(mode) for mode in modes)))
+    return found
+
+
+def _filter_designs(filters: ModalFilters, modes: tuple[int, ...]) -> list[ModeDesign]:
+    """Design each filter alone; it is that of the batch, and has a certificate of its own."""
+    found = []
+    for index, mode in enumerate(modes):
+        lines = [replace(line, direction=(1.0,)) for line in filters.vibrations[index]]
+        design = kalman(
+            tip_tilt_plant(
+                frame_rate_hz=filters.turbulence.frame_rate_hz,
+                turbulence=filters.turbulence.model(index),
+                noise_nm=filters.noise_nm[index],
+                vibrations=lines or None,
+                delay_frames=filters.delay_frames,
+                sensor_gain=float(filters.sensor_gain[index]),
+                modes=1,
+                mirror=filters.mirror,
+            )
+        )
+        frequency = np.linspace(0.05, 0.45, 9) / filters.dt_s
+        own, alone = (
+            c.to_statespace().frequency_response(frequency)
+            for c in (filters.controller(index), design.controller)
+        )
+        apart = float(np.max(np.abs(own - alone)) / np.max(np.abs(own)))
+        if not apart < _SAME:
+            raise NumericalError(
+                f"the filter of mode {mode + 1} must be that of its models; it is {apart:.2g} off.",
+                residual=apart,
+            )
+        found.append(ModeDesign(design, (mode,)))
+    return found
