@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.storage.fits_structure import CARD, check_fits
+from lbt_synth.storage.fits_writer import image_unit, primary_unit
 from lbt_synth.storage.input_files import LARGEST_BYTES
 from lbt_synth.validation import FloatArray
 
@@ -57,21 +58,12 @@ def fits_bytes(
     ...     units["A"].data.tolist()
     [[1.0, 2.0]]
     """
-    from astropy.io import fits
-
     arrays = arrays if text is None else _with_text(arrays, text)
-    primary = fits.PrimaryHDU()
-    primary.header.update(cards)
-    for line in comments:
-        primary.header.add_comment(line)
-    units = [fits.ImageHDU(data=np.array(array), name=name) for name, array in arrays.items()]
-    for unit in units:
-        unit.header.update((headers or {}).get(unit.name, {}))
-    for unit in (primary, *units):  # instead of the time, so that equal contents give equal files
-        unit.add_checksum(when="of this unit")
-    buffer = io.BytesIO()
-    fits.HDUList([primary, *units]).writeto(buffer)
-    return buffer.getvalue()
+    units = [
+        image_unit(name, np.asarray(array), (headers or {}).get(name, {}))
+        for name, array in arrays.items()
+    ]
+    return b"".join([primary_unit(cards, comments), *units])
 
 
 def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:

@@ -15,7 +15,7 @@ BLOCK, CARD = 2880, 80
 _MOST = {"NAXIS": 999, "ZNAXIS": 999, "TFIELDS": 999}  # the standard's own limits
 _MOST_CARDS = 20_000  # of one header
 _MOST_UNITS = 5_000
-_ONES = 2**32 - 1
+ONES = 2**32 - 1
 
 
 def check_fits(content: bytes) -> None:
@@ -52,14 +52,14 @@ def _check_unit(content: bytes, start: int, first: bytes) -> int:
     if not content.startswith(first, start):
         raise ValueError("the first card")
     cards, data = _read_header(content, start)
-    stop = data + _whole_blocks(_data_bytes(cards))
+    stop = data + whole_blocks(_data_bytes(cards))
     if stop > len(content):
         raise ValueError("the size")
-    of_data = _ones_complement_sum(content, data, stop)
+    of_data = ones_complement_sum(content, data, stop)
     sums = {name: cards.get(name, "").strip("' ") for name in ("DATASUM", "CHECKSUM")}
-    total = _ones_complement_sum(content, start, data) + of_data
+    total = ones_complement_sum(content, start, data) + of_data
     if (sums["DATASUM"] and sums["DATASUM"] != str(of_data)) or (
-        sums["CHECKSUM"] and total % _ONES != 0
+        sums["CHECKSUM"] and total % ONES != 0
     ):
         raise ValueError("the checksum")
     return stop
@@ -71,7 +71,7 @@ def _read_header(content: bytes, start: int) -> tuple[dict[str, str], int]:
     for at in range(start, start + _MOST_CARDS * CARD, CARD):
         card = content[at : at + CARD]
         if card.rstrip() == b"END":
-            return cards, start + _whole_blocks(at + CARD - start)
+            return cards, start + whole_blocks(at + CARD - start)
         if card[8:10] == b"= ":
             value = card[10:].split(b"/")[0].decode("latin-1").strip()
             cards.setdefault(card[:8].decode("latin-1").rstrip(), value)
@@ -114,14 +114,15 @@ def _read_integer(cards: dict[str, str], keyword: str, default: int) -> int:
     return int(text)
 
 
-def _whole_blocks(size: int) -> int:
+def whole_blocks(size: int) -> int:
+    """Return a size rounded up to whole blocks."""
     return -(-size // BLOCK) * BLOCK
 
 
-def _ones_complement_sum(content: bytes, start: int, stop: int) -> int:
+def ones_complement_sum(content: bytes, start: int, stop: int) -> int:
     """Return the sum of the words of blocks, with the carry added at the other end."""
     words = np.frombuffer(content, dtype=">u4", offset=start, count=(stop - start) // 4)
     total = int(words.sum(dtype=np.uint64))
     while total >> 32:
-        total = (total & _ONES) + (total >> 32)
+        total = (total & ONES) + (total >> 32)
     return total
