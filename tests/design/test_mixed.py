@@ -163,16 +163,26 @@ def test_a_plant_with_memory_is_not_assembled_again(plant):
             again()
 
 
-def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
+class PanicException(BaseException):
+    """What the compiled solver raises, by its name."""
+
+
+def panic(*arguments, **options):
+    raise PanicException("out of range")
+
+
+def test_a_solver_that_panics_below_cvxpy_is_an_error_of_ours(monkeypatch):
     import cvxpy
 
-    class PanicException(BaseException):
-        pass
-
-    def panic(*arguments, **options):
-        raise PanicException("out of range")
-
     monkeypatch.setattr(cvxpy.Problem, "solve", panic)
+    with pytest.raises(lbt.errors.NumericalError, match="numbers out of its range"):
+        lbt.design.polytopic(lbt_axis_plant(), half_width_hz=1.0)
+
+
+def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
+    import clarabel
+
+    monkeypatch.setattr(clarabel, "DefaultSolver", panic)
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     with pytest.raises(lbt.errors.NumericalError, match="numbers out of its range"):
         lbt.hinf(walk, route="lmi")

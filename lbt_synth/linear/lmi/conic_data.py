@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, IntArray
 
 # Tighter tolerances end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
@@ -64,6 +64,42 @@ class ConicSolution:
     iterations: int
 
 
+def _triangle(d: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return rows, columns and scales of the upper triangle as the solver has it, by columns."""
+    column, row = np.tril_indices(d)
+    return row, column, np.where(row == column, 1.0, np.sqrt(2))
+
+
+def dual_matrix(multipliers: FloatArray) -> FloatArray:
+    """Return the multiplier of a symmetric matrix, (d, d), from those of its rows."""
+    d = int(np.sqrt(2 * multipliers.size))
+    row, column, scale = _triangle(d)
+    matrix = np.zeros((d, d))
+    matrix[row, column] = matrix[column, row] = multipliers / scale
+    return matrix
+
+
+class SymmetricUnknown:
+    """A symmetric matrix whose upper triangle is unknown, by rows."""
+
+    def __init__(self, n: int) -> None:
+        self.row, self.column = np.triu_indices(n)
+        self.trace = np.where(self.row == self.column, 1.0, 0.0)
+        self.size = self.row.size
+
+    def congruence(self, M: FloatArray) -> FloatArray:
+        """Return the rows (d, d, size) of ``M P M'``, with M (d, n)."""
+        left, right = M[:, self.row], M[:, self.column]
+        half = left[:, None] * right * np.where(self.row == self.column, 0.5, 1.0)
+        return np.asarray(half + half.swapaxes(0, 1))
+
+    def matrix(self, x: FloatArray) -> FloatArray:
+        """Return the matrix of the unknowns (size,)."""
+        matrix = np.zeros((self.row[-1] + 1, self.row[-1] + 1))
+        matrix[self.row, self.column] = matrix[self.column, self.row] = x
+        return matrix
+
+
 class ConicProgramme:
     """Minimise ``x'P x / 2 + q'x``, with ``offsets + rows x`` in cones."""
 
@@ -88,8 +124,8 @@ class ConicProgramme:
     def add_semidefinite(self, rows: sparse.csr_matrix, offsets: FloatArray) -> None:
         """Require of each of k symmetric matrices, (k d d, n) and (k, d, d), that it is >= 0."""
         count, d, _ = offsets.shape
-        column, row = np.tril_indices(d)  # the upper triangle, column by column
-        scale = np.tile(np.where(row == column, 1.0, np.sqrt(2)), count)
+        row, column, scale = _triangle(d)
+        scale = np.tile(scale, count)
         at = (np.arange(count)[:, None] * d * d + row * d + column).ravel()
         cones = [clarabel.PSDTriangleConeT(d)] * count
         self._add(sparse.diags(scale) @ rows[at], scale * offsets.ravel()[at], cones)

@@ -17,15 +17,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from scipy.linalg import null_space
+from scipy import sparse
+from scipy.linalg import block_diag, null_space
 
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
-from lbt_synth.linear.lmi.conic_data import require_optimum
-from lbt_synth.linear.lmi.solver import solve, symmetrise
+from lbt_synth.linear.lmi.conic_data import (
+    ConicProgramme,
+    SymmetricUnknown,
+    dual_matrix,
+    require_optimum,
+)
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.validation import FloatArray, frozen_copy
 
@@ -124,13 +128,18 @@ def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: fl
     """
     scaled = balance(problem, coordinates, scale)
     A, B, C = scaled.problem.A, scaled.problem.B, scaled.problem.C
-    P = cp.Variable(A.shape, symmetric=True)
-    block = cp.bmat(
-        [[A @ P @ A.T + B @ B.T - P, A @ P @ C.T], [C @ P @ A.T, np.eye(len(C)) + C @ P @ C.T]]
-    )
-    run = solve(cp.Maximize(cp.trace(P)), [symmetrise(block) >> 0, P >> 0])
+    P = SymmetricUnknown(len(A))
+    seen, kept = np.vstack([A, C]), np.eye(len(A) + len(C), len(A))
+    programme = ConicProgramme(P.size)
+    rows = P.congruence(seen) - P.congruence(kept)
+    _require_positive(programme, rows, block_diag(B @ B.T, np.eye(len(C))))
+    _require_positive(programme, P.congruence(np.eye(len(A))), np.zeros_like(A))
+    found = programme.minimize(-P.trace)
+    run = found.status, found.iterations
     require_optimum(run, "the semidefinite programme of the Kalman filter", _ADVICE)
-    return scaled.solution(P.value, np.linalg.inv((P.value + P.value.T) / 2), run)
+    covariance = P.matrix(found.x)
+    information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    return scaled.solution(covariance, information, run)
 
 
 def least_gamma_lmi(
@@ -138,15 +147,16 @@ def least_gamma_lmi(
 ) -> LmiSolution:
     """Find the least gamma, and a filter that reaches it."""
     scaled = balance(problem, coordinates, scale)
-    P = cp.Variable(scaled.problem.A.shape, symmetric=True)
-    gamma_squared = cp.Variable(nonneg=True)
     basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
-    inequalities = _inequalities(scaled.problem, basis, P, gamma_squared, 1.0)
-    run = solve(cp.Minimize(gamma_squared), inequalities)
+    P, programme = _storage_programme(scaled.problem, basis)
+    programme.add_nonnegative(np.eye(1, P.size + 1, P.size), np.zeros(1))
+    found = programme.minimize(np.append(np.zeros(P.size), 1.0))
+    run = found.status, found.iterations
     require_optimum(run, "the least gamma's semidefinite programme", _ADVICE)
-    level = float(gamma_squared.value)
-    witness = scaled.witness(inequalities[0].dual_value, basis)
-    return _unpack(scaled, P.value / level, level, run, witness=witness)
+    level = float(found.x[-1])
+    d = basis.shape[1]
+    witness = scaled.witness(dual_matrix(found.dual[: d * (d + 1) // 2]), basis)
+    return _unpack(scaled, P.matrix(found.x[:-1]) / level, level, run, witness=witness)
 
 
 def hinf_lmi(
@@ -155,10 +165,10 @@ def hinf_lmi(
     """Find the central filter of a given gamma, which has the greatest storage matrix."""
     scaled = balance(problem, coordinates, scale)
     level = (gamma / scale) ** 2
-    P = cp.Variable(scaled.problem.A.shape, symmetric=True)
     basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
-    inequalities = _inequalities(scaled.problem, basis, P, 1.0, 1 / level)
-    run = solve(cp.Maximize(cp.trace(P)), inequalities)
+    P, programme = _storage_programme(scaled.problem, basis, level)
+    found = programme.minimize(-P.trace)
+    run = found.status, found.iterations
     if "infeasible" in run[0]:
         raise InfeasibleError(
             f"no H-infinity filter reaches gamma = {gamma:.9g}: the LMI is infeasible. "
@@ -166,23 +176,38 @@ def hinf_lmi(
             gamma=gamma,
         )
     require_optimum(run, "the semidefinite programme of the H-infinity filter", _ADVICE)
-    return _unpack(scaled, P.value, level, run)
+    return _unpack(scaled, P.matrix(found.x), level, run)
 
 
-def _inequalities(
-    problem: EstimationProblem, basis: FloatArray, P: Any, input_weight: Any, output_weight: float
-) -> list[Any]:
-    """Return the two inequalities; dividing them by gamma^2 suits a large, given level."""
+def _storage_programme(
+    problem: EstimationProblem, basis: FloatArray, level: float | None = None
+) -> tuple[SymmetricUnknown, ConicProgramme]:
+    """Return the storage matrix and its two inequalities, the dissipation first.
+
+    Without a level ``gamma^2`` is one more unknown, the last; with one, all is divided by it,
+    which suits large levels.
+    """
     A, B, L = problem.A, problem.B, problem.L
     Nx, Nw = basis[: len(A)], basis[len(A) :]
     step, seen = A @ Nx + B @ Nw, L @ Nx
-    dissipation = (
-        Nx.T @ P @ Nx
-        + input_weight * (Nw.T @ Nw)
-        - step.T @ P @ step
-        - output_weight * (seen.T @ seen)
-    )
-    return [symmetrise(dissipation) >> 0, P - output_weight * (L.T @ L) >> 0]
+    P = SymmetricUnknown(len(A))
+    dissipation, storage = P.congruence(Nx.T) - P.congruence(step.T), P.congruence(np.eye(len(A)))
+    weight, own = 1.0, np.zeros_like(seen.T @ seen)
+    if level is None:
+        dissipation = np.dstack([dissipation, Nw.T @ Nw])
+        storage = np.dstack([storage, np.zeros_like(A)])
+    else:
+        weight, own = 1 / level, Nw.T @ Nw
+    programme = ConicProgramme(dissipation.shape[2])
+    _require_positive(programme, dissipation, own - weight * (seen.T @ seen))
+    _require_positive(programme, storage, -weight * (L.T @ L))
+    return P, programme
+
+
+def _require_positive(programme: ConicProgramme, rows: FloatArray, offset: FloatArray) -> None:
+    """Require that a symmetric matrix ``offset + rows x``, (d, d) and (d, d, n), is >= 0."""
+    flat = sparse.csr_matrix(rows.reshape(-1, rows.shape[2]))
+    programme.add_semidefinite(flat, (offset + offset.T)[None] / 2)
 
 
 def _unpack(
