@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from lbt_synth.design.certificate import Certificate, certify_loop
 from lbt_synth.design.facts import IntegratorFacts
@@ -14,13 +13,14 @@ from lbt_synth.design.integrator_law import PURE, IntegratorLaw
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller
+from lbt_synth.linear.scalar_search import find_least
 from lbt_synth.loop import (
     LoopEnsemble,
     close_loop,
-    ensemble_residuals,
     model_budget,
     stable_sensor_gains,
 )
+from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
@@ -309,9 +309,13 @@ def optimal_integrator(
         vibrations=tuple(map(ensemble_vibration, stationary_vibrations(truth.vibrations))),
     )
 
-    def variances(controllers: list[Controller]) -> FloatArray:
-        loops = replace(ensemble, loops=len(controllers))
-        return ensemble_residuals(controllers, hardware, loops).rms_nm ** 2
+    A, B, C, D = textbook_matrices([law.controller(hardware, 1.0)])
+
+    def variances(gains: FloatArray) -> FloatArray:
+        factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
+        scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
+        loops = replace(ensemble, loops=gains.size)
+        return residuals_from_matrices(scaled, hardware, loops).rms_nm ** 2
 
     return _least_residual(hardware, law, variances, truth.sensor_gain)
 
@@ -350,7 +354,8 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     """
     require_instance(plant, TipTiltPlant)
 
-    def variances(controllers: list[Controller]) -> FloatArray:
+    def variances(gains: FloatArray) -> FloatArray:
+        controllers = (law.controller(plant.hardware, gain) for gain in gains.tolist())
         loops = (close_loop(plant.hardware, controller) for controller in controllers)
         found = [model_budget(one, plant).rms_nm if one.is_stable else np.nan for one in loops]
         return np.square(found)
@@ -361,35 +366,28 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
 def _least_residual(
     hardware: LoopHardware,
     law: IntegratorLaw,
-    variances: Callable[[list[Controller]], FloatArray],
+    variances: Callable[[FloatArray], FloatArray],
     sensor_gain: float,
 ) -> IntegratorDesign:
     """Refine each local minimum over a grid of gains, and design with the least.
 
-    ``variances`` are those that stable loops leave, and nan of an unstable one.
+    ``variances`` are those that loops of many gains leave, nan of an unstable one.
     """
     gains = _TRIALS * hardware_gain_limit(hardware, law) / max(1.0, sensor_gain)
     trials = _allowed_gains(hardware, law, gains) if law.demands else np.log(gains)
 
     def left(log_gains: FloatArray) -> FloatArray:
-        found = variances([law.controller(hardware, gain) for gain in np.exp(log_gains).tolist()])
+        found = variances(np.exp(log_gains))
         return np.where(np.isnan(found), np.inf, found)
 
     values = left(trials)
     walls = np.concatenate([[np.inf], values, [np.inf]])
     low = np.flatnonzero((values < walls[:-2]) & (values <= walls[2:])).tolist()
-    refined = [
-        minimize_scalar(
-            lambda log_gain: float(left(np.array([log_gain]))[0]),
-            bounds=(float(trials[max(i - 1, 0)]), float(trials[min(i + 1, trials.size - 1)])),
-            method="bounded",
-            options={"xatol": 1e-7},
-        )
-        for i in low
-    ]
-    best = int(np.argmin([found.fun for found in refined]))
+    ends = [(max(i - 1, 0), min(i + 1, trials.size - 1)) for i in low]
+    refined = [find_least(left, *trials[list(pair)].tolist(), width=1e-7) for pair in ends]
+    best = int(np.argmin([least for _, least in refined]))
     limited = low[best] == trials.size - 1  # the largest gain that was tried
     limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
     status = f"limited by {limit}" if limited else "least residual"
-    gain = float(np.exp(refined[best].x))
+    gain = float(np.exp(refined[best][0]))
     return _design_with_gain(hardware, gain, law, route="search", status=status)

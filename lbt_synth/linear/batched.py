@@ -10,7 +10,7 @@ from lbt_synth.validation import Entry, FloatArray
 
 def transpose(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
     """Transpose each matrix of a stack."""
-    return np.swapaxes(stack, -1, -2)
+    return stack.swapaxes(-1, -2)
 
 
 def symmetrise(stack: FloatArray) -> FloatArray:
@@ -20,8 +20,9 @@ def symmetrise(stack: FloatArray) -> FloatArray:
 
 def frobenius_norms(stack: FloatArray) -> FloatArray:
     """Frobenius norm of each matrix of a stack, (N,)."""
-    squares = np.einsum("...ij,...ij->...", stack, stack)
-    return np.asarray(np.sqrt(squares), dtype=np.float64)
+    *lead, n, m = stack.shape
+    rows = stack.reshape(*lead, n * m)
+    return np.asarray(np.sqrt(np.vecdot(rows, rows)))
 
 
 def solve_stack(matrices: npt.NDArray[Entry], right: npt.NDArray[Entry]) -> npt.NDArray[Entry]:

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import NumericalError, UnstableLoopError
+from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.state_space import StateSpace, pointwise_response, schur_response
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -91,20 +90,20 @@ def hinf_norm(system: Any) -> HinfNorm:
             f"{radius:.9g}. An unstable system has no finite norm.",
             spectral_radius=radius,
         )
-    found = [_peak(part.balanced(), 0.0, np.pi) for part in _independent_parts(G)]
+    found = [_peak(part.balanced(), 0.0, np.pi) for part in independent_parts(G)]
     return max(found, key=float)
 
 
-def _independent_parts(G: StateSpace) -> list[StateSpace]:
+def independent_parts(G: StateSpace) -> list[StateSpace]:
     """Return the parts of a system that share no state, input or output, equal ones once."""
     (n, m), p = G.B.shape, len(G.C)
     x, u, y = np.split(np.arange(n + m + p), [n, n + m])
     links = np.zeros((n + m + p, n + m + p), dtype=np.bool_)
     links[:n, : n + m] = np.hstack([G.A, G.B]) != 0
     links[n + m :, : n + m] = np.hstack([G.C, G.D]) != 0
-    count, label = connected_components(csr_matrix(links), directed=False)
+    label = connected_parts(links)
     parts = {}
-    for part in range(count):
+    for part in range(np.max(label) + 1):
         states, inputs, outputs = (np.flatnonzero(label[nodes] == part) for nodes in (x, u, y))
         if inputs.size and outputs.size:
             if not states.size:

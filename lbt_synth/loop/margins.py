@@ -9,6 +9,7 @@ import numpy as np
 
 from lbt_synth.linear import Block, Controller, hinf_norm
 from lbt_synth.linear.held_controller import HasController
+from lbt_synth.linear.norms import independent_parts
 from lbt_synth.linear.structured_singular_value.bound import upper_bound
 from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
@@ -211,7 +212,8 @@ def _disk_margin(loop: ClosedLoop) -> float:
     """
     S = loop.output_sensitivity()
     centred = replace(S, D=S.D - np.eye(len(S.D)) / 2)
-    return 1 / upper_bound(centred, (Block(),) * len(S.D), _DISK_TOLERANCE)[0]
+    parts = independent_parts(centred)  # each measurement is an input and an output of its part
+    return 1 / max(upper_bound(p, (Block(),) * len(p.D), _DISK_TOLERANCE)[0] for p in parts)
 
 
 def _delay_margin_frames(loop: ClosedLoop) -> float:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.systems import random_system
 
 import lbt_synth as lbt
-from lbt_synth.linear.norms import _independent_parts, band_norm, largest_real_part, spectral_norms
+from lbt_synth.linear.norms import band_norm, independent_parts, largest_real_part, spectral_norms
 
 
 @given(
@@ -196,16 +196,16 @@ def test_norms_over_a_band():
 
 
 @pytest.mark.parametrize("through", [0.0, 3.0])
-def test_the_norm_of_independent_parts_is_the_largest_of_theirs(through):
+def test_the_norm_ofindependent_parts_is_the_largest_of_theirs(through):
     """Two equal lags, a third one, a state that nothing moves, and a path without states."""
     poles, gains = [0.5, 0.8, 0.5, 0.99], [1.0, 0.3, 1.0, 0.0]
     B, D = np.diag([1.0, 1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 0.0, through])
     system = lbt.linear.StateSpace(A=np.diag(poles), B=B, C=np.diag(gains), D=D)
-    assert len(_independent_parts(system)) == (1 if through else 2)
+    assert len(independent_parts(system)) == (1 if through else 2)
     assert float(lbt.hinf_norm(system)) == pytest.approx(max(2.0, through))
     turned = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
     mixed = lbt.linear.StateSpace(
         A=turned @ system.A @ turned.T, B=turned @ system.B, C=system.C @ turned.T, D=D
     )
-    assert len(_independent_parts(mixed)) == 1
+    assert len(independent_parts(mixed)) == 1
     assert float(lbt.hinf_norm(mixed)) == pytest.approx(max(2.0, through))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.batched import frobenius_norms
+from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.moving_parameter.positive_definite import UNIT
 from lbt_synth.validation import FloatArray, IntArray, real_array, set_fields
@@ -100,10 +100,10 @@ def split_blocks(family: ParameterFamily, nominal: float) -> tuple[list[Block], 
     """
     entries = np.max(np.abs(family.matrices), axis=(0, 1))
     coupled = entries > _COUPLING * np.max(entries)
-    count, labels = connected_components(coupled, directed=False)
+    labels = connected_parts(coupled)
     blocks: dict[bytes, Block] = {}
     whole_S, whole_V = np.zeros((2, *entries.shape))
-    for label in range(count):
+    for label in range(np.max(labels) + 1):
         states = np.flatnonzero(labels == label).astype(np.int64)
         own = family.matrices[..., states[:, None], states]
         key = own.tobytes()

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh, null_space
-from scipy.optimize import minimize_scalar
 
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
@@ -35,6 +34,7 @@ from lbt_synth.linear.output_feedback.full_information import (
     estimation_side,
 )
 from lbt_synth.linear.riccati.dare import solve_dare
+from lbt_synth.linear.scalar_search import find_least
 from lbt_synth.validation import FloatArray
 
 _STEPS = 64  # of the recursion that bounds the storage matrix
@@ -115,22 +115,17 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
     """Level that both sides prove together, at the best relative weight of the two."""
     shared = float(np.linalg.norm(one.root.T @ two.root, "nuc"))
 
-    def level(weight: float) -> float:
-        t = np.exp(weight)
+    def levels(weights: FloatArray) -> FloatArray:
+        t = np.exp(weights)
         spent = t * one.spent + two.spent / t
         gained = t * one.gained + two.gained / t
-        return float((shared + np.sqrt(shared**2 + gained * spent)) / max(spent, 1e-300))
+        levels = (shared + np.sqrt(shared**2 + gained * spent)) / np.maximum(spent, 1e-300)
+        return np.asarray(levels)
 
     grid = np.linspace(-_WIDEST, _WIDEST, 97)
-    best = float(grid[int(np.argmax([level(w) for w in grid]))])
-    step = float(grid[1] - grid[0])
-    found = minimize_scalar(
-        lambda w: -level(w),
-        bounds=(best - step, best + step),
-        method="bounded",
-        options={"xatol": 1e-9},
-    )
-    return max(level(best), level(float(found.x)))
+    best, step = float(grid[np.argmax(levels(grid))]), float(grid[1] - grid[0])
+    refined, _ = find_least(lambda w: -levels(w), best - step, best + step, width=1e-9)
+    return float(np.max(levels(np.array([best, refined]))))
 
 
 def _moments(side: Side, pairs: Witness) -> _Moments:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import brentq
 
 from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
@@ -19,6 +18,7 @@ from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
+from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.validation import FloatArray, frozen_copy
 
 
@@ -284,7 +284,8 @@ def least_gamma(
         return trial.slack
 
     for _ in range(60):  # the upper level is feasible in exact arithmetic
-        if slack(upper) > 0:
+        above = slack(upper)
+        if above > 0:
             break
         upper *= 1.0001 if upper < 1.01 * lower else 1.01
     if not met:
@@ -294,8 +295,15 @@ def least_gamma(
             gamma=upper,
         )
     root = lower
-    if lower < upper and slack(lower) <= 0:
-        root = brentq(slack, lower, upper, xtol=_GAMMA_TOLERANCE * upper, rtol=_GAMMA_TOLERANCE)
+    below = slack(lower) if lower < upper else 1.0
+    if below <= 0:
+        whole, ends = upper, ((upper / lower) ** 2, 1.0)  # the slack is almost linear in gamma^-2
+        root = whole * find_root(
+            lambda s: slack(whole * s**-0.5),
+            *ends,
+            width=2 * _GAMMA_TOLERANCE,
+            values=(below, above),
+        ) ** (-0.5)
     upper, width = min(met), _GAMMA_TOLERANCE
     for _ in range(100):  # the search leaves one end of its bracket far away: bring it in
         if upper - lower <= 2.5 * _GAMMA_TOLERANCE * upper:

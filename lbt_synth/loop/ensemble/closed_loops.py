@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
+from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response, mirror_system, tapped_mirror
@@ -81,7 +80,7 @@ def split_into_subloops(
     controller = (x, x, A), (x, y, B), (u, x, C), (u, y, D)
     for rows, columns, entries in (*controller, (y, r, sensor[None]), (r, u, influence[None])):
         links[np.ix_(rows, columns)] = _nonzero_entries(entries)
-    _, label = connected_components(csr_matrix(links), directed=False)
+    label = connected_parts(links)
     subloops, rest = [], []
     for each in np.unique(label):
         own = label == each

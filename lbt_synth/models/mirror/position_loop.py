@@ -16,11 +16,11 @@ from typing import Annotated, Any
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.block_filtering import filter_series
+from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.validation import (
     Count,
     FloatArray,
@@ -281,8 +281,9 @@ class PositionLoop:
         below = np.flatnonzero(amplitude(grid) < np.sqrt(0.5))
         if below.size == 0 or below[0] == 0:
             return float("nan") if below.size else float(grid[-1])
-        ends = grid[below[0] - 1 : below[0] + 1]
-        return float(brentq(lambda f: float(amplitude(f)[0]) - np.sqrt(0.5), *ends))
+        low, high = grid[below[0] - 1 : below[0] + 1].tolist()
+        level = np.sqrt(0.5)
+        return find_root(lambda f: float(amplitude(f)[0]) - level, low, high, width=1e-9 * low)
 
     def _law(self) -> FloatArray:
         """Acceleration [positions per sample^2] that the loop computes, over states and command."""

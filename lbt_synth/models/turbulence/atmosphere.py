@@ -10,19 +10,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from math import factorial
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
-from scipy.special import j0, j1, jv
+from scipy.special import j0, j1
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.linear.cubic_spline import CubicSpline, cubic_spline
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray, Obstruction, Positive, check_fields, real_array
 
 ARCSEC_RAD = np.pi / 180 / 3600
 LOWEST = 1e-4  # spectra are constant below this frequency, in units of V / D
 TAIL = np.linspace(12, 120, 400)  # last knots of spectra, in these units
+_AT_ONCE = 10  # frequencies of a spectrum that are integrated together, in the cache
+_SERIES = [(-1) ** k / (factorial(k) * factorial(k + 2)) for k in range(8)]  # of J_2
 _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
 
 
@@ -139,19 +143,20 @@ def _filtered_spectrum(scale_ratio: float, eps: float, f: FloatArray) -> FloatAr
 
 
 def _bessel_j2(x: FloatArray) -> FloatArray:
-    """J_2, by its recurrence where that loses no digits, which is several times faster."""
+    """J_2, by its recurrence where that loses no digits, else by its series."""
     out = np.empty_like(x)
     large = x > 1
     out[large] = 2 * j1(x[large]) / x[large] - j0(x[large])
-    out[~large] = jv(2, x[~large])
+    square = x[~large] ** 2 / 4
+    out[~large] = square * polyval(square, _SERIES)
     return out
 
 
-@lru_cache(maxsize=1)
-def _spatial_panels() -> tuple[FloatArray, FloatArray]:
-    """Nodes over spatial frequency [1/D]: octaves below 1/4, steps of 1/2 above."""
-    low = np.geomspace(1e-9, 0.25, 90)
-    return gauss_panels(np.concatenate([low, np.arange(0.5, 40.5, 0.5)]), 8)
+@lru_cache(maxsize=2)
+def _spatial_panels(*, is_flat: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Nodes over spatial frequency [1/D]: octaves below 1/4 unless all is flat there."""
+    low = np.array([0.0, 0.25]) if is_flat else np.geomspace(1e-9, 0.25, 90)
+    return gauss_panels(np.concatenate([low, [0.5], np.arange(1.0, 41.0)]), 10)
 
 
 @lru_cache(maxsize=128)
@@ -168,11 +173,11 @@ class LogSpline:
     It is constant below its first knot, and the power law f^(-17/3) of tilt beyond the last.
     """
 
-    spline: Any  # a PPoly of scipy
+    spline: CubicSpline
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the logarithms of the spectrum at logarithms of frequencies."""
-        first, last = self.spline.x[[0, -1]]
+        first, last = self.spline.knots[[0, -1]]
         values = self.spline(np.clip(x, first, last))
         return np.asarray(values - 17 / 3 * np.maximum(x - last, 0))
 
@@ -183,18 +188,13 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
 
     ``S(f) = (4 / V) int_0^inf Phi(f/V, f_y) df_y`` (one-sided).
     """
-    from scipy.interpolate import CubicSpline  # slow to import
-
-    frequency = np.concatenate(
-        [
-            np.geomspace(LOWEST, 0.3, 120, endpoint=False),
-            np.linspace(0.3, 12, 480, endpoint=False),
-            TAIL,
-        ]
-    )
-    fy, wy = _spatial_panels()
-    density = [
-        4 * np.sum(wy * _filtered_spectrum(scale_ratio, obstruction, np.hypot(f, fy)))
-        for f in frequency
-    ]
-    return LogSpline(spline=CubicSpline(np.log(frequency), np.log(density)))
+    slow = np.geomspace(LOWEST, 0.3, 120, endpoint=False)
+    fast = np.concatenate([np.linspace(0.3, 12, 480, endpoint=False), TAIL])
+    density = []
+    for frequency, is_flat in ((slow, False), (fast, True)):
+        fy, wy = _spatial_panels(is_flat=is_flat)
+        for f in np.array_split(frequency, frequency.size // _AT_ONCE):
+            spectrum = _filtered_spectrum(scale_ratio, obstruction, np.hypot(f[:, None], fy))
+            density.append(4 * spectrum @ wy)
+    knots = np.log(np.concatenate([slow, fast]))
+    return LogSpline(spline=cubic_spline(knots, np.log(np.concatenate(density))))

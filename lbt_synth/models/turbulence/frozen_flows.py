@@ -16,6 +16,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear.cubic_spline import CubicSpline
 from lbt_synth.models.turbulence.atmosphere import (
     Atmosphere,
     LogSpline,
@@ -144,15 +145,13 @@ def _interpolate_over_scales(
     x: FloatArray, scale_ratio: FloatArray, obstruction: float, values: FloatArray
 ) -> None:
     """Fill in the logarithms of spectra that each have their own outer scale."""
-    from scipy.interpolate import PPoly  # slow to import
-
     octave = np.floor(np.log2(scale_ratio))
     for each in np.unique(octave):
         knots, coefficients = _octave_splines(int(each), obstruction)
         rows = np.flatnonzero(octave == each)
         place = 2 * (np.log2(scale_ratio[rows]) - each) - 1
         for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
-            spline = PPoly.construct_fast(coefficients @ terms, knots)
+            spline = CubicSpline(knots=knots, coefficients=coefficients @ terms)
             values[row] = LogSpline(spline=spline)(x[row])
 
 
@@ -166,4 +165,5 @@ def _octave_splines(octave: int, obstruction: float) -> tuple[FloatArray, FloatA
     ratios = 2.0 ** (octave + (nodes + 1) / 2)
     splines = [tilt_spline(float(ratio), obstruction).spline for ratio in ratios]
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, _TERMS - 1))
-    return splines[0].x, np.stack([spline.c for spline in splines], axis=-1) @ inverse.T
+    stacked = np.stack([spline.coefficients for spline in splines], axis=-1)
+    return splines[0].knots, stacked @ inverse.T
