@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
 from lbt_synth.design.facts import DesignFacts, without_units
-from lbt_synth.loop import close_loop, loop_margins, moving_gain
+from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import LoopFacts
@@ -62,6 +62,8 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
 
 def add_moving_gain(report: Report, design: Design) -> None:
     """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
+    from lbt_synth.loop import moving_gain
+
     if design.hardware is None:
         return
     loop = close_loop(design.hardware, design)

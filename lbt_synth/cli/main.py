@@ -95,7 +95,7 @@ def _terminate(*_: object) -> None:
 
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
-    gc.set_threshold(100_000, 50, 50)  # what imports and charts make stays until the end
+    gc.set_threshold(200_000, 50, 50)  # what imports and charts make stays until the end
     reopen_closed()
     try:
         try:
@@ -115,6 +115,7 @@ def entry_point() -> None:
         sys.stderr.flush()
     except OSError:
         discard(2)
+    gc.freeze()  # Python's exit would look through all of it once more
     sys.exit(status)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
@@ -16,7 +16,6 @@ from ruamel.yaml.constructor import ConstructorError, SafeConstructor
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
-from lbt_synth.config.end_to_end import build_end_to_end_setup
 from lbt_synth.config.plant_and_truth import (
     build_atmosphere,
     build_plant,
@@ -29,9 +28,7 @@ from lbt_synth.config.plant_and_truth import (
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.several_sensors import build_fused_plant, build_true_motions
-from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
-from lbt_synth.interop import EndToEndSetup
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
@@ -41,6 +38,10 @@ from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray
+
+if TYPE_CHECKING:
+    from lbt_synth.design import Design
+    from lbt_synth.interop import EndToEndSetup
 
 Checked = TypeVar("Checked", bound=BaseModel)
 _LARGEST_BYTES = 2**17  # of a file; ruamel.yaml may read no more than 30 kB per second
@@ -180,6 +181,8 @@ class Config(Summarised):
     @property
     def end_to_end(self) -> EndToEndSetup:
         """The end-to-end simulation; ConfigError if the file does not describe one."""
+        from lbt_synth.config.end_to_end import build_end_to_end_setup
+
         with name_file(self.source):
             return build_end_to_end_setup(self.settings, self.hardware, self.truth)
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design.certificate import Certificate, Check, certify_loop
+from lbt_synth.design.expected_disturbance import ModeDisturbance
 from lbt_synth.design.facts import RobustFacts
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.design.shaping.channel import (
@@ -18,13 +19,14 @@ from lbt_synth.design.shaping.channel import (
     laguerre_basis,
     mode_loop,
 )
-from lbt_synth.design.shaping.objectives import leaves
+from lbt_synth.design.shaping.objectives import VibrationBand, leaves
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
+from lbt_synth.models.spectra import SumSpectrum
 from lbt_synth.storage.rows import fill_row
 from lbt_synth.validation import (
     ComplexArray,
@@ -230,9 +232,19 @@ class ShapedDesign(Design):
         specs = enumerate(self.specifications)
         return tuple((mode, demand.label) for mode, spec in specs for demand in spec.demands)
 
+    def expected_disturbance(self) -> tuple[ModeDisturbance, ...]:
+        """Return what the specifications name on each mode."""
+        return tuple(map(_named_disturbance, self.specifications))
+
+    def violated_demands(self, controller: Controller) -> tuple[str, ...]:
+        """Return the demands that a controller violates, none where it couples the modes."""
+        from lbt_synth.design.violated_demands import violated_demands
+
+        return violated_demands(self, controller) or ()
+
     def facts(self) -> RobustFacts:
         """Return what the controller is, beside the limits over its bands."""
-        from lbt_synth.design.model_limits import shaped_limit
+        from lbt_synth.design.shaping.limit import shaped_limit
 
         limit_nm, above = shaped_limit(self)
         return fill_row(RobustFacts, self, limit_nm=limit_nm, above_limit_percent=above)
@@ -271,6 +283,16 @@ class ShapedDesign(Design):
         apart = float(np.max(np.abs(whole - single)))
         how = f"sensitivity at {f.size} frequencies"
         return Check("whole loop against its modes", apart, 1e-6, how)
+
+
+def _named_disturbance(specification: Specification) -> ModeDisturbance:
+    """Return what a specification names, at the first of its sensor gains."""
+    every = leaves(specification.objective)
+    parts = [part for part in every if part.sensor_gain == every[0].sensor_gain]
+    bands = tuple(part for part in parts if isinstance(part, VibrationBand))
+    found = [part.skirts if isinstance(part, VibrationBand) else part.turbulence for part in parts]
+    spectra = tuple(spectrum for spectrum in found if spectrum is not None)
+    return ModeDisturbance(spectrum=SumSpectrum(parts=spectra) if spectra else None, bands=bands)
 
 
 def _mode_checks(

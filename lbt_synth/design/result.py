@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from lbt_synth.design.certificate import (
     certify_infeasible,
     certify_loop,
 )
+from lbt_synth.design.expected_disturbance import ModeDisturbance, modelled_disturbance
 from lbt_synth.design.facts import FilterFacts, model_facts, summarise_design
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
@@ -32,10 +33,13 @@ from lbt_synth.linear.riccati.filtering import (
     gamma_riccati,
     kalman_riccati,
 )
-from lbt_synth.loop import AnyLoop, close_loop
+from lbt_synth.loop import close_loop
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
 from lbt_synth.storage.summaries import Summarised, Summary, count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
+
+if TYPE_CHECKING:
+    from lbt_synth.loop import AnyLoop
 
 ORIGIN = "distance from its Riccati filter"
 
@@ -101,6 +105,14 @@ class Design(Summarised):
     def several_sensors(self) -> bool:
         """Whether the design reads other sensors beside the loop's own, by a periodic filter."""
         return False
+
+    def expected_disturbance(self) -> tuple[ModeDisturbance, ...] | None:
+        """Return what the design expects on each mode; None if it was made for no disturbance."""
+        return None
+
+    def violated_demands(self, controller: Controller) -> tuple[str, ...] | None:
+        """Return the demands on the design that a controller violates; None if it has none."""
+        return None
 
     def facts(self) -> Any:
         """Return the numbers that this kind of design has, a row; None if there are none."""
@@ -185,6 +197,10 @@ class EstimatorDesign(Design, ABC):
     def knows_mirror(self) -> bool:
         """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
         return False
+
+    def expected_disturbance(self) -> tuple[ModeDisturbance, ...] | None:
+        """Return what the plant has on each mode; None for a bare estimation problem."""
+        return modelled_disturbance(self.problem)
 
     @abstractmethod
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:

@@ -140,10 +140,11 @@ def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
     >>> round(budget.noise_nm**2, 9)
     3.0
     """
-    from lbt_synth.loop.fusion.fused_loop import FusedLoop, fused_budget
+    if not isinstance(loop, ClosedLoop):
+        from lbt_synth.loop.fusion.fused_loop import FusedLoop, fused_budget
 
-    if isinstance(loop, FusedLoop):
-        return fused_budget(loop, truth)
+        if isinstance(loop, FusedLoop):
+            return fused_budget(loop, truth)
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     require_true_gain(loop.sensor_gain, truth)

@@ -60,10 +60,10 @@ class FilterKind:
 def _kind(*, several_sensors: bool) -> FilterKind:
     """Return the kind of a filter; its module is imported when a design is at hand."""
     if several_sensors:
-        from lbt_synth.methods.fused import FUSED
+        from lbt_synth.methods.filter_kinds.fused import FUSED
 
         return FUSED
-    from lbt_synth.methods.one_sensor import ONE_SENSOR
+    from lbt_synth.methods.filter_kinds.one_sensor import ONE_SENSOR
 
     return ONE_SENSOR
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,11 +12,8 @@ from lbt_synth.design import Design
 from lbt_synth.design.model_limits import above_percent, limit_or_none
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import (
-    AnyLoop,
-    BandLimit,
     ClosedLoop,
     Imaging,
-    ResidualLimit,
     broken_loops,
     least_residual,
     least_worst_residual,
@@ -27,6 +25,9 @@ from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, number
+
+if TYPE_CHECKING:
+    from lbt_synth.loop import AnyLoop, BandLimit, ResidualLimit
 
 _GRID = 65  # shifts over the range of errors, at least
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
-from lbt_synth.design.expected_disturbance import expected_disturbance
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop import (
     EnsembleVibration,
@@ -304,7 +303,7 @@ def robustness_map(
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
     """Return the errors at which the vibration that moves most is within a band of the design."""
     lines = [line.frequency_hz for line in stationary_vibrations(truth.vibrations)]
-    expected = expected_disturbance(design)
+    expected = design.expected_disturbance()
     if not lines or expected is None:
         return None
     most_hz = max(lines, key=lambda f: truth.frequency_shift_hz(f, 1.0))

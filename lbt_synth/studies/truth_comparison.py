@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from lbt_synth.config import Config
-from lbt_synth.design import Design, ShapedDesign
-from lbt_synth.design.violated_demands import violated_demands
+from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.loop import ClosedLoop, ResidualLimit
 from lbt_synth.methods.registry import reference_methods
@@ -111,12 +110,12 @@ def _warnings(
         return
     found = unexpected_power(design, loop, config.truth)
     yield from map(str, found)
-    if not isinstance(design, ShapedDesign):
-        return
     for name, (other, residual_nm) in others.items():
         if not residual_nm**2 < (1 - _CLEAR) * row.residual_nm**2:
             continue
-        violated = violated_demands(design, other.controller)
+        violated = design.violated_demands(other.controller)
+        if violated is None:
+            return
         if violated:
             yield f"{name} leaves less in the truth; it violates: {'; '.join(violated)}"
         elif not found:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.design.expected_disturbance import ModeDisturbance, expected_disturbance
+from lbt_synth.design.expected_disturbance import ModeDisturbance
 from lbt_synth.design.shaping.frequencies import spectrum_edges
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop import ClosedLoop, residual_budget
@@ -92,7 +92,7 @@ def unexpected_power(design: Design, loop: ClosedLoop, truth: Truth) -> tuple[Un
     >>> [(round(each.low_hz), round(each.true_nm)) for each in found]
     [(30, 100)]
     """
-    expected = expected_disturbance(design)
+    expected = design.expected_disturbance()
     if expected is None:
         return ()
     least_nm2 = _SHARE * residual_budget(loop, truth).rms_nm ** 2

@@ -188,6 +188,29 @@ def test_designing_needs_no_solver_that_it_does_not_use():
     assert not {"cvxpy", "control", "matplotlib", "astropy"} & loaded_after(code)
 
 
+def loaded_by_command(*words):
+    """Modules in memory after a command ran."""
+    return loaded_after(f"from lbt_synth.cli.main import main; main({[str(w) for w in words]})")
+
+
+@pytest.mark.parametrize("method", ["kalman", "hinf", "integrator"])
+def test_a_design_of_one_sensor_loads_what_it_uses(tmp_path, method):
+    """What a design does not need took half of its time."""
+    ours = (
+        *("design.fusion", "design.loop_shaping", "design.modal", "design.shaping.reduction"),
+        *("design.mixed", "design.polytopic", "design.lqg", "linear.moving_parameter"),
+        *("linear.periodic.riccati", "linear.output_feedback", "loop.fusion.fused_loop"),
+        *("loop.simulation", "interop", "config.end_to_end", "studies.study", "studies.robustness"),
+        *("report.figures", "report.page", "identification.fit", "identification.records"),
+    )
+    scipys = ("optimize", "interpolate", "sparse.csgraph", "spatial", "stats", "signal", "fft")
+    unused = {f"lbt_synth.{name}" for name in ours} | {f"scipy.{name}" for name in scipys}
+    unused |= {"cvxpy", "control", "matplotlib", "astropy", "bokeh", "jinja2", "fpdf"}
+    loaded = loaded_by_command("design", LBT_YAML, "--method", method, "-o", tmp_path / "d.fits")
+    assert "lbt_synth.design.certificate" in loaded
+    assert not unused & loaded
+
+
 @pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
 def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(monkeypatch, given, expected):
     """Two threads on two busy cores made a design of 5 s take a minute."""

@@ -6,7 +6,6 @@ from scipy.integrate import quad
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.design.expected_disturbance import expected_disturbance
 
 AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
 
@@ -14,7 +13,7 @@ AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz
 @pytest.mark.parametrize("design", [lbt.kalman, lambda plant: lbt.kalman(plant.full())])
 def test_a_filter_expects_the_variance_of_its_model(design):
     plant = lbt_axis_plant()
-    (found,) = expected_disturbance(design(plant))
+    (found,) = design(plant).expected_disturbance()
     (line,) = plant.vibrations
     f = line.frequency_hz
     near = quad(lambda x: found.spectrum.psd([x])[0], 0, 400, points=[f], limit=400)[0]
@@ -33,7 +32,7 @@ def test_a_shaped_design_expects_its_spectra_bands_and_skirts():
         functions=16,
         states=None,
     )
-    (found,) = expected_disturbance(design)
+    (found,) = design.expected_disturbance()
     assert found.bands == (band,)
     f = np.array([10.0, 20.0, 40.0])
     expected = plant.turbulence[0].psd(f) + band.skirts.psd(f)
@@ -41,8 +40,7 @@ def test_a_shaped_design_expects_its_spectra_bands_and_skirts():
 
 
 def test_an_integrator_and_a_bare_filter_expect_nothing_of_a_loop():
-    assert (
-        expected_disturbance(lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)) is None
-    )
+    plain = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
+    assert plain.expected_disturbance() is None
     bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    assert expected_disturbance(lbt.kalman(bare)) is None
+    assert lbt.kalman(bare).expected_disturbance() is None

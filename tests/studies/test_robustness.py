@@ -12,7 +12,6 @@ from support.plants import LBT_YAML, lbt_axis_plant
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
-from lbt_synth.design.expected_disturbance import expected_disturbance
 from lbt_synth.methods.registry import gain_robust_method
 from lbt_synth.methods.request import PlantInputs, design_request
 
@@ -295,7 +294,7 @@ def test_a_map_knows_the_band_of_its_design(kalman, settings):
 
     assert band(kalman, settings.truth) is None
     low, high = band(robust, settings.truth)
-    (edges,) = {(part.low_hz, part.high_hz) for part in expected_disturbance(robust)[0].bands}
+    (edges,) = {(part.low_hz, part.high_hz) for part in robust.expected_disturbance()[0].bands}
     assert (20.0 + low, 20.0 + high) == pytest.approx(edges)
     assert band(robust, replace(settings.truth, vibrations=(sinusoid(70.0),))) is None
     assert band(robust, replace(settings.truth, vibrations=())) is None

@@ -1,0 +1,1 @@
+"""Filters of one sensor and of several: how each is described, recorded and rebuilt."""
