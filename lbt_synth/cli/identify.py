@@ -20,6 +20,7 @@ from lbt_synth.identification import (
 def run(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
     places = loop_records.find_places(arguments, arguments.output)
+    earlier = loop_records.earlier_lines(arguments)
     record = loop_records.read_record(arguments)
     choose_unit(arguments, record.diameter_m)
     options = loop_records.identification_options(arguments, record)
@@ -41,7 +42,7 @@ def run(arguments: Namespace) -> Report:
             record,
             readings.values,
             channels=readings.channels,
-            earlier=loop_records.earlier_lines(arguments.earlier_model),
+            earlier=earlier,
         )
         loop_records.add_accelerometers(report, found)
     report.notes += [loop_records.marked_note(note) for note in notes]

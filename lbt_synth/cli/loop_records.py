@@ -34,6 +34,7 @@ from lbt_synth.identification.accelerometers.readings import (
     fill_missing,
     load_readings,
 )
+from lbt_synth.identification.accelerometers.swapped import EarlierLine
 from lbt_synth.identification.auto import RecordedDesign
 from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.fit.model_tables import axis_names, model_tables
@@ -144,7 +145,11 @@ def _expected_lines(
         lines += load_lines([(f, arguments.lines_error_hz) for f in arguments.lines_hz])
     if arguments.lines_file is not None:
         lines += load_lines(arguments.lines_file)
-    if arguments.accelerometers is not None:
+    if arguments.accelerometers is None:
+        for option in ("accelerometer_rate_hz", "acceleration_unit"):
+            if getattr(arguments, option) is not None:
+                raise ProblemError(f"--{option.replace('_', '-')} goes with --accelerometers.")
+    else:
         if isinstance(record, SpectrumRecord):
             raise ProblemError(
                 "accelerometers are compared with the recorded series; got a spectrum. Give their "
@@ -170,9 +175,19 @@ def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
     )
 
 
-def earlier_lines(path: str | None) -> list[tuple[float, dict[str, complex]]]:
+def earlier_lines(arguments: Namespace) -> list[EarlierLine]:
     """Return how channels moved with each line of an earlier configuration, if there is one."""
-    vibrations = [] if path is None else load_config(path).settings.model.vibrations or []
+    path = arguments.earlier_model
+    if path is None:
+        return []
+    if arguments.accelerometers is None:
+        raise ProblemError("--earlier-model goes with --accelerometers.")
+    vibrations = load_config(path).settings.model.vibrations or []
+    if not any(line.accelerometers for line in vibrations):
+        raise ProblemError(
+            f"{path} must say how accelerometers move, for --earlier-model; no vibration of its "
+            "model does. Try what identify --accelerometers wrote."
+        )
     return [
         (
             line.frequency_hz,

@@ -65,8 +65,6 @@ def add_prior_knowledge(parser: ArgumentParser) -> None:
     add_option(known, "--accelerometer-rate-hz", float, text)
     text = f"their unit: {', '.join(M_S2)} (default m/s2)"
     add_option(known, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
-    text = "earlier configuration with the same accelerometers, to find exchanged channels"
-    add_option(known, "--earlier-model", str, text)
     add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
     add_option(known, "--most-lines", int, "most vibrations per axis", 20)
 
