@@ -3,7 +3,8 @@
 Given the wavefront, the readings of a channel are normal with the mean ``expected F`` and the
 variance ``noise + F* unseen F``: what the wavefront leaves open of the lines moves the channel,
 too. The factors F are found with these weights, in turn with the noise, whose median is robust
-against lines of the channel's own.
+against lines of the channel's own. An error of a sensor gain moves all factors in one direction;
+it has its own part in their errors.
 """
 
 from __future__ import annotations
@@ -28,11 +29,19 @@ class BandFit:
 
     readings: ComplexArray  # (f,): without the lines of other bands
     factors: ComplexArray  # (lines,)
-    variances: FloatArray  # (lines,): of the complex factors
+    variances: FloatArray  # (lines,): of the complex factors, for the gains of the model
+    slopes: ComplexArray  # (lines, axes): of the factors, for a standard error of each sensor gain
     chances: FloatArray  # (lines,): that a channel without a line would show as much
     coherences: FloatArray  # (lines,)
     noise: FloatArray  # (lines,): density near each line [(m/s^2)^2/Hz]
     weights: FloatArray  # (f,): inverse variances
+
+    def errors(self, j: int) -> tuple[float, float]:
+        """Return the standard errors of a factor along itself, and across: of size and phase."""
+        turned = self.slopes[j] * np.exp(-1j * np.angle(self.factors[j]))
+        scatter = self.variances[j] / 2
+        along, across = (np.sqrt(scatter + np.sum(part**2)) for part in (turned.real, turned.imag))
+        return float(along), float(across)
 
 
 def fit_band(band: LineBand, channel: int, others: ComplexArray) -> BandFit:
@@ -55,7 +64,9 @@ def fit_band(band: LineBand, channel: int, others: ComplexArray) -> BandFit:
         open_part = np.einsum("j,fjk,k->f", whole.conj(), band.unseen, whole).real
     inverse = np.linalg.pinv(info)
     variances = np.diag(inverse @ _spread(np.sqrt(weights)[:, None] * x, band) @ inverse).real
-    return _judge(band, a, factors, variances, noise, weights)
+    change = np.einsum("fja,j->fa", band.moved, whole)
+    slopes = np.asarray(-inverse @ (x.conj().T @ (weights[:, None] * change)))
+    return _judge(band, a, factors, variances, slopes, noise, weights)
 
 
 def _spread(rows: ComplexArray, band: LineBand) -> ComplexArray:
@@ -69,6 +80,7 @@ def _judge(
     a: ComplexArray,
     factors: ComplexArray,
     variances: FloatArray,
+    slopes: ComplexArray,
     noise: float,
     weights: FloatArray,
 ) -> BandFit:
@@ -100,6 +112,7 @@ def _judge(
         readings=a,
         factors=factors,
         variances=variances,
+        slopes=slopes,
         chances=chances,
         coherences=coherences,
         noise=own,

@@ -75,9 +75,24 @@ def clock_shift(pairs: Sequence[Pair], largest: float) -> ClockShift:
     misfit, others = 2 * float(both[0][0] - both[1][0]), len(pairs) - 1
     if others and not rivals.any() and chdtrc(others, misfit) > _CHANCE:
         spread = np.sqrt(max(misfit / others, 1.0))
-        return ClockShift(frames=place, error_frames=float(error * spread), by_phases=True)
+        error = float(np.hypot(error * spread, _gain_error(pairs)))
+        return ClockShift(frames=place, error_frames=error, by_phases=True)
     place, error = _peak(pairs, float(lags[np.argmax(free)]), 0)
     return ClockShift(frames=place, error_frames=error, by_phases=False)
+
+
+def _gain_error(pairs: Sequence[Pair]) -> float:
+    """Return what errors of the sensor gains leave of the shift by phases [frames].
+
+    They turn the factors of all lines and channels at once.
+    """
+    slope, size = 0.0, 0.0
+    for band, fit, j, _ in pairs:
+        turn = (fit.slopes[j] / fit.factors[j]).imag  # [rad] per standard error of each gain
+        angle = float(np.mean(band.angle[band.core[:, j]]))
+        weight = 2 * abs(fit.factors[j]) ** 2 / fit.variances[j]
+        slope, size = slope + weight * angle * turn, size + weight * angle**2
+    return float(np.linalg.norm(slope / size))
 
 
 def _evidence(pairs: Sequence[Pair], lags: FloatArray) -> tuple[FloatArray, FloatArray]:

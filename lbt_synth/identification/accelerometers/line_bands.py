@@ -34,6 +34,7 @@ class LineBand:
     angle: FloatArray  # (f,) [rad per frame]
     readings: ComplexArray  # (f, channels) [m/s^2 per sqrt(Hz)]
     expected: ComplexArray  # (f, all lines): of a motion of 1 nm per nm [m/s^2 per sqrt(Hz)]
+    moved: ComplexArray  # (f, all lines, axes): change of it for a standard error of each gain
     unseen: FloatArray  # (f, all lines, all lines): covariance that the wavefront leaves of it
     core: BoolArray  # (f, lines): frequencies of the lines themselves
     follows: BoolArray  # (f - 1,): whether a value is a neighbour of the one before
@@ -43,14 +44,19 @@ def line_bands(
     model: IdentifiedModel,
     lines: Sequence[IdentifiedLine],
     wavefront: FloatArray,
+    moved: FloatArray,
     readings: FloatArray,
     stretches: Sequence[tuple[int, int]],
 ) -> list[LineBand]:
-    """Return the bands of all lines, wavefront (frames, axes) and readings (frames, channels)."""
-    rate = model.frame_rate_hz
+    """Return the bands of all lines, wavefront (frames, axes) and readings (frames, channels).
+
+    ``moved`` (frames, axes) is the change of the wavefront for a standard error of its sensor gain.
+    """
+    rate, axes = model.frame_rate_hz, wavefront.shape[1]
     length = max(stop - start for start, stop in stretches)
     kept = [each for each in stretches if each[1] - each[0] >= length / 4]
-    parts = [_transform(np.hstack([wavefront, readings])[start:stop], rate) for start, stop in kept]
+    series = np.hstack([wavefront, moved, readings])
+    parts = [_transform(series[start:stop], rate) for start, stop in kept]
     frequency = np.concatenate([part[0] for part in parts])
     values = np.concatenate([part[1] for part in parts])
     shapes = np.concatenate(
@@ -60,14 +66,14 @@ def line_bands(
         ]
     )
     follows = np.diff(frequency) > 0
-    z, a = values[:, : wavefront.shape[1]], values[:, wavefront.shape[1] :]
+    z, step, a = np.split(values, [axes, 2 * axes], axis=1)
     out = []
     resolution = rate / length
     for group, low, high in _groups(lines, resolution):
         inside = np.flatnonzero((frequency >= low) & (frequency <= high))
         f = frequency[inside]
         own = [lines[j] for j in group]
-        estimate, unseen = _wiener(model, lines, shapes[inside], f, z[inside])
+        gain, unseen = _wiener(model, lines, shapes[inside], f)
         second = -NM * (2 * rate * np.sin(np.pi * f / rate)) ** 2
         reach = [_reach(line, resolution, _CORE_HALF_WIDTHS, _CORE_BINS) for line in own]
         centres = np.array([line.frequency_hz for line in own])
@@ -76,7 +82,8 @@ def line_bands(
                 lines=tuple(group),
                 angle=2 * np.pi * f / rate,
                 readings=a[inside],
-                expected=second[:, None] * estimate,
+                expected=second[:, None] * np.einsum("fja,fa->fj", gain, z[inside]),
+                moved=second[:, None, None] * gain * step[inside, None],
                 unseen=second[:, None, None] ** 2 * unseen,
                 core=np.abs(f[:, None] - centres) <= reach,
                 follows=(np.diff(inside) == 1) & follows[inside[:-1]],
@@ -145,9 +152,8 @@ def _wiener(
     lines: Sequence[IdentifiedLine],
     shapes: FloatArray,
     frequency: FloatArray,
-    wavefront: ComplexArray,
-) -> tuple[ComplexArray, FloatArray]:
-    """Return the estimate of each line (f, lines) and the covariance of its error."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return the gain that estimates each line, (f, lines, axes), and its error's covariance."""
     axes = len(model.axes)
     along = np.array([(line.direction or (1.0,))[:axes] for line in lines])  # (lines, axes)
     background = [np.interp(frequency, a.frequency_hz, a.background_nm2_hz) for a in model.axes]
@@ -155,6 +161,5 @@ def _wiener(
     total += np.stack(background, axis=1)[:, :, None] * np.eye(axes)
     cross = shapes[:, :, None] * along  # (f, lines, axes)
     gain = np.linalg.solve(total, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
-    estimate = np.einsum("fja,fa->fj", gain, wavefront)
     unseen = shapes[:, :, None] * np.eye(len(lines)) - np.einsum("fja,fka->fjk", gain, cross)
-    return estimate, unseen
+    return gain, unseen

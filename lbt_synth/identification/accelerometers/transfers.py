@@ -156,6 +156,7 @@ def accelerometer_transfers(
     line, the factors maximise the likelihood of the channel given the wavefront: what the
     wavefront's noise leaves open of the line, by the spectra of the model, is a second noise that
     grows with the factor, so noise of the wavefront does not bias it (errors in variables).
+    Standard errors count those of the model's sensor gains, which turn all factors together.
 
     Parameters
     ----------
@@ -272,7 +273,10 @@ def _lay_and_fit(
     limit: float,
 ) -> tuple[int, list[Pair]]:
     """Return the whole frames by which readings come late, and fits of them without that."""
-    series, lag = record.pseudo_open_loop(model.sensor_gains), 0
+    gains, lag = np.array(model.sensor_gains), 0
+    errors = np.array([axis.sensor_gain_error or 0.0 for axis in model.axes])
+    series = record.pseudo_open_loop(gains)
+    moved = record.pseudo_open_loop(gains + errors) - series
     for step in range(_PASSES):
         frames = np.arange(record.frames) + lag
         known = (frames >= 0) & (frames < len(readings))
@@ -284,7 +288,7 @@ def _lay_and_fit(
                 f"record and accelerations must have {_SHORTEST} usable frames in a row side by "
                 f"side; they have {record.frames} and {len(readings)} frames."
             )
-        bands = line_bands(model, lines, series, readings[index], stretches)
+        bands = line_bands(model, lines, series, moved, readings[index], stretches)
         if step == 0 and (extra := likeliest_lag(bands, largest)):
             lag += extra
             continue
@@ -343,7 +347,7 @@ def _row(
 ) -> TransferRow:
     band, fit, j, _ = pair
     place, factor = places[band.lines[j]], fit.factors[j]
-    error = float(np.sqrt(fit.variances[j] / 2))
+    error, across = fit.errors(j)
     return TransferRow(
         channel=name,
         line=place,
@@ -351,7 +355,7 @@ def _row(
         motion_nm_per_nm=float(abs(factor)),
         motion_error_nm_per_nm=error,
         phase_deg=float(np.degrees(np.angle(factor))),
-        phase_error_deg=float(min(np.degrees(error / max(abs(factor), 1e-300)), 180.0)),
+        phase_error_deg=float(min(np.degrees(across / max(abs(factor), 1e-300)), 180.0)),
         coherence=float(fit.coherences[j]),
         chance=_chance(pair),
         useful=_chance(pair) < limit,

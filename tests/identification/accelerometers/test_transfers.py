@@ -1,6 +1,6 @@
 """How channels of accelerometers move with lines: factors, clocks, and what is left out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -82,6 +82,25 @@ def test_factors_shift_and_noise_are_those_of_the_channels():
     for row in found.channels:
         assert row.noise_m_s2 == pytest.approx(noise, rel=0.2)
     assert found.channels[1].verdict == "used for 31.1, 56 Hz"
+
+
+def test_errors_count_that_of_the_sensor_gain():
+    """Of an open loop the gain scales the wavefront: motions are as uncertain as it, phases not."""
+    it, channel = night(), reading(2.0, -0.7, 1.3, noise=2e-3)
+    axes = tuple(replace(axis, sensor_gain_error=0.05) for axis in it.model.axes)
+    unsure = replace(it.model, axes=axes)
+    exact, found = (
+        lbt.identification.accelerometer_transfers(model, it.record, channel)
+        for model in (it.model, unsure)
+    )
+    for known, row in zip(exact.transfers, found.transfers, strict=True):
+        assert row.motion_nm_per_nm == known.motion_nm_per_nm
+        # a gain of 1.05 instead of 1 makes the wavefront smaller by 1 - 1 / 1.05
+        scale = row.motion_nm_per_nm * (1 - 1 / 1.05)
+        expected = np.hypot(known.motion_error_nm_per_nm, scale)
+        assert row.motion_error_nm_per_nm == pytest.approx(expected, rel=0.02)
+        assert row.phase_error_deg == pytest.approx(known.phase_error_deg, rel=0.02)
+    assert found.shift.error_frames == pytest.approx(exact.shift.error_frames, rel=0.02)
 
 
 @pytest.mark.parametrize("age", [0, 6, 140])
