@@ -12,11 +12,10 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.identification.commands.fitted_gains import judge_fitted_gains
-from lbt_synth.identification.commands.gain_interval import allowed_gains
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.design_for_gains import design_for_gains, is_stable_at_gains
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.likeliest_gain import identify_likeliest
+from lbt_synth.identification.likeliest_gain import identify_likeliest, identify_with_gains
 from lbt_synth.identification.method_choice import MethodChoice, choose_method
 from lbt_synth.identification.prediction.comparison import (
     PredictionRow,
@@ -174,11 +173,11 @@ def design_from_record(
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
-    allowed = None if record.commands is None or sensor_gain is not None else allowed_gains(record)
-    gains |= {"announced": announced, "allowed": allowed}
-    fit_model = partial(identify_likeliest, record, **gains, **options)
+    options |= gains | {"announced": announced}
+    first, _ = split_halves(record.stretches(), record.frames)
+    half, allowed = identify_with_gains(record, stretches=first, **options)
+    fit_model = partial(identify_likeliest, record, allowed=allowed, **options)
     design = partial(_design, gamma_ratio=gamma_ratio)
-    half = fit_model(stretches=split_halves(record.stretches(), record.frames)[0])
     if allowed is not None:
         assumptions += _judge_gains(half, accept_record)
     found = None

@@ -1,4 +1,4 @@
-"""The model of a record at the likelier of two sensor gains, where the fit has several optima."""
+"""The model of a record at the likeliest sensor gain, and the gains that record and model allow."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.identification.commands.gain_interval import allowed_gains
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.records.record import LoopRecord
@@ -15,39 +16,38 @@ from lbt_synth.validation import FloatArray
 _OUTSIDE = 1.3  # factor beyond an interval of gains
 
 
+def identify_with_gains(
+    record: LoopRecord, **options: Any
+) -> tuple[IdentifiedModel, FloatArray | None]:
+    """Identify a record; return the model and the sensor gains that it allows, (axes, 2).
+
+    None for an open loop, or a gain that is given. Where the coarse spectrum asks for other gains
+    than the fit, and a fit that is held at these is clearly less likely, the fit decides.
+    ``options`` are those of :func:`identify`.
+    """
+    model = identify(record, **options)
+    if record.commands is None or options.get("sensor_gain") is not None:
+        return model, None
+    allowed = allowed_gains(record, model)
+    if agrees(model, allowed):
+        return model, allowed
+    best, excluded = _compare(record, model, allowed, options)
+    own = np.repeat(np.array(best.sensor_gains)[:, None], 2, axis=1)
+    return best, own if excluded else allowed
+
+
 def identify_likeliest(
     record: LoopRecord, *, allowed: FloatArray | None, **options: Any
 ) -> IdentifiedModel:
     """Identify a record, from other sensor gains as well if the first is one that it excludes.
 
     Wide resonances may carry a fit to a gain far from the true one, where the likelihood has
-    another optimum.
-
-    Parameters
-    ----------
-    record : LoopRecord
-        The record.
-    allowed : (axes, 2) ndarray or None
-        Intervals of :func:`allowed_gains`; None for an open loop, or a gain that is given.
-    **options
-        Those of :func:`identify`.
-
-    Returns
-    -------
-    IdentifiedModel
-        The likelier model by the criterion of the fit, with a note if it is not the first.
-
-    Raises
-    ------
-    ProblemError, NumericalError
-        As :func:`identify`.
+    another optimum. ``allowed`` and ``options`` are those of :func:`identify_with_gains`.
     """
     model = identify(record, **options)
     if allowed is None or options.get("sensor_gain") is not None or agrees(model, allowed):
         return model
-    begun = options | {"sensor_gain": np.sqrt(np.prod(allowed, axis=1)).tolist(), "start": None}
-    other = identify(record, **options | {"start": identify(record, **begun)})
-    return other if _criterion(other) < _criterion(model) else model
+    return _compare(record, model, allowed, options)[0]
 
 
 def agrees(model: IdentifiedModel, allowed: FloatArray) -> bool:
@@ -57,11 +57,27 @@ def agrees(model: IdentifiedModel, allowed: FloatArray) -> bool:
     return bool(near.all())
 
 
+def _compare(
+    record: LoopRecord, model: IdentifiedModel, allowed: FloatArray, options: dict[str, Any]
+) -> tuple[IdentifiedModel, bool]:
+    """Return the likeliest of a model and those from allowed gains; whether these are excluded."""
+    inside = options | {"sensor_gain": np.sqrt(np.prod(allowed, axis=1)).tolist()}
+    held = [identify(record, **inside | {"start": start}) for start in (None, model)]
+    begun = min(held, key=_criterion)
+    other = identify(record, **options | {"start": begun})
+    best = min(model, other, key=_criterion)
+    excluded = _criterion(begun) > _criterion(best) + _price(best)
+    return best, excluded and not agrees(best, allowed)
+
+
+def _price(model: IdentifiedModel) -> float:
+    """Return what a component must add to the logarithm of the likelihood."""
+    values = max(float(np.sum(axis.data.count)) for axis in model.axes)
+    return 0.5 * PARAMETERS * float(np.log(values))
+
+
 def _criterion(model: IdentifiedModel) -> float:
     """Return minus the logarithm of the likelihood plus the price of all components."""
-    total = 0.0
-    for axis in model.axes:
-        fitted, count = axis.fitted_model, float(np.sum(axis.data.count))
-        price = 0.5 * PARAMETERS * np.log(count)
-        total += fitted.contrast + price * len(fitted.spectrum.components)
-    return float(total)
+    price = _price(model)
+    fits = [axis.fitted_model for axis in model.axes]
+    return float(sum(fit.contrast + price * len(fit.spectrum.components) for fit in fits))

@@ -49,6 +49,61 @@ def slow() -> lbt.models.ARModel:
     )
 
 
+def resonant_record(seed: int = 0) -> lbt.identification.LoopRecord:
+    """Return a loop of sensor gain 0.9 under frozen flow, two wide resonances and a line."""
+    resonances = ((60.0, 0.1, 60.0, 20.0), (110.0, 0.08, 30.0, 120.0), (31.0, 0.004, 40.0, 70.0))
+    return _directed_record(500.0, 0.9, 0.4, 5.0, resonances, 12.0, seed)
+
+
+def crowded_record(seed: int = 2) -> lbt.identification.LoopRecord:
+    """Return a loop of little noise under two strong resonances at the places of two lines."""
+    resonances = (
+        (106.9, 0.0055, 80.4, 84.9),
+        (142.77, 0.0039, 89.2, 104.1),
+        (104.43, 0.0024, 11.2, 8.1),
+        (94.86, 0.1559, 44.8, 179.9),
+        (103.68, 0.1455, 87.2, 148.3),
+    )
+    return _directed_record(1000.0, 0.491, 0.386, 2.05, resonances, 10.06, seed)
+
+
+def _directed_record(
+    rate_hz: float,
+    sensor_gain: float,
+    gain: float,
+    noise_nm: float,
+    resonances: tuple[tuple[float, float, float, float], ...],
+    wind_speed_m_s: float,
+    seed: int,
+) -> lbt.identification.LoopRecord:
+    """Return half a minute of an integrator; resonances by frequency, damping, rms, direction."""
+    path = lbt.LoopHardware(frame_rate_hz=rate_hz)
+    truth = lbt.Truth(
+        turbulence=lbt.Atmosphere(
+            seeing_arcsec=1.057,
+            outer_scale_m=39.57,
+            wind_speed_m_s=wind_speed_m_s,
+            diameter_m=8.22,
+        ),
+        vibrations=tuple(
+            lbt.Vibration(
+                frequency_hz=f,
+                damping=z,
+                rms_nm=r,
+                direction=(np.cos(np.deg2rad(a)), np.sin(np.deg2rad(a))),
+            )
+            for f, z, r, a in resonances
+        ),
+        noise_nm=noise_nm,
+        sensor_gain=sensor_gain,
+    )
+    law, frames = lbt.integrator(path, gain=gain).controller, int(30 * rate_hz)
+    run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=500)
+    return lbt.identification.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=rate_hz, delay_frames=2, unit="nm"
+    )
+
+
 def spliced_record(
     seeds: tuple[int, ...] = (0,), *, delay: float = 2.0, **options
 ) -> lbt.identification.LoopRecord:

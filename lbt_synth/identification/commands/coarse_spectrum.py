@@ -115,8 +115,12 @@ def coarse_axis(
     *,
     independent: float,
     frame_rate_hz: float,
+    resonances: Sequence[tuple[float, float]] = (),
 ) -> CoarseAxis:
-    """Return the powers of one axis, given (segments, f) and guesses (n, segments, f)."""
+    """Return the powers of one axis, given (segments, f) and guesses (n, segments, f).
+
+    ``resonances`` are known ones, by frequency [Hz] and damping ratio.
+    """
     power = np.mean(abs(measured) ** 2, axis=0)
     is_peak, lines, width = _find_peaks(frequency_hz, power)
     band = _bands(frequency_hz[~is_peak], frame_rate_hz)
@@ -132,14 +136,17 @@ def coarse_axis(
         means = np.array([np.bincount(band, weights=row) / size for row in rows])
         return means.reshape((*values.shape[:-1], size.size))
 
-    f = merge(frequency_hz)
-    square = half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
+    def warp(f: FloatArray) -> FloatArray:
+        return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
+
+    square = warp(merge(frequency_hz))
+    known = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in resonances]
     return CoarseAxis(
         count=np.asarray(size * independent, dtype=np.float64),
         bands=Quadratic(*map(merge, quadratic)),
         peak_count=independent,
         peaks=Quadratic(*(part[..., is_peak] for part in quadratic)),
-        shapes=_background_shapes(square, frequency_hz[0]),
+        shapes=_background_shapes(square, frequency_hz[0], known),
         square=square,
         lines=np.log(lines),
         line_width=width,
@@ -180,7 +187,9 @@ def _bands(frequency_hz: FloatArray, frame_rate_hz: float, *, least: int = 1) ->
     return np.asarray(band)
 
 
-def _background_shapes(square: FloatArray, lowest_hz: float) -> FloatArray:
+def _background_shapes(
+    square: FloatArray, lowest_hz: float, known: Sequence[FloatArray]
+) -> FloatArray:
     """Return the shapes of noise, turbulence and wide resonances over the bands, (k, b).
 
     Nothing but noise and the skirts of slower parts has a place at high frequencies: there the
@@ -191,7 +200,7 @@ def _background_shapes(square: FloatArray, lowest_hz: float) -> FloatArray:
     bumps = [
         resonance(square, centre, _BUMP_DAMPING) for centre in np.geomspace(*_BUMPS_HZ, _BUMPS)
     ]
-    shapes = np.array([np.ones_like(square), *falls, *bumps])
+    shapes = np.array([np.ones_like(square), *falls, *bumps, *known])
     return np.asarray(shapes / np.max(shapes, axis=1, keepdims=True))
 
 

@@ -12,6 +12,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification.commands.control_law import record_control_law
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
 from lbt_synth.identification.commands.plausibility import could_have_run
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import close_loop, stable_sensor_gains
 from lbt_synth.validation import BoolArray, FloatArray
@@ -22,13 +23,16 @@ _NEAR = np.geomspace(0.7, 1.43, 21)  # of the best gain, itself included
 _FAR = 6.0  # nats below the best gain that a record still allows
 
 
-def allowed_gains(record: LoopRecord) -> FloatArray:
+def allowed_gains(record: LoopRecord, model: IdentifiedModel | None = None) -> FloatArray:
     """Return the interval of sensor gains of each axis that a closed-loop record allows.
 
     Parameters
     ----------
     record : LoopRecord
         A closed-loop record with its delay.
+    model : IdentifiedModel, optional
+        Its resonances are part of the coarse spectrum, which has no wide ones of its own above
+        25 Hz and would explain such by a wrong gain.
 
     Returns
     -------
@@ -59,7 +63,7 @@ def allowed_gains(record: LoopRecord) -> FloatArray:
     True
     """
     everything = np.tile([_LEAST, _MOST], (record.axes, 1))
-    coarse = CoarseRecord(record)
+    coarse = CoarseRecord(record, None if model is None else _resonances(model))
     if not coarse.stretches:
         return everything
     given = Guess(kind="as given")
@@ -78,6 +82,13 @@ def allowed_gains(record: LoopRecord) -> FloatArray:
     inside = np.clip(intervals, running[0], running[-1])
     apart = (intervals[:, 0] > running[-1]) | (intervals[:, 1] <= running[0])
     return np.where(apart[:, None], [running[0], running[-1]], inside)
+
+
+def _resonances(model: IdentifiedModel) -> list[list[tuple[float, float]]]:
+    """Return frequency [Hz] and damping ratio of the components of each axis."""
+    to_hz = model.frame_rate_hz / (2 * np.pi)
+    each = (axis.fitted_model.spectrum.components for axis in model.axes)
+    return [[(c.frequency * to_hz, c.damping_ratio) for c in components] for components in each]
 
 
 def _has_run(record: LoopRecord, gains: FloatArray) -> BoolArray:

@@ -147,10 +147,19 @@ def _matrices(axes: int) -> Iterator[FloatArray]:
 
 
 class CoarseRecord:
-    """The transforms of one record, on which guesses are compared; none without ``stretches``."""
+    """The transforms of one record, on which guesses are compared; none without ``stretches``.
 
-    def __init__(self, record: LoopRecord) -> None:
+    ``resonances`` are known ones that the spectra of the axes may show, by frequency [Hz] and
+    damping ratio.
+    """
+
+    def __init__(
+        self,
+        record: LoopRecord,
+        resonances: Sequence[Sequence[tuple[float, float]]] | None = None,
+    ) -> None:
         self.record = record
+        self.resonances = [()] * record.axes if resonances is None else resonances
         trimmed = [(a + _MARGIN, b - _MARGIN) for a, b in record.stretches()]
         self.stretches = [(a, b) for a, b in trimmed if b - a >= _SHORTEST]
         self._known: dict[tuple[object, ...], ComplexArray] = {}
@@ -218,6 +227,7 @@ class CoarseRecord:
             corrections,
             independent=self.independent,
             frame_rate_hz=self.record.frame_rate_hz,
+            resonances=self.resonances[i],
         )
         high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
         level = np.mean(abs(self.measured[i][:, high]) ** 2)

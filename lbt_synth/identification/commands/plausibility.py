@@ -12,7 +12,7 @@ from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
 from lbt_synth.identification.commands.law_controller import law_controller
 from lbt_synth.identification.fit.fitting import Search, cost
-from lbt_synth.identification.fit.order_search import find_components
+from lbt_synth.identification.fit.order_search import find_components, try_other_gains
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
@@ -65,13 +65,16 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     return float(np.max(abs(poles[moves]), initial=0.0))
 
 
-def finer_saving(coarse: CoarseRecord, guess: Guess) -> float:
+def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float) -> float:
     """Return how much likelier a guess is than the record as given, by the model of the fit.
 
     Both have the lines and the wide resonances that they need, at the price of the criterion: the
-    coarse spectrum has few.
+    coarse spectrum has few. Before a saving is clear, the record as given is fitted from other
+    gains as well.
     """
-    return _cost(coarse, Guess(kind="as given")) - _cost(coarse, guess)
+    given, other = Guess(kind="as given"), _cost(coarse, guess)
+    saving = _cost(coarse, given) - other
+    return saving if saving < clear else _cost(coarse, given, other_gains=True) - other
 
 
 def finer_saving_of_gain(coarse: CoarseRecord, guess: Guess, gains: Sequence[float]) -> float:
@@ -79,7 +82,9 @@ def finer_saving_of_gain(coarse: CoarseRecord, guess: Guess, gains: Sequence[flo
     return min(_cost(coarse, guess, gain) for gain in gains) - _cost(coarse, guess)
 
 
-def _cost(coarse: CoarseRecord, guess: Guess, gain: float | None = None) -> float:
+def _cost(
+    coarse: CoarseRecord, guess: Guess, gain: float | None = None, *, other_gains: bool = False
+) -> float:
     """Return the criterion of the best model of a guess, over all axes, at any gain or at one."""
     record = coarse.record
     corrections = coarse.corrections(guess)
@@ -94,7 +99,10 @@ def _cost(coarse: CoarseRecord, guess: Guess, gain: float | None = None) -> floa
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         search = Search(data=data, gain=gain, most_lines=_LINES)
         try:
-            total += cost(search, find_components(search, None, rounds=_ROUNDS))
+            found = find_components(search, None, rounds=_ROUNDS)
+            if other_gains:
+                found, _ = try_other_gains(search, found)
+            total += cost(search, found)
         except NumericalError:
             return np.inf
     return total

@@ -36,7 +36,7 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each
 
 AS_GIVEN = "as given"
 _CLEAR = 20.0  # nats that decide
-_CLEAR_FINER = 8.0  # the same by the criterion of the fit, beyond its price of resonances
+_CLEAR_FINER = 8.0  # the same by the criterion of the fit, where a shift is of whole frames
 _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
@@ -266,8 +266,9 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     shown = nats >= clear / 2 or np.isinf(score[0])
     finer = 0.0
     if not surprising[0] or surprising[best]:  # the law does not ask for it
-        finer = finer_saving(coarse, guess) if nats >= clear else 0.0
-        shown = finer >= _CLEAR_FINER and not part_of_a_frame
+        least = _CLEAR_FINER if guess.shift_frames % 1 == 0 else _CLEAR
+        finer = finer_saving(coarse, guess, clear=least) if nats >= clear else 0.0
+        shown = finer >= least and not part_of_a_frame
     if not shown:
         return replace(given, rival=guesses[best], rival_nats=finer)
     fine = coarse.compare([guess])

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import GAINS, LOWEST_LINE_HZ, MOST_LINES, Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.order_search import gain_ambiguity, search_model
+from lbt_synth.identification.fit.order_search import search_model, try_other_gains
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -134,8 +134,9 @@ def identify_axis(
         return describe_axis(search, model, relative or None, note)
     if not data.closed:
         return describe_axis(search, model, None, "1: of an open loop it has no meaning")
+    model, away = _compare_gains(search, model)
     own_error = standard_errors(model.spectrum, parameter_covariance(model)).log_gain
-    error = _gain_error(search, model, own_error or float("inf"))
+    error = max(own_error, away) if away > _APART * own_error else own_error
     if error <= _GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
         if error > own_error:  # what the gain moves is as ambiguous
@@ -295,11 +296,9 @@ def estimate_averages(density: FloatArray) -> float | None:
     return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))
 
 
-def _gain_error(search: Search, model: FittedModel, error: float) -> float:
-    """Return the standard error of the logarithm of the gain, given that of the fit alone."""
+def _compare_gains(search: Search, model: FittedModel) -> tuple[FittedModel, float]:
+    """Return the likeliest model, and how far the gain of another is that is nearly as likely."""
     spectrum = model.spectrum
-    if error > _GAIN_ERROR or spectrum.drop_wide(WIDE_DAMPING) == spectrum:
-        return error
-    # a model with wide resonances may stand for another gain
-    away = gain_ambiguity(search, model)
-    return away if away > _APART * error else error
+    if spectrum.drop_wide(WIDE_DAMPING) == spectrum and not spectrum.colour:
+        return model, 0.0
+    return try_other_gains(search, model)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.integrate import trapezoid
@@ -44,6 +44,7 @@ _MOST_ROUNDS = 12
 _HALF = float(np.log(0.5))
 _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
+_OTHER_NOISE = 5.0  # log-likelihood by which white noise or a coloured one is excluded
 _COLOUR = 0.3  # of the noise, where a fit begins
 
 
@@ -77,25 +78,30 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
     return fitting.cost(search, model) + search.price * wide + coloured
 
 
-def gain_ambiguity(search: Search, best: FittedModel) -> float:
-    """Return how far the logarithm of the gain of another, nearly as likely model is.
+def try_other_gains(search: Search, model: FittedModel) -> tuple[FittedModel, float]:
+    """Return the likeliest model from several gains, and how far others of nearly its cost are.
 
-    Wide resonances can explain what a wrong gain leaves: other gains are tried, then fitted.
+    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves. The distance
+    is that of the logarithms of the gains.
     """
-    least, gain = fitting.cost(search, best), best.spectrum.log_gain
-    away = 0.0
-    for trial in _STARTING_GAINS:
-        if abs(float(np.log(trial)) - gain) < _SAME_GAIN:
+    spectrum, found = model.spectrum, [model]
+    for gain, colour in product(_STARTING_GAINS, sorted({spectrum.colour, 0.0})):
+        if colour == spectrum.colour and abs(np.log(gain) - spectrum.log_gain) < _SAME_GAIN:
             continue
+        begin = replace(search, gain=gain, colour=colour)
         try:
-            begin = replace(search, gain=trial, colour=best.spectrum.colour)
-            other = find_components(begin, best.spectrum, rounds=_FEW_ROUNDS)
+            held = find_components(begin, replace(spectrum, colour=colour), rounds=_FEW_ROUNDS)
         except NumericalError:
             continue
-        made = fitting.fit(search, other.spectrum)
-        if made is not None and fitting.cost(search, made) < least + search.price:
-            away = max(away, abs(made.spectrum.log_gain - gain))
-    return away
+        free = fitting.fit(search, held.spectrum)
+        found += [] if free is None else [free]
+    best = min(found, key=lambda each: _cost_of_noise(search, each))
+    least, away = _cost_of_noise(search, best), 0.0
+    for each in found:
+        same = bool(each.spectrum.colour) == bool(best.spectrum.colour)
+        if _cost_of_noise(search, each) < least + (search.price if same else _OTHER_NOISE):
+            away = max(away, abs(each.spectrum.log_gain - best.spectrum.log_gain))
+    return (model if best is model else fitting.add_evidence(search, best)), away
 
 
 def find_components(

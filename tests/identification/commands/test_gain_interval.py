@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop
+from support.recorded_loops import resonant_record
 from support.wrong_commands import record
 
 import lbt_synth as lbt
@@ -17,6 +18,16 @@ def test_the_true_gain_is_allowed(seed) -> None:
     assert np.all(low < 0.7)
     assert np.all(high > 0.7)
     assert np.all(high / low < 2)
+
+
+def test_wide_resonances_are_known_from_a_model() -> None:
+    """The coarse spectrum alone explains them by a gain of 1.4 to 2, where the truth is 0.9."""
+    resonant = resonant_record()
+    assert np.all(allowed_gains(resonant)[:, 0] > 1.3)
+    low, high = allowed_gains(resonant, lbt.identify(resonant)).T
+    assert np.all(low < 1.3 * 0.9)
+    assert np.all(high > 0.9 / 1.3)
+    assert np.all(high / low < 1.6)
 
 
 def test_a_record_that_shows_nothing_allows_everything() -> None:

@@ -1,0 +1,87 @@
+"""Loops under wide resonances: is the sensor gain found, and what does the design of `auto` leave?
+
+    python benchmarks/wide_resonances.py [--records 24] [--first 0] [--seconds 30] [--auto]
+
+Loops of two axes at 500 or 1000 Hz with a delay of 2 frames, an integrator of gain 0.2 to 0.6,
+sensor gain 0.4 to 1, noise 2 to 25 nm, frozen flow, 1 to 5 lines as in wrong_commands.py and two
+resonances of damping 0.05 to 0.2. ``--auto`` designs from each record and gives the residual in
+the true loop, over that of an integrator of gain 0.4 in the same loop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+from wrong_commands import draw_lines, frozen_flow
+
+import lbt_synth as lbt
+
+
+def draw(seed: int, seconds: float) -> tuple[lbt.identification.LoopRecord, lbt.Truth]:
+    """Draw a loop, and record it."""
+    rng = np.random.default_rng([seed, 771])
+    rate = float(rng.choice([500.0, 1000.0]))
+    noise = float(np.exp(rng.uniform(np.log(2), np.log(25))))
+    sensor, gain = float(rng.uniform(0.4, 1.0)), float(rng.uniform(0.2, 0.6))
+    lines = list(draw_lines(rng, int(rng.integers(1, 6)), (0.002, 0.01)))
+    lines += draw_lines(rng, 2, (0.05, 0.2))
+    path = lbt.LoopHardware(frame_rate_hz=rate)
+    truth = lbt.Truth(
+        turbulence=frozen_flow(rng), vibrations=tuple(lines), noise_nm=noise, sensor_gain=sensor
+    )
+    law, frames = lbt.integrator(path, gain=gain).controller, int(seconds * rate)
+    run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=500)
+    record = lbt.identification.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=rate, delay_frames=2, unit="nm"
+    )
+    return record, truth
+
+
+def residual_nm(design: lbt.Design, record: lbt.identification.LoopRecord, truth: lbt.Truth):
+    """Return what a design leaves in the true loop; infinite if that is unstable."""
+    path = lbt.LoopHardware(frame_rate_hz=record.frame_rate_hz)
+    loop = lbt.close_loop(path, design.controller, sensor_gain=truth.sensor_gain)
+    return lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else np.inf
+
+
+def main() -> None:
+    """Print a line per record, and the summary."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--records", type=int, default=24)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--auto", action="store_true")
+    given = parser.parse_args()
+    deviations = []
+    for seed in range(given.first, given.first + given.records):
+        record, truth = draw(seed, given.seconds)
+        start, words = time.process_time(), ""
+        try:
+            model = lbt.design_from_record(record) if given.auto else lbt.identify(record)
+        except lbt.errors.LbtSynthError as error:
+            print(f"{seed:3d}  refused: {error}", flush=True)
+            continue
+        seconds = time.process_time() - start
+        if isinstance(model, lbt.identification.RecordedDesign):
+            usual = lbt.integrator(model.model.hardware, gain=0.4 / truth.sensor_gain)
+            left, its = (residual_nm(made, record, truth) for made in (model.design, usual))
+            words = f"  leaves {left:6.1f} nm, the integrator {its:6.1f}"
+            model = model.model
+        gain, error = model.sensor_gains[0], model.axes[0].sensor_gain_error
+        off = np.nan if error is None else (gain - truth.sensor_gain) / error
+        deviations.append(off)
+        print(
+            f"{seed:3d}  gain {truth.sensor_gain:.3f}  found {gain:.3f}  off by {off:5.1f} errors"
+            f"{words}  {seconds:5.1f} s",
+            flush=True,
+        )
+    z = np.array(deviations)
+    inside = 100 * np.array([np.nanmean(abs(z) < 1), np.nanmean(abs(z) < 2)])
+    print(f"deviations over their errors: rms {np.sqrt(np.nanmean(z**2)):.2f}, largest", end=" ")
+    print(f"{np.nanmax(abs(z)):.1f}, within one {inside[0]:.0f} %, within two {inside[1]:.0f} %")
+
+
+if __name__ == "__main__":
+    main()
