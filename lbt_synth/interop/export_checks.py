@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from lbt_synth.design import Check, Design, FusedFilter, certify_loop
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.arithmetic_cost import FrameCost
 from lbt_synth.linear import Controller
-from lbt_synth.linear.state_space import LinearSystem
+from lbt_synth.linear.state_space import LinearSystem, RunningController
 from lbt_synth.loop.simulation.run import SteppedController, step_loop
 from lbt_synth.validation import FloatArray, require_instance
 
@@ -124,31 +125,36 @@ def rehearsal_error(design: Design, other: SteppedController) -> float:
     order) and noise; a controller alone may be unstable, so only its loop can be compared.
     A design without a loop is fed white noise.
     """
-    rng = np.random.default_rng(0)
-    hardware = design.hardware
-    q, m = design.controller.B.shape[1], len(design.controller.C)
-    own = design.controller.start()
     with np.errstate(all="ignore"):  # what overflows is found to be infinite
-        if hardware is None:
-            series = rng.standard_normal((FRAMES, q))
-            expected = np.array([own.step(y) for y in series])
-            found = np.array([other.step(y) for y in series])
-        else:
-            total = rng.standard_normal((1, FRAMES, hardware.modes))
-            for k in range(1, FRAMES):
-                total[0, k] = _POLE * total[0, k - 1] + np.sqrt(1 - _POLE**2) * total[0, k]
-            noise = 0.1 * rng.standard_normal((1, FRAMES, q))
-            n = hardware.modes
-            expected = step_loop(own, 1.0, hardware, total, noise)[0, :, n : n + m]
-            try:
-                found = step_loop(other, 1.0, hardware, total, noise)[0, :, n : n + m]
-            except ProblemError:
-                return float("inf")
+        expected = _own_commands(design)
+        try:
+            found = _rehearse(design, other)
+        except ProblemError:
+            return float("inf")
         size = float(np.max(np.abs(expected)))
         error = float(np.max(np.abs(found - expected)))
     if not np.isfinite(error):
         return float("inf")
     return error / size if size > 0 else error
+
+
+@lru_cache(maxsize=8)
+def _own_commands(design: Design) -> FloatArray:
+    """Return the commands of the controller itself, the same for each precision."""
+    return _rehearse(design, design.controller.start())
+
+
+def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
+    """Return the commands (frames, m) of a controller that takes the place of a design's own."""
+    rng = np.random.default_rng(0)
+    hardware, q = design.hardware, design.controller.B.shape[1]
+    if hardware is None:
+        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
+    n, total = hardware.modes, rng.standard_normal((1, FRAMES, hardware.modes))
+    for k in range(1, FRAMES):
+        total[0, k] = _POLE * total[0, k - 1] + np.sqrt(1 - _POLE**2) * total[0, k]
+    noise = 0.1 * rng.standard_normal((1, FRAMES, q))
+    return step_loop(controller, 1.0, hardware, total, noise)[0, :, n : n + hardware.n_commands]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -266,16 +266,17 @@ def step_loop(
     cases, frames, n = total.shape
     m, q = hardware.n_commands, hardware.n_measurements
     taps, gains = hardware.mirror_taps, np.broadcast_to(sensor_gain, frames)
+    sensor, influence = hardware.sensor, hardware.influence
     out = np.zeros((cases, frames, n + m + q))
     for case in range(cases):
         controller.reset()
         residual = np.zeros(n)
         commands = np.zeros((len(taps), m))  # u(k), u(k-1), ...
         for k in range(frames):
-            y = gains[k] * hardware.sensor @ residual + noise[case, k]
+            y = gains[k] * sensor @ residual + noise[case, k]
             u = step_controller(controller, y, m, frame=k, applied=commands[0])
             commands[1:] = commands[:-1]
             commands[0] = u if stroke == np.inf else np.clip(u, -stroke, stroke)
-            residual = total[case, k] - hardware.influence @ (taps @ commands)
+            residual = total[case, k] - influence @ (taps @ commands)
             out[case, k] = np.concatenate([residual, commands[0], y])
     return out
