@@ -36,11 +36,11 @@ _ROOM = 0.98  # of the loss, for what is rounded
 
 
 class _Steering(NamedTuple):
-    """The loop of a design at a sensor gain."""
+    """The loop of a design at a sensor gain, and 1 / D, the filter to the pseudo-open loop."""
 
     loop: ClosedLoop
-    inverse: StateSpace  # 1 / D, from the measurement without correction to pseudo-open loop
-    peak: float  # its norm
+    inverse: StateSpace
+    peak: float  # norm of 1 / D
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,7 +66,7 @@ class PredictiveFilter:
             loop = close_loop(self.hardware, self.design.controller, sensor_gain=gain)
             s, each = loop.output_sensitivity(), np.eye(self.hardware.modes)
             inverse = replace(s, C=(1 - 1 / gain) * s.C, D=(1 - 1 / gain) * s.D + each / gain)
-            self._steering[gain] = _Steering(loop, inverse.balanced(), float(hinf_norm(inverse)))
+            self._steering[gain] = _Steering(loop, inverse, float(hinf_norm(inverse)))
         return self._steering[gain]
 
     @cached_property
@@ -75,14 +75,22 @@ class PredictiveFilter:
         return tuple(np.geomspace(*proved_gains(self.design, self.hardware), _GAINS).tolist())
 
     @cached_property
-    def own_nm(self) -> dict[float, FloatArray]:
-        """The rms residual of the design at each sensor gain of its proof, (m,)."""
-        every = slice(self.hardware.modes)
-        return {
-            gain: np.sqrt(mode_variances(self.design, self.at(gain).loop, every))
-            for gain in scenario_gains(self.design)
-            if self.gains[0] <= gain <= self.gains[-1]
-        }
+    def sizes_nm(self) -> dict[float, tuple[float, float]]:
+        """The rms of the pseudo-open loop, all modes, and that of the least residual of a mode.
+
+        At each sensor gain of the proof.
+        """
+        every, sizes = slice(self.hardware.modes), {}
+        for gain in scenario_gains(self.design):
+            if self.gains[0] <= gain <= self.gains[-1]:
+                loop, s, _ = self.at(gain)
+                pol = replace(s, B=np.hstack([gain * s.B, s.B]), D=np.hstack([gain * s.D, s.D]))
+                seen, left = (
+                    mode_variances(self.design, one, every)
+                    for one in (replace(loop, system=pol), loop)
+                )
+                sizes[gain] = float(np.sqrt(np.sum(seen))), float(np.sqrt(np.min(left)))
+        return sizes
 
     def fewest_steps(self, loss: float) -> int:
         """Return the steps after which what is cut off costs at most that part of the residual."""
@@ -108,7 +116,7 @@ class PredictiveFilter:
         if cut.norm > loss or cut.small_gain >= 1:
             return False
         return all(
-            np.max(cut.residual_nm(gain) / own) <= _ROOM * loss for gain, own in self.own_nm.items()
+            cut.residual_nm(gain) <= _ROOM * loss * own for gain, (_, own) in self.sizes_nm.items()
         )
 
 
@@ -121,24 +129,15 @@ class CutFilter:
     taps: FloatArray | None = None  # (steps, m, m)
 
     @cached_property
-    def _tail(self) -> StateSpace:
-        """The system whose impulse response is that of the filter after the last step."""
+    def norm(self) -> float:
+        """Bound on the norm of what is left out: what is cut off, and what taps are rounded by."""
         system = self.whole.system
         late = system.C @ np.linalg.matrix_power(system.A, self.steps - 1)
-        return replace(system, C=late @ system.A, D=late @ system.B)
-
-    @cached_property
-    def _rounded(self) -> float:
-        """Bound on the norm of what the taps are rounded by."""
-        if self.taps is None:
-            return 0.0
-        off = self.whole.taps(self.steps) - self.taps
-        return float(np.sum(np.linalg.norm(off, ord=2, axis=(1, 2))))
-
-    @cached_property
-    def norm(self) -> float:
-        """Bound on the norm of what is left out."""
-        return float(hinf_norm(self._tail)) + self._rounded
+        norm = float(hinf_norm(replace(system, C=late @ system.A, D=late @ system.B)))
+        if self.taps is not None:
+            off = self.whole.taps(self.steps) - self.taps
+            norm += float(np.sum(np.linalg.norm(off, ord=2, axis=(1, 2))))
+        return norm
 
     def _gain_around(self, gain: float) -> float:
         return abs(1 - gain) * self.whole.at(gain).peak * self.norm
@@ -159,17 +158,7 @@ class CutFilter:
 
     def residual_nm(self, gain: float) -> float:
         """Bound the rms of the residual's change at a sensor gain, over all modes."""
-        loop, pol, _ = self.whole.at(gain)
-        pair = [_follow(pol, self._tail)] + ([pol] if self._rounded else [])
-        left = [
-            replace(s, B=np.hstack([gain * s.B, s.B]), D=np.hstack([gain * s.D, s.D])) for s in pair
-        ]
-        every = slice(self.whole.hardware.modes)
-        rms = [
-            np.sqrt(np.sum(mode_variances(self.whole.design, replace(loop, system=s), every)))
-            for s in left
-        ]
-        return self._peak(gain) * float(np.dot([1.0, self._rounded][: len(rms)], rms))
+        return self._peak(gain) * self.norm * self.whole.sizes_nm[gain][0]
 
     def prove(self) -> tuple[Check, ...]:
         """Check the loop around the filter, in single precision, with products in any order."""
@@ -214,15 +203,3 @@ def predictive_filter(design: Design, hardware: LoopHardware) -> PredictiveFilte
     s, n = loop.commanding(), hardware.modes
     system = replace(s, B=s.B[:, n:], D=s.D[:, n:]).balanced()
     return PredictiveFilter(design=design, hardware=hardware, system=system)
-
-
-def _follow(first: StateSpace, second: StateSpace) -> StateSpace:
-    """Return a system followed by another one."""
-    none = np.zeros((first.n_states, second.n_states))
-    return StateSpace(
-        A=np.block([[first.A, none], [second.B @ first.C, second.A]]),
-        B=np.vstack([first.B, second.B @ first.D]),
-        C=np.hstack([second.D @ first.C, second.C]),
-        D=second.D @ first.D,
-        dt_s=first.dt_s,
-    )

@@ -118,7 +118,8 @@ def test_the_length_is_the_shortest_that_meets_the_loss():
 
     def losses(steps):
         cut = CutFilter(whole=found, steps=steps)
-        return [cut.norm, *(cut.residual_nm(gain) / own[0] for gain, own in found.own_nm.items())]
+        lost = (cut.residual_nm(gain) / own for gain, (_, own) in found.sizes_nm.items())
+        return [cut.norm, *lost]
 
     assert np.max(losses(fewest)) <= 0.01 < 1.03 * np.max(losses(fewest - 1))
 
