@@ -39,7 +39,8 @@ def run(arguments: Namespace) -> Report:
     options = {name: value for name, value in options.items() if value is not None}
     for option in options:
         if option not in target.options:
-            fitting = " or ".join(n for n in target_names() if option in target_named(n).options)
+            *some, last = (n for n in target_names() if option in target_named(n).options)
+            fitting = f"{', '.join(some)} or {last}" if some else last
             given = option.replace("_", "-")
             raise ProblemError(
                 f"--{given} goes with --for {fitting}; got --for {arguments.target}."

@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from lbt_synth.design import Check
+from lbt_synth.interop.arithmetic_cost import FrameCost
+from lbt_synth.interop.export_checks import Exported
 from lbt_synth.interop.target import CERTIFICATE, Arithmetic
+from lbt_synth.loop.simulation.run import SteppedController
 from lbt_synth.storage.atomic_files import write_together
 from lbt_synth.storage.rows import json_record
 
 
-def write_certified(
+def write_export(
     files: dict[Path, bytes],
     *,
     target: str,
     arithmetic: Arithmetic,
     checks: Sequence[Check],
     gain_digest: str | None,
+    error: float,
+    start: Callable[[float], SteppedController],
+    error_single: float | None = None,
+    cost: FrameCost | None = None,
     **facts: Any,
-) -> tuple[Path, ...]:
+) -> Exported:
     """Write files and their certificate, all or none.
 
     Parameters
@@ -35,13 +42,15 @@ def write_certified(
         What was proved in that arithmetic.
     gain_digest : str or None
         SHA-256 of the gain file.
+    error, start, error_single, cost
+        As in :class:`Exported`; without another one, the error is that of single precision.
     **facts
         What else the file depends on, such as its precision.
 
     Returns
     -------
-    tuple of Path
-        The files, and the certificate.
+    Exported
+        The files, and the certificate as the last one.
     """
     digests = {path.name: hashlib.sha256(data).hexdigest() for path, data in files.items()}
     first, *others = files
@@ -57,4 +66,11 @@ def write_certified(
     }
     text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
     written = (*files.items(), (first.with_suffix(CERTIFICATE), text.encode()))
-    return write_together(dict(written))
+    return Exported(
+        files=write_together(dict(written)),
+        error=error,
+        error_single=error if error_single is None else error_single,
+        start=start,
+        checks=tuple(checks),
+        cost=cost,
+    )

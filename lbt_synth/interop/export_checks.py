@@ -103,21 +103,6 @@ class MatrixForm:
         return np.asarray(on_state @ self._state + on_y @ y)
 
 
-class WrittenTerms(MatrixForm):
-    """A controller stepped as the C source is written: term by term, each rounded.
-
-    In each row of ``[A, B]`` and ``[C, D]`` the terms are added from left to right, as one
-    statement of the straight-line source does and as the loops over whole matrices do; terms that
-    are zero change nothing.
-    """
-
-    def _combine(
-        self, on_state: npt.NDArray[Any], on_y: npt.NDArray[Any], y: npt.NDArray[Any]
-    ) -> npt.NDArray[Any]:
-        terms = np.hstack([on_state * self._state, on_y * y])
-        return np.asarray(np.add.accumulate(terms, axis=1)[:, -1])
-
-
 def rehearsal_error(design: Design, other: SteppedController) -> float:
     """Largest difference of commands from the controller's, over the largest command.
 

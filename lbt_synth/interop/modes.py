@@ -59,9 +59,9 @@ def all_modes(
     modal: bool = True,
 ) -> AllModes:
     """Return the designs of a file, each certified; ``modal`` requires one of modes."""
-    if other_gain is not None:
-        design = _with_integrators(design, file, modes, other_gain)
     if isinstance(design, MixedController | ModalFilters):
+        if other_gain is not None:
+            raise ProblemError("other_gain goes with a design; here each mode has its own gain.")
         parts, own = _mode_designs(design, file, hardware), design.n_modes
         if not parts:
             raise ProblemError("at least one mode must have a gain above 0; all are 0.")
@@ -69,23 +69,22 @@ def all_modes(
             require_exportable(part.design)
     else:
         require_exportable(design)
+        modal = modal or other_gain is not None
         own = require_modal(design, file) if modal else len(design.controller.C)
         parts = [ModeDesign(design, tuple(range(own)))]
-    count = own if modes is None else integer(modes, "modes", at_least=own)
+    count = own if modes is None else integer(modes, "modes", at_least=1)
+    if count < own:
+        raise ProblemError(f"modes must be at least {own}, those of the design; got {count}.")
+    if other_gain is not None:
+        if modes is None:
+            raise ProblemError("other_gain needs modes, the number of modes of the RTC; got none.")
+        loop = parts[0].design.hardware
+        assert loop is not None  # require_modal refuses a design without a loop
+        others = integrator(loop.single_mode(), gain=number(other_gain, "other_gain", above=0))
+        if count > own:
+            parts.append(ModeDesign(others, tuple(range(own, count))))
+        own = count
     return AllModes(parts=parts, own=own, count=count)
-
-
-def _with_integrators(
-    design: ModalDesign, file: str, modes: int | None, gain: float
-) -> MixedController:
-    """Return a design with integrators for all further modes."""
-    if not isinstance(design, Design):
-        raise ProblemError("other_gain goes with a design; a controller of all modes has gains.")
-    own = require_modal(design, file)
-    if modes is None:
-        raise ProblemError("other_gain needs modes, the number of modes of the RTC; got none.")
-    gains = np.full(integer(modes, "modes", at_least=own), number(gain, "other_gain", above=0))
-    return MixedController(filter=design, gains=gains, filtered=range(own))
 
 
 def _mode_designs(

@@ -6,22 +6,26 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lbt_synth.design import Check, Design
-from lbt_synth.interop.export_checks import WrittenTerms
+from lbt_synth.interop.export_checks import MatrixForm
 from lbt_synth.interop.written_loop import matrix_rounding, prove_written
 from lbt_synth.linear import Controller
+from lbt_synth.linear.state_space import LinearSystem
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.validation import FloatArray
 
 
-class SourceTerms(WrittenTerms):
-    """The terms of a source, which is given its own commands as the applied ones.
+class SourceTerms(MatrixForm):
+    """A controller stepped as its source is written: term by term, each rounded.
 
-    Where they are ``given``, the last inputs of the controller take them.
+    In each row of ``[A, B]`` and ``[C, D]`` the terms are added from left to right, as one
+    statement of the straight-line source does and as the loops over whole matrices do; terms that
+    are zero change nothing. Where applied commands are ``given``, the last inputs take its own.
     """
 
-    def __init__(self, written: Controller, dtype: Any, *, given: bool) -> None:
+    def __init__(self, written: LinearSystem, dtype: Any, *, given: bool = False) -> None:
         self._last = np.zeros(len(written.C) if given else 0)
         super().__init__(written, dtype)
 
@@ -35,6 +39,10 @@ class SourceTerms(WrittenTerms):
         u = super().step(np.concatenate([y, self._last]))
         self._last = u[: self._last.size]
         return u
+
+    def _combine(self, on_state: NDArray[Any], on_y: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+        terms = np.hstack([on_state * self._state, on_y * y])
+        return np.asarray(np.add.accumulate(terms, axis=1)[:, -1])
 
 
 def prove_source(

@@ -24,7 +24,7 @@ from lbt_synth.interop.c.source_text import (
     round_to_single,
     wrap_sum,
 )
-from lbt_synth.interop.export_certificate import write_certified
+from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     FRAMES,
     Exported,
@@ -181,7 +181,8 @@ def export_c(
     checks = joined.prove(*read_source(*texts), ROUNDOFF[precision])
     require_proved(checks, f"{precision} precision", "Try double precision.")
     source, declarations = (text.encode("ascii") for text in texts)
-    files = write_certified(
+    dtype = np.float32 if single else np.float64
+    return write_export(
         {target: source, header: declarations},
         target="c",
         arithmetic=TARGET.arithmetic,
@@ -189,14 +190,9 @@ def export_c(
         gain_digest=gain_digest,
         form=form,
         precision=precision,
-    )
-    dtype = np.float32 if single else np.float64
-    return Exported(
-        files=files,
         error=error,
         error_single=error_single,
         start=lambda _: SourceTerms(joined.controller, dtype, given=given),
-        checks=checks,
         cost=frame_cost(joined.controller),
     )
 

@@ -20,7 +20,7 @@ from lbt_synth.interop.c.fused_terms import (
     prove_fused,
 )
 from lbt_synth.interop.c.source_text import exact_constant, render_source, wrap_sum
-from lbt_synth.interop.export_certificate import write_certified
+from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import Exported, comment_text, provenance_lines
 from lbt_synth.interop.target import Arithmetic
 from lbt_synth.interop.written_loop import require_proved
@@ -66,7 +66,8 @@ def export_fused(
         gain_digest=gain_digest,
         **_written_out(terms, single=single),
     )
-    files = write_certified(
+    dtype = np.float32 if single else np.float64
+    return write_export(
         {target: source.encode("ascii"), header: declarations.encode("ascii")},
         target="c",
         arithmetic=replace(
@@ -81,14 +82,9 @@ def export_fused(
         precision=precision,
         period=len(terms.read),
         sensors=list(terms.rows),
-    )
-    dtype = np.float32 if single else np.float64
-    return Exported(
-        files=files,
         error=error,
         error_single=error_single,
         start=lambda _: FusedSource(terms, dtype),
-        checks=checks,
         cost=cost,
     )
 

@@ -13,7 +13,7 @@ from lbt_synth.design import Check, Design
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.cacao.applied_filter import LONGEST_DELAY, AppliedFilter
 from lbt_synth.interop.cacao.truncation import CutFilter, predictive_filter
-from lbt_synth.interop.export_certificate import write_certified
+from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
@@ -128,7 +128,7 @@ def export_cacao(
             cube[np.ix_(modes_of_copy, range(count), modes_of_copy)] = own
     first, matrix = whole.parts[0].design, _flat(cube)
     content = _matrix_bytes(matrix, first, provenance_lines(first, gain_digest), count)
-    files = write_certified(
+    return write_export(
         {target: content},
         target="cacao",
         arithmetic=TARGET.arithmetic,
@@ -138,13 +138,8 @@ def export_cacao(
         modes=whole.count,
         latency_frames=delay + 1,
         sign=_SIGN,
-    )
-    return Exported(
-        files=files,
         error=error,
-        error_single=error,
         start=lambda limit: AppliedFilter(matrix, delay, limit),
-        checks=tuple(checks),
     )
 
 

@@ -15,7 +15,7 @@ from lbt_synth.interop.dao.inner_loop import InnerLoop
 from lbt_synth.interop.dao.lattice_rounding import round_together
 from lbt_synth.interop.dao.mode_loop import DirectFormLoop, shaped_mode_loop
 from lbt_synth.interop.dao.refit import refit
-from lbt_synth.interop.export_certificate import write_certified
+from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
@@ -118,7 +118,7 @@ def export_dao(
     first = whole.parts[0].design
     lines = provenance_lines(first, gain_digest)
     content = _matrix_bytes(matrix, first, lines, fits=target.suffix.lower() == ".fits")
-    files = write_certified(
+    return write_export(
         {target: content},
         target="dao",
         arithmetic=TARGET.arithmetic,
@@ -128,13 +128,8 @@ def export_dao(
         modes=whole.count,
         sign=_SIGN,
         coefficients=_AGAIN if again else _OWN,
-    )
-    return Exported(
-        files=files,
         error=error,
-        error_single=error,
         start=lambda limit: InnerLoop(matrix[:, : whole.own], limit=limit),
-        checks=tuple(checks),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from lbt_synth.design import Check, Design, certify_loop
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.interop.export_certificate import write_certified
+from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
@@ -140,7 +140,7 @@ def export_iir(
     data = fits_bytes(cards, arrays, comments=join_labels(lines))
     checks = _prove(design, data, precision)
     require_proved(checks, f"{precision} precision, as a transfer function", _HINT)
-    files = write_certified(
+    return write_export(
         {target: data},
         target="iir",
         arithmetic=TARGET.arithmetic,
@@ -148,13 +148,9 @@ def export_iir(
         gain_digest=gain_digest,
         precision=precision,
         specula_precision=_SWITCH[precision],
-    )
-    return Exported(
-        files=files,
         error=error,
         error_single=single,
         start=lambda _: DirectForm(num, den, _KINDS[precision]),
-        checks=checks,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Check, Design
-from lbt_synth.interop.export_certificate import write_certified
+from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     MatrixForm,
@@ -110,19 +110,15 @@ def export_mat(
     data = _mat_bytes(content)
     checks = _prove(design, data)
     require_proved(checks, "double precision, in textbook form", "Design with fewer states.")
-    files = write_certified(
+    return write_export(
         {target: data},
         target="matlab",
         arithmetic=TARGET.arithmetic,
         checks=checks,
         gain_digest=gain_digest,
-    )
-    return Exported(
-        files=files,
         error=error,
         error_single=single,
         start=lambda _: _Textbook(textbook, np.float64),
-        checks=checks,
     )
 
 

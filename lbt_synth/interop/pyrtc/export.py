@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.interop.export_certificate import write_certified
+from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
@@ -153,7 +153,7 @@ def export_pyrtc(
         _RESPONSE: _response_bytes(found.response, whole.count),
         _GAIN: save_gain(folder / _GAIN, design).read_bytes(),
     }
-    files = write_certified(
+    return write_export(
         {folder / name: content for name, content in contents.items()},
         target="pyrtc",
         arithmetic=TARGET.arithmetic,
@@ -161,13 +161,8 @@ def export_pyrtc(
         gain_digest=gain_digest,
         delay_frames=found.delay_frames,
         modes=whole.count,
-    )
-    return Exported(
-        files=files,
         error=worst,
-        error_single=worst,
         start=lambda limit: InnerLoop(design, limit),
-        checks=tuple(checks),
     )
 
 

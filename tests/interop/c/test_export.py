@@ -15,7 +15,8 @@ from support.compiled import STRICT, Compiled, compiler
 from support.exports import bare_design, relative
 
 import lbt_synth as lbt
-from lbt_synth.interop.export_checks import WrittenTerms, rehearsal_error
+from lbt_synth.interop.c.arithmetic import SourceTerms
+from lbt_synth.interop.export_checks import rehearsal_error
 
 FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
@@ -54,7 +55,7 @@ def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, 
         assert written.error_single == written.error
     else:
         assert 1e-9 < written.error_single < LIMITS["single"]
-    ours = WrittenTerms(design.controller, np.float32 if single else np.float64)
+    ours = SourceTerms(design.controller, np.float32 if single else np.float64)
     theirs.reset()
     for y in np.random.default_rng(6).standard_normal((50, 2)):
         assert np.array_equal(ours.step(y), theirs.step(y))
