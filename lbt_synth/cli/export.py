@@ -46,8 +46,9 @@ def run(arguments: Namespace) -> Report:
                 f"--{given} goes with --for {fitting}; got --for {arguments.target}."
             )
     output = Path(arguments.output)
-    endings = () if target.contents else (*target.endings[1:], CERTIFICATE)
-    places = [output, *(output.parent / (output.stem + ending) for ending in endings)]
+    places = [output, *(output.parent / (output.stem + ending) for ending in target.endings[1:])]
+    if not target.contents:
+        places.append(output.parent / (output.name + CERTIFICATE))
     if target.contents and output.is_dir():
         places = [output / name for name in target.contents]
     require_writable(*places, inputs=[arguments.gain])

@@ -35,7 +35,7 @@ def write_export(
     Parameters
     ----------
     files : dict of Path to bytes
-        What is written. The certificate has the name of the first one.
+        What is written. The name of the certificate is that of the first one, and an ending.
     target, arithmetic : str, Arithmetic
         Name of the target, and how it computes.
     checks : sequence of Check
@@ -65,7 +65,7 @@ def write_export(
         "checks": [json_record(check) for check in checks],
     }
     text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
-    written = (*files.items(), (first.with_suffix(CERTIFICATE), text.encode()))
+    written = (*files.items(), (first.with_name(first.name + CERTIFICATE), text.encode()))
     return Exported(
         files=write_together(dict(written)),
         error=error,

@@ -17,7 +17,7 @@ from lbt_synth.storage.rows import column, table_row
 if TYPE_CHECKING:
     from lbt_synth.interop.export_checks import Exported
 
-CERTIFICATE = ".certificate.json"  # ending of the certificate beside what is written
+CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
 
 
 @table_row

@@ -49,7 +49,7 @@ def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
     )
     data = json.loads(text)
     assert status == 0
-    endings = (".c", ".h", ".certificate.json")
+    endings = (".c", ".h", ".c.certificate.json")
     assert data["files"] == [str(out.with_suffix(ending)) for ending in endings]
     assert data["frame_cost"]["multiplications"] == 30
     assert data["gain_digest"] in out.read_text()

@@ -28,7 +28,7 @@ CASES = {
     "export pyrtc": (
         "gain.fits",
         ("gain.fits", "--for", "pyrtc", "-o", "."),
-        "config.certificate.json",
+        "config.yaml.certificate.json",
     ),
     "export c header": ("gain.fits", ("gain.fits", "--for", "c", "-o", "other.c"), "other.h"),
     "rehearse": ("gain.fits", ("gain.fits", "--for", "dao", "-o", "OUT.png")),

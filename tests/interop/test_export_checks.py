@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -42,3 +43,13 @@ def test_what_no_format_takes(tmp_path, designs, file):
     with pytest.raises(lbt.errors.OutputError, match="cannot write"):
         export(tmp_path / "nowhere" / file, designs["integrator"])
     assert not list(tmp_path.iterdir())
+
+
+def test_exports_to_two_targets_keep_their_certificates(tmp_path, designs):
+    lbt.interop.export_c(tmp_path / "k.c", designs["integrator"])
+    lbt.interop.export_dao(tmp_path / "k.npy", designs["integrator"])
+    found = {path.name: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
+    assert {name: read["target"] for name, read in found.items()} == {
+        "k.c.certificate.json": "c",
+        "k.npy.certificate.json": "dao",
+    }

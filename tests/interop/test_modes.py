@@ -42,7 +42,7 @@ def test_a_design_and_integrators_make_one_matrix(tmp_path, designs):
     assert not matrix[:, 4].any()  # no gain, no command
     names = [check.name for check in written.checks]
     assert any("spectral radius" in name and name.endswith("(modes 2 and 5)") for name in names)
-    beside = json.loads((tmp_path / "k.certificate.json").read_text())
+    beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
     assert [check["name"] for check in beside["checks"]] == names
 
 

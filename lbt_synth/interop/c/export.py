@@ -123,7 +123,7 @@ def export_c(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     written = lbt.interop.export_c(pathlib.Path(folder) / "slow.c", slow)
     ...     [file.name for file in written.files]
-    ['slow.c', 'slow.h', 'slow.certificate.json']
+    ['slow.c', 'slow.h', 'slow.c.certificate.json']
     """
     target = _source_path(path)
     header = target.with_suffix(".h")

@@ -54,8 +54,8 @@ def export_cacao(
     Parameters
     ----------
     path : path-like
-        File to write, ending in ``.fits``. The proof goes beside it, with the ending
-        ``.certificate.json``.
+        File to write, ending in ``.fits``. The proof goes beside it, with
+        ``.certificate.json`` after its name.
     design : Design, MixedController or ModalFilters
         Design with unit sensor and influence matrices, whose mirror settles at once; or a design
         with integrators for the other modes; or a filter for each mode.

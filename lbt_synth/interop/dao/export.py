@@ -60,8 +60,8 @@ def export_dao(
     Parameters
     ----------
     path : path-like
-        File to write, ending in ``.npy`` or ``.fits``. The proof goes beside it, with the ending
-        ``.certificate.json``.
+        File to write, ending in ``.npy`` or ``.fits``. The proof goes beside it, with
+        ``.certificate.json`` after its name.
     design : Design, MixedController or ModalFilters
         Design whose modes decouple, with unit sensor and influence matrices; or a design with
         integrators for the other modes; or a filter for each mode.

@@ -114,7 +114,7 @@ def export_pyrtc(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     written = lbt.interop.export_pyrtc(pathlib.Path(folder) / "slow", slow)
     ...     sorted(file.name for file in written.files)
-    ['config.certificate.json', 'config.yaml', 'gain.fits', 'interaction_matrix.npz']
+    ['config.yaml', 'config.yaml.certificate.json', 'gain.fits', 'interaction_matrix.npz']
     """
     folder = Path(path)
     if not isinstance(design, Design):
@@ -186,5 +186,5 @@ TARGET = Target(
     ),
     file="folder with the configuration, the gain file and their certificate",
     write=export_pyrtc,
-    contents=(_CONFIG, _GAIN, _RESPONSE, str(Path(_CONFIG).with_suffix(CERTIFICATE))),
+    contents=(_CONFIG, _GAIN, _RESPONSE, _CONFIG + CERTIFICATE),
 )

@@ -40,7 +40,7 @@ def test_fits_and_npy_are_alike_and_the_certificate_names_the_file(tmp_path, des
     for ending in ("npy", "fits"):
         target = tmp_path / f"{ending}.{ending}"
         written = lbt.interop.export_dao(target, designs["kalman"], order=6, gain_digest=digest)
-        beside = json.loads((tmp_path / f"{ending}.certificate.json").read_text())
+        beside = json.loads((tmp_path / f"{ending}.{ending}.certificate.json").read_text())
         assert beside["file_sha256"] == hashlib.sha256(target.read_bytes()).hexdigest()
         assert (beside["order"], beside["modes"], beside["gain_sha256"]) == (6, 2, digest)
         assert [c["name"] for c in beside["checks"]] == [c.name for c in written.checks]
@@ -78,7 +78,7 @@ def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, sh
     matrix = np.load(written.files[0])
     assert matrix.shape == (2 * order + 1, 1)
     assert max(written_radius(matrix, gain) for gain in np.geomspace(0.5, 1.2, 40)) < 1
-    beside = json.loads((tmp_path / "k.certificate.json").read_text())
+    beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
     assert beside["coefficients"].startswith("made again for single precision")
     air, line, *_ = shaped.specifications[0].objective.terms
     vibration = lbt.models.SinusoidalVibration(
@@ -96,7 +96,7 @@ def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, sh
 
 def test_coefficients_of_the_gain_file_are_kept_where_they_pass(tmp_path, designs):
     lbt.interop.export_dao(tmp_path / "k.npy", designs["kalman"])
-    beside = json.loads((tmp_path / "k.certificate.json").read_text())
+    beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
     assert beside["coefficients"] == "of the gain file, rounded"
 
 

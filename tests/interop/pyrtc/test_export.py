@@ -14,7 +14,7 @@ from support.gain_file_edits import odd_plant
 import lbt_synth as lbt
 from lbt_synth.interop.pyrtc import export as pyrtc_export
 
-NAMES = ["config.certificate.json", "config.yaml", "gain.fits", "interaction_matrix.npz"]
+NAMES = ["config.yaml", "config.yaml.certificate.json", "gain.fits", "interaction_matrix.npz"]
 
 
 def read(folder):
@@ -43,7 +43,7 @@ def test_the_folder_holds_all_that_it_refers_to(tmp_path):
 
 def test_the_certificate_has_digests_and_checks(tmp_path):
     written = lbt.interop.export_pyrtc(tmp_path, lbt_designs()["hinf"], gain_digest="b" * 64)
-    found = json.loads((tmp_path / "config.certificate.json").read_text())
+    found = json.loads((tmp_path / "config.yaml.certificate.json").read_text())
     assert found["gain_sha256"] == "b" * 64
     assert [check["passed"] for check in found["checks"]] == [True] * len(written.checks)
     assert found["arithmetic"]["precision"].startswith("single for signals")
