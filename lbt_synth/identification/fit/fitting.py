@@ -19,6 +19,7 @@ from lbt_synth.identification.fit.whittle import (
     SpectrumModel,
     contrast,
     damping_parameter,
+    density,
     minimise,
     observe_information,
 )
@@ -198,7 +199,7 @@ def prune(search: Search, model: FittedModel) -> FittedModel:
     data = search.merge(model.spectrum)
     whole = contrast(data, model.spectrum)
     for i in range(len(model.spectrum.components)):
-        less = model.spectrum.drop(i)
+        less = _drop(data, model.spectrum, i)
         if less is not None:
             required = required_gain(search, model.spectrum, i)
             spare = contrast(data, less) - whole - 4 * required
@@ -210,6 +211,19 @@ def prune(search: Search, model: FittedModel) -> FittedModel:
         if made is not None and made.contrast - model.contrast < required:
             return prune(search, made)
     return model
+
+
+def _drop(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> SpectrumModel | None:
+    """Return the model without a component; None if that is its only turbulence.
+
+    A wide component may have taken the place of the noise: its white part then becomes noise.
+    """
+    less, noise = spectrum.drop(i), float(np.exp(spectrum.log_noise))
+    if less is None:
+        return None
+    lost = density(data, spectrum) - density(data, less)
+    white = float(np.min(lost)) * data.frame_rate_hz / 2
+    return replace(less, log_noise=float(np.log(noise + white))) if white > noise else less
 
 
 def required_gain(

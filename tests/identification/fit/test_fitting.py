@@ -1,14 +1,15 @@
-"""Fits of given components: what leaves the band is dropped."""
+"""Fits of given components: what leaves the band, or adds too little, is dropped."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from lbt_synth.identification.fit.fitting import Search, fit
+from lbt_synth.identification.fit.fitting import Search, fit, prune
 from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.whittle import SpectrumModel
+from lbt_synth.identification.fit.whittle import SpectrumModel, contrast
 
 RATE = 1000.0
 
@@ -27,3 +28,21 @@ def test_a_line_that_leaves_the_band_is_dropped() -> None:
     found = fit(search, replace(start, components=(slow, away)))
     assert found is not None
     assert len(found.spectrum.components) == 1
+
+
+def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:
+    """A resonance near the Nyquist frequency, damped within a frame, is white as noise is."""
+    rng = np.random.default_rng(2)
+    walk = np.cumsum(rng.standard_normal(32768))
+    series = 26 * rng.standard_normal(walk.size) + walk - np.linspace(0, walk[-1], walk.size)
+    data = loop_periodogram(series, None, frame_rate_hz=RATE, stretches=[(0, walk.size)])
+    search = Search(data=data, gain=1.0)
+    slow = search.component("turbulence", 0.3, 0.5, 50.0**2)
+    wide = search.component("line", 450.0, 0.826, 26.0**2)
+    start = SpectrumModel(0.0, float(np.log(0.3**2)), 0.0, search.log_angle(50.0), (slow, wide))
+    found = fit(search, start)
+    assert found is not None
+    stuck = replace(found, spectrum=start, contrast=contrast(data, start))
+    pruned = prune(search, stuck).spectrum
+    assert pruned.lines == ()
+    assert np.exp(pruned.log_noise) == pytest.approx(26**2, rel=0.05)
