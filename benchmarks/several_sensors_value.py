@@ -2,16 +2,20 @@
 
 Run ``python benchmarks/several_sensors_value.py``. It prints, over the seeing, the exact residual
 of tip with the Kalman filter of the wavefront alone and with an accelerometer whose noise is a
-tenth of what the line moves, and the same of a simulation.
+tenth of what the line moves, and the same of a simulation; the least residual of any controller
+where there is no line; and the ratio of acceleration and noise at which the residual is halved.
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import brentq
 
 import lbt_synth as lbt
 from lbt_synth.loop.fusion.simulation import simulate_fused
@@ -19,37 +23,67 @@ from lbt_synth.loop.fusion.simulation import simulate_fused
 CONFIG = """\
 version: 1
 telescope: {{diameter_m: 8.22, obstruction: 0.11}}
-atmosphere: {{seeing_arcsec: {seeing}, outer_scale_m: 22, wind_speed_m_s: {wind}}}
+{air}
 loop: {{frame_rate_hz: 800, delay_frames: 2}}
 sensor: {{noise_nm: 77.5}}
 sensors:
   mirror:
-    {{kind: accelerometer, rate_hz: 800, delay_frames: 1, channels: [m1], noise_m_s2: 8.9e-4}}
+    {{kind: accelerometer, rate_hz: 800, delay_frames: 1, channels: [m1], noise_m_s2: {noise}}}
 model:
-  turbulence: {{kind: ar2}}
+  turbulence: {turbulence}
   vibrations:
     - {{axis: tip, frequency_hz: 20, damping: 0.01, rms_nm: 563.6,
        accelerometers: {{m1: {{motion_nm_per_nm: 1.0}}}}}}
-truth: {{vibrations: model}}
+truth: {{vibrations: model{truth}}}
 """
-AIR = ((0.4, 5), (0.6, 10), (0.8, 20))  # seeing [arcsec], wind [m/s]
+ATMOSPHERE = "atmosphere: {{seeing_arcsec: {}, outer_scale_m: 22, wind_speed_m_s: {}}}"
+AIR = {
+    f"{seeing} arcsec, {wind} m/s": (ATMOSPHERE.format(seeing, wind), "{kind: ar2}", "")
+    for seeing, wind in ((0.4, 5), (0.6, 10), (0.8, 20))
+} | {"none": ("", "{kind: ar, coefficients: [0.99], driving_rms_nm: 0.001}", ", turbulence: none")}
+ACCELERATION = 8.9e-3  # of the line [m/s^2 rms]
 FRAMES, CASES = 20_000, 4
+
+
+def load(air: str, ratio: float) -> lbt.config.Config:
+    """Return the loop in some air, with an accelerometer of a signal-to-noise ratio."""
+    atmosphere, turbulence, truth = AIR[air]
+    parts = {"air": atmosphere, "turbulence": turbulence, "truth": truth}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "loop.yaml"
+        path.write_text(CONFIG.format(noise=ACCELERATION / ratio, **parts))
+        return lbt.load_config(path)
+
+
+def tip_nm(config: lbt.config.Config, loop: lbt.loop.AnyLoop) -> float:
+    """Return what a loop leaves of tip."""
+    return float(np.sqrt(lbt.residual_budget(loop, config.truth).total_nm2[0, 0]))
+
+
+def fused_tip_nm(air: str, ratio: float) -> float:
+    """Return what the Kalman filter of both sensors leaves of tip."""
+    config = load(air, ratio)
+    plant = config.fused_plant
+    controller = plant.controller(lbt.linear.periodic_kalman(plant).gains)
+    return tip_nm(config, lbt.loop.close_fused_loop(config.hardware, plant.suite, controller))
+
+
+def halving_excess(ratio: float, *, air: str, half_nm: float) -> float:
+    """Return by how much a filter of both sensors misses half of the residual of one."""
+    return fused_tip_nm(air, ratio) - half_nm
 
 
 def main() -> int:
     """Print the table."""
-    print("| air | own sensor [nm] | of it the line ", end="")
-    print("| with accelerometer | of it the line | ratio | in a run |")
-    print("|---|---:|---:|---:|---:|---:|---:|")
-    for seeing, wind in AIR:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "loop.yaml"
-            path.write_text(CONFIG.format(seeing=seeing, wind=wind))
-            config = lbt.load_config(path)
-        fused = config.design("kalman")
-        plain = lbt.kalman(config.plant)
-        own = lbt.residual_budget(lbt.close_loop(config.hardware, plain), config.truth)
-        both = lbt.residual_budget(fused.loop(), config.truth)
+    print("| air | own sensor [nm] | of it the line | with accelerometer | of it the line ", end="")
+    print("| ratio | in a run | no line, least | halved at |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
+    for air in AIR:
+        config = load(air, 10)
+        fused, plain = config.design("kalman"), lbt.kalman(config.plant)
+        loops = lbt.close_loop(config.hardware, plain), fused.loop()
+        own, both = (tip_nm(config, loop) for loop in loops)
+        lines = [lbt.residual_budget(loop, config.truth).vibration_nm for loop in loops]
         run = simulate_fused(
             fused.controllers,
             fused.problem.suite,
@@ -59,11 +93,13 @@ def main() -> int:
             cases=CASES,
         )
         simulated = float(np.sqrt(np.mean(run.residual_nm[:, :, 0] ** 2)))
-        left = [np.sqrt(budget.total_nm2[0, 0]) for budget in (own, both)]
+        calm = replace(config.truth, vibrations=(), motions=())
+        least = np.sqrt(lbt.loop.least_residual(config.hardware, calm).variance_nm2[0])
+        excess = partial(halving_excess, air=air, half_nm=own / 2)
+        halved = brentq(excess, 5, 50, xtol=0.01)
         print(
-            f"| {seeing} arcsec, {wind} m/s | {left[0]:.1f} | {own.vibration_nm:.1f} "
-            f"| {left[1]:.1f} | {both.vibration_nm:.1f} | {left[1] / left[0]:.2f} "
-            f"| {simulated:.1f} |"
+            f"| {air} | {own:.1f} | {lines[0]:.1f} | {both:.1f} | {lines[1]:.1f} "
+            f"| {both / own:.2f} | {simulated:.1f} | {least:.1f} | {halved:.1f} |"
         )
     return 0
 
