@@ -20,9 +20,8 @@ def symmetrise(stack: FloatArray) -> FloatArray:
 
 def frobenius_norms(stack: FloatArray) -> FloatArray:
     """Frobenius norm of each matrix of a stack, (N,)."""
-    *lead, n, m = stack.shape
-    rows = stack.reshape(*lead, n * m)
-    return np.asarray(np.sqrt(np.vecdot(rows, rows)))
+    squares = np.einsum("...ij,...ij->...", stack, stack)
+    return np.asarray(np.sqrt(squares), dtype=np.float64)
 
 
 def solve_stack(matrices: npt.NDArray[Entry], right: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
