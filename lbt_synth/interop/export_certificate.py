@@ -30,27 +30,10 @@ def write_export(
     cost: FrameCost | None = None,
     **facts: Any,
 ) -> Exported:
-    """Write files and their certificate, all or none.
+    """Write files and their certificate, named after the first file; all or none.
 
-    Parameters
-    ----------
-    files : dict of Path to bytes
-        What is written. The name of the certificate is that of the first one, and an ending.
-    target, arithmetic : str, Arithmetic
-        Name of the target, and how it computes.
-    checks : sequence of Check
-        What was proved in that arithmetic.
-    gain_digest : str or None
-        SHA-256 of the gain file.
-    error, start, error_single, cost
-        As in :class:`Exported`; without another one, the error is that of single precision.
-    **facts
-        What else the file depends on, such as its precision.
-
-    Returns
-    -------
-    Exported
-        The files, and the certificate as the last one.
+    ``facts`` are what else the files depend on. Without another one, the error is that of single
+    precision.
     """
     digests = {path.name: hashlib.sha256(data).hexdigest() for path, data in files.items()}
     first, *others = files

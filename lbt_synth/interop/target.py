@@ -67,15 +67,8 @@ class Target:
 
 
 def target_names() -> tuple[str, ...]:
-    """Return the names of the targets, without loading them.
+    """Return the names of the targets, sorted, without loading them.
 
-    Returns
-    -------
-    tuple of str
-        The names, sorted.
-
-    Examples
-    --------
     >>> from lbt_synth.interop.target import target_names
     >>> target_names()
     ('c', 'cacao', 'dao', 'iir', 'matlab', 'pyrtc')

@@ -65,24 +65,11 @@ class Rounding:
 def matrix_rounding(
     whole: FloatArray, entry: Controller, signals: FloatArray, roundoff: float
 ) -> Rounding:
-    """Return the rounding of sums of products, row by row.
+    """Return the rounding of the products and the partial sums of each row, from left to right.
 
-    Parameters
-    ----------
-    whole : (r, c) ndarray
-        Coefficients; the terms of a row are added from left to right. The columns belong to the
-        signals, then to the measurements, then to the commands, as far as there are columns.
-    entry : Controller
-        From an error in each of the r sums to the command.
-    signals : (s, n) ndarray
-        Rows that read the signals from the controller's state.
-    roundoff : float
-        Largest relative error of an operation.
-
-    Returns
-    -------
-    Rounding
-        Each product and each partial sum with an error uniform in its interval.
+    The columns of ``whole`` (r, c) belong to the signals, which rows (s, n) read from the
+    controller's state, then to measurements, then to commands, as far as there are columns;
+    ``entry`` leads from an error in each of the r sums to the command.
     """
     count = len(signals)
 
@@ -97,22 +84,7 @@ def matrix_rounding(
 
 
 def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> None:
-    """Refuse an export with the first check that fails.
-
-    Parameters
-    ----------
-    checks : tuple of Check
-        Those of :func:`prove_written`.
-    arithmetic : str
-        That of the target, for the message.
-    hint : str
-        What to try instead.
-
-    Raises
-    ------
-    NumericalError
-        With the value of the check as its ``residual``.
-    """
+    """Refuse an export with the first check that fails, its value, and what to try instead."""
     for check in checks:
         if not check.passed:
             raise NumericalError(
@@ -141,22 +113,8 @@ def prove_written(
 ) -> tuple[Check, ...]:
     """Check the loop around a controller as it is written, against that of its design.
 
-    Parameters
-    ----------
-    design : Design
-        The design, of a loop.
-    written : Controller
-        The controller with the numbers of the file.
-    rounding : Rounding, optional
-        What the arithmetic adds.
-    left_out : LeftOut, optional
-        What the file lacks of that controller.
-
-    Returns
-    -------
-    tuple of Check
-        Stability over the design's sensor gains; residual, arithmetic included, and modulus margin
-        within 1 % of the design's; the demands of a shaped design, each within 1 % of its limit.
+    It is stable over the design's sensor gains; residual, arithmetic included, and modulus margin
+    are within 1 % of the design's, and so is each demand of a shaped design of its limit.
     """
     hardware = design.hardware
     assert hardware is not None  # the callers refuse a design without a loop

@@ -14,7 +14,6 @@ import numpy as np
 from lbt_synth.design import Design, FusedFilter
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.interop.arithmetic_cost import frame_cost, has_straight_line_form
-from lbt_synth.interop.c.arithmetic import SourceTerms
 from lbt_synth.interop.c.fused_export import export_fused
 from lbt_synth.interop.c.joined import join
 from lbt_synth.interop.c.reading import read_source
@@ -29,7 +28,6 @@ from lbt_synth.interop.export_checks import (
     FRAMES,
     Exported,
     provenance_lines,
-    rehearsal_error,
     require_certified,
     require_exportable,
 )
@@ -157,14 +155,9 @@ def export_c(
     given = form == "estimator"  # the applied commands
     parts = [_written_part(part.design, given=given, single=single) for part in whole.parts]
     joined = join(whole, parts, applied=given)
-    error_double, error_single = (
-        max(
-            rehearsal_error(own.design, SourceTerms(written, kind, given=given))
-            for own, written in zip(whole.parts, parts, strict=True)
-        )
-        for kind in (np.float64, np.float32)
-    )
-    error = error_single if single else error_double
+    errors = {kind: joined.rehearsal_error(kind) for kind in (np.float64, np.float32)}
+    kind = np.float32 if single else np.float64
+    error = errors[kind]
     _require_finite(error, precision)
     lines = provenance_lines(whole.parts[0].design, gain_digest)
     if single:  # in double precision the figure would depend on this machine's matrix products
@@ -181,7 +174,6 @@ def export_c(
     checks = joined.prove(*read_source(*texts), ROUNDOFF[precision])
     require_proved(checks, f"{precision} precision", "Try double precision.")
     source, declarations = (text.encode("ascii") for text in texts)
-    dtype = np.float32 if single else np.float64
     return write_export(
         {target: source, header: declarations},
         target="c",
@@ -191,8 +183,8 @@ def export_c(
         form=form,
         precision=precision,
         error=error,
-        error_single=error_single,
-        start=lambda _: SourceTerms(joined.controller, dtype, given=given),
+        error_single=errors[np.float32],
+        start=lambda _: joined.start(kind),
         cost=frame_cost(joined.controller),
     )
 
@@ -226,14 +218,10 @@ def _checked_form(design: ModalDesign, form: str | None) -> str:
 def _require_finite(error: float, precision: str) -> None:
     """Refuse commands that grow beyond all numbers of a precision."""
     if not math.isfinite(error):
+        hint = {"single": "Try double precision.", "double": "Scale the states of the controller."}
         raise NumericalError(
             f"the commands must stay finite in {precision} precision; they grew beyond all "
-            f"numbers within {FRAMES} frames. "
-            + (
-                "Try double precision."
-                if precision == "single"
-                else "Scale the states of the controller."
-            ),
+            f"numbers within {FRAMES} frames. {hint[precision]}",
             status="arithmetic",
             residual=error,
         )

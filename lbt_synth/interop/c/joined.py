@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Check
-from lbt_synth.interop.c.arithmetic import prove_source
+from lbt_synth.interop.c.arithmetic import SourceTerms, prove_source
+from lbt_synth.interop.export_checks import rehearsal_error
 from lbt_synth.interop.modes import AllModes
 from lbt_synth.linear import Controller
 from lbt_synth.validation import FloatArray
@@ -32,9 +33,22 @@ class Joined:
     """Controllers side by side; the last ``applied`` inputs take the applied commands."""
 
     whole: AllModes
+    parts: Sequence[Controller]
     controller: Controller
     applied: int
     copies: list[list[_Copy]]  # of each part
+
+    def rehearsal_error(self, kind: Any) -> float:
+        """Return the largest error of a part in the arithmetic of the source."""
+        given = self.applied > 0
+        return max(
+            rehearsal_error(part.design, SourceTerms(own, kind, given=given))
+            for part, own in zip(self.whole.parts, self.parts, strict=True)
+        )
+
+    def start(self, kind: Any) -> SourceTerms:
+        """Return the whole in the arithmetic of the source."""
+        return SourceTerms(self.controller, kind, given=self.applied > 0)
 
     def prove(self, states: FloatArray, commands: FloatArray, roundoff: float) -> tuple[Check, ...]:
         """Check the loop of each part with the coefficients of a source; equal copies once."""
@@ -61,7 +75,9 @@ def join(whole: AllModes, controllers: Sequence[Controller], *, applied: bool) -
         n, (m, q) = only.n_states, only.D.shape
         copy = _Copy(np.arange(n), np.arange(q), np.arange(m))
         taken = m if applied else 0
-        return Joined(whole=whole, controller=only, applied=taken, copies=[[copy]])
+        return Joined(
+            whole=whole, parts=controllers, controller=only, applied=taken, copies=[[copy]]
+        )
     places, count = [], 0
     for part, own in zip(whole.parts, controllers, strict=True):
         copies = []
@@ -80,4 +96,10 @@ def join(whole: AllModes, controllers: Sequence[Controller], *, applied: bool) -
         D[np.ix_(copy.commands, copy.inputs)] = own.D
     A = block_diag(*(own.A for own, _ in pairs))
     joined = Controller(A=A, B=B, C=C, D=D, dt_s=controllers[0].dt_s)
-    return Joined(whole=whole, controller=joined, applied=m if applied else 0, copies=places)
+    return Joined(
+        whole=whole,
+        parts=controllers,
+        controller=joined,
+        applied=m if applied else 0,
+        copies=places,
+    )

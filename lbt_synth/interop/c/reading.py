@@ -18,19 +18,10 @@ _TERM = re.compile(r"(-?)\s*(?:c\[(\d+)\] \* )?([xnya])(\d+)")
 
 
 def read_source(source: str, header: str) -> tuple[FloatArray, FloatArray]:
-    """Read what the source computes with.
+    """Return the factors in the new state and in the commands, from the texts of two files.
 
-    Parameters
-    ----------
-    source, header : str
-        Texts of the two files.
-
-    Returns
-    -------
-    states : (n, n + q) or (n, n + q + m) ndarray
-        Factors of the state, of the measurements and of the applied commands in the new state.
-    commands : (m, n + q) ndarray
-        Factors of the new state and of the measurements in the commands.
+    Those of the state are (n, n + q), or (n, n + q + m) with the applied commands; those of the
+    commands (m, n + q) act on the new state and on the measurements.
     """
     sizes = {name: int(count) for name, count in _SIZE.findall(header)}
     n, q, m = (sizes[name] for name in ("STATES", "MEASUREMENTS", "COMMANDS"))

@@ -21,17 +21,7 @@ _SWAPS = 5  # at most, per pair of columns
 def round_together(exact: FloatArray, sensitivity: FloatArray) -> NDArray[np.float32]:
     """Round coefficients (n,) to single precision, with a small ``sensitivity @ error``.
 
-    Parameters
-    ----------
-    exact : (n,) ndarray
-        Coefficients.
-    sensitivity : (m, n) ndarray
-        What an error of each coefficient does.
-
-    Returns
-    -------
-    (n,) ndarray of float32
-        The rounded coefficients; an exact zero stays zero.
+    A row of the sensitivity (m, n) says what an error of each does. An exact zero stays zero.
 
     Examples
     --------
