@@ -194,11 +194,12 @@ def design_from_record(
     name = method_named(method).title
     held_out = _test_on_unseen(record, half, {name: design(method, half)}, imaging, taps)
     step(1)
+    whole, allowed = identify_with_gains(record, start=half, **options)
     safe = design_for_gains(
         fit_model,
         partial(design, method),
         _design_robustly,
-        half,
+        (whole, half),
         allowed,
         command_scale_known=command_scale_known,
     )

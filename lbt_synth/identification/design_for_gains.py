@@ -57,21 +57,21 @@ def design_for_gains(
     fit_model: Callable[..., IdentifiedModel],
     design: Callable[[IdentifiedModel], Design],
     design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
-    half: IdentifiedModel,
+    models: tuple[IdentifiedModel, IdentifiedModel],
     allowed: FloatArray | None,
     *,
     command_scale_known: bool,
 ) -> SafeDesign:
-    """Return a design that is stable at all possible gains.
+    """Return a design that is stable at all possible gains of two models, for the first of them.
 
     Commands that were recorded at half their size look like twice the sensor gain, and no record
     can tell; so half of the gains are possible, unless the scale of the commands is known.
     """
-    model = fit_model(start=half)
+    model, _ = models
     made = design(model)
     if allowed is None:
         return SafeDesign(model=model, design=made)
-    intervals = possible_gains(allowed, model, half)
+    intervals = possible_gains(allowed, *models)
     assumed = (
         f"the sensor gain lies within {_words(intervals)}, as the record and its model allow; the "
         "loop is stable at all of these"

@@ -26,6 +26,11 @@ def half(fit_model):
     return fit_model()
 
 
+@pytest.fixture(scope="module")
+def models(fit_model, half):
+    return fit_model(start=half), half
+
+
 def kalman(model):
     return lbt.kalman(model.plant())
 
@@ -45,17 +50,17 @@ def fail(model, gains):
     raise lbt.errors.InfeasibleError("too much")
 
 
-def test_gains_that_the_fit_shows_keep_the_design(fit_model, half):
+def test_gains_that_the_fit_shows_keep_the_design(fit_model, half, models):
     gain, error = half.axes[0].sensor_gain, half.axes[0].sensor_gain_error
     allowed = np.array([[0.6, 1.2]])
-    safe = design_for_gains(fit_model, kalman, fail, half, allowed, command_scale_known=True)
+    safe = design_for_gains(fit_model, kalman, fail, models, allowed, command_scale_known=True)
     assert safe.design.method == "kalman"
     assert safe.model.axes[0].sensor_gain == pytest.approx(gain, abs=error)
     (text,) = safe.assumptions
     assert "the loop is stable at all of these" in text
     assert "at the size that was applied, as was stated" in text
     assert safe.notes == ()
-    free = design_for_gains(fit_model, kalman, fail, half, None, command_scale_known=False)
+    free = design_for_gains(fit_model, kalman, fail, models, None, command_scale_known=False)
     assert free.assumptions == ()
 
 
@@ -64,7 +69,8 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
     record = spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9)
     fit_model = partial(lbt.identification.identify, record)
     first = fit_model()
-    made = partial(design_for_gains, fit_model, hinf, half=first, allowed=np.array([[0.8, 1.0]]))
+    models, allowed = (fit_model(start=first), first), np.array([[0.8, 1.0]])
+    made = partial(design_for_gains, fit_model, hinf, models=models, allowed=allowed)
     best = made(design_robustly=fail, command_scale_known=True)
     halves = possible_gains(np.array([[0.8, 1.0]]), first) * [0.5, 1.0]
     assert best.design.method == "hinf"
@@ -80,17 +86,17 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
             lambda **_: first,
             lambda _: best.design,
             fail,
-            first,
+            (first, first),
             np.array([[0.8, 1.0]]),
             command_scale_known=False,
         )
 
 
-def test_gains_that_are_too_far_apart_take_robust_synthesis_or_no_design(fit_model, half):
+def test_gains_that_are_too_far_apart_take_robust_synthesis_or_no_design(fit_model, half, models):
     wide = np.array([[0.02, 0.4]])  # the fit is outside: both count
     with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):
-        design_for_gains(fit_model, hinf, fail, half, wide, command_scale_known=True)
-    safe = design_for_gains(fit_model, hinf, robust, half, wide, command_scale_known=True)
+        design_for_gains(fit_model, hinf, fail, models, wide, command_scale_known=True)
+    safe = design_for_gains(fit_model, hinf, robust, models, wide, command_scale_known=True)
     assert safe.design.method == gain_robust_method()
     assert unstable_gains(safe.design, possible_gains(wide, half)) is None
     assert "lies within 0.02 to 0.9" in safe.assumptions[0]
