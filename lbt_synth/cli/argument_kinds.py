@@ -94,3 +94,14 @@ def add_faults(parser: ArgumentParser) -> None:
         help="a sensor or channel that fails [s], as in m2@10s or wavefront@20s..20.2s; READING "
         "missing (seen, default), zero or frozen (believed)",
     )
+
+
+def add_engine(parser: ArgumentParser) -> None:
+    """Add what runs the samples of a study or the entries of a league."""
+    engine = parser.add_mutually_exclusive_group()
+    add_option(engine, "--jobs", int, "processes", 1)
+    text = "Dask scheduler that runs it instead, as tcp://host:8786; it can run code here: trust it"
+    add_option(engine, "--dask", str, text, metavar="ADDRESS")
+    text = "files of the authority, certificate and key for a scheduler at tls://host:8786"
+    metavar = ("CA", "CERT", "KEY")
+    add_option(parser, "--dask-tls", str, text, nargs=3, metavar=metavar)

@@ -12,6 +12,7 @@ from lbt_synth.cli.argument_kinds import (
     GAIN_FILE,
     TargetChoice,
     add_config,
+    add_engine,
     add_faults,
     add_gain,
     add_gains,
@@ -277,22 +278,12 @@ def league(parser: ArgumentParser) -> None:
     add_output(parser, "directory to write into")
     add_option(parser, "--splits", int, "tests of each record, in its second half", 3)
     add_option(parser, "--entries", str, "those that compete (default: all)", nargs="+")
-    _add_engine(parser)
+    add_engine(parser)
     add_switch(parser, "--pdf", "write the page as a PDF, too (league.pdf)")
     add_missing_facts(parser)
     add_repairs(parser)
     add_acceptance(parser)
     add_prior_knowledge(parser)
-
-
-def _add_engine(parser: ArgumentParser) -> None:
-    engine = parser.add_mutually_exclusive_group()
-    add_option(engine, "--jobs", int, "processes", 1)
-    text = "Dask scheduler that runs it instead, as tcp://host:8786; it can run code here: trust it"
-    add_option(engine, "--dask", str, text, metavar="ADDRESS")
-    text = "files of the authority, certificate and key for a scheduler at tls://host:8786"
-    metavar = ("CA", "CERT", "KEY")
-    add_option(parser, "--dask-tls", str, text, nargs=3, metavar=metavar)
 
 
 def diagnose(parser: ArgumentParser) -> None:
@@ -380,7 +371,7 @@ def study(parser: ArgumentParser) -> None:
     add_unit(parser)
     parser.add_argument("study", metavar="file", help="study file (YAML)")
     add_output(parser, "directory of the study")
-    _add_engine(parser)
+    add_engine(parser)
     add_switch(parser, "--pdf", "write the page as a PDF, too (summary.pdf)")
     instead = parser.add_mutually_exclusive_group()
     add_switch(instead, "--dry-run", "say how many samples and how long, and write nothing")

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.linear.panel_edges import distinct_edges, pole_edges
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.linear.scalar_search import find_root
-from lbt_synth.loop.budget import distinct_edges, pole_edges, resonance_edges
+from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only
 

@@ -129,11 +129,7 @@ def export_c(
     prefix = require_identifier(target.stem if name is None else name)
     form = _checked_form(design, form)
     if isinstance(design, FusedFilter):
-        if modes is not None or other_gain is not None:
-            raise ProblemError(
-                "modes and other_gain go with a design of one sensor; got one of several. Leave "
-                "them out."
-            )
+        _require_one_sensor(modes, other_gain)
         require_certified(design)
         return export_fused(
             target,
@@ -187,6 +183,15 @@ def export_c(
         start=lambda _: joined.start(kind),
         cost=frame_cost(joined.controller),
     )
+
+
+def _require_one_sensor(modes: int | None, other_gain: float | None) -> None:
+    """Refuse options of designs of one sensor."""
+    if modes is not None or other_gain is not None:
+        raise ProblemError(
+            "modes and other_gain go with a design of one sensor; got one of several. Leave them "
+            "out."
+        )
 
 
 def _source_path(path: str | os.PathLike[str]) -> Path:
