@@ -5,6 +5,10 @@ measurement, whatever the controller (:mod:`lbt_synth.loop.youla`), and every st
 loop stable. At the sensor gain g, with the path L of norm 1, the commands are
 ``Q w / D`` with ``D = 1 - (1 - g) L Q``. Without a part E of Q they change by ``E w / D D'``, where
 ``D' = D + (1 - g) L E``: no more than a small gain, ``|1 - g| |E / D| < 1``, allows.
+
+For all gains of an interval: ``|1 - g| |1 / D|`` is one over the least singular value, over
+frequency, of ``p - L Q``, ``p = 1 / (1 - g)``. That distance changes by no more than p does, which
+bounds it between two gains.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
 _LONGEST = 1 << 17  # steps that are looked for
-_GAINS = 9  # at which the small gain is computed
+_CLOSE = 0.5  # of the least distance that is computed: a bound on all others
 _ROOM = 0.98  # of the loss, for what is rounded
 
 
@@ -70,9 +74,44 @@ class PredictiveFilter:
         return self._steering[gain]
 
     @cached_property
-    def gains(self) -> tuple[float, ...]:
-        """Sensor gains at which the small gain is computed."""
-        return tuple(np.geomspace(*proved_gains(self.design, self.hardware), _GAINS).tolist())
+    def interval(self) -> tuple[float, float]:
+        """Sensor gains for which the small gain is proved."""
+        return proved_gains(self.design, self.hardware)
+
+    def least_distance(self, enough: float) -> float:
+        """Return a lower bound on the distance of L Q from ``1 / (1 - g)`` within the interval.
+
+        Where one is found that is not above ``enough``, it is returned.
+        """
+        least = float("inf")
+        for end, stop in self._places():
+            own = self._distance(end)
+            if stop is None:  # beyond this place the distance is larger than at the end
+                stop = float(np.copysign(float(hinf_norm(self.system)) + own, end))
+            parts = [((end, own), (stop, self._distance(stop)))]
+            while parts:
+                (a, at_a), (b, at_b) = parts.pop()
+                least = min(least, at_a, at_b)
+                if least <= enough:
+                    return least
+                if (at_a + at_b - abs(b - a)) / 2 < _CLOSE * least:
+                    middle = (a + b) / 2
+                    between = middle, self._distance(middle)
+                    parts += [((a, at_a), between), (between, (b, at_b))]
+        return _CLOSE * least
+
+    def _places(self) -> list[tuple[float, float | None]]:
+        """Return the intervals of ``1 / (1 - g)``; at g = 1 one goes on without end."""
+        low, high = self.interval
+        out: list[tuple[float, float | None]] = []
+        if low < 1:
+            out.append((1 / (1 - low), 1 / (1 - high) if high < 1 else None))
+        if high > 1:
+            out.append((1 / (1 - high), 1 / (1 - low) if low > 1 else None))
+        return out
+
+    def _distance(self, place: float) -> float:
+        return abs(place) / self.at(1 - 1 / place).peak
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
@@ -82,7 +121,7 @@ class PredictiveFilter:
         """
         every, sizes = slice(self.hardware.modes), {}
         for gain in scenario_gains(self.design):
-            if self.gains[0] <= gain <= self.gains[-1]:
+            if self.interval[0] <= gain <= self.interval[1]:
                 loop, s, _ = self.at(gain)
                 pol = replace(s, B=np.hstack([gain * s.B, s.B]), D=np.hstack([gain * s.D, s.D]))
                 seen, left = (
@@ -144,8 +183,8 @@ class CutFilter:
 
     @cached_property
     def small_gain(self) -> float:
-        """Largest gain around the loop of what is left out; below 1 the cut filter is stable."""
-        return max(self._gain_around(gain) for gain in self.whole.gains)
+        """Bound on the gain around the loop of what is left out; below 1 it keeps that stable."""
+        return self.norm / self.whole.least_distance(self.norm)
 
     def _peak(self, gain: float) -> float:
         """Bound on 1 / D' at a sensor gain."""
@@ -164,9 +203,9 @@ class CutFilter:
         """Check the loop around the filter, in single precision, with products in any order."""
         assert self.taps is not None  # what is proved has been rounded
         checks = prove_written(self.whole.design, *self._as_computed(self.taps), left_out=self)
-        low, high = self.whole.gains[0], self.whole.gains[-1]
+        low, high = self.whole.interval
         name = f"small gain of what is left out, sensor gains {low:.4g} to {high:.4g}"
-        return (*checks, Check(name, self.small_gain, 1.0, f"level sets at {_GAINS} gains"))
+        return (*checks, Check(name, self.small_gain, 1.0, "level sets, bound between gains"))
 
     def _as_computed(self, taps: FloatArray) -> tuple[Controller, Rounding]:
         """Return the filter of the design as a controller, and the rounding of the taps' sums."""

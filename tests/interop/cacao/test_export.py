@@ -12,7 +12,7 @@ from astropy.io import fits
 
 import lbt_synth as lbt
 from lbt_synth.interop.cacao.applied_filter import AppliedFilter
-from lbt_synth.interop.cacao.truncation import CutFilter, predictive_filter
+from lbt_synth.interop.cacao.truncation import CutFilter, PredictiveFilter, predictive_filter
 from lbt_synth.interop.written_loop import mode_variances
 from lbt_synth.loop.simulation.run import step_loop
 
@@ -155,7 +155,37 @@ def test_the_small_gain_is_that_of_the_closed_form(path):
     for gain in np.geomspace(max(1.01 * low, 0.1), min(high / 1.01, 10.0), 9):
         s = 1 / (1 + gain * 0.3 / (z * (z - 1)))
         expected = max(expected, abs(1 - gain) * np.max(np.abs(s + (1 - s) / gain)) * left_out)
-    assert CutFilter(whole=found, steps=2).small_gain == pytest.approx(expected, rel=1e-4)
+    bound = CutFilter(whole=found, steps=2).norm / found.least_distance(0.0)
+    assert expected < 1.0001 * bound
+    assert bound < 2.0001 * expected
+
+
+def test_the_small_gain_holds_between_the_gains_that_are_computed(path, monkeypatch):
+    """A distance that dips at sensor gain 0.125 alone; it changes no faster than its place."""
+    found = predictive_filter(lbt.integrator(path, gain=0.3), path)
+    found = replace(found, system=replace(found.system, C=2 * found.system.C))  # of a larger norm
+    dip = 1 / (1 - 0.125)
+    tried = []
+
+    def distance(_, place):
+        tried.append(1 - 1 / place)
+        return 1e-3 + min(abs(place - dip), 0.3)
+
+    monkeypatch.setattr(PredictiveFilter, "_distance", distance)
+    assert min(distance(None, 1 / (1 - g)) for g in np.geomspace(*found.interval, 9)) > 0.015
+    assert 0.5e-3 <= found.least_distance(0.0) <= 1e-3
+    assert found.least_distance(2e-3) <= 2e-3  # and no more than is enough
+    tried.clear()
+    monkeypatch.setattr(CutFilter, "norm", 5e-3)
+    assert CutFilter(whole=found, steps=9).small_gain >= 1
+    assert len(tried) < 40
+
+
+def test_the_distance_of_a_loop_is_bounded_at_all_its_gains(path):
+    found = predictive_filter(lbt.integrator(path, gain=0.3), path)
+    each = [g for g in np.geomspace(*found.interval, 60) if g != 1]
+    least = min(1 / (abs(1 - g) * found.at(g).peak) for g in each)
+    assert found.least_distance(0.0) <= least <= 2.001 * found.least_distance(0.0)
 
 
 def test_rounding_is_bounded_by_a_loop_in_that_arithmetic(path):
