@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
+from lbt_synth.errors import NumericalError
 from lbt_synth.identification.commands.gain_interval import allowed_gains
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
@@ -62,10 +64,14 @@ def _compare(
 ) -> tuple[IdentifiedModel, bool]:
     """Return the likeliest of a model and those from allowed gains; whether these are excluded."""
     inside = options | {"sensor_gain": np.sqrt(np.prod(allowed, axis=1)).tolist()}
-    held = [identify(record, **inside | {"start": start}) for start in (None, model)]
+    held = []
+    for start in (None, model):
+        with suppress(NumericalError):
+            held.append(identify(record, **inside | {"start": start}))
+    if not held:
+        return model, False
     begun = min(held, key=_criterion)
-    other = identify(record, **options | {"start": begun})
-    best = min(model, other, key=_criterion)
+    best = min(model, identify(record, **options | {"start": begun}), key=_criterion)
     excluded = _criterion(begun) > _criterion(best) + _price(best)
     return best, excluded and not agrees(best, allowed)
 

@@ -48,6 +48,8 @@ class CubicSpline:
 
 def cubic_spline(x: FloatArray, y: FloatArray) -> CubicSpline:
     """Return the spline through at least four points (k,), x increasing."""
+    if x.size < 4:
+        raise ValueError(f"a spline needs at least four points; got {x.size}")
     step, rise = np.diff(x), np.diff(y)
     slope = rise / step
     bands, right = np.zeros((3, x.size)), np.zeros(x.size)

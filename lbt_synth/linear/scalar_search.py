@@ -39,8 +39,10 @@ def find_root(
     """
     a, b = low, high
     at_a, at_b = (function(a), function(b)) if values is None else values
-    if at_a * at_b > 0:
-        raise ValueError(f"the function has one sign at both ends, {low} and {high}")
+    if np.isnan(at_a + at_b) or (at_a and at_b and (at_a > 0) == (at_b > 0)):
+        raise ValueError(
+            f"the signs at {low} and {high} must differ; the values are {at_a} and {at_b}"
+        )
     part = 0.5
     while True:
         best, at_best = (a, at_a) if abs(at_a) < abs(at_b) else (b, at_b)
@@ -49,6 +51,8 @@ def find_root(
             return best
         x = a + float(np.clip(part, least, 1 - least)) * (b - a)
         at_x = function(x)
+        if np.isnan(at_x):
+            raise ValueError(f"the function has no value at {x}")
         if (at_x > 0) == (at_a > 0):
             c, at_c = a, at_a
         else:
@@ -56,7 +60,9 @@ def find_root(
         a, at_a = x, at_x
         place, slope = (a - b) / (c - b), (at_a - at_b) / (at_c - at_b)
         part = 0.5
-        if slope**2 < place and (1 - slope) ** 2 < 1 - place:  # the inverse parabola is safe
+        if (
+            slope * slope < place and (1 - slope) * (1 - slope) < 1 - place
+        ):  # the inverse parabola is safe
             part = at_a / (at_b - at_a) * at_c / (at_b - at_c)
             part += (c - a) / (b - a) * at_a / (at_c - at_a) * at_b / (at_c - at_b)
 

@@ -8,6 +8,7 @@ Source: FITS Standard 4.0, sections 4.1, 4.2 and 7.1, and its appendix J on chec
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from lbt_synth.storage.fits_structure import (
     whole_blocks,
 )
 
+_KEYWORD = re.compile(r"[A-Z0-9_-]{1,8}")
 _BITS = {"u1": 8, "i2": 16, "i4": 32, "i8": 64, "f4": -32, "f8": -64}  # BITPIX of a type
 _PIECE = 33  # characters of a long string in one card: all may be quotes, which are doubled
 _LONGEST_TEXT = 67  # of a string in one card, quotes doubled
@@ -43,6 +45,10 @@ def primary_unit(cards: Mapping[str, Any], comments: Sequence[str] = ()) -> byte
 
 def image_unit(name: str, array: npt.NDArray[Any], cards: Mapping[str, Any]) -> bytes:
     """Return an image HDU; its first axis is the last of FITS."""
+    if not array.ndim:
+        raise ValueError(f"the image {name} needs an axis at least; got a number")
+    if array.dtype.str[1:] not in _BITS:
+        raise ValueError(f"the image {name} must be of {', '.join(_BITS)}; got {array.dtype}")
     lengths = array.shape[::-1]
     head: dict[str, Any] = {
         "XTENSION": ("IMAGE", "Image extension"),
@@ -84,6 +90,8 @@ def _unit(cards: Mapping[str, Any], data: bytes, comments: Sequence[str]) -> byt
 
 def _cards(keyword: str, given: Any) -> list[str]:
     """Return the cards of a value, or of a pair of value and comment."""
+    if not _KEYWORD.fullmatch(keyword):
+        raise ValueError(f"a keyword has at most 8 of A-Z, 0-9, _ and -; got {keyword!r}")
     value, comment = given if isinstance(given, tuple) else (given, "")
     end = f" / {comment}" if comment else ""
     if not isinstance(value, str):
@@ -105,6 +113,8 @@ def _number_text(value: Any) -> str:
         return "T" if value else "F"
     if isinstance(value, int | np.integer):
         return str(int(value))
+    if not np.isfinite(value):
+        raise ValueError(f"a number of a FITS header is finite; got {value}")
     mantissa, letter, exponent = repr(float(value)).upper().partition("E")
     return mantissa[: _LONGEST_NUMBER - len(letter + exponent)] + letter + exponent
 

@@ -26,3 +26,8 @@ def test_cubes_are_exact():
     np.testing.assert_allclose(
         cubic_spline(x, 2 * x**3 - x + 4)(at), 2 * at**3 - at + 4, atol=1e-11
     )
+
+
+def test_three_points_are_too_few():
+    with pytest.raises(ValueError, match="four points"):
+        cubic_spline(np.arange(3.0), np.zeros(3))

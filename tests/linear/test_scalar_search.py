@@ -64,3 +64,19 @@ def test_least_values(name):
         assert found == pytest.approx(place, abs=2 * width)
     own = float(function(np.array([found]))[0])
     assert value == pytest.approx(own, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [lambda x: 1e-200 * (x + 1), lambda x: float("nan"), lambda x: x if x in (-1, 1) else np.nan],
+)
+def test_a_root_that_is_not_bracketed_is_refused(function):
+    with pytest.raises(ValueError, match="must differ|has no value"):
+        find_root(function, -1.0 if function(-1.0) == -1 else 0.0, 1.0, width=1e-9)
+
+
+def test_values_of_any_size_have_a_root():
+    def function(x):
+        return -1e-170 if x < 0.2 else (2e-170 if x > 0.9 else 1.0)
+
+    assert find_root(function, 0.0, 1.0, width=1e-9) == pytest.approx(0.2, abs=1e-9)

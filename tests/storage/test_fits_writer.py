@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.fits_structure import check_fits
+from lbt_synth.storage.fits_writer import image_unit, primary_unit
 
 CARDS = {
     "VERSION": (1, "layout of the HDUs A, B, C, D"),
@@ -95,3 +96,25 @@ def test_a_long_comment_is_cut_at_the_end_of_its_card():
 def test_what_is_no_printable_ascii_is_refused(text):
     with pytest.raises(ValueError, match="printable ASCII"):
         fits_bytes({"NAME": text}, {})
+
+
+@pytest.mark.parametrize(
+    ("cards", "match"),
+    [
+        ({"K": float("nan")}, "finite"),
+        ({"K": float("-inf")}, "finite"),
+        ({"LONGKEYWORD": 1}, "keyword"),
+        ({"lower": 1}, "keyword"),
+    ],
+)
+def test_cards_that_are_not_fits_are_refused(cards, match):
+    with pytest.raises(ValueError, match=match):
+        primary_unit(cards)
+
+
+@pytest.mark.parametrize(
+    "array", [np.array(5.0), np.zeros(2, dtype="u2"), np.zeros(2, dtype="c16")]
+)
+def test_arrays_that_are_not_written_are_refused(array):
+    with pytest.raises(ValueError, match="an axis|must be of"):
+        image_unit("A", array, {})
