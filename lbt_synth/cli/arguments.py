@@ -380,6 +380,7 @@ def study(parser: ArgumentParser) -> None:
 
 def paper(parser: ArgumentParser) -> None:
     """Compute the tables and figures of Agapito et al. 2008, ours beside theirs."""
+    add_unit(parser)
     add_output(parser, "directory to write into")
 
 

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import track_progress
 from lbt_synth.methods.registry import design_title
 from lbt_synth.report.paper import PaperResult, write_paper
+from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import json_record
-from lbt_synth.studies.paper.parameters import PARAMETERS, TABLE_III
+from lbt_synth.studies.paper.parameters import DIAMETER_M, TABLE_III, parameter_rows
 from lbt_synth.studies.paper.tables import TableEntry, rms_difference, table_iii
 
 
 def run(arguments: Namespace) -> Report:
     """Compute and write the tables and figures of the paper."""
+    choose_unit(arguments, DIAMETER_M)
     folder = make_directory(arguments.output)
     rows = list(
         track_progress(
@@ -27,6 +30,8 @@ def run(arguments: Namespace) -> Report:
         method: rms_difference([e for e in result.table_iii if e.method == method])
         for method in dict.fromkeys(entry.method for entry in result.table_iii)
     }
+    with own_display_unit():  # JSON stays in nm
+        parameters = parameter_rows()
     report = Report(
         data={
             "table_ii": [json_record(entry) for entry in result.table_ii],
@@ -34,7 +39,7 @@ def run(arguments: Namespace) -> Report:
             "table_iii_rms_points": columns,
             "hinf_gamma_ratio": _gamma_ratio(result),
             "parameters": [
-                dict(zip(("name", "value", "origin"), row, strict=True)) for row in PARAMETERS
+                dict(zip(("name", "value", "origin"), row, strict=True)) for row in parameters
             ],
         },
         notes=[
@@ -43,7 +48,7 @@ def run(arguments: Namespace) -> Report:
             f"H-infinity: bound at {_gamma_ratio(result):.3f} times the least at 20 Hz",
         ],
     )
-    report.add_table("Parameters", ("parameter", "value", "origin"), PARAMETERS)
+    report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
     for number, entries in (("II", result.table_ii), ("III", result.table_iii)):
         _add_comparison(report, f"Table {number}: Strehl ratio [%] at 2.2 um", entries)
     report.note_files(result.files)

@@ -175,8 +175,7 @@ def certify_filter(
     gain = np.asarray(gain_predictor)
     checks = list(certificate.checks)
     if gamma is not None:
-        limit = gamma * (1 + NORM_TOLERANCE)
-        checks.append(Check("norm of the estimation error", norm.upper, limit, LEVEL_SETS))
+        checks.append(bound_check(norm.upper, gamma))
     if least_variance:
         innovation = problem.R + problem.C @ P @ problem.C.T
         optimal = np.linalg.solve(innovation, (problem.A @ P @ problem.C.T + problem.S).T).T
@@ -185,6 +184,12 @@ def certify_filter(
         how = "gain recomputed from the Lyapunov covariance"
         checks.append(Check("distance from the least-variance gain", distance, GAIN_TOLERANCE, how))
     return replace(certificate, checks=tuple(checks))
+
+
+def bound_check(norm: float, bound: float) -> Check:
+    """Check the norm of an estimation error against the bound that was asked for."""
+    name = "norm of the estimation error over its bound, less 1"
+    return Check(name, norm / bound - 1, NORM_TOLERANCE, LEVEL_SETS)
 
 
 def certify_error(

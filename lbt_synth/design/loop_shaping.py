@@ -309,14 +309,14 @@ def _mode_checks(
         found = float(np.sqrt(spec.objective.measured_nm2(loop)))
     except UnstableLoopError:
         found = np.inf
-    name, how = "root of the objective, against the one claimed [nm]", "closed loops in state space"
-    limit = objective_nm * (1 + _RMS_TOLERANCE)
-    above = objective_nm / found - 1 if found > 0 else np.inf
+    how = "closed loops in state space"
+    above = found / objective_nm - 1 if objective_nm > 0 else np.inf
+    below = objective_nm / found - 1 if found > 0 else np.inf
     return [
         stable,
         *checks,
-        Check(name, found, limit, how),
-        Check("objective claimed over the one found, less 1", above, _CLAIM_TOLERANCE, how),
+        Check("objective found over the one claimed, less 1", above, _RMS_TOLERANCE, how),
+        Check("objective claimed over the one found, less 1", below, _CLAIM_TOLERANCE, how),
     ]
 
 

@@ -116,9 +116,9 @@ class PolytopicDesign(EstimatorDesign):
         beyond, high_hz = beyond - interval.half_width_hz, interval.high_hz
         again = bound_worst_error(interval, predictor, norm)
         search, one = "grid of frequencies, refined", "relative, one error system"
-        change = abs(there / worst - 1)
+        change, above = abs(there / worst - 1), again / bound - 1
         rows = (
-            ("bound over the interval, recomputed", again, bound * (1 + limit), _NORMS[norm]),
+            ("bound recomputed over the one stated, less 1", above, limit, _NORMS[norm]),
             ("worst error found over the bound, less 1", found / bound - 1, limit, search),
             ("worst error found over the one stated, less 1", found / worst - 1, limit, search),
             ("worst error stated, against that at its frequency", change, limit, one),

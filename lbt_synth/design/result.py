@@ -302,9 +302,9 @@ class FilterDesign(EstimatorDesign):
         problem, start = self.problem, kalman_riccati(self.problem)
         checks = [self._gain_check(), *self._origin_checks(start)]
         if self.rms_requested is not None:
-            limit = self.rms_requested * (1 + NORM_TOLERANCE)
-            name = "standard deviation of the estimation error"
-            checks.append(Check(name, certificate.rms, limit, "Lyapunov equation"))
+            above = certificate.rms / self.rms_requested - 1
+            name = "standard deviation of the estimation error over its bound, less 1"
+            checks.append(Check(name, above, NORM_TOLERANCE, "Lyapunov equation"))
         if self.gamma_least is not None:
             equation = GammaEquation(problem, start)
             meets = [

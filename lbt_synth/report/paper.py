@@ -13,10 +13,11 @@ from lbt_synth.report.figures.robustness import robustness_figure
 from lbt_synth.report.figures.sigma import sigma_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import csv_rows
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
-from lbt_synth.studies.paper.parameters import PARAMETERS, TABLE_III, VIBRATION_HZ
+from lbt_synth.studies.paper.parameters import TABLE_III, VIBRATION_HZ, parameter_rows
 from lbt_synth.studies.paper.tables import TableEntry, compare_with_paper, paper_filters, table_ii
 
 
@@ -40,11 +41,9 @@ def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) ->
         write_atomically(folder / name, csv_rows(entries))
         for name, entries in (("table_ii.csv", second), ("table_iii.csv", third))
     ]
-    files.append(
-        write_atomically(
-            folder / "parameters.csv", csv_bytes(("parameter", "value", "origin"), PARAMETERS)
-        )
-    )
+    with own_display_unit():  # CSV stays in nm
+        parameters = csv_bytes(("parameter", "value", "origin"), parameter_rows())
+    files.append(write_atomically(folder / "parameters.csv", parameters))
     published = {
         name: [(row.model_hz - VIBRATION_HZ, getattr(row, name)) for row in TABLE_III]
         for name in (kalman_design.method, hinf_design.method)

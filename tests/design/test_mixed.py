@@ -206,4 +206,4 @@ def test_the_demand_is_kept_and_checked(tmp_path, plant):
     assert loaded.recertify().passed
     forged = dataclasses.replace(loaded, rms_requested=139.0)
     failed = [check.name for check in forged.recertify().checks if not check.passed]
-    assert failed == ["standard deviation of the estimation error"]
+    assert failed == ["standard deviation of the estimation error over its bound, less 1"]

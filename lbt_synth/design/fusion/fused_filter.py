@@ -10,10 +10,10 @@ import numpy as np
 
 from lbt_synth.design.certificate import (
     GAIN_TOLERANCE,
-    LEVEL_SETS,
     NORM_TOLERANCE,
     Certificate,
     Check,
+    bound_check,
     certify_error,
 )
 from lbt_synth.design.fusion.failures import Fallback, failed_loop, make_fallbacks
@@ -186,7 +186,7 @@ class FusedFilter(Design):
             if self.gamma_requested is None:
                 checks.append(_least_variance_check(problem, self.gains))
             else:
-                checks += self._bound_checks(certificate)
+                checks += self._bound_checks(certificate, self.gamma_requested)
         checks.append(_stable("spectral radius of the closed loop", self.loop()))
         checks += self._fallback_checks()
         powers = certificate.rms_per_output.reshape(-1, len(problem.L)) ** 2
@@ -207,9 +207,8 @@ class FusedFilter(Design):
             for checks in (radii, apart)
         ]
 
-    def _bound_checks(self, certificate: Certificate) -> list[Check]:
-        limit = (self.gamma_requested or 0.0) * (1 + NORM_TOLERANCE)
-        checks = [Check("norm of the estimation error", certificate.gamma, limit, LEVEL_SETS)]
+    def _bound_checks(self, certificate: Certificate, bound: float) -> list[Check]:
+        checks = [bound_check(certificate.gamma, bound)]
         start = periodic_kalman(self.problem)
         if self.gamma_least is not None:
             meets = [
@@ -219,7 +218,7 @@ class FusedFilter(Design):
             off = 0.0 if meets == [False, True] else np.inf
             how = "gamma-Riccati equation on both sides"
             checks.append(Check("least norm of any filter, error", off, NORM_TOLERANCE, how))
-        level = self.gamma_central or self.gamma_requested or 0.0
+        level = self.gamma_central or bound
         central = periodic_hinf(self.problem, level, start)
         apart = np.inf if central is None else relative_distance(self.gains, central.gains)
         name, how = "distance from its Riccati filter", "relative"

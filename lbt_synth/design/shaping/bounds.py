@@ -228,8 +228,9 @@ class CommandRms(CheckedFields):
 
         edges = [resonance_edges(loop.at(1.0)), spectrum_edges(self.turbulence, nyquist)]
         variance = adaptive_integral(power, np.unique(np.concatenate(edges)))[0, 0]
-        name = f"command {self._what} [nm rms]"
-        return (Check(name, float(np.sqrt(variance)), self.at_most_nm, "adaptive quadrature"),)
+        share = float(np.sqrt(variance)) / self.at_most_nm
+        name = f"rms of the command {self._what} over its bound"
+        return (Check(name, share, 1.0, "adaptive quadrature"),)
 
     @property
     def _shown_limit(self) -> str:

@@ -25,11 +25,23 @@ _LATER_CHECKS = {  # than 0.2
     "least norm of any filter, error",
     "level proved over the infeasible level, less 1",
     "objective claimed over the one found, less 1",
+    "norm of the estimation error over its bound, less 1",
+    "standard deviation of the estimation error over its bound, less 1",
+    "bound recomputed over the one stated, less 1",
+    "objective found over the one claimed, less 1",
+    "rms of the command stroke over its bound",
+    "rms of the command step over its bound",
 }
 _RETIRED_CHECKS = {  # since 0.2
     "controller against its gains",
     "controller against its parameters",
     "controller, against the one made of the filter",
+    "norm of the estimation error",
+    "standard deviation of the estimation error",
+    "bound over the interval, recomputed",
+    "root of the objective, against the one claimed [nm]",
+    "command stroke [nm rms]",
+    "command step [nm rms]",
 }
 
 

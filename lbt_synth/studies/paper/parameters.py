@@ -27,6 +27,7 @@ from lbt_synth.models import (
     nm_per_mas,
     tip_tilt_plant,
 )
+from lbt_synth.storage.display_unit import nm_text
 
 VIBRATION_HZ = 20.0
 
@@ -170,25 +171,28 @@ def _plant(turbulence: ARModel, vibration_nm: float, damping: float) -> TipTiltP
     )
 
 
-# name, value and origin of each
-PARAMETERS = (
-    ("diameter, obstruction", f"{DIAMETER_M} m, {OBSTRUCTION} D", "paper, Table I"),
-    (
-        "seeing, outer scale, wind",
-        f"{ATMOSPHERE.seeing_arcsec:g} arcsec, {ATMOSPHERE.outer_scale_m:g} m, "
-        f"{ATMOSPHERE.wind_speed_m_s:g} m/s",
-        "paper, Table I",
-    ),
-    ("frame rate, delay", f"{FRAME_RATE_HZ:g} Hz, {DELAY_FRAMES:g} frames", "paper, Table I"),
-    ("vibration", f"{VIBRATION_HZ:g} Hz, {VIBRATION_MAS:g} mas", "paper, section V-C"),
-    ("turbulence pole, rms", "0.98860, 591.6 nm", "derived from Table I"),
-    ("measurement noise", f"{NOISE_NM} nm per frame", "derived from Table I"),
-    ("80 mas as the rms of a sinusoid", f"{VIBRATION_NM:.1f} nm", "read so here"),
-    ("optical gain of the pyramid", f"{TRUTH_SENSOR_GAIN}", "fitted"),
-    ("Strehl of the other modes", f"{OTHER_MODES_STREHL}", "fitted"),
-    ("damping of the vibration", f"{KALMAN_DAMPING}", "fitted"),
-    ("classical gain x optical gain", f"{CLASSICAL_EFFECTIVE_GAIN}", "fitted"),
-    ("H-inf vibration weight / noise", f"{HINF_VIBRATION_WEIGHT}", "fitted"),
-    ("H-inf turbulence weight / noise", f"{HINF_TURBULENCE_WEIGHT}", "fitted"),
-    ("H-inf gamma / noise", f"{HINF_GAMMA}", "fitted"),
-)
+def parameter_rows() -> tuple[tuple[str, str, str], ...]:
+    """Return name, value and origin of each parameter, wavefronts in the unit shown."""
+    model = turbulence_model()
+    pole, rms_nm = model.coefficients[0], model.rms_nm
+    return (
+        ("diameter, obstruction", f"{DIAMETER_M} m, {OBSTRUCTION} D", "paper, Table I"),
+        (
+            "seeing, outer scale, wind",
+            f"{ATMOSPHERE.seeing_arcsec:g} arcsec, {ATMOSPHERE.outer_scale_m:g} m, "
+            f"{ATMOSPHERE.wind_speed_m_s:g} m/s",
+            "paper, Table I",
+        ),
+        ("frame rate, delay", f"{FRAME_RATE_HZ:g} Hz, {DELAY_FRAMES:g} frames", "paper, Table I"),
+        ("vibration", f"{VIBRATION_HZ:g} Hz, {VIBRATION_MAS:g} mas", "paper, section V-C"),
+        ("turbulence pole, rms", f"{pole:.5f}, {nm_text(rms_nm, '.1f')}", "derived from Table I"),
+        ("measurement noise", f"{nm_text(NOISE_NM, '.1f')} per frame", "derived from Table I"),
+        ("80 mas as the rms of a sinusoid", nm_text(VIBRATION_NM, ".1f"), "read so here"),
+        ("optical gain of the pyramid", f"{TRUTH_SENSOR_GAIN}", "fitted"),
+        ("Strehl of the other modes", f"{OTHER_MODES_STREHL}", "fitted"),
+        ("damping of the vibration", f"{KALMAN_DAMPING}", "fitted"),
+        ("classical gain x optical gain", f"{CLASSICAL_EFFECTIVE_GAIN}", "fitted"),
+        ("H-inf vibration weight / noise", f"{HINF_VIBRATION_WEIGHT}", "fitted"),
+        ("H-inf turbulence weight / noise", f"{HINF_TURBULENCE_WEIGHT}", "fitted"),
+        ("H-inf gamma / noise", f"{HINF_GAMMA}", "fitted"),
+    )

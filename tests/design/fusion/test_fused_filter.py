@@ -85,7 +85,8 @@ def test_a_least_gamma_that_is_wrong(hinf, factor):
 
 def test_a_bound_that_is_not_met(hinf):
     found = failed(replace(hinf, gamma_requested=0.99 * hinf.gamma))
-    assert found == {"norm of the estimation error", "distance from its Riccati filter"}
+    norm = "norm of the estimation error over its bound, less 1"
+    assert found == {norm, "distance from its Riccati filter"}
     kalman = lbt.linear.periodic_kalman(hinf.problem).gains
     assert "distance from its Riccati filter" in failed(replace(hinf, gains=kalman))
 
