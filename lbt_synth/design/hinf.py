@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -19,7 +18,7 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     least_gamma,
 )
-from lbt_synth.validation import FloatArray, choice, frozen_copy, number
+from lbt_synth.validation import choice, number
 
 if TYPE_CHECKING:
     from lbt_synth.linear.lmi.filters import LmiSolution
@@ -174,22 +173,15 @@ def require_reachable(gamma: float, least: float) -> None:
 
 
 class _RiccatiRoute:
-    """Filters by the gamma-Riccati equation, in units in which the Kalman errors have size one."""
+    """Filters by the gamma-Riccati equation."""
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
-        spread = np.sqrt(np.diag(start.P))
-        usable = (spread > 1e-150) & (spread < 1e150)
-        # powers of two: the change of units rounds nothing
-        self.units = np.exp2(np.round(np.log2(np.where(usable, spread, 1.0))))[:, None]
-        self.problem = scale_states(problem, self.units)
-        self.start = self._rescale(start, 1 / self.units)
+        self.problem, self.start = problem, start
 
     def least_gamma(self) -> tuple[SolvedGains, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)
         _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
-        witness = worst_invisible_disturbance(self.problem, best.P, level, self.start.P)
-        states = frozen_copy(self.units * witness.states)
-        return self._rescale(best, self.units), replace(witness, states=states)
+        return best, worst_invisible_disturbance(self.problem, best.P, level, self.start.P)
 
     def central(self, gamma: float) -> SolvedGains:
         solution = gamma_riccati(self.problem, gamma, start=self.start)
@@ -199,16 +191,7 @@ class _RiccatiRoute:
                 "Try a larger gamma.",
                 gamma=gamma,
             )
-        return self._rescale(solution, self.units)
-
-    @staticmethod
-    def _rescale(solution: FilterRiccati, units: FloatArray) -> FilterRiccati:
-        return replace(
-            solution,
-            P=frozen_copy(units * solution.P * units.T),
-            gain_predictor=frozen_copy(units * solution.gain_predictor),
-            gain_filter=frozen_copy(units * solution.gain_filter),
-        )
+        return solution
 
 
 class _LmiRoute:
@@ -229,18 +212,6 @@ class _LmiRoute:
         from lbt_synth.linear.lmi.filters import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
-
-
-def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:
-    """Return the problem with its states divided by units (n, 1)."""
-    return EstimationProblem(
-        A=problem.A * units.T / units,
-        B=problem.B / units,
-        C=problem.C * units.T,
-        D=problem.D,
-        L=problem.L * units.T,
-        dt_s=problem.dt_s,
-    )
 
 
 def _verified_bracket(

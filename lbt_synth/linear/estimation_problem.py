@@ -290,3 +290,22 @@ def filter_gains(
     weighted = np.linalg.solve(problem.R, problem.C).T  # C' R^-1
     gain_filter = np.linalg.solve(information + weighted @ problem.C, weighted)
     return frozen_copy(A_s @ gain_filter + injection), frozen_copy(gain_filter)
+
+
+def error_units(covariance: FloatArray) -> FloatArray:
+    """Units (n, 1) in which errors of this covariance have size one: powers of two, to be exact."""
+    spread = np.sqrt(np.diag(covariance))
+    usable = (spread > 1e-150) & (spread < 1e150)
+    return np.asarray(np.exp2(np.round(np.log2(np.where(usable, spread, 1.0)))))[:, None]
+
+
+def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:
+    """Return the problem with its states divided by units (n, 1)."""
+    return EstimationProblem(
+        A=problem.A * units.T / units,
+        B=problem.B / units,
+        C=problem.C * units.T,
+        D=problem.D,
+        L=problem.L * units.T,
+        dt_s=problem.dt_s,
+    )

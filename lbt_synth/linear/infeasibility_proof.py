@@ -14,12 +14,17 @@ a point. If rounding breaks the "at least", the price of the shortfall is added 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh, null_space
 
-from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
+from lbt_synth.linear.estimation_problem import (
+    EstimationProblem,
+    decorrelate,
+    error_units,
+    scale_states,
+)
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.validation import FloatArray, matrix, set_fields
@@ -126,6 +131,9 @@ def worst_invisible_disturbance(
     sinusoid at the frequency of the slowest pole of that recursion, for problems in which a
     steady oscillation limits gamma. P and covariance are (n, n).
     """
+    units = error_units(covariance)
+    problem = scale_states(problem, units)
+    P, covariance = P / units / units.T, covariance / units / units.T
     A, B, _ = decorrelate(problem)
     C, L = problem.C, problem.L
     W = C.T @ np.linalg.solve(problem.R, C) - L.T @ L / gamma**2
@@ -137,7 +145,8 @@ def worst_invisible_disturbance(
     poles = np.linalg.eigvals(backward)
     slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
     candidates += [_sinusoid(problem, float(np.angle(pole))) for pole in slow]
-    return max(candidates, key=lambda witness: infeasible_level(problem, witness, covariance))
+    best = max(candidates, key=lambda witness: infeasible_level(problem, witness, covariance))
+    return replace(best, states=units * best.states)
 
 
 def _hide(problem: EstimationProblem, states: FloatArray, disturbances: FloatArray) -> Witness:

@@ -20,12 +20,13 @@ def test_there_is_a_template_of_each_telescope():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_template_makes_a_certified_filter(tmp_path, name):
+def test_a_template_makes_certified_filters(tmp_path, name):
     path = tmp_path / "t.yaml"
     path.write_text(telescope_template(name))
     config = lbt.load_config(path)
     design = lbt.kalman(config.plant)
     assert design.certificate.passed
+    assert lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati").certificate.passed
     loop = lbt.close_loop(config.hardware, design.controller)
     left = lbt.residual_budget(loop, config.truth).rms_nm
     loop = lbt.close_loop(config.hardware, config.design("integrator").controller)

@@ -24,6 +24,25 @@ def test_the_numbers_of_the_lbt(axis_plant):
     assert least["lmi"] == pytest.approx(least["riccati"], rel=1e-6)
 
 
+def test_both_routes_bracket_slow_wind_shake_of_thousands_of_nanometres():
+    """Poles of modulus 0.9999 on both axes, with 8 um beside noise of 3 nm: the ELT's template."""
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=1000.0,
+        turbulence=lbt.models.ARModel(
+            coefficients=[1.998866, -0.99887], driving_rms_nm=0.85, frame_rate_hz=1000.0
+        ),
+        vibrations=[
+            lbt.Vibration(frequency_hz=0.75, damping=0.3, rms_nm=340.0, direction=(1, 0)),
+            lbt.Vibration(frequency_hz=0.3, damping=0.3, rms_nm=8090.0, direction=(0, 1)),
+        ],
+        noise_nm=2.7,
+    )
+    lmi, riccati = (lbt.hinf(plant, gamma_ratio=1.2, route=m) for m in ("lmi", "riccati"))
+    assert riccati.gamma_least == pytest.approx(lmi.gamma_least, rel=1e-7)
+    assert riccati.gamma_infeasible == pytest.approx(riccati.gamma_least, rel=1e-7)
+    assert lmi.gamma == pytest.approx(riccati.gamma, rel=1e-5)
+
+
 @pytest.mark.parametrize("ratio", [1.02, 1.2, 2.0])
 def test_hinf_by_lmi_is_the_central_filter_of_the_riccati_equation(axis_plant, ratio):
     gamma = ratio * LEAST_GAMMA_NM

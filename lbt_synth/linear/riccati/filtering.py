@@ -6,13 +6,18 @@ Control", SIAM (1999), doi:10.1137/1.9781611970760, chapter 4 (a-priori filter).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
-from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
+from lbt_synth.linear.estimation_problem import (
+    EstimationProblem,
+    decorrelate,
+    error_units,
+    scale_states,
+)
 from lbt_synth.linear.matrix_functions import is_stable
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
@@ -113,6 +118,7 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
 
 _RESIDUAL_LIMIT = 1e-9
 _GAMMA_TOLERANCE = 4e-12
+_INDEFINITE = 1e-6  # what poles near the unit circle may leave below zero in a doubling
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,7 +126,7 @@ class LevelTrial:
     """Whether one level can be met, and the solution of its equation if so."""
 
     slack: float  # least eigenvalue of ``I - L P L' / gamma^2``; negative if it cannot be met
-    P: FloatArray | None = None  # (n, n)
+    P: FloatArray | None = None  # (n, n), in the units of the equation
     iterations: int = 0  # doublings
 
 
@@ -140,17 +146,20 @@ class GammaEquation:
         A1 = A N F,   G1 = W N F,   H1 = A M L'(gamma^2 I - L M L')^-1 L M A'
 
     H1 is positive semidefinite and holds no difference of large numbers, so the
-    doubling starts inside the stabilising solution's reach.
+    doubling starts inside the stabilising solution's reach. The states are in units in which
+    the Kalman errors have size one.
     """
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
-        self.problem, self.start = problem, start
-        self.A, self.B, self.injection = decorrelate(problem)
+        self.units = error_units(start.P)
+        self.problem = scale_states(problem, self.units)
+        self.start = _scale_solution(start, 1 / self.units)
+        self.A, self.B, self.injection = decorrelate(self.problem)
         self.identity = np.eye(len(self.A))
-        self.keep = self.identity - start.gain_filter @ problem.C
-        filtered = self.keep @ start.P
+        self.keep = self.identity - self.start.gain_filter @ self.problem.C
+        filtered = self.keep @ self.start.P
         self.filtered = (filtered + filtered.T) / 2
-        self.information = problem.C.T @ np.linalg.solve(problem.R, problem.C)
+        self.information = self.problem.C.T @ np.linalg.solve(self.problem.R, self.problem.C)
 
     def trial(self, gamma: float) -> LevelTrial:
         """Solve at one level, to the accuracy of the doubling."""
@@ -172,7 +181,7 @@ class GammaEquation:
         spectrum = np.linalg.eigvalsh(X)
         slack = 1 - float(np.linalg.eigvalsh(L @ P @ L.T)[-1]) / gamma**2
         transition = np.linalg.solve((self.identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
-        if spectrum[0] < -1e-9 * abs(spectrum[-1]) or not is_stable(transition):
+        if spectrum[0] < -_INDEFINITE * abs(spectrum[-1]) or not is_stable(transition):
             return LevelTrial(slack=-1.0)
         return LevelTrial(slack=slack, P=P if slack > 0 else None, iterations=int(steps[0]))
 
@@ -207,14 +216,25 @@ class GammaEquation:
         gain = self.A @ gain_filter + self.injection
         if not is_stable(problem.A - gain @ problem.C):
             return None
-        return FilterRiccati(
-            P=frozen_copy(P),
-            gain_predictor=frozen_copy(gain),
-            gain_filter=frozen_copy(gain_filter),
+        solution = FilterRiccati(
+            P=P,
+            gain_predictor=gain,
+            gain_filter=gain_filter,
             residual=residual,
             iterations=trial.iterations,
             status="doubling",
         )
+        return _scale_solution(solution, self.units)
+
+
+def _scale_solution(solution: FilterRiccati, units: FloatArray) -> FilterRiccati:
+    """Return the solution with its states multiplied by units (n, 1)."""
+    return replace(
+        solution,
+        P=frozen_copy(units * solution.P * units.T),
+        gain_predictor=frozen_copy(units * solution.gain_predictor),
+        gain_filter=frozen_copy(units * solution.gain_filter),
+    )
 
 
 def gamma_riccati(
