@@ -59,6 +59,8 @@ def all_modes(
     modal: bool = True,
 ) -> AllModes:
     """Return the designs of a file, each certified; ``modal`` requires one of modes."""
+    if hardware is not None and design.hardware is not None:
+        raise ProblemError("hardware must be left out where a design has a loop; got both.")
     if isinstance(design, MixedController | ModalFilters):
         if other_gain is not None:
             raise ProblemError("other_gain goes with a design; here each mode has its own gain.")
