@@ -140,10 +140,6 @@ class GeneralizedPlant(Summarised):
         parts = _partition(system.A, system.B, system.C, system.D, p1, m1)
         return GeneralizedPlant(**parts, dt_s=require_same_time(system))
 
-    def without_D22(self) -> GeneralizedPlant:
-        """Return the plant whose measurements do not see the control at once."""
-        return replace(self, D22=np.zeros_like(self.D22))
-
     def closed_loop(self, controller: StateSpace | ContinuousSystem) -> Any:
         """Return the system from w to z with ``u = K y``.
 
