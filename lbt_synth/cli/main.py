@@ -11,6 +11,7 @@ import importlib
 import json
 import signal
 import sys
+import threading
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -74,19 +75,20 @@ def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:
 @contextmanager
 def _interruptible() -> Iterator[None]:
     """Let signals raise exceptions where they would end the process at once."""
-    handlers: dict[int, Callable[[int, FrameType | None], object]] = {
-        signal.SIGINT: signal.default_int_handler,
-        signal.SIGTERM: _terminate,
-    }
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_DFL:  # not the console script
-        handlers = {}
+    handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
+    interruption = signal.getsignal(signal.SIGINT)
+    if interruption is signal.SIG_DFL:  # by the console script
+        handlers[signal.SIGINT] = signal.default_int_handler
+    # shells and nohup ignore SIGINT of what runs in the background, where SIGTERM ends it
+    alone = threading.current_thread() is threading.main_thread()
+    if interruption in (signal.SIG_DFL, signal.SIG_IGN) and alone:
+        handlers[signal.SIGTERM] = _terminate
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
         yield
     finally:
-        for number in handlers:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _terminate(*_: object) -> None:

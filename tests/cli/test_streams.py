@@ -106,15 +106,20 @@ def test_the_command_itself_may_be_interrupted(monkeypatch, capsys):
     assert (status, error) == (130, "lbt-synth: interrupted\n")
 
 
-def test_a_termination_says_what_is_kept(monkeypatch, capsys, tmp_path):
+@pytest.mark.parametrize("interruption", [signal.SIG_DFL, signal.SIG_IGN], ids=["heard", "ignored"])
+def test_a_termination_says_what_is_kept(monkeypatch, capsys, tmp_path, interruption):
+    """Shells ignore interruptions of what runs in the background."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, interruption)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     monkeypatch.setattr(
         "lbt_synth.studies.run_study", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM)
     )
     study = ROOT / "examples" / "study.yaml"
     try:
         status, out, error = run(capsys, "study", study, "-o", tmp_path / "s")
+        assert signal.getsignal(signal.SIGINT) == interruption
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
