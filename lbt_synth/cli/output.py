@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from rich import table as rich_table
 from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
 from rich.console import Console
 from rich.text import Text
 
@@ -21,6 +22,7 @@ from lbt_synth.storage.rows import cell_text, fact_table, json_record, json_unit
 from lbt_synth.storage.tables import Table
 
 _WIDTH = 200  # where the output is no terminal
+_LONGEST_NUMBER = 20  # letters; a longer word may be broken
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
 
 
@@ -95,19 +97,53 @@ class Report:
             for line in self.opening:
                 console.print(printable(line), markup=False, soft_wrap=True)
             for table in self.tables:
-                console.print(_printable(table))
+                for part in _fit_width(table, console.width):
+                    console.print(part)
             for line in self.notes:
                 console.print(printable(line), markup=False, soft_wrap=True)
         sys.stdout.write(captured.get())
 
 
-def _printable(table: Table) -> rich_table.Table:
+def _fit_width(table: Table, room: int) -> list[rich_table.Table]:
+    """Set a table in as many parts as its numbers need, each with all rows and some columns."""
+    parts = [table]
+    for most in range(max(len(table.headings) - 1, 1), 0, -1):
+        parts = list(table.by_columns(most))
+        if all(sum(_widths(part)[1]) + _frame(part) <= room for part in parts):
+            break
+    return [_printable(part, room) for part in parts]
+
+
+def _frame(table: Table) -> int:
+    """Width of what stands around and between the columns."""
+    return 3 * len(table.headings) + 1
+
+
+def _widths(table: Table) -> tuple[list[int], list[int]]:
+    """Widths of the columns in which no cell is broken, and in which no number is."""
+    columns = [
+        [heading, *(row[i].text for row in table.cells() if i < len(row) > 1)]
+        for i, heading in enumerate(table.headings)
+    ]
+    whole = [max(cell_len(printable(text)) for text in column) for column in columns]
+    words = [max(cell_len(word) for word in printable(" ".join(c)).split()) for c in columns]
+    return whole, [min(word, _LONGEST_NUMBER) for word in words]
+
+
+def _printable(table: Table, room: int) -> rich_table.Table:
+    widths, least = _widths(table)
+    while sum(widths) > room - _frame(table) and max(widths) > 1:
+        broken = [i for i, width in enumerate(widths) if width > least[i]] or range(len(widths))
+        widths[max(broken, key=widths.__getitem__)] -= 1
     out = rich_table.Table(
         title=Text(printable(table.caption), style="bold"), title_justify="left", box=SIMPLE_HEAD
     )
-    for i, heading in enumerate(table.headings):
+    for i, (heading, width) in enumerate(zip(table.headings, widths, strict=True)):
         out.add_column(
-            Text(printable(heading)), justify="left" if i in (0, *table.words) else "right"
+            Text(printable(heading)),
+            justify="left" if i in (0, *table.words) else "right",
+            width=width,
+            overflow="fold",
         )
     for row in table.cells():
         out.add_row(*(Text(printable(cell.text)) for cell in row))

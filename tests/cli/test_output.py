@@ -87,6 +87,33 @@ def test_rows_and_facts_of_a_report(capsys):
     assert "residual   1234.6   nm" in lines[-3]
 
 
+@pytest.mark.parametrize("width", [30, 40, 80, 200])
+def test_no_number_is_cut_for_a_narrow_terminal(capsys, monkeypatch, width):
+    """Columns move below each other before a number loses a digit; words and digests are broken."""
+    monkeypatch.setattr("lbt_synth.cli.output._WIDTH", width)
+    headings = ("design", "above the limit of the band [%]", "computed by", "residual [nm]")
+    numbers = [("1304.501234", "-4.00071e-11"), ("231.599999", "175.071234")]
+    digest = "7fca5104ba11fd3491526e67a502252483eee8233e85fe02f227a7f95c5518a3"
+    report = Report()
+    report.add_table(
+        "Distance to the limits",
+        headings,
+        [(f"integrator {a}", a, f"level sets {digest}", b) for a, b in numbers],
+    )
+    report.print(as_json=False)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= width
+    assert "…" not in "".join(lines)
+    words = " ".join(lines).split()
+    for number in (number for row in numbers for number in row):
+        assert number in words
+    assert {"integrator", "sets", "[%]", "[nm]"} <= set(words)
+    assert (
+        sum(line.startswith("Distance") for line in lines) == {30: 3, 40: 3, 80: 1, 200: 1}[width]
+    )
+    assert (digest in words) is (width == 200)
+
+
 def test_tables_of_any_values():
     report = Report()
     report.add_table("Mixed", ("name", "unit", "value"), [("a", "nm", 1 / 3), ("b", "", None)])
