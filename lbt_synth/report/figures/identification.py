@@ -226,13 +226,13 @@ def _cumulative_curves(axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -
 def _innovations_panel(axis: IdentifiedAxis) -> Panel:
     test = axis.whiteness
     even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
-    bound = _KOLMOGOROV / np.sqrt(test.effective)
-    excess = test.cumulative - even
+    bound = 100 * _KOLMOGOROV / np.sqrt(test.effective)
+    excess = 100 * (test.cumulative - even)
     reach = max(2 * bound, 1.2 * float(np.max(np.abs(excess))))
     return Panel(
         title="innovations, less white noise",
         x=_frequency(axis),
-        y=Axis(label="cumulative power", low=-reach, high=reach),
+        y=Axis(label="power up to f", unit="%", low=-reach, high=reach),
         marks=(
             Span(name="99 % of white noise", axis="y", low=-bound, high=bound),
             Curve(name="", x=test.frequency_hz, y=excess, width=1.0),

@@ -32,7 +32,7 @@ def test_titles_of_panels_stay_in_their_drawing():
     title = "a very long name " * 10
     for columns in (1, 2, 3):
         figure = draw_figure(many_panels(columns, title, columns).panels, columns=columns)
-        figure.canvas.draw()
+        figure.draw_without_rendering()
         for axes in figure.axes:
             shown = axes.get_title(loc="left")
             assert "…" in shown

@@ -18,7 +18,7 @@ def model() -> lbt.identification.IdentifiedModel:
 
 def test_figure_of_a_short_spectrum(model):
     figure = lbt.report.figures.identification_figure(model)
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     labels = [text.get_text() for text in figure.axes[4].get_xticklabels() if text.get_text()]
     assert {"10", "20", "50"} <= set(labels)
     for plot, axis in zip(figure.axes[:2], model.axes, strict=True):
@@ -35,6 +35,16 @@ def test_figure_of_a_short_spectrum(model):
             x, y = plot.transAxes.transform(text.get_position())
             assert edges.x0 < x < edges.x1
             assert y > top
+
+
+def test_the_labels_of_axes_are_whole_and_beside_their_numbers(model):
+    figure = lbt.report.figures.identification_figure(model)
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        label = axes.yaxis.label.get_window_extent()
+        assert label.x0 >= 0
+        numbers = [text for text in axes.get_yticklabels() if text.get_text()]
+        assert label.x1 <= min(text.get_window_extent().x0 for text in numbers)
 
 
 def test_the_interval_of_white_noise_does_not_fill_its_panel(model):
