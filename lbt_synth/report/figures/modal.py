@@ -68,7 +68,8 @@ def modal_figure(
     x = Axis(label="mode, in Noll's order from tip on", log=True, low=1, high=max(count, 2))
     panels = []
     if gains is not None:
-        above = Curve(name="", x=modes, y=curves["gains"], look=None, width=1.2, step="center")
+        look = len(residuals_nm)  # of none of the residuals, nor of the turbulence
+        above = Curve(name="", x=modes, y=curves["gains"], look=look, width=1.2, step="center")
         y = Axis(label="integrator gain", low=0)
         panels.append(Panel(x=x, y=y, marks=(above,), height_in=1.7))
     # modes are counted, there is nothing between them

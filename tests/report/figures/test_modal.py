@@ -19,6 +19,8 @@ def test_modal_figure_has_labels_units_and_all_modes():
     for line, values in zip(below.get_lines()[1:], residuals.values(), strict=True):
         assert line.get_xdata().tolist() == [1, 2, 3]
         assert line.get_ydata().tolist() == values
+    (gains,) = above.get_lines()
+    assert gains.get_color() not in [line.get_color() for line in below.get_lines()]
     assert len(lbt.report.figures.modal_figure({"one": [1.0]}).axes) == 1
 
 
