@@ -48,9 +48,15 @@ def interval_text(low: float, high: float, digits: int = 4) -> str:
     return f"{number_text(low, digits)} to {number_text(high, digits)}"
 
 
+def print_text(text: str) -> str:
+    """Return a text of the terminal with the signs of print; no line ends behind a minus."""
+    text = text.replace("+-", "±")
+    return re.sub(r"(?<![\w.])-(?=[\d.])|(?<=\de)-(?=\d)", MINUS, text)
+
+
 def unbroken_text(text: str) -> str:
-    """Keep a number and its error, and the two ends of an interval, in one line."""
-    return re.sub(" (±|to) ", rf"{NO_BREAK}\1{NO_BREAK}", text)
+    """Keep a number, its sign and its error, and the two ends of an interval, in one line."""
+    return re.sub(" (±|to) ", rf"{NO_BREAK}\1{NO_BREAK}", print_text(text))
 
 
 def listing_text(items: Sequence[str]) -> str:

@@ -37,4 +37,6 @@ def test_numbers_as_texts():
 
 def test_a_number_and_its_error_stay_in_one_line():
     assert unbroken_text("1 ± 2 (3 to 4)") == "1\u00a0±\u00a02 (3\u00a0to\u00a04)"
+    assert unbroken_text("-1 +- 2") == "\u22121\u00a0±\u00a02"
+    assert unbroken_text("-3.1e-08, 1e-6, a-b") == "\u22123.1e\u221208, 1e\u22126, a-b"
     assert unbroken_text("tomorrow is not together") == "tomorrow is not together"

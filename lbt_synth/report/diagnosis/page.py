@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from lbt_synth.report.diagnosis.tables import (
     record_tables,
     residual_tables,
 )
-from lbt_synth.report.number_text import MINUS
+from lbt_synth.report.number_text import print_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import paragraph
@@ -112,20 +111,15 @@ def _print_tables(tables: Iterable[Table]) -> list[Table]:
     return [
         replace(
             table,
-            caption=_print_text(table.caption),
-            headings=tuple(map(_print_text, table.headings)),
+            caption=print_text(table.caption),
+            headings=tuple(map(print_text, table.headings)),
             rows=tuple(
-                tuple(_print_text(cell) if isinstance(cell, str) else cell for cell in row)
+                tuple(print_text(cell) if isinstance(cell, str) else cell for cell in row)
                 for row in table.rows
             ),
         )
         for table in tables
     ]
-
-
-def _print_text(text: str) -> str:
-    """Return a text of the terminal with the signs of print."""
-    return re.sub(r"(?<![\w.])-(?=\d)", MINUS, text.replace("+-", "±"))
 
 
 def _verdict_blocks(found: Diagnosis) -> list[Block]:
@@ -134,11 +128,11 @@ def _verdict_blocks(found: Diagnosis) -> list[Block]:
     doubtful = found.loop is None or found.loop.modulus < NARROW
     tone = "bad" if wrong else "note" if doubtful else "good"
     return [
-        Notice(text=_print_text(state), tone=tone),
-        Paragraph(text=_print_text(" ".join(rest))),
+        Notice(text=print_text(state), tone=tone),
+        Paragraph(text=print_text(" ".join(rest))),
         *_print_tables(residual_tables(found)),
         *residual_charts(found),
-        *(Notice(text=_print_text(f"{note[0].upper()}{note[1:]}")) for note in found.notes),
+        *(Notice(text=print_text(f"{note[0].upper()}{note[1:]}")) for note in found.notes),
     ]
 
 
