@@ -94,7 +94,7 @@ def panel_figure(
     own |= {key: ColumnDataSource(columns) for key, columns in panel_columns(panel).items()}
     _draw_marks(figure, panel, own, named)
     if panel.categories:
-        names = {i: scales.shorten(name, 24) for i, name in enumerate(panel.categories)}
+        names = {i: scales.shorten(name, 28) for i, name in enumerate(panel.categories)}
         figure.yaxis[0].update(ticker=list(names), major_label_overrides=names, axis_label=None)
         figure.ygrid.grid_line_color = None
     _hover_curves(figure, panel, own)
