@@ -349,7 +349,8 @@ def require_length(
     record : LoopRecord
         The record.
     frames : int, optional
-        Usable frames that are needed, in stretches of at least 256.
+        Usable frames that are needed, in stretches of at least 256. Those at the start of a record,
+        whose commands came before it, count.
     seconds : float, optional
         The same as a time [s].
     resolution_hz : float, optional
@@ -379,7 +380,9 @@ def require_length(
     rate = record.frame_rate_hz
     needed = integer(frames, "frames", at_least=1)
     needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
-    lengths = [stop - start for start, stop in record.stretches()]
+    known = record.commands is None or record.delay_frames is None
+    before = 0 if known else len(record.hardware.mirror_taps)  # commands that no record knows
+    lengths = [stop - (start if start > before else 0) for start, stop in record.stretches()]
     count = sum(length for length in lengths if length >= _SHORTEST_STRETCH)
     longest = max(lengths, default=0)
     if count < needed:

@@ -226,3 +226,16 @@ def test_length():
     quick = lbt.identification.loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
     with pytest.raises(lbt.errors.ProblemError, match="needs 8000 usable frames"):
         lbt.identification.require_length(quick)
+
+
+@pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
+def test_commands_before_a_record_do_not_make_it_shorter(delay):
+    y = np.random.default_rng(0).standard_normal(5000)
+    known = {"frame_rate_hz": RATE, "unit": "nm", "delay_frames": delay}
+    whole = lbt.identification.loop_record(y, y, **known)
+    assert whole.stretches() == ((int(np.ceil(delay)), 5000),)
+    assert lbt.identification.require_length(whole, seconds=5) == 5000
+    y[int(np.ceil(delay))] = np.nan  # a frame that was lost
+    late = lbt.identification.loop_record(y, np.zeros(5000), **known)
+    with pytest.raises(lbt.errors.ProblemError, match="needs 5000 usable frames"):
+        lbt.identification.require_length(late, seconds=5)
