@@ -151,7 +151,10 @@ def _describe_choice(
 ) -> MethodChoice:
     """Return the choice with its table, and say by how much it is better."""
     title, usual = method_named(chosen).title, default_method()
-    notes = [f"the {method_named(n).title} is left out: {why}" for n, why in failures.items()]
+    notes = [
+        f"the {method_named(name).title} is left out: {why.rstrip('.')}"
+        for name, why in failures.items()
+    ]
     shown = [name for name in residuals.names if name not in failures]
     if chosen not in shown:
         return MethodChoice(method=chosen, rows=(), notes=tuple(notes))
