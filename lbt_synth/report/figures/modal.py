@@ -69,7 +69,7 @@ def modal_figure(
     panels = []
     if gains is not None:
         look = len(residuals_nm)  # of none of the residuals, nor of the turbulence
-        above = Curve(name="", x=modes, y=curves["gains"], look=look, width=1.2, step="center")
+        above = Curve(name="", x=modes, y=curves["gains"], look=look, dash=0, step="center")
         y = Axis(label="integrator gain", low=0)
         panels.append(Panel(x=x, y=y, marks=(above,), height_in=1.7))
     # modes are counted, there is nothing between them
