@@ -51,13 +51,17 @@ def printed(command: str, folder: Path) -> list[str]:
 def corrected(page: Path, folder: Path) -> list[str]:
     """Return the lines of a page with the numbers of today, and print those that differ."""
     lines = page.read_text().splitlines()
-    out, found, inside = [], [], False
+    out, found, inside, command = [], [], False, ""
     for number, line in enumerate(lines, start=1):
         if line.startswith("```"):
             inside = line.startswith("```console")
             found = []
-        elif inside and line.startswith("$ "):
-            found = printed(line[2:], folder)
+        elif inside and (command or line.startswith("$ ")):
+            command += line.removeprefix("$ ")
+            if command.endswith("\\"):  # goes on in the next line
+                command = command[:-1]
+            else:
+                found, command = printed(command, folder), ""
         elif inside and line.strip():
             same = [i for i, new in enumerate(found) if shape(new) == shape(line)]
             if same:  # a page may leave lines out
