@@ -23,7 +23,7 @@ class CubicSpline:
     ----------
     knots : (k,) ndarray
         Where the polynomials meet, increasing.
-    coefficients : (4, k - 1) ndarray
+    coefficients : (4, k - 1, ...) ndarray
         Of the powers 3, 2, 1 and 0 of the distance from the knot below.
 
     Examples
@@ -39,7 +39,7 @@ class CubicSpline:
     coefficients: FloatArray
 
     def __call__(self, x: FloatArray) -> FloatArray:
-        """Return the values at some places; the polynomials at the ends go on beyond them."""
+        """Return the values of one curve; the polynomials at the ends go on beyond them."""
         piece = np.searchsorted(self.knots[1:-1], x, side="right")
         distance = x - self.knots[piece]
         cubic, square, slope, value = self.coefficients[:, piece]
@@ -47,20 +47,21 @@ class CubicSpline:
 
 
 def cubic_spline(x: FloatArray, y: FloatArray) -> CubicSpline:
-    """Return the spline through at least four points (k,), x increasing."""
+    """Return the spline through at least four points, x (k,) increasing, of curves y (k, ...)."""
     if x.size < 4:
         raise ValueError(f"a spline needs at least four points; got {x.size}")
-    step, rise = np.diff(x), np.diff(y)
-    slope = rise / step
-    bands, right = np.zeros((3, x.size)), np.zeros(x.size)
+    step = np.diff(x)
+    bands, right = np.zeros((3, x.size)), np.zeros(y.shape)
     bands[0, 2:], bands[2, :-2] = step[:-1], step[1:]
     bands[1, 1:-1] = 2 * (step[:-1] + step[1:])
+    step = step.reshape(-1, *(1,) * (y.ndim - 1))
+    slope = np.diff(y, axis=0) / step
     right[1:-1] = 3 * (step[1:] * slope[:-1] + step[:-1] * slope[1:])
     for end, beside, way in ((0, 1, 1), (-1, -2, -1)):
         h, g = step[end], step[beside]
-        bands[1, end], bands[1 - way, beside] = g, h + g
+        bands[1, end], bands[1 - way, beside] = g.item(), (h + g).item()
         right[end] = ((3 * h + 2 * g) * g * slope[end] + h**2 * slope[beside]) / (h + g)
-    tangent = solve_banded((1, 1), bands, right)
+    tangent = solve_banded((1, 1), bands, right.reshape(x.size, -1)).reshape(y.shape)
     bend = (tangent[:-1] + tangent[1:] - 2 * slope) / step
     parts = (bend / step, (slope - tangent[:-1]) / step - bend, tangent[:-1], y[:-1])
     return CubicSpline(knots=x, coefficients=np.stack(parts))

@@ -9,6 +9,13 @@ from scipy.interpolate import CubicSpline
 from lbt_synth.linear.cubic_spline import cubic_spline
 
 
+def test_splines_of_several_curves_are_those_of_each():
+    rng = np.random.default_rng(1)
+    x, y = np.cumsum(rng.random(20) + 0.05), rng.standard_normal((20, 3, 2))
+    own, other = cubic_spline(x, y).coefficients, CubicSpline(x, y).c
+    np.testing.assert_allclose(own, other, atol=1e-9 * np.max(np.abs(other)))
+
+
 @pytest.mark.parametrize("size", [4, 5, 60])
 def test_spline_is_that_of_scipy(size):
     rng = np.random.default_rng(size)

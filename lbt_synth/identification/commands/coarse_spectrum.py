@@ -19,8 +19,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lbt_synth.identification.commands.spectral_peaks import (
+    find_spectral_peaks,
+    smooth_neighbours,
+)
 from lbt_synth.identification.fit.periodogram import half_angle_square, tukey
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 _SEGMENT_S = 6.0
 _MOST_SEGMENTS = 24
@@ -29,8 +33,6 @@ _SLOWEST_HZ, _FASTEST_HZ = 0.15, 6.0  # corners of the turbulence
 _CORNERS, _ORDERS = 5, (1, 2, 3)  # slopes of -2, -4, -6
 _BUMPS_HZ, _BUMPS, _BUMP_DAMPING = (1.5, 25.0), 8, 0.18
 _LINE_DAMPING = 0.004  # only the skirts of a line are compared, which do not show it
-_PEAK, _SKIRT = 3.0, 1.25  # over the surroundings
-_SURROUNDINGS, _REACH, _MOST_PEAKS = 81, 40, 16  # frequencies, frequencies, peaks
 _SMALLEST = 1e-9  # of the measured power
 _FIRST_PASSES, _MOST_PASSES, _SETTLED = 20, 40, 0.05
 
@@ -122,7 +124,7 @@ def coarse_axis(
     ``resonances`` are known ones, by frequency [Hz] and damping ratio.
     """
     power = np.mean(abs(measured) ** 2, axis=0)
-    is_peak, lines, width = _find_peaks(frequency_hz, power)
+    is_peak, lines, width = find_spectral_peaks(frequency_hz, power)
     band = _bands(frequency_hz[~is_peak], frame_rate_hz)
     size = np.bincount(band)
     quadratic = Quadratic(
@@ -151,31 +153,6 @@ def coarse_axis(
         lines=np.log(lines),
         line_width=width,
     )
-
-
-def _find_peaks(
-    frequency_hz: FloatArray, power: FloatArray
-) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return the frequencies at peaks (f,), where the peaks are (l,), and their widths (l,)."""
-    from scipy.ndimage import median_filter, uniform_filter1d
-    from scipy.signal import find_peaks
-
-    log = np.log(uniform_filter1d(power, 3, mode="nearest"))
-    above = log - median_filter(log, size=_SURROUNDINGS, mode="nearest")
-    tops, _ = find_peaks(above, height=np.log(_PEAK), distance=4)
-    highest = np.argsort(-above[tops], kind="stable")[:_MOST_PEAKS]
-    is_peak = np.zeros(power.size, dtype=np.bool_)
-    for top in tops[highest]:
-        low, high = max(top - _REACH, 0), min(top + _REACH + 1, power.size)
-        ends = np.flatnonzero(above[low:high] <= np.log(_SKIRT)) + low
-        start = np.max(ends[ends < top], initial=low)
-        stop = np.min(ends[ends > top], initial=high - 1)
-        is_peak[max(start - 1, 0) : stop + 2] = True
-    edges = np.flatnonzero(np.diff(np.r_[False, is_peak, False].astype(int))).reshape(-1, 2)
-    lines = np.array([frequency_hz[a + np.argmax(power[a:b])] for a, b in edges])
-    step = frequency_hz[1] - frequency_hz[0]
-    width = np.array([max(2.0, 0.3 * (b - a)) * step for a, b in edges])
-    return is_peak, lines, width / lines
 
 
 def _bands(frequency_hz: FloatArray, frame_rate_hz: float, *, least: int = 1) -> IntArray:
@@ -365,10 +342,8 @@ def coherence_credit(
     count as an explanation. What shakes along a direction has no phase between the axes; the
     coupling that a wrong guess leaves has one, and no credit.
     """
-    from scipy.ndimage import uniform_filter1d
-
     band = _bands(frequency_hz, frame_rate_hz, least=3)
-    power = [uniform_filter1d(np.mean(abs(x) ** 2, axis=0), 3) for x in (one, other)]
+    power = [smooth_neighbours(np.mean(abs(x) ** 2, axis=0)) for x in (one, other)]
     x, y = (each / np.sqrt(p) for each, p in zip((one, other), power, strict=True))
     cross = np.mean((x * y.conj()).real, axis=0)
     sums = [np.bincount(band, weights=np.mean(abs(each) ** 2, axis=0)) for each in (x, y)]

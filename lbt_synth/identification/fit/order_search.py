@@ -14,7 +14,6 @@ from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
@@ -190,7 +189,7 @@ def _fit_background(search: Search, gain: float) -> FittedModel | None:
     zero = np.zeros_like(f)
     smooth = replace(data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight)
     white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
-    slow = max(float(trapezoid(d, f)) - white, 0.1 * white)
+    slow = max(float(np.trapezoid(d, f)) - white, 0.1 * white)
     known = replace(search, gain=gain)
     corner = known.log_angle(fitting.STARTING_CORNER_HZ)
     ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), search.colour, corner, ())

@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.linear.cubic_spline import cubic_spline
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 TAPER = 0.1  # of a segment, both ends together
@@ -54,8 +55,6 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     The last has the coefficients of polynomials in two variables, cubic in the part of a step of
     the grid and in log g beyond its knot, the highest power of the latter first: (4, 4, w, d).
     """
-    from scipy.interpolate import CubicSpline
-
     h = tukey(_SAMPLES)
     transform = np.fft.rfft(h, 2 * _SAMPLES)
     correlation = np.fft.irfft(np.abs(transform) ** 2)[:_SAMPLES]
@@ -75,7 +74,7 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     blend = np.clip((grid - _LOBES / 2) / (_LOBES / 2), 0, 1)
     k = np.maximum(at * (1 - blend) + mean * blend, 1e-14)
     knots = np.log(widths)
-    value = np.asarray(CubicSpline(knots, np.log(k)).c)  # (4, w, d)
+    value = cubic_spline(knots, np.log(k)).coefficients  # (4, w, d)
     slope = np.gradient(value, axis=2)
     rise, (m0, m1) = np.diff(value, axis=2), (slope[..., :-1], slope[..., 1:])
     powers = [value[..., :-1], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise]

@@ -227,7 +227,7 @@ def _describe_turbulence(
 
 def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Whiteness:
     """Test whether power and model (f,) differ as white innovations do."""
-    from scipy.stats import chi2, kstwobign
+    from scipy.special import chdtrc, kolmogorov
 
     ratio = power / model
     effective = float(np.sum(data.count))
@@ -243,10 +243,10 @@ def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Wh
         filled[1:-1] = ratio - np.mean(ratio[_LOWEST:])
         filled[: 1 + _LOWEST] = 0
         correlation = np.fft.irfft(filled, size)[1 : lags + 1] * size / (2 * np.sum(ratio))
-        p_value = float(chi2.sf(2 * effective * float(np.sum(correlation**2)), lags))
+        p_value = float(chdtrc(lags, 2 * effective * float(np.sum(correlation**2))))
     return Whiteness(
         deviation=deviation,
-        p_value=float(kstwobign.sf(deviation * np.sqrt(effective))),
+        p_value=float(kolmogorov(deviation * np.sqrt(effective))),
         autocorrelation=frozen_copy(correlation),
         correlation_p_value=p_value,
         frequency_hz=data.frequency_hz,
