@@ -19,6 +19,7 @@ from lbt_synth.identification.fit.whittle import (
     WIDE_DAMPING,
     SpectrumModel,
     contrast,
+    density,
     minimise,
 )
 
@@ -64,17 +65,18 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
     if centre < 2 * half:
         return 0.0
     data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
-    best = single = contrast(data, spectrum)
+    single, rest = contrast(data, spectrum), density(data, spectrum.exchange(i))
+    best = single
     for share in _SHARES:
         lower, upper = (
             line.shift(float(np.log1p(move * half / centre)), _NARROWER, float(np.log(power)))
             for move, power in ((-_APART * (1 - share), share), (_APART * share, 1 - share))
         )
-        start = spectrum.exchange(i).add(lower, replace(upper, announced=None))
+        start = spectrum.alone(lower, replace(upper, announced=None))
         width = np.zeros(start.pack().size)
         width[-2 * _TRIPLE :] = 2 * (np.inf, _LIKE, np.inf)
         priors = Priors(centre=start.pack(), width=width)
-        found = minimise(data, start, priors)
+        found = minimise(data, start, priors, held=rest, bound=best)
         if found is not None:
             away = (found.spectrum.pack() - priors.centre)[[1 - 2 * _TRIPLE, 1 - _TRIPLE]]
             best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)

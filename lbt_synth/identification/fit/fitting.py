@@ -17,6 +17,7 @@ from lbt_synth.identification.fit.whittle import (
     FittedModel,
     Kind,
     SpectrumModel,
+    component_densities,
     contrast,
     damping_parameter,
     density,
@@ -51,7 +52,7 @@ _DAMPING_PRIORS = {  # of the odds, but for the turbulence
 _UNKNOWN_TAPER = 2.0  # width of the prior of a line where the taper is not known
 
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
-_WIDEST_HZ = 3.0
+_WIDEST_HZ, _SHARE = 3.0, 0.1  # of a group, and of what it holds of a line
 _BINS = 10  # on either side of a line that stay single
 _SIDELOBES = 64  # the same for a line narrower than _SMEARED bins, with the taper's sidelobes
 _SMEARED = 3
@@ -134,8 +135,11 @@ class Search:
         for line in spectrum.lines:
             centre, half_width = self.place(line)
             fine = _SIDELOBES if half_width < _SMEARED * step else _BINS
-            away = np.maximum(np.abs(f - centre) - fine * step, 0)
-            size = np.minimum(size, np.maximum(step, 0.1 * np.maximum(half_width, 2 * away)))
+            reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, the widest group is larger
+            near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
+            away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)
+            wide = _SHARE * np.maximum(half_width, 2 * away)
+            size[near] = np.minimum(size[near], np.maximum(step, wide))
         group = np.floor(np.cumsum(step / size) - 1e-9)
         return np.flatnonzero(np.diff(group, prepend=-np.inf) > 0)
 
@@ -285,6 +289,8 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
         return spectrum
     moves = product(np.log1p(_SHIFTS * step / centre), _POWERS)
     # the width stays
-    trials = [spectrum.exchange(i, line.shift(move, -move, power)) for move, power in moves]
+    trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
     data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
-    return min([spectrum, *trials], key=lambda trial: contrast(data, trial))
+    model = density(data, spectrum.exchange(i)) + component_densities(data, trials)
+    each = np.sum(data.count * (np.log(model) + data.power(spectrum.gain) / model), axis=1)
+    return spectrum.exchange(i, trials[int(np.argmin(each))])

@@ -145,6 +145,10 @@ class SpectrumModel:
         first, *others = self.components
         return replace(self, components=(first, *filter(wanted, others)))
 
+    def alone(self, *wanted: Component) -> SpectrumModel:
+        """Return components without the others and without noise."""
+        return replace(self, log_noise=_NOTHING, colour=0.0, components=wanted)
+
     def add(self, *new: Component) -> SpectrumModel:
         """Return the model with more components."""
         return replace(self, components=(*self.components, *new))
@@ -178,6 +182,7 @@ class SpectrumModel:
 
 
 _DIFFERENCE = 1e-4  # of a logarithm
+_NOTHING = float(np.log(np.finfo(float).tiny))  # as a logarithm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -269,6 +274,16 @@ def _smear(
             slopes[i, 1, start:stop] += by_width[part]
 
 
+def component_densities(data: LoopPeriodogram, components: Sequence[Component]) -> FloatArray:
+    """Return the densities of components but for the roll-off of turbulence, (c, f)."""
+    shape = [(c.frequency, c.damping_ratio, c.log_power) for c in components]
+    frequency, ratio, power = np.array(shape).reshape(-1, 3).T
+    own, _ = unit_densities(frequency, ratio, data.half_angle_square)
+    own *= 2 / data.frame_rate_hz * np.exp(power)[:, None]
+    _smear(data, components, own)
+    return own
+
+
 @lru_cache(maxsize=64)
 def _component_density(
     data: LoopPeriodogram, component: Component, corner: float, order: float
@@ -293,9 +308,11 @@ def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
     return total
 
 
-def contrast(data: LoopPeriodogram, spectrum: SpectrumModel) -> float:
-    """Return L without the priors."""
-    model = density(data, spectrum)
+def contrast(
+    data: LoopPeriodogram, spectrum: SpectrumModel, held: FloatArray | float = 0.0
+) -> float:
+    """Return L without the priors; ``held`` (f,) is a density beside the model's."""
+    model = held + density(data, spectrum)
     power = data.power(spectrum.gain)
     return float(np.sum(data.count * (np.log(model) + power / model)))
 
@@ -317,12 +334,15 @@ def log_slopes(
 
 
 def derivatives(
-    data: LoopPeriodogram, spectrum: SpectrumModel
+    data: LoopPeriodogram, spectrum: SpectrumModel, held: FloatArray | float = 0.0
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Return L without the priors, its gradient (p,) and its information matrix (p, p)."""
+    """Return L without the priors, its gradient (p,) and its information matrix (p, p).
+
+    ``held`` (f,) is a density beside the model's.
+    """
     count, gain = data.count, spectrum.gain
     each, slopes, by_shape = densities(data, spectrum)
-    model = each.sum(axis=0)
+    model = held + each.sum(axis=0)
     ratio = data.power(gain) / model
     rows = log_slopes(each, slopes, by_shape, model)
     weighted = rows * count
@@ -342,18 +362,20 @@ def minimise(
     start: SpectrumModel,
     priors: Priors,
     *,
+    held: FloatArray | float = 0.0,
     bound: float = float("inf"),
     accuracy: float = EXACT,
 ) -> FittedModel | None:
     """Minimise L by scoring in a trust region, to an accuracy.
 
-    Return None if L is not finite, or will hardly fall below a bound.
+    ``held`` (f,) is a density beside the model's. Return None if L is not finite, or will hardly
+    fall below a bound.
     """
     free, theta = priors.free, start.pack()
 
     def differentiate(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         theta[free] = x
-        value, gradient, information = derivatives(data, start.unpack(theta))
+        value, gradient, information = derivatives(data, start.unpack(theta), held)
         return value, gradient[free], information[np.ix_(free, free)]
 
     found = scoring_minimum(differentiate, theta[free], priors, bound=bound, accuracy=accuracy)
@@ -364,7 +386,7 @@ def minimise(
     information = np.zeros((theta.size, theta.size))
     information[np.ix_(free, free)] = reduced
     return FittedModel(
-        spectrum=spectrum, contrast=contrast(data, spectrum), information=information
+        spectrum=spectrum, contrast=contrast(data, spectrum, held), information=information
     )
 
 
