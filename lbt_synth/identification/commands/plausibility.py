@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from lbt_synth.identification.commands.law_controller import law_controller
 from lbt_synth.identification.fit.fitting import Search, cost
 from lbt_synth.identification.fit.order_search import find_components, try_other_gains
 from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
@@ -25,6 +28,8 @@ _HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _STABLE = 1 - 1e-9  # spectral radius below which a loop has run
 _SEGMENT_S = 6.0
 _ROUNDS, _LINES = 3, 10  # of the search for lines
+
+_Fit: TypeAlias = tuple[Search, FittedModel | None]
 
 
 def already_integrates(law: ControlLaw) -> bool:
@@ -65,27 +70,46 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     return float(np.max(abs(poles[moves]), initial=0.0))
 
 
-def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float) -> float:
+def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: bool) -> float:
     """Return how much likelier a guess is than the record as given, by the model of the fit.
 
     Both have the lines and the wide resonances that they need, at the price of the criterion: the
-    coarse spectrum has few. Before a saving is clear, the record as given is fitted from other
-    gains as well.
+    coarse spectrum has few. A guess that does not decide must be likelier with those of the record
+    as given. Before a saving is clear, that is fitted from other gains as well.
     """
-    given, other = Guess(kind="as given"), _cost(coarse, guess)
-    saving = _cost(coarse, given) - other
-    return saving if saving < clear else _cost(coarse, given, other_gains=True) - other
+    as_given = Guess(kind="as given")
+    given = _fit_axes(coarse, as_given)
+    if not decides:
+        saving = _cost(given) - _cost(_fit_axes(coarse, guess, starts=given))
+        if saving < 0:
+            return saving
+    other = _cost(_fit_axes(coarse, guess))
+    saving = _cost(given) - other
+    if saving < clear:
+        return saving
+    return _cost(_fit_axes(coarse, as_given, other_gains=True)) - other
 
 
 def finer_saving_of_gain(coarse: CoarseRecord, guess: Guess, gains: Sequence[float]) -> float:
     """Return how much likelier any gain is than the best of some, by the model of the fit."""
-    return min(_cost(coarse, guess, gain) for gain in gains) - _cost(coarse, guess)
+    held = min(_cost(_fit_axes(coarse, guess, gain)) for gain in gains)
+    return held - _cost(_fit_axes(coarse, guess))
 
 
-def _cost(
-    coarse: CoarseRecord, guess: Guess, gain: float | None = None, *, other_gains: bool = False
-) -> float:
-    """Return the criterion of the best model of a guess, over all axes, at any gain or at one."""
+def _cost(fits: Sequence[_Fit]) -> float:
+    """Return the criterion over all axes; infinite where a fit failed."""
+    return sum(np.inf if model is None else cost(search, model) for search, model in fits)
+
+
+def _fit_axes(
+    coarse: CoarseRecord,
+    guess: Guess,
+    gain: float | None = None,
+    *,
+    starts: Sequence[_Fit] = (),
+    other_gains: bool = False,
+) -> list[_Fit]:
+    """Return the best model of each axis for a guess, at any gain or at one."""
     record = coarse.record
     corrections = coarse.corrections(guess)
     length = int(_SEGMENT_S * record.frame_rate_hz)
@@ -94,15 +118,15 @@ def _cost(
         for a, b in coarse.stretches
         for start in range(a, max(b - length, a) + 1, length)
     ]
-    total = 0.0
-    for y, c in zip(record.measurements.T, corrections.T, strict=True):
+    begins = [model.spectrum if model else None for _, model in starts] or [None] * record.axes
+    out: list[_Fit] = []
+    for y, c, begin in zip(record.measurements.T, corrections.T, begins, strict=True):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         search = Search(data=data, gain=gain, most_lines=_LINES)
-        try:
-            found = find_components(search, None, rounds=_ROUNDS)
+        found: FittedModel | None = None
+        with suppress(NumericalError):
+            found = find_components(search, begin, rounds=0 if starts else _ROUNDS)
             if other_gains:
                 found, _ = try_other_gains(search, found)
-            total += cost(search, found)
-        except NumericalError:
-            return np.inf
-    return total
+        out.append((search, found))
+    return out

@@ -267,7 +267,8 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     finer = 0.0
     if not surprising[0] or surprising[best]:  # the law does not ask for it
         least = _CLEAR_FINER if guess.shift_frames % 1 == 0 else _CLEAR
-        finer = finer_saving(coarse, guess, clear=least) if nats >= clear else 0.0
+        if nats >= clear:
+            finer = finer_saving(coarse, guess, clear=least, decides=not part_of_a_frame)
         shown = finer >= least and not part_of_a_frame
     if not shown:
         return replace(given, rival=guesses[best], rival_nats=finer)
