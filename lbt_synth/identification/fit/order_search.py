@@ -39,6 +39,7 @@ _OVERDAMPED = 2.0  # damping ratio of a turbulence that is a drift already
 _LARGEST_DAMPING = 0.9  # of the turbulence beside a drift, when a fit begins
 _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a first-order drift may meet the noise
 _FEW_ROUNDS = 3
+_LITTLE, _CLEARLY = 0.1, 1.0  # log-likelihood that a component or a move must save at least
 _MOST_ROUNDS = 12
 _HALF = float(np.log(0.5))
 _SAME_GAIN = 0.15  # of a logarithm
@@ -140,17 +141,17 @@ def _trials(search: Search, spectrum: SpectrumModel) -> Iterator[tuple[SpectrumM
     # where no line can be added, a second turbulence would take the place of one
     room = len(spectrum.lines) < search.most_lines
     if room and not overdamped:
-        yield from ((trial, 0.0) for trial in _add_first_order(search, spectrum))
+        yield from ((trial, _LITTLE) for trial in _add_first_order(search, spectrum))
     found = _find_excesses(search, spectrum)
     found = [c for c in found if c.gain > 0.25 * found[0].gain]
     while found:
-        yield _add_candidates(search, spectrum, found), 0.0
+        yield _add_candidates(search, spectrum, found), _LITTLE
         found = found[: len(found) // 2]
     for i, component in enumerate(spectrum.components):
         if component.kind == "line":
-            yield from ((trial, 1.0) for trial in _line_moves(search, spectrum, i))
+            yield from ((trial, _CLEARLY) for trial in _line_moves(search, spectrum, i))
     if room and overdamped and not any(c.kind == "slow" for c in spectrum.components):
-        yield from ((trial, 0.0) for trial in _add_first_order(search, spectrum))
+        yield from ((trial, _LITTLE) for trial in _add_first_order(search, spectrum))
 
 
 def _begin(search: Search) -> FittedModel | None:
