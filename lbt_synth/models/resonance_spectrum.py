@@ -95,12 +95,13 @@ def unit_densities(
     rest = 2 * (2 - p) - b
     # of the logarithm of the numerator by b, and by p = 1 - q with b held
     top = np.hstack([1 / b - 1 / rest, 1 / p - 2 / rest + 1 / (2 - p)])
-    slopes = np.empty((b.size, 2, s.size))
-    for i in range(2):
-        by_b, by_p = jacobian[:, 0, i, None], jacobian[:, 1, i, None]
-        constant = np.sum(top * jacobian[:, :, i], axis=1, keepdims=True)
-        bottom = (2 * by_b + by_p * s) * near + (2 * p * by_p) * wide
-        np.subtract(constant, bottom * over, out=slopes[:, i])
+    # and of that of the denominator
+    bottom = np.ones((b.size, 3, s.size))
+    np.multiply(near, over, out=bottom[:, 1])
+    np.multiply(s * near + 2 * p * wide, over, out=bottom[:, 2])
+    falls = jacobian.transpose(0, 2, 1) * [-2.0, -1.0]
+    constant = np.sum(top[:, :, None] * jacobian, axis=1)
+    slopes = np.concatenate([constant[:, :, None], falls], axis=2) @ bottom
     return _drive(b, p) * over, slopes
 
 

@@ -103,11 +103,12 @@ def segment_transforms(
     frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
     scale = np.sqrt(2 / frame_rate_hz / np.sum(taper**2))
     scale = scale / np.sqrt(half_angle_square(frequency, frame_rate_hz))
-    steps = np.diff(series[rows], axis=1)
-    steps -= np.mean(steps, axis=1, keepdims=True)
-    transforms = rfft(taper[:, None] * steps, axis=1)[:, 1 : (size + 1) // 2]
+    steps = np.diff(np.ascontiguousarray(series.T)[:, rows])
+    steps -= np.mean(steps, axis=-1, keepdims=True)
+    steps *= taper
+    transforms = rfft(steps)[..., 1 : (size + 1) // 2]
     independent = len(rows) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
-    return frequency, np.moveaxis(transforms, 2, 0) * scale, float(independent)
+    return frequency, transforms * scale, float(independent)
 
 
 def coarse_axis(

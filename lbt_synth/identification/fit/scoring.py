@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -70,28 +71,44 @@ def scoring_minimum(
     for _ in range(_MOST_STEPS):
         if not (np.isfinite(value) and np.all(np.isfinite(information))):
             return None
-        curvature, axes = np.linalg.eigh(information + rest)
-        curvature, slope = np.maximum(np.abs(curvature), _LEAST_INFORMATION), gradient @ axes
-        gain = 0.5 * float(np.sum(slope**2 / curvature))
+        step, gain, expected = _best_step(information + rest, gradient, radius)
         if gain < accuracy:
             break
-        step = _trust_step(slope, curvature, radius)
-        if value - _HOPE * gain > bound and float(np.linalg.norm(step)) < _WITHIN * radius:
+        size = float(np.linalg.norm(step))
+        if value - _HOPE * gain > bound and size < _WITHIN * radius:
             return None  # a whole step, which can be trusted
-        expected = -float(slope @ step + 0.5 * step @ (curvature * step))
-        trial = np.clip(x + axes @ step, -_FARTHEST, _FARTHEST)
+        trial = np.clip(x + step, -_FARTHEST, _FARTHEST)
         made = evaluate(trial)
         if np.isfinite(made[0]):
             between = 0.5 * (information + made[2])
             rest = rest + _secant(made[1] - gradient - (between + rest) @ (trial - x), trial - x)
         gained = (value - made[0]) / expected
         if not gained > _POOR:
-            radius = 0.25 * min(radius, float(np.linalg.norm(step)))
-        elif gained > _GOOD and float(np.linalg.norm(step)) > _WITHIN * radius:
+            radius = 0.25 * min(radius, size)
+        elif gained > _GOOD and size > _WITHIN * radius:
             radius = min(2 * radius, _LARGEST_RADIUS)
         if gained > _ACCEPTED:
             x, (value, gradient, information) = trial, made
     return x, information
+
+
+def _best_step(
+    curvature: FloatArray, gradient: FloatArray, radius: float
+) -> tuple[FloatArray, float, float]:
+    """Return the step (p,) to the least of a quadratic form within a radius, and two gains.
+
+    They are what the step to the least of all gains, and what this step gains. The curvature
+    (p, p) counts by its absolute value.
+    """
+    whole, info = dposv(curvature, -gradient)[1:]
+    if info == 0 and float(np.linalg.norm(whole)) <= radius:
+        gain = -0.5 * float(gradient @ whole)
+        return whole, gain, gain
+    size, axes = np.linalg.eigh(curvature)
+    size, slope = np.maximum(np.abs(size), _LEAST_INFORMATION), gradient @ axes
+    step = _trust_step(slope, size, radius)
+    gain = 0.5 * float(np.sum(slope**2 / size))
+    return axes @ step, gain, -float(slope @ step + 0.5 * step @ (size * step))
 
 
 def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ Everything is in units of the measurement: a component's variance is g^2 times t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -60,14 +61,14 @@ class Component:
     @property
     def frequency(self) -> float:
         """Natural frequency, an angle per frame."""
-        return float(np.exp(self.log_frequency))
+        return math.exp(self.log_frequency)
 
     @property
     def damping_ratio(self) -> float:
         """Damping ratio."""
         if self.kind == "turbulence":
-            return float(_LEAST + np.exp(self.damping))
-        return float(1 / (1 + np.exp(-self.damping)))
+            return _LEAST + math.exp(self.damping)
+        return 1 / (1 + math.exp(-self.damping))
 
     @property
     def damping_slope(self) -> float:
@@ -205,21 +206,13 @@ def densities(
     """
     s, white = data.half_angle_square, 2 / data.frame_rate_hz
     components = spectrum.components
-    frequency, ratio, slope, power = (
-        np.array(
-            [
-                (c.frequency, c.damping_ratio, c.damping_slope, np.exp(c.log_power))
-                for c in components
-            ]
-        )
-        .reshape(-1, 4)
-        .T
-    )
+    each = [(c.frequency, c.damping_ratio, c.damping_slope, c.log_power) for c in components]
+    frequency, ratio, slope, power = np.array(each).reshape(-1, 4).T
     density = np.empty((1 + len(components), s.size))
     shape, by_colour = _log_colour(spectrum.colour, s)
     density[0] = white * np.exp(spectrum.log_noise + shape)
     unit, slopes = unit_densities(frequency, ratio, s)
-    np.multiply(unit, white * power[:, None], out=density[1:])
+    np.multiply(unit, white * np.exp(power)[:, None], out=density[1:])
     fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
     for c, own in zip(components, density[1:], strict=True):
         if c.kind == "turbulence":
@@ -326,10 +319,13 @@ def log_slopes(
     spectrum.
     """
     share = each / model
-    rows = np.zeros((4 + PARAMETERS * len(slopes), model.size))
-    rows[1], rows[2], rows[3] = share[0], by_shape[0] * share[0], by_shape[1] * share[1]
-    rows[4::3], rows[5::3] = slopes[:, 0] * share[1:], slopes[:, 1] * share[1:]
-    rows[6::3] = share[1:]
+    rows = np.empty((4 + PARAMETERS * len(slopes), model.size))
+    rows[0] = 0
+    np.multiply(by_shape, share[:2], out=rows[2:4])
+    rows[1] = share[0]
+    components = rows[4:].reshape(-1, PARAMETERS, model.size)
+    np.multiply(slopes, share[1:, None], out=components[:, :2])
+    components[:, 2] = share[1:]
     return rows
 
 
@@ -344,15 +340,15 @@ def derivatives(
     each, slopes, by_shape = densities(data, spectrum)
     model = held + each.sum(axis=0)
     ratio = data.power(gain) / model
-    rows = log_slopes(each, slopes, by_shape, model)
-    weighted = rows * count
-    gradient = weighted @ (1 - ratio)
-    information = weighted @ rows.T
+    root = np.sqrt(count)
+    rows = log_slopes(each, slopes, by_shape, model / root)  # as often as each value counts
+    gradient = rows @ (root * (1 - ratio))
+    information = rows @ rows.T
     # the gain changes the data, not the model
     cross, square = 2 * gain * data.crossed, 2 * gain**2 * data.corrected
     by_gain = (cross + square) / model
     gradient[GAIN] = np.sum(count * by_gain)
-    information[GAIN] = information[:, GAIN] = -weighted @ by_gain
+    information[GAIN] = information[:, GAIN] = -rows @ (root * by_gain)
     information[GAIN, GAIN] = np.sum(count * (cross + 2 * square) / model)
     return float(np.sum(count * (np.log(model) + ratio))), gradient, information
 
