@@ -39,9 +39,12 @@ class LbtSynthError(Exception):
     ----------
     in_python : str
         Advice at the end of the message for scripts alone; the command line leaves it out.
+    at_terminal : str
+        Advice that the command line alone adds to the message.
     """
 
     in_python: str = ""
+    at_terminal: str = ""
 
     def __init__(self, message: str = "", **data: Any) -> None:
         advice = data.get("in_python", "")

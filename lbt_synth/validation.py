@@ -253,10 +253,11 @@ def _instance(value: object, _: str, kind: Any) -> object:
     return value
 
 
-def choice(value: Any, name: str, options: Sequence[str]) -> str:
-    """Return one of a list of words."""
+def choice(value: Any, name: str, options: Sequence[str], **advice: str) -> str:
+    """Return one of a list of words; advice goes with the error for any other."""
     if value not in options:
-        raise ProblemError(f"{name} must be one of {', '.join(options)}; got {value!r}.")
+        text = f"{name} must be one of {', '.join(options)}; got {value!r}."
+        raise ProblemError(text, **advice)
     return cast(str, value)
 
 

@@ -45,6 +45,8 @@ def say_error(error: LbtSynthError, arguments: Namespace) -> str:
     while cause is not None:
         if advice := getattr(cause, "in_python", ""):
             message = message.replace(f" {advice}", "")
+        if advice := getattr(cause, "at_terminal", ""):
+            message = f"{message} {advice}"
         cause = cause.__cause__
     return message if isinstance(error, ConfigError) else _say_names(message, arguments)
 

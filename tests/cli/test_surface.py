@@ -11,6 +11,7 @@ import lbt_synth as lbt
 from lbt_synth.cli.surface import file_kind
 
 STUDY = ROOT / "examples" / "study.yaml"
+KNOWN = ("--unit", "nm", "--frame-rate-hz", "1000", "--delay-frames", "2")
 SAID = [
     (
         ("design", "CONFIG", "--method", "hinf", "--gamma", "1", "-o", "OUT.fits"),
@@ -55,6 +56,16 @@ SAID = [
     (
         ("identify", "NAMED.csv", "--unit", "mas", "-o", "OUT.yaml"),
         ("nothing tells the telescope, by which angles become nm: give --diameter-m; the frame",),
+    ),
+    (
+        ("identify", "NAMED.csv", *KNOWN, "--command-unit", "V", "-o", "OUT.yaml"),
+        ("--command-unit must be one of nm, um", "got 'V'. For volts or counts say nm, and --comm"),
+    ),
+    (
+        ("identify", "NIGHT", "--unit", "mas", "-o", "OUT.yaml"),
+        (
+            "--unit must be that of the data, 'nm'; got 'mas'. Leave it out; --show-unit is the unit",
+        ),
     ),
     (
         ("simulate", "GAIN", "CONFIG"),

@@ -70,9 +70,17 @@ def same_unit(one: str, other: str) -> bool:
     return len({unit_name(u) or density_unit(u) or u.lower() for u in map(str, (one, other))}) == 1
 
 
-def nm_per(unit: str, *, diameter_m: float | None = None) -> float:
+VOLTS = {
+    "in_python": "For volts or counts say nm, and give repair_commands the nm of one as the scale.",
+    "at_terminal": "For volts or counts say nm, and give the nm of one by --command-scale.",
+}
+
+
+def nm_per(unit: str, *, diameter_m: float | None = None, name: str = "unit") -> float:
     """Return the nanometres of wavefront, rms over the pupil, of one unit."""
-    word = choice((unit_name(unit) if isinstance(unit, str) else None) or unit, "unit", UNITS)
+    advice = VOLTS if name == "command_unit" else {}
+    word = (unit_name(unit) if isinstance(unit, str) else None) or unit
+    word = choice(word, name, UNITS, **advice)
     if word in _NM:
         return _NM[word]
     if diameter_m is None:

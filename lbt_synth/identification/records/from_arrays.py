@@ -108,7 +108,8 @@ def loop_record(
     scale = nm_per(unit, diameter_m=diameter_m)
     y, u = _series_in_nm(measurements, "measurements", scale), None
     if commands is not None:
-        scale = nm_per(unit if command_unit is None else command_unit, diameter_m=diameter_m)
+        own = unit if command_unit is None else command_unit
+        scale = nm_per(own, diameter_m=diameter_m, name="command_unit")
         u = _series_in_nm(commands, "commands", scale)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")

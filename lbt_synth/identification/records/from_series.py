@@ -17,6 +17,7 @@ from lbt_synth.identification.records.column_selection import (
     number_axes,
 )
 from lbt_synth.identification.records.columns import (
+    VOLTS,
     Column,
     density_unit,
     hz_per,
@@ -161,10 +162,14 @@ def _find_unit(
     (own,) = found
     if not own and given is None:
         raise ProblemError(
-            f"nothing tells the unit of {join_names(chosen)}; give {option} ({_UNITS[kind]})."
+            f"nothing tells the unit of {join_names(chosen)}; give {option} ({_UNITS[kind]}).",
+            **(VOLTS if option == "command_unit" else {}),
         )
     if own and given is not None and not same_unit(own, given):
-        raise ProblemError(f"{option} must be that of the data, {own!r}; got {given!r}.")
+        raise ProblemError(
+            f"{option} must be that of the data, {own!r}; got {given!r}.",
+            at_terminal="Leave it out; --show-unit is the unit of what is shown.",
+        )
     return own or str(given)
 
 

@@ -95,5 +95,9 @@ def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
         lbt.errors.ProblemError, match="nothing tells the unit of u; give command_unit"
     ):
         lbt.load_record(mine, commands=silent, frame_rate_hz=RATE)
+    with pytest.raises(
+        lbt.errors.ProblemError, match="command_unit must be one of nm, .*'V'.*volts .* scale"
+    ):
+        lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="V")
     seen = lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="um")
     assert np.allclose(seen.commands[:, 0], 1e3 * u)
