@@ -59,7 +59,10 @@ SAID = [
     ),
     (
         ("identify", "NAMED.csv", *KNOWN, "--command-unit", "V", "-o", "OUT.yaml"),
-        ("--command-unit must be one of nm, um", "got 'V'. For volts or counts say nm, and --comm"),
+        (
+            "--command-unit must be one of nm, um",
+            "got 'V'. For volts or counts say nm, and give the",
+        ),
     ),
     (
         ("identify", "NIGHT", "--unit", "mas", "-o", "OUT.yaml"),
