@@ -17,7 +17,7 @@ from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import csv_rows
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
-from lbt_synth.studies.paper.parameters import TABLE_III, VIBRATION_HZ, parameter_rows
+from lbt_synth.studies.paper.parameters import TABLE_III, parameter_rows
 from lbt_synth.studies.paper.tables import TableEntry, compare_with_paper, paper_filters, table_ii
 
 
@@ -45,7 +45,7 @@ def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) ->
         parameters = csv_bytes(("parameter", "value", "origin"), parameter_rows())
     files.append(write_atomically(folder / "parameters.csv", parameters))
     published = {
-        name: [(row.model_hz - VIBRATION_HZ, getattr(row, name)) for row in TABLE_III]
+        name: [(row.error_hz, getattr(row, name)) for row in TABLE_III]
         for name in (kalman_design.method, hinf_design.method)
     }
     filters = {design_label(design.method): design for design in (kalman_design, hinf_design)}

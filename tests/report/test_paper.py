@@ -7,6 +7,7 @@ import csv
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.report import paper
 from lbt_synth.report.paper import write_paper
 from lbt_synth.studies.paper import tables as compute
 
@@ -34,3 +35,20 @@ def test_written_files(tmp_path, table_iii):
     assert len(rows) == 30
     assert float(rows[0]["paper_strehl_percent"]) == 22.4
     assert lbt.load_gain(tmp_path / "paper_hinf.fits").recertify().passed
+
+
+def test_the_papers_points_lie_on_our_curves(tmp_path, table_iii, monkeypatch):
+    drawn = []
+
+    def draw(*arguments):
+        drawn.append(lbt.report.figures.robustness_figure(*arguments))
+        return drawn[-1]
+
+    monkeypatch.setattr(paper, "robustness_figure", draw)
+    write_paper(tmp_path, table_iii)
+    lines = {line.get_label(): line.get_xydata() for line in drawn[0].axes[0].get_lines()}
+    assert len(lines) == 4
+    for name in ("Kalman", "H∞"):
+        ours, theirs = lines[name], sorted(map(tuple, lines[f"{name}, paper"]))
+        assert ours[:, 0].tolist() == [error for error, _ in theirs]
+        assert max(abs(ours[:, 1] - [strehl for _, strehl in theirs])) < 1.5  # points of percent
