@@ -88,8 +88,11 @@ def robustness_figure(
 
 def strehl_panel(curves: Sequence[Curve]) -> Panel:
     """Return curves of the Strehl ratio over the frequency error, on a scale that they fill."""
-    least = min((float(np.nanmin(curve.y)) for curve in curves if curve.y.size), default=0.0)
-    y = Axis(label="Strehl ratio", unit="%", low=max(0.0, 10 * np.floor((least - 5) / 10)))
+    values = np.concatenate([curve.y for curve in curves] or [np.zeros(0)])
+    values = values[np.isfinite(values)]
+    least, most = (values.min(), values.max()) if values.size else (0.0, 100.0)
+    step = 10.0 if most - least > 10 else 1.0  # of the lower end
+    y = Axis(label="Strehl ratio", unit="%", low=max(0.0, step * np.floor(least / step - 0.5)))
     return Panel(x=FREQUENCY_ERROR, y=y, marks=tuple(curves), height_in=2.5)
 
 

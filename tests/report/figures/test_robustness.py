@@ -20,6 +20,10 @@ def test_robustness_figure_draws_the_paper_beside(config):
     assert "[%]" in axis.get_ylabel()
     assert 50 < axis.get_ylim()[0] < 80  # the scale is that of what is there
     assert "[Hz]" in axis.get_xlabel()
+    (better,) = lbt.report.figures.robustness_figure(
+        [replace(row, strehl=0.99 + row.strehl / 1000) for row in rows]
+    ).axes
+    assert 97.9 < better.get_ylim()[0] < 99
 
 
 def test_robustness_figure_of_an_unstable_method(config):
