@@ -45,7 +45,7 @@ def write_paper(directory: str | os.PathLike[str], rows: list[RobustnessRow]) ->
         parameters = csv_bytes(("parameter", "value", "origin"), parameter_rows())
     files.append(write_atomically(folder / "parameters.csv", parameters))
     published = {
-        name: [(row.error_hz, getattr(row, name)) for row in TABLE_III]
+        name: [(e.error_hz, getattr(e, name)) for e in TABLE_III if e.error_hz is not None]
         for name in (kalman_design.method, hinf_design.method)
     }
     filters = {design_label(design.method): design for design in (kalman_design, hinf_design)}
