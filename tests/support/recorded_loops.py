@@ -52,7 +52,7 @@ def slow() -> lbt.models.ARModel:
 def resonant_record(seed: int = 0) -> lbt.identification.LoopRecord:
     """Return a loop of sensor gain 0.9 under frozen flow, two wide resonances and a line."""
     resonances = ((60.0, 0.1, 60.0, 20.0), (110.0, 0.08, 30.0, 120.0), (31.0, 0.004, 40.0, 70.0))
-    return _directed_record(500.0, 0.9, 0.4, 5.0, resonances, 12.0, seed)
+    return _directed_record(500.0, 0.9, 0.4, 5.0, resonances, _air(12.0), seed)
 
 
 def crowded_record(seed: int = 2) -> lbt.identification.LoopRecord:
@@ -64,7 +64,30 @@ def crowded_record(seed: int = 2) -> lbt.identification.LoopRecord:
         (94.86, 0.1559, 44.8, 179.9),
         (103.68, 0.1455, 87.2, 148.3),
     )
-    return _directed_record(1000.0, 0.491, 0.386, 2.05, resonances, 10.06, seed)
+    return _directed_record(1000.0, 0.491, 0.386, 2.05, resonances, _air(10.06), seed)
+
+
+def hidden_resonance_record(seed: int = 63) -> lbt.identification.LoopRecord:
+    """Return a loop of sensor gain 0.995 under a wide resonance that a lower gain explains."""
+    resonances = (
+        (35.41, 0.0075, 68.9, 83.8),
+        (45.69, 0.0056, 29.1, 101.1),
+        (124.98, 0.0031, 47.1, 79.1),
+        (41.97, 0.0086, 84.6, 11.5),
+        (20.17, 0.1502, 12.2, 173.3),
+        (139.78, 0.1958, 84.1, 169.4),
+    )
+    air = lbt.Atmosphere(
+        seeing_arcsec=1.381, outer_scale_m=23.6, wind_speed_m_s=23.1, diameter_m=8.22
+    )
+    return _directed_record(1000.0, 0.995, 0.2266, 2.82, resonances, air, seed)
+
+
+def _air(wind_speed_m_s: float) -> lbt.Atmosphere:
+    """Return strong turbulence above a telescope of 8 m."""
+    return lbt.Atmosphere(
+        seeing_arcsec=1.057, outer_scale_m=39.57, wind_speed_m_s=wind_speed_m_s, diameter_m=8.22
+    )
 
 
 def _directed_record(
@@ -73,18 +96,13 @@ def _directed_record(
     gain: float,
     noise_nm: float,
     resonances: tuple[tuple[float, float, float, float], ...],
-    wind_speed_m_s: float,
+    air: lbt.Atmosphere,
     seed: int,
 ) -> lbt.identification.LoopRecord:
     """Return half a minute of an integrator; resonances by frequency, damping, rms, direction."""
     path = lbt.LoopHardware(frame_rate_hz=rate_hz)
     truth = lbt.Truth(
-        turbulence=lbt.Atmosphere(
-            seeing_arcsec=1.057,
-            outer_scale_m=39.57,
-            wind_speed_m_s=wind_speed_m_s,
-            diameter_m=8.22,
-        ),
+        turbulence=air,
         vibrations=tuple(
             lbt.Vibration(
                 frequency_hz=f,

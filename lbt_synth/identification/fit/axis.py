@@ -30,7 +30,6 @@ from lbt_synth.validation import FloatArray, number, real_array, require_instanc
 
 _GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
 _POOR_GAIN = 0.1  # relative error from which a note says so
-_APART = 3.0  # standard errors
 _LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0
 
 
@@ -136,7 +135,7 @@ def identify_axis(
         return describe_axis(search, model, None, "1: of an open loop it has no meaning")
     model, away = _compare_gains(search, model)
     own_error = standard_errors(model.spectrum, parameter_covariance(model)).log_gain
-    error = max(own_error, away) if away > _APART * own_error else own_error
+    error = max(own_error, away)
     if error <= _GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
         if error > own_error:  # what the gain moves is as ambiguous

@@ -236,7 +236,11 @@ def _gain_per_axis(given: Any, count: int) -> list[float | None]:
 def _pool_gains(
     axes: list[IdentifiedAxis], found_gain: list[int], fit: Callable[..., list[IdentifiedAxis]]
 ) -> tuple[list[IdentifiedAxis], str]:
-    """Fit the axes again with the mean of the gains that were found, if they agree."""
+    """Fit the axes again with the mean of the gains that were found, if they agree.
+
+    Where these scatter by more than their errors, so does the mean: its error is scaled by
+    ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
+    """
     gains = np.array([axes[i].sensor_gain for i in found_gain])
     errors = np.array([axes[i].sensor_gain_error for i in found_gain], dtype=float)
     log, weight = np.log(gains), (gains / errors) ** 2
@@ -244,7 +248,8 @@ def _pool_gains(
     if np.any(np.abs(log - mean) * gains > _APART * errors):
         values = ", ".join(f"{g:.3f} +- {e:.3f}" for g, e in zip(gains, errors, strict=True))
         return axes, f"warning: the axes have different sensor gains, {values}"
-    gain, error = float(np.exp(mean)), 1 / float(np.sqrt(np.sum(weight)))
+    scatter = float(np.sum(weight * (log - mean) ** 2)) / max(len(found_gain) - 1, 1)
+    gain, error = float(np.exp(mean)), float(np.sqrt(max(scatter, 1.0) / np.sum(weight)))
     pooled = fit([gain] * len(axes), axes, gain * error)
     notes = ["that of the other axis"] * len(axes)
     for i in found_gain:

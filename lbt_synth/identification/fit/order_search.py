@@ -96,10 +96,10 @@ def try_other_gains(search: Search, model: FittedModel) -> tuple[FittedModel, fl
         free = fitting.fit(search, held.spectrum)
         found += [] if free is None else [free]
     best = min(found, key=lambda each: _cost_of_noise(search, each))
-    least, away = _cost_of_noise(search, best), 0.0
+    least, away = fitting.cost(search, best), 0.0
     for each in found:
         same = bool(each.spectrum.colour) == bool(best.spectrum.colour)
-        if _cost_of_noise(search, each) < least + (search.price if same else _OTHER_NOISE):
+        if fitting.cost(search, each) < least + (search.price if same else _OTHER_NOISE):
             away = max(away, abs(each.spectrum.log_gain - best.spectrum.log_gain))
     return (model if best is model else fitting.add_evidence(search, best)), away
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 from support.plants import ROOT
-from support.recorded_loops import integrator_loop, slow
+from support.recorded_loops import hidden_resonance_record, integrator_loop, slow
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
@@ -45,6 +45,15 @@ def test_closed_loop_gives_lines_noise_and_sensor_gain() -> None:
     truth = slow().psd(found.frequency_hz) + 2 * (6 / 0.6) ** 2 / RATE
     away = found.frequency_hz > 150
     assert np.median(found.fitted_nm2_hz[away] / truth[away]) == pytest.approx(1, rel=0.1)
+
+
+def test_a_gain_that_a_wide_resonance_may_explain_has_a_wide_error() -> None:
+    """A lower gain and one resonance less are nearly as likely as the truth."""
+    record = hidden_resonance_record()
+    y, u = np.asarray(record.measurements)[:, 0], np.asarray(record.commands)[:, 0]
+    found = lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=RATE)
+    assert found.sensor_gain_error is not None
+    assert abs(found.sensor_gain - 0.995) < 2 * found.sensor_gain_error
 
 
 def test_standard_errors_are_honest() -> None:

@@ -47,6 +47,15 @@ def test_axes_share_a_sensor_gain_where_they_agree() -> None:
     assert one.axes[0].sensor_gain == one.axes[1].sensor_gain
 
 
+def test_a_mean_gain_is_no_better_than_its_axes_agree() -> None:
+    """The error of a mean of two is half their difference where that exceeds their errors."""
+    model = joint((0.6, 0.65), (0.4, 0.4))
+    assert model.sensor_gains[0] == model.sensor_gains[1]
+    assert model.axes[0].sensor_gain_error == pytest.approx(0.025, rel=0.15)
+    agreed = joint((0.6, 0.6), (0.4, 0.4))
+    assert agreed.axes[0].sensor_gain_error < 0.013
+
+
 def test_identify_needs_what_it_needs() -> None:
     y = np.random.default_rng(0).standard_normal((6000, 1))
     without = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
