@@ -139,10 +139,10 @@ class _Bracket:
         proofs = [max(levels, key=lambda each: each[0])]
         loose = proofs[0][0] < self.least * (1 - _LOOSE)
         if route == "lmi":
-            proofs.append(_inequality_proof(form.plant, equations, solution.gamma))
+            proofs.append(_inequality_proof(form.plant, solution.gamma))
         elif loose and len(form.plant.A) <= _LARGEST_LMI:
             with suppress(NumericalError):
-                proofs.append(_inequality_proof(form.plant, equations, solution.gamma))
+                proofs.append(_inequality_proof(form.plant, solution.gamma))
         proved, self.witness = max(proofs, key=lambda each: each[0])
         if proofs[0][0] > _SAME_REASON * self.least:  # an inequality gives no reason in words
             self.witness = replace(self.witness, reason=proofs[0][1].reason)
@@ -155,14 +155,11 @@ class _Bracket:
         self.infeasible = min(proved, self.least)
 
 
-def _inequality_proof(
-    plant: GeneralizedPlant, equations: TwoRiccati, gamma: float
-) -> tuple[float, ControlWitness]:
+def _inequality_proof(plant: GeneralizedPlant, gamma: float) -> tuple[float, ControlWitness]:
     """Return the level that the dual of the matrix inequalities proves, and the proof."""
     from lbt_synth.linear.lmi.output_feedback import least_level_lmi
 
-    X, Y = equations.control.least, equations.estimation.least
-    _, witness = least_level_lmi(plant, X, Y, gamma)
+    _, witness = least_level_lmi(plant, gamma)
     return infeasible_control_level(plant, witness), witness
 
 

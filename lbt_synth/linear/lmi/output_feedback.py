@@ -15,29 +15,30 @@ import numpy as np
 from scipy.linalg import null_space
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
+from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.lmi.conic_data import require_optimum
 from lbt_synth.linear.lmi.solver import solve, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import Side, control_side, estimation_side
-from lbt_synth.linear.output_feedback.lower_bound import ControlWitness
+from lbt_synth.linear.output_feedback.lower_bound import (
+    ControlWitness,
+    storage_coordinates,
+    storage_root,
+)
 from lbt_synth.validation import FloatArray
 
 _REASON = "the dual of the matrix inequalities has a point there"
 
 
-def least_level_lmi(
-    plant: GeneralizedPlant, X: FloatArray, Y: FloatArray, scale: float
-) -> tuple[float, ControlWitness]:
+def least_level_lmi(plant: GeneralizedPlant, scale: float) -> tuple[float, ControlWitness]:
     """Return the least gamma of the programme, and the witness of its dual solution.
 
-    X and Y (n, n), least costs of control and of estimation, give each side coordinates in which
-    its storage matrix is at most gamma; the scale is the size of gamma.
+    The least cost of each side gives coordinates in which its storage matrix is at most gamma; the
+    scale is the size of gamma.
     """
     scaled = replace(plant, C1=plant.C1 / scale, D11=plant.D11 / scale, D12=plant.D12 / scale)
-    X = X / scale**2
     level = cp.Variable()
-    sides = [_Storage(estimation_side(scaled), Y), _Storage(control_side(scaled), X)]
+    sides = [_Storage(estimation_side(scaled)), _Storage(control_side(scaled))]
     constraints = [side.dissipation(level) << 0 for side in sides]
     shared = sides[0].basis.T @ sides[1].basis
     coupling = cp.bmat([[sides[0].storage, shared], [shared.T, sides[1].storage]])
@@ -54,9 +55,9 @@ def least_level_lmi(
 class _Storage:
     """The storage matrix of one side, and the pairs that its constraint hides."""
 
-    def __init__(self, side: Side, least: FloatArray) -> None:
+    def __init__(self, side: Side) -> None:
         self.side = side
-        self.basis, self.inverse = whitening_coordinates(least)
+        self.basis, self.inverse = storage_coordinates(storage_root(side))
         self.size = self.basis.shape[1]
         self.hidden = null_space(np.hstack([side.B2.T @ self.basis, side.D12.T]))
         self.storage = cp.Variable((self.size, self.size), symmetric=True)

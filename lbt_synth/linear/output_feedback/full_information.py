@@ -15,13 +15,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.matrix_functions import is_stable
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
-from lbt_synth.linear.riccati.routes import doubling
+from lbt_synth.linear.riccati.routes import solve_by_doubling, solve_by_schur
 from lbt_synth.validation import FloatArray
 
-_NEGATIVE = 1e-9  # share of the largest eigenvalue that rounding may make the least one negative
+_ROUNDING = 1e-9  # share of a solution that its residual, or a negative part, may be
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,8 +61,8 @@ class FullInformation:
     """Solves ``X`` of one side for any gamma, as the excess over the least-variance solution.
 
     With the law of least variance ``u = -feedback x - feedforward w``, what is left is a problem
-    without state weight, so that the doubling starts inside the reach of the stabilising solution
-    and D12 may be singular. Of the side of estimation, transposed, ``weight`` is the covariance of
+    without state weight, so that doubling starts inside the reach of the stabilising solution and
+    D12 may be singular. Of the side of estimation, transposed, ``weight`` is the covariance of
     the innovation and ``feedback`` its gain into the state.
     """
 
@@ -78,33 +77,52 @@ class FullInformation:
         C, D = C1 - D12 @ self.feedback, D11 - D12 @ self.feedforward
         self.pushed = D.T @ D + self.B.T @ dare.X @ self.B
         self.cross = self.A.T @ dare.X @ self.B + C.T @ D
-        self.reach = B2 @ np.linalg.solve(self.weight, B2.T)
+        self.reach = np.linalg.solve(np.linalg.cholesky(self.weight), B2.T).T
 
     def floor(self) -> float:
         """Level that no X can have: that of one step after rest."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.pushed)[-1], 0.0)))
 
     def solve(self, gamma: float) -> tuple[float, FloatArray | None]:
-        """Return the slack of the last step's condition, below 0 where there is no X, and X."""
-        n = len(self.A)
-        room = gamma**2 * np.eye(len(self.pushed)) - self.pushed
-        if np.linalg.eigvalsh(room)[0] <= 0:
+        """Return the slack of the last step's condition, and X where the slack is above 0.
+
+        Next to the least level X may grow without bound, where doubling loses its digits: the
+        ordered Schur form keeps them, and its slack goes on below that level. Where its eigenvalues
+        lie on the circle its X solves nothing, and where the equation is ill scaled it has none.
+        """
+        equation = self._equation(gamma)
+        m, unit = self.B.shape[1], gamma**2 / max(float(np.sum(self.B**2)), 1e-300)
+        if np.linalg.eigvalsh(equation.R[0, :m, :m])[-1] >= 0:
             return -1.0, None
-        solved = np.linalg.solve(room, np.hstack([self.cross.T, self.B.T]))
-        A = self.A + self.B @ solved[:, :n]
-        G, H = self.reach - self.B @ solved[:, n:], self.cross @ solved[:, :n]
-        found = doubling(A[None], (G + G.T)[None] / 2, (H + H.T)[None] / 2)[0][0]
-        if not np.all(np.isfinite(found)):
+        for route in (solve_by_schur, solve_by_doubling):
+            found, _ = route(equation)
+            gains, residual, relative = equation.evaluate(found)
+            nothing = float(np.linalg.norm(residual)) < _ROUNDING * unit
+            if nothing or relative[0] < _ROUNDING:
+                break
+        else:
             return -1.0, None
-        spectrum = np.linalg.eigvalsh(found)
-        closed = np.linalg.solve(np.eye(n) + G @ found, A)
-        if spectrum[0] < -_NEGATIVE * abs(spectrum[-1]) or not is_stable(closed):
+        if np.max(np.abs(equation.poles(gains))) >= 1:
             return -1.0, None
-        BX = self.side.B2.T @ found
-        answer = np.linalg.solve(self.weight + BX @ self.side.B2, BX @ self.B)
-        pushed = self.pushed + self.B.T @ found @ self.B - (BX @ self.B).T @ answer
-        slack = 1 - float(np.linalg.eigvalsh((pushed + pushed.T) / 2)[-1]) / gamma**2
-        return slack, self.least + found if slack > 0 else None
+        X, weights = found[0], equation.weights(found)[0]
+        answer = np.linalg.solve(weights[m:, m:], weights[m:, :m])
+        slack = -float(np.linalg.eigvalsh(weights[:m, :m] - weights[:m, m:] @ answer)[-1])
+        if slack <= 0:
+            return slack, None
+        sizes = np.linalg.eigvalsh(X)
+        negative = sizes[0] < -_ROUNDING * max(sizes[-1], unit)
+        return (-1.0, None) if negative else (slack, self.least + X)
+
+    def _equation(self, gamma: float) -> Equations:
+        """Return the equation of the excess; disturbances are in units of the level."""
+        (n, m), p = self.B.shape, self.reach.shape[1]
+        return Equations(
+            A=self.A[None],
+            B=np.hstack([self.B / gamma, self.reach])[None],
+            Q=np.zeros((1, n, n)),
+            R=block_diag(self.pushed / gamma**2 - np.eye(m), np.eye(p))[None],
+            S=np.hstack([self.cross / gamma, np.zeros((n, p))])[None],
+        )
 
     def refine(self, X: FloatArray, gamma: float) -> FloatArray:
         """Return X after Newton steps on a residual in extended precision."""

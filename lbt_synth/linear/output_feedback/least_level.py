@@ -87,8 +87,9 @@ class TwoRiccati:
 
         def slack(gamma: float) -> float:
             value, solution = self.solve(gamma)
-            if solution is not None:
-                found[gamma] = solution
+            if solution is None:
+                return min(value, -_TOLERANCE)  # at a slack of 0 there is no controller
+            found[gamma] = solution
             return value
 
         loop = self.plant.closed_loop(self.least_variance())

@@ -16,15 +16,18 @@ oscillation has no growth but for rounding, and no price.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import eigh, null_space
 
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
+from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import (
@@ -40,7 +43,12 @@ from lbt_synth.validation import FloatArray
 _STEPS = 64  # of the recursion that bounds the storage matrix
 _STEADY = 1e-12  # part of the states' moments by which those of an oscillation may change
 _STRAYED = 1e-9  # share of the successors that may lie outside of its range
+_RANKS = (1e-12, 1e-8, 1e-7, 1e-6)  # shares of the largest root of a cost that count as none
+_SUMMED = 1e-16  # what is left of a sum by squaring
 _WIDEST = 12.0  # logarithm of the relative weight of the two sides
+
+
+_SideOf: TypeAlias = Callable[[GeneralizedPlant], Side]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,11 +111,13 @@ def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -
     ... )
     2.0
     """
-    pairs = (witness.unseen, estimation_side(plant)), (witness.unmoved, control_side(plant))
-    found = [_moments(side, each) for each, side in pairs if each is not None]
-    levels = [np.sqrt(m.gained / m.spent) for m in found if m.spent > 0]
-    if len(found) == 2:
-        levels.append(_coupled_level(*found))
+    pairs = (witness.unseen, estimation_side), (witness.unmoved, control_side)
+    levels = []
+    sides = [_moments(plant, side_of, each) for each, side_of in pairs if each is not None]
+    for found in zip(*sides, strict=True):  # each rank gives a proof
+        levels += [np.sqrt(m.gained / m.spent) for m in found if m.spent > 0]
+        if len(found) == 2:
+            levels.append(_coupled_level(*found))
     return float(max(levels, default=0.0))
 
 
@@ -128,15 +138,22 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
     return float(np.max(levels(np.array([best, refined]))))
 
 
-def _moments(side: Side, pairs: Witness) -> _Moments:
-    """Evaluate pairs against the side in whose equation they are the costates."""
+def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> list[_Moments]:
+    """Evaluate pairs against the side in whose equation they are the costates, for each rank."""
+    side = side_of(plant)
     steady = _hidden(side, pairs.states, pairs.disturbances)
     growth = steady.after @ steady.after.T - pairs.states @ pairs.states.T
     size = float(np.sum(pairs.states**2))
     turning = pairs.states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
     if steady.hidden and turning:
-        return _Moments(steady.gained, steady.spent, np.zeros((len(pairs.states), 1)))
-    basis, inverse = whitening_coordinates(_least_storage(side))
+        none = np.zeros((len(pairs.states), 1))
+        return [_Moments(steady.gained, steady.spent, none)] * len(_RANKS)
+    root = _storage_root_of(plant, side_of)
+    return [_moments_within(side, pairs, *storage_coordinates(root, rank)) for rank in _RANKS]
+
+
+def _moments_within(side: Side, pairs: Witness, basis: FloatArray, inverse: FloatArray) -> _Moments:
+    """Evaluate pairs in the range of a storage matrix."""
     states = basis @ (inverse @ pairs.states)
     found = _hidden(side, states, pairs.disturbances)
     strayed = np.linalg.norm(found.after - basis @ (inverse @ found.after))
@@ -173,19 +190,52 @@ def _hidden(side: Side, states: FloatArray, signals: FloatArray) -> _Hidden:
     )
 
 
-def _least_storage(side: Side) -> FloatArray:
-    """Bound from below what any law leaves: the least cost, or some steps of its recursion."""
+def storage_coordinates(root: FloatArray, rank: float = _RANKS[2]) -> tuple[FloatArray, FloatArray]:
+    """Return T (n, r) with ``T T'`` the storage of a root, and its left inverse.
+
+    Directions below a share of the largest are left out: few, and rounding costs a proof; many, and
+    its successors leave the range.
+    """
+    spread = np.linalg.norm(root, axis=1)
+    spread = np.where(spread > 0, spread, 1.0)
+    directions, sizes, _ = np.linalg.svd(root / spread[:, None], full_matrices=False)
+    kept = sizes > rank * sizes[0]
+    basis = spread[:, None] * directions[:, kept] * sizes[kept]
+    return basis, (directions[:, kept] / sizes[kept]).T / spread
+
+
+def storage_root(side: Side) -> FloatArray:
+    """Return a root (n, r) of what any law leaves: the least cost, or some steps to it.
+
+    A root has costs to the square of rounding, which still limit what a storage matrix may be.
+    """
     A, B, Q = side.A, side.B2, side.C1.T @ side.C1
     R, S = side.D12.T @ side.D12, side.C1.T @ side.D12
     with suppress(ProblemError, SynthesisError):  # a singular problem has no stabilising law
-        return solve_dare(A, B, Q, R, S).X
-    X = np.zeros_like(A)
+        law = solve_dare(A, B, Q, R, S).gain_feedback
+        root, step = (side.C1 - side.D12 @ law).T, (A - B @ law).T
+        for _ in range(_STEPS):
+            root, step = _joined(root, step @ root), step @ step
+            if np.linalg.norm(step) < _SUMMED:
+                break
+        return root
+    root = np.zeros((len(A), 1))
     for _ in range(_STEPS):
-        law = np.linalg.lstsq(R + B.T @ X @ B, B.T @ X @ A + S.T, rcond=1e-13)[0]
-        step, error = A - B @ law, side.C1 - side.D12 @ law
-        X = step.T @ X @ step + error.T @ error
-        X = (X + X.T) / 2
-    return X
+        BX = B.T @ root @ root.T
+        law = np.asarray(np.linalg.lstsq(R + BX @ B, BX @ A + S.T, rcond=1e-13)[0], dtype=float)
+        root = _joined((A - B @ law).T @ root, (side.C1 - side.D12 @ law).T)
+    return root
+
+
+@lru_cache(maxsize=4)
+def _storage_root_of(plant: GeneralizedPlant, side_of: _SideOf) -> FloatArray:
+    """Return the root of a side once for all that may prove something of it."""
+    return storage_root(side_of(plant))
+
+
+def _joined(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return a root of the sum of two matrices from their roots."""
+    return np.asarray(np.linalg.qr(np.hstack([one, other]).T)[1].T)
 
 
 def last_step(worst: WorstCase, X: FloatArray) -> Witness:

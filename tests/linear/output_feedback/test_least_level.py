@@ -24,7 +24,9 @@ def slicot_norm(plant, gamma):
     return float(lbt.hinf_norm(loop)) if loop.spectral_radius < 1 else np.inf
 
 
-@pytest.mark.parametrize("seed", range(1, 13))
+# of the last four, an oscillation limits the level, a slack is exactly zero in the search, X grows
+# without bound next to the level, and states are in very different units
+@pytest.mark.parametrize("seed", [*range(1, 13), 15, 863, 637, 921])
 def test_slicot_reaches_no_less(seed):
     plant = random_plant(seed)
     least = lbt.hinf_controller(plant).gamma_least
@@ -32,7 +34,8 @@ def test_slicot_reaches_no_less(seed):
     assert slicot_norm(plant, least * 1.01) < least * 1.01
 
 
-@pytest.mark.parametrize("seed", range(1, 9))
+# of the last two, storages differ by twelve orders
+@pytest.mark.parametrize("seed", [*range(1, 9), 73, 257])
 def test_witness_closes_the_bracket(seed):
     design = lbt.hinf_controller(random_plant(seed))
     assert design.gamma_least * (1 - 1e-6) < design.gamma_infeasible <= design.gamma_least
@@ -41,10 +44,8 @@ def test_witness_closes_the_bracket(seed):
 @pytest.mark.parametrize("seed", range(6))
 def test_inequality_finds_the_same_level(seed):
     plant = random_plant(seed, n=5, D22=False)
-    equations = TwoRiccati(plant)
-    least = equations.least_level().gamma
-    X, Y = equations.control.least, equations.estimation.least
-    level, witness = least_level_lmi(plant, X, Y, 2 * least)
+    least = TwoRiccati(plant).least_level().gamma
+    level, witness = least_level_lmi(plant, 2 * least)
     assert level == pytest.approx(least, rel=1e-6)
     assert lbt.linear.infeasible_control_level(plant, witness) == pytest.approx(least, rel=1e-6)
 
