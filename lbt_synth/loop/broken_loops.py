@@ -17,6 +17,7 @@ from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_onl
 _SAME = 1e-9  # difference of sensitivities of equal axes
 _LARGEST = 1e6  # loop gain beyond which, and below its inverse, much is rounding
 _UNIFORM = 512  # frequencies at equal steps, beside those around resonances
+_TURN, _ROUNDS = 0.15, 6  # a response turns less from one frequency to the next [rad]; halvings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,14 +140,13 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
     edges = distinct_edges(np.concatenate([resonance_edges(loop) / nyquist, poles[poles > 1e-6]]))
     nodes, _ = gauss_panels(edges * nyquist, 12)
     uniform = np.linspace(0, nyquist, _UNIFORM + 1)[1:]
-    grid = frozen_copy(np.unique(np.concatenate([nodes, uniform])))
 
     def broken(frequency_hz: FloatArray) -> ComplexArray:
         """Return the response of each broken loop, (f, q); with S, ``1 + l_i = 1 / S_ii``."""
         sensitivity = system.frequency_response(frequency_hz)
         return np.asarray(1 / np.diagonal(sensitivity, axis1=1, axis2=2) - 1)
 
-    responses = broken(grid)
+    grid, responses = _refine_turns(broken, np.unique(np.concatenate([nodes, uniform])))
     shared: list[list[int]] = []
     for index, own in enumerate(responses.T):
         like = (group for group in shared if _is_same(own, responses[:, group[0]]))
@@ -156,6 +156,22 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
         else:
             group.append(index)
     return tuple(_examine(broken, grid, responses, group) for group in shared)
+
+
+def _refine_turns(
+    broken: Callable[[FloatArray], ComplexArray], grid: FloatArray
+) -> tuple[FloatArray, ComplexArray]:
+    """Return a grid that is finer where responses turn, as beside their zeros, and them on it."""
+    responses = broken(grid)
+    for _ in range(_ROUNDS):
+        turns = np.max(np.abs(np.angle(responses[1:] * responses[:-1].conj())), axis=1)
+        (wide,) = np.nonzero(turns > _TURN)
+        if not wide.size:
+            break
+        between = (grid[wide] + grid[wide + 1]) / 2
+        responses = np.insert(responses, wide + 1, broken(between), axis=0)
+        grid = np.insert(grid, wide + 1, between)
+    return read_only(grid), responses
 
 
 def phase_margin_deg(loops: tuple[BrokenLoop, ...]) -> float:

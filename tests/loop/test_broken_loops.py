@@ -70,6 +70,30 @@ def test_the_phase_of_two_integrators_begins_at_minus_180():
     assert found.phase_deg[0] == pytest.approx(-180, abs=1)
 
 
+def test_a_response_is_followed_around_its_zeros():
+    """``L = 0.15 z^-2 n(z) / (1 - z^-1)``, with two zeros n just inside the unit circle."""
+    omega, radius = 2 * np.pi * 137.3 / RATE, 0.999
+    notch = np.array([1, -2 * radius * np.cos(omega), radius**2])
+    notch *= 0.15 / notch.sum()
+    hardware = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    controller = lbt.Controller(  # a sum, and the last two measurements
+        A=[[1, notch[1], notch[2]], [0, 0, 0], [0, 1, 0]],
+        B=[[notch[0]], [1], [0]],
+        C=[[1, 0, 0]],
+        D=0.0,
+        dt_s=1 / RATE,
+    )
+    loop = lbt.close_loop(hardware, controller)
+    (found,) = lbt.loop.broken_loops(loop)
+    z = np.exp(2j * np.pi * found.frequency_hz / RATE)
+    expected = np.polyval(notch[::-1], 1 / z) / z**2 / (1 - 1 / z)
+    assert np.allclose(found.response, expected, rtol=1e-6)
+    assert np.max(np.abs(np.diff(np.unwrap(np.angle(expected))))) < 0.2
+    centre = np.exp(1j * omega)
+    least = np.abs(np.polyval(notch[::-1], 1 / centre) / (1 - 1 / centre))
+    assert found.gain_db.min() == pytest.approx(20 * np.log10(least), abs=0.1)
+
+
 def test_a_loop_without_a_crossing_has_no_phase_margin():
     hardware = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     timid = lbt.Controller(A=0.5, B=0.1, C=1.0, D=0.0, dt_s=1 / RATE)

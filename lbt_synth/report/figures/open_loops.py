@@ -155,13 +155,15 @@ def bode_panels(loops: Sequence[OpenLoop]) -> tuple[Panel, Panel]:
     gain_marks: list[Mark] = []
     phase_marks: list[Mark] = []
     lowest, highest = -180.0, -90.0
+    low, high = np.inf, -np.inf
     for each in loops:
         found = each.broken
         if found is None:
             gains.append(each.curve(np.zeros(0), np.zeros(0)))
             continue
         f, gain, phase, _ = each.points
-        gains.append(each.curve(f, _within(gain, gain)))
+        low, high = min(low, float(np.min(gain))), max(high, float(np.max(gain)))
+        gains.append(each.curve(f, np.maximum(gain, 2 * _LOWEST_DB)))  # a zero is far below
         phases.append(each.curve(f, phase))
         lowest = min(lowest, float(np.nanmin(phase)))
         highest = max(highest, float(np.nanmax(phase)))
@@ -170,7 +172,13 @@ def bode_panels(loops: Sequence[OpenLoop]) -> tuple[Panel, Panel]:
         for frequency_hz, ends in _phase_marks(found):
             phase_marks += _mark("phase margin", [frequency_hz] * 2, ends, "circle")
     phases += [Rule(name="", at=at, axis="y", dash=1) for at in _critical_phases(lowest, highest)]
-    y, below = Axis(label="loop gain", unit="dB"), Axis(label="phase", unit="deg")
+    y = Axis(
+        label="loop gain",
+        unit="dB",
+        low=_LOWEST_DB if low < _LOWEST_DB else None,
+        high=_HIGHEST_DB if high > _HIGHEST_DB else None,
+    )
+    below = Axis(label="phase", unit="deg")
     return (
         Panel(x=FREQUENCY, y=y, marks=(*gains, *gain_marks)),
         Panel(x=FREQUENCY, y=below, marks=(*phases, *phase_marks)),

@@ -42,6 +42,18 @@ def test_a_bode_plot_has_the_gain_and_the_phase_of_the_closed_form():
     assert points(gain, "gain margin") == [pytest.approx((800 / 6, -20 * np.log10(2)), abs=1e-6)]
 
 
+def test_a_bode_plot_ends_at_sixty_decibels_and_its_curves_do_not():
+    hardware = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    law = lbt.design.IntegratorLaw(integrators=2, zero_hz=5, phase_margin_deg=30)
+    doubled = lbt.integrator(hardware, law=law)
+    assert FIGURES.bode_figure(HALF).axes[0].get_ylim()[1] < 60
+    axes, _ = FIGURES.bode_figure({"doubled": doubled}).axes
+    assert axes.get_ylim()[1] == 60
+    line = axes.get_lines()[1].get_ydata()
+    assert np.all(np.isfinite(line))
+    assert line.max() > 60
+
+
 def test_no_loop_of_a_nyquist_plot_enters_its_disks():
     (axes,) = FIGURES.nyquist_figure(HALF).axes
     x, y = curve(axes, "loop")
