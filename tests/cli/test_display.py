@@ -56,6 +56,15 @@ def test_no_nanometre_is_left(capsys, files, command, unit):
     assert re.findall(r".*\bnm\b.*", out) == []
 
 
+def test_no_nanometre_is_left_on_a_page(capsys, files):
+    page = files / "r.html"
+    assert main(["report", CONFIG, f"{files}/k.fits", "--unit", "mas", "-o", str(page)]) == 0
+    text = re.sub(r"(?s)<(script|style|pre)\b.*?</\1>|<[^>]+>", " ", page.read_text())
+    assert re.findall(r".*\bnm\b.*", text) == []
+    assert "mas of noise per" in " ".join(text.split())
+    capsys.readouterr()
+
+
 def test_the_numbers_are_those_of_the_diameter(capsys, files):
     in_nm, in_mas = (
         float(

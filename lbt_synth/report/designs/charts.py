@@ -207,7 +207,7 @@ def _step_chart(report: DesignReport) -> Chart:
     return chart(
         "step",
         panels,
-        step=f"{STEP_NM:g}",
+        step=nm_text(STEP_NM, ".4g"),
         frame=number_text(1e3 / report.config.hardware.frame_rate_hz),
         peaks=listing_text(peaks),
     )

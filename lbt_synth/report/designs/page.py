@@ -166,7 +166,7 @@ def _situation_text(report: DesignReport) -> str:
         mirror="that settles at once" if hardware.mirror is None else "with dynamics",
         turbulence=report.config.settings.true_turbulence.replace("_", " "),
         lines=listing_text(lines) or "no vibration",
-        noise=listing_text([number_text(float(value), 3) for value in np.unique(noise)]),
+        noise=listing_text([nm_text(float(value)) for value in np.unique(noise)]),
         gain=number_text(report.real_gain),
     )
 

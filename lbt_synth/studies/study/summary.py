@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.storage.display_unit import shown_format, shown_unit
 from lbt_synth.storage.rows import cell_text
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies.study.percentiles import Percentile, Share
@@ -85,18 +86,25 @@ def residual_table(statistics: StudyStatistics) -> Table:
     """Residual of each controller, and the medians of its parts."""
     found = statistics.controllers
     parts = dict.fromkeys(part for c in found for part in c.parts_nm)
+    unit, factor = shown_unit("nm rms")
+
+    def text(residual_nm: float) -> str:
+        if np.isinf(residual_nm):
+            return "unstable"
+        return cell_text(residual_nm * factor, shown_format(".1f", factor))
+
     return _table_by_controller(
         "Residual of tip and tilt over the samples",
-        "residual [nm rms]",
+        f"residual [{unit}]",
         found,
         (
             *(
-                (ordinal(each.percent), lambda c, i=i: _nanometres(c.residual_nm[i].value))
+                (ordinal(each.percent), lambda c, i=i: text(c.residual_nm[i].value))
                 for i, each in enumerate(found[0].residual_nm)
             ),
             *([("median over the stable loops", None)] if parts else []),
             *(
-                (f"of {part}", lambda c, part=part: _nanometres(c.parts_nm.get(part, np.nan)))
+                (f"of {part}", lambda c, part=part: text(c.parts_nm.get(part, np.nan)))
                 for part in parts
             ),
         ),
@@ -267,11 +275,6 @@ def _with_error(value: float, error: float, digits: int = 1) -> str:
     """Return a part with its standard error as percentages, a dash if it is nan."""
     text = percent(value, digits)
     return text if text == "-" or np.isnan(error) else f"{text} ± {percent(error, digits)}"
-
-
-def _nanometres(value: float) -> str:
-    """Return a residual: "unstable" if it is infinite, a dash if it is nan."""
-    return "unstable" if np.isinf(value) else cell_text(value, ".1f")
 
 
 def _interval(found: Percentile | Share, digits: int = 1) -> str:

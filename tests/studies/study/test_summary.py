@@ -6,6 +6,7 @@ import numpy as np
 from support.study_results import cell_text, make_columns
 
 import lbt_synth as lbt
+from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
 from lbt_synth.studies.study.summary import (
     comparison_table,
     sensitivity_table,
@@ -45,6 +46,11 @@ def test_tables(small):
     residual = {row[0]: row[1] for row in tables["Residual of tip and tilt"].rows if len(row) > 1}
     assert residual["99th percentile"] == "unstable"
     assert residual["of noise"] == "20.0"
+    with own_display_unit():
+        show_in(DisplayUnit(name="mas", nm=8.0))
+        angles = lbt.studies.summary_tables(found)[1]
+    assert angles.headings[0] == "residual [mas rms]"
+    assert {row[0]: row[1] for row in angles.rows if len(row) > 1}["of noise"] == "2.50"
     worst = worst_table(found.controllers[0], ["gain"])
     assert [cell_text(cell) for cell in worst.rows[0]] == ["11", "unstable", "0.6"]
     assert [cell_text(cell) for cell in worst.rows[1]] == ["12", "40.0", "0.7"]
