@@ -35,6 +35,7 @@ _BUMPS_HZ, _BUMPS, _BUMP_DAMPING = (1.5, 25.0), 8, 0.18
 _LINE_DAMPING = 0.004  # only the skirts of a line are compared, which do not show it
 _SMALLEST = 1e-9  # of the measured power
 _FIRST_PASSES, _MOST_PASSES, _SETTLED = 20, 40, 0.05
+_LARGEST = 2.0  # step of the logarithm of an amplitude
 
 
 class Quadratic(NamedTuple):
@@ -126,12 +127,13 @@ def coarse_axis(
     """
     power = np.mean(abs(measured) ** 2, axis=0)
     is_peak, lines, width = find_spectral_peaks(frequency_hz, power)
-    band = _bands(frequency_hz[~is_peak], frame_rate_hz)
+    step = float(frequency_hz[1] - frequency_hz[0])
+    band = _bands(frequency_hz[~is_peak], frame_rate_hz, step)
     size = np.bincount(band)
     quadratic = Quadratic(
         power,
-        np.mean((measured * guesses.conj()).real, axis=1),
-        np.mean(abs(guesses) ** 2, axis=1),
+        np.mean((measured.conj() * guesses).real, axis=1),
+        np.mean(guesses.real**2 + guesses.imag**2, axis=1),
     )
 
     def merge(values: FloatArray) -> FloatArray:
@@ -156,9 +158,10 @@ def coarse_axis(
     )
 
 
-def _bands(frequency_hz: FloatArray, frame_rate_hz: float, *, least: int = 1) -> IntArray:
-    """Return the band of each frequency, (f,), of at least some frequencies."""
-    step = frequency_hz[1] - frequency_hz[0]
+def _bands(
+    frequency_hz: FloatArray, frame_rate_hz: float, step: float, *, least: int = 1
+) -> IntArray:
+    """Return the band of each frequency, (f,), of at least some steps."""
     width = np.minimum(_BAND * frequency_hz, _WIDEST_BAND * frame_rate_hz)
     width = np.maximum(width, least * step)
     _, band = np.unique(np.floor(np.cumsum(step / width) - 1e-9), return_inverse=True)
@@ -209,6 +212,8 @@ class _Fit:
         self.axis, self.guess, self.free = axis, guess, free
         self.fixed, self.lines = len(axis.shapes), axis.lines.size
         self.amplitudes = self.fixed + self.lines
+        shapes = axis.shapes
+        self.pairs = (shapes[:, None] * shapes).reshape(self.fixed**2, -1).T
 
     def minimise(self, gain: FloatArray) -> CoarseFit:
         """Return the least contrast of each row, by damped scoring."""
@@ -237,96 +242,113 @@ class _Fit:
 
     def _misfit(self, theta: FloatArray) -> FloatArray:
         """Return the mean deviance of the bands of each row."""
-        gain, a, lines = self._split(theta)
-        model = np.einsum("rk,rkb->rb", a, self._shapes(lines)[0])
+        gain, model, *_ = self._model(theta)
         ratio = self.axis.bands.take(self.guess).power(gain) / model
         return np.asarray(np.mean(2 * self.axis.count * (ratio - 1 - np.log(ratio)), axis=1))
 
     def _begin(self, gain: FloatArray) -> FloatArray:
         """Return starting values, with amplitudes by multiplicative updates."""
-        lines = np.tile(self.axis.lines, (gain.size, 1))
-        shapes, _ = self._shapes(lines[:1])
+        skirts, _ = self._skirts(self.axis.lines[None])
+        shapes = np.vstack([self.axis.shapes, skirts[0]])
         power, count = self.axis.bands.take(self.guess).power(gain), self.axis.count
         level = np.median(power, axis=1)[:, None] / self.amplitudes
-        a = level / np.mean(shapes[0], axis=1)
+        a = level / np.mean(shapes, axis=1)
         for _ in range(_FIRST_PASSES):
-            model = a @ shapes[0]
+            model = a @ shapes
             weight = count / model
-            a *= np.sqrt(((weight * power / model) @ shapes[0].T) / (weight @ shapes[0].T))
+            a *= np.sqrt(((weight * power / model) @ shapes.T) / (weight @ shapes.T))
             a = np.maximum(a, 1e-12 * np.max(a, axis=1, keepdims=True))
-        return np.column_stack([gain, np.log(a), lines])
+        return np.column_stack([gain, np.log(a), np.tile(self.axis.lines, (gain.size, 1))])
 
-    def _shapes(self, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return all shapes (rows, k, b), and the log derivative of the lines by their places."""
+    def _skirts(self, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the shapes of lines (rows, l, b), and their log derivatives by their places."""
         square = self.axis.square
         centre = np.exp(lines)[:, :, None]
         skirt = 1e-3 * resonance(square, centre, _LINE_DAMPING)
         shift = square - centre**2
         stretch = 4 * _LINE_DAMPING**2 * centre**2 * square
-        slope = 4 - (2 * stretch - 4 * centre**2 * shift) / (shift**2 + stretch)
-        fixed = np.broadcast_to(self.axis.shapes, (len(lines), *self.axis.shapes.shape))
-        return np.concatenate([fixed, skirt], axis=1), slope
+        return skirt, 4 - (2 * stretch - 4 * centre**2 * shift) / (shift**2 + stretch)
 
-    def _split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return gains, amplitudes and places of the lines."""
-        k = 1 + self.amplitudes
-        return theta[:, 0], np.exp(theta[:, 1:k]), theta[:, k:]
+    def _model(
+        self, theta: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return gains (rows,), models (rows, b), amplitudes, the parts of lines and their slopes.
+
+        The amplitudes are those of the shapes that all rows share, (rows, k); parts and slopes are
+        (rows, l, b).
+        """
+        k = 1 + self.fixed
+        a = np.exp(theta[:, 1 : 1 + self.amplitudes])
+        skirt, slope = self._skirts(theta[:, 1 + self.amplitudes :])
+        skirt *= a[:, self.fixed :, None]
+        model = a[:, : self.fixed] @ self.axis.shapes + np.sum(skirt, axis=1)
+        return theta[:, 0], model, a[:, : k - 1], skirt, slope
+
+    def _away(self, theta: FloatArray) -> FloatArray:
+        """Return how far lines are from their peaks, over their widths, (rows, l)."""
+        away = theta[:, 1 + self.amplitudes :] - self.axis.lines
+        return np.asarray(away / self.axis.line_width)
 
     def _contrast(self, theta: FloatArray, rows: IntArray) -> FloatArray:
         """Return the contrast of each row."""
         axis, guess = self.axis, self.guess[rows]
-        gain, a, lines = self._split(theta)
-        model = np.einsum("rk,rkb->rb", a, self._shapes(lines)[0])
+        gain, model, *_ = self._model(theta)
         ratio = axis.bands.take(guess).power(gain) / model
         at_peaks = np.log(axis.peaks.take(guess).power(gain)) + 1
-        away = (lines - axis.lines) / axis.line_width
         return np.asarray(
             (np.log(model) + ratio) @ axis.count
             + axis.peak_count * np.sum(at_peaks, axis=1)
-            + 0.5 * np.sum(away**2, axis=1)
+            + 0.5 * np.sum(self._away(theta) ** 2, axis=1)
         )
 
     def _derivatives(self, theta: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return gradients (rows, p) and information (rows, p, p) of the contrast."""
+        """Return gradients (rows, p) and information (rows, p, p) of the contrast.
+
+        What the shapes that all rows share add is a product of two matrices.
+        """
         axis, guess = self.axis, self.guess[rows]
-        gain, a, lines = self._split(theta)
-        shapes, slope = self._shapes(lines)
-        model = np.einsum("rk,rkb->rb", a, shapes)
-        share = a[:, :, None] * shapes / model[:, None, :]
-        log_slopes = np.concatenate([share, share[:, self.fixed :] * slope], axis=1)
+        gain, model, a, skirt, slope = self._model(theta)
         bands, peaks = axis.bands.take(guess), axis.peaks.take(guess)
         by_gain = bands.slope(gain) / model
         at_peaks = peaks.slope(gain) / peaks.power(gain)
-        weighted = log_slopes * axis.count
-        n = theta.shape[1]
+        excess = axis.count * (1 - bands.power(gain) / model)
+        share = skirt / model[:, None]
+        own = np.concatenate([share, share * slope], axis=1)  # of lines, by power and place
+        weighted = own * axis.count
+        n, k = theta.shape[1], 1 + self.fixed
         gradient, information = np.empty((len(rows), n)), np.empty((len(rows), n, n))
         gradient[:, 0] = by_gain @ axis.count + axis.peak_count * np.sum(at_peaks, axis=1)
-        excess = 1 - bands.power(gain) / model
-        gradient[:, 1:] = np.einsum("rkb,rb->rk", weighted, excess)
+        gradient[:, 1:k] = a * ((excess / model) @ axis.shapes.T)
+        gradient[:, k:] = (own @ excess[:, :, None])[:, :, 0]
         information[:, 0, 0] = (bands.corrected / model) @ (2 * axis.count)
         information[:, 0, 0] += axis.peak_count * np.sum(at_peaks**2, axis=1)
-        information[:, 0, 1:] = -np.einsum("rb,rkb->rk", by_gain, weighted)
+        information[:, 0, 1:k] = -a * ((axis.count * by_gain / model) @ axis.shapes.T)
+        information[:, 0, k:] = -(weighted @ by_gain[:, :, None])[:, :, 0]
+        pairs = ((axis.count / model**2) @ self.pairs).reshape(-1, self.fixed, self.fixed)
+        information[:, 1:k, 1:k] = a[:, :, None] * pairs * a[:, None]
+        information[:, k:, 1:k] = ((weighted / model[:, None]) @ axis.shapes.T) * a[:, None]
+        information[:, 1:k, k:] = information[:, k:, 1:k].transpose(0, 2, 1)
+        information[:, k:, k:] = weighted @ own.transpose(0, 2, 1)
         information[:, 1:, 0] = information[:, 0, 1:]
-        information[:, 1:, 1:] = weighted @ log_slopes.transpose(0, 2, 1)
-        k = 1 + self.amplitudes
         if not self.free:
             gradient[:, 0] = information[:, 0, 1:] = information[:, 1:, 0] = 0.0
             information[:, 0, 0] = 1.0
-        gradient[:, k:] += (lines - axis.lines) / axis.line_width**2
-        information[:, range(k, n), range(k, n)] += 1 / axis.line_width**2
+        places = range(1 + self.amplitudes, n)
+        gradient[:, places] += self._away(theta) / axis.line_width
+        information[:, places, places] += 1 / axis.line_width**2
         return gradient, information
 
     def _limit(self, theta: FloatArray, step: FloatArray) -> FloatArray:
-        """Return the parameters after a step of bounded size, the gain still above 0."""
+        """Return the parameters after a step, each of bounded size, the gain still above 0."""
         k = 1 + self.amplitudes
-        size = np.max(abs(step[:, 1:k]), axis=1)
-        moves = abs(step[:, k:]) / self.axis.line_width
-        size = np.maximum(size, 2 * np.max(moves, axis=1, initial=0))
-        trial = theta + step * np.minimum(1, 2 / np.maximum(size, 1e-9))[:, None]
+        trial = theta + step
         trial[:, 0] = np.maximum(trial[:, 0], 0.2 * theta[:, 0])
+        trial[:, 1:k] = theta[:, 1:k] + np.clip(step[:, 1:k], -_LARGEST, _LARGEST)
+        width = self.axis.line_width
+        trial[:, k:] = theta[:, k:] + np.clip(step[:, k:], -width, width)
         level = np.max(trial[:, 1:k], axis=1, keepdims=True)
         trial[:, 1:k] = np.maximum(trial[:, 1:k], level - 40)
-        return np.asarray(trial)
+        return trial
 
 
 def coherence_credit(
@@ -343,7 +365,8 @@ def coherence_credit(
     count as an explanation. What shakes along a direction has no phase between the axes; the
     coupling that a wrong guess leaves has one, and no credit.
     """
-    band = _bands(frequency_hz, frame_rate_hz, least=3)
+    step = float(frequency_hz[1] - frequency_hz[0])
+    band = _bands(frequency_hz, frame_rate_hz, step, least=3)
     power = [smooth_neighbours(np.mean(abs(x) ** 2, axis=0)) for x in (one, other)]
     x, y = (each / np.sqrt(p) for each, p in zip((one, other), power, strict=True))
     cross = np.mean((x * y.conj()).real, axis=0)

@@ -55,6 +55,18 @@ def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
     assert found.misfit[0] == pytest.approx(1.0, abs=0.4)
 
 
+def test_bands_are_as_wide_beside_a_peak_at_the_lowest_frequencies() -> None:
+    f, z, n = segment_transforms(white(2), [(0, FRAMES)], RATE)
+    plain = coarse_axis(f, z[0], z, independent=n, frame_rate_hz=RATE)
+    peaked = z[0].copy()
+    peaked[:, 4:7] *= 30.0
+    found = coarse_axis(f, peaked, z, independent=n, frame_rate_hz=RATE)
+    assert found.lines.size > plain.lines.size
+    assert found.count.size <= plain.count.size
+    total = np.sum(found.count) + found.peak_count * found.peaks.measured.size
+    assert total == pytest.approx(n * f.size)
+
+
 def test_the_right_correction_is_found_with_its_gain() -> None:
     slow = np.zeros(FRAMES)
     w = 20 * white(4)[:, 0]
