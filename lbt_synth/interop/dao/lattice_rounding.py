@@ -16,12 +16,14 @@ from lbt_synth.validation import FloatArray
 
 _SHORTER = 0.9  # of Lovasz's condition
 _SWAPS = 5  # at most, per pair of columns
+_HELD = 1e-13  # of the sensitivity, to an error that does nothing
 
 
 def round_together(exact: FloatArray, sensitivity: FloatArray) -> NDArray[np.float32]:
     """Round coefficients (n,) to single precision, with a small ``sensitivity @ error``.
 
-    A row of the sensitivity (m, n) says what an error of each does. An exact zero stays zero.
+    A row of the sensitivity (m, n) says what an error of each does. An exact zero stays zero, and
+    where a change does nothing the coefficients stay next to their exact values.
 
     Examples
     --------
@@ -36,7 +38,9 @@ def round_together(exact: FloatArray, sensitivity: FloatArray) -> NDArray[np.flo
     """
     used = np.flatnonzero(exact)
     step = np.spacing(np.abs(exact[used]).astype(np.float32)).astype(np.float64)
-    scaled = np.linalg.qr(sensitivity[:, used] * step)[1]
+    scaled = sensitivity[:, used] * step
+    held = _HELD * float(np.linalg.norm(scaled)) * np.eye(used.size)
+    scaled = np.linalg.qr(np.vstack([scaled, held]))[1]
     near = np.round(exact[used] / step)
     change = _reduced_change(scaled)
     Q, R = np.linalg.qr(scaled @ change)

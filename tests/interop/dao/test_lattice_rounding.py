@@ -47,3 +47,12 @@ def test_zeros_stay():
     exact = np.array([0.0, 1.1, 0.0, 0.7])
     found = round_together(exact, np.eye(4))
     assert found.tolist() == exact.astype(np.float32).tolist()
+
+
+def test_errors_that_do_nothing_stay_small():
+    """Two coefficients of which only the sum matters, one without effect, one with hardly any."""
+    exact = np.array([0.81, -0.41, 0.7, 1.3])
+    sensitivity = np.array([[1.0, 1.0, 0.0, 1e-200]])
+    found = round_together(exact, sensitivity)
+    np.testing.assert_allclose(found, exact, rtol=4e-7)
+    assert misses(found, exact, sensitivity) < 3e-8
