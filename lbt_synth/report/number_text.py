@@ -17,7 +17,9 @@ def number_text(value: float, digits: int = 4) -> str:
         return DASH
     if math.isinf(value):
         return "∞" if value > 0 else f"{MINUS}∞"
-    if value != 0 and not 1e-4 <= abs(value) < 1e7:
+    if value == 0:
+        return "0"  # without the sign of rounding
+    if not 1e-4 <= abs(value) < 1e7:
         mantissa, power = f"{value:.{max(digits - 1, 0)}e}".split("e")
         if "." in mantissa:
             mantissa = mantissa.rstrip("0").rstrip(".")

@@ -31,6 +31,7 @@ def test_numbers_as_texts():
     assert fixed_text(float("-inf"), 1) == "\u2212∞"
     assert signed_text(0.5) == "+0.5"
     assert signed_text(0.0) == "0"
+    assert number_text(-0.0) == "0"
     assert listing_text([]) == ""
     assert listing_text(["a", "b", "c"]) == "a, b and c"
 

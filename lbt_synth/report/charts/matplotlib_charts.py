@@ -209,6 +209,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> Any:
     width_in = axes.get_window_extent().width / axes.figure.dpi
     title = scales.shorten(panel.title, max(8, int(width_in / paper_layout.LETTER_IN)))
     axes.set_title(title, loc="left", parse_math=False)
+    # fpdf2 does not cut collections off at the edges of a panel
+    low, high = sorted(scales.scale_ends(panel)[1])
     for mark in panel.marks:
         match mark:
             case Curve():
@@ -216,10 +218,11 @@ def _draw_panel(axes: Axes, panel: Panel) -> Any:
                 style = _curve_style(mark) | {"drawstyle": step, "label": mark.name or None}
                 axes.plot(mark.x, mark.y, **style)
                 if mark.error is not None:
-                    ends = mark.y - mark.error, mark.y + mark.error
+                    ends = np.clip((mark.y - mark.error, mark.y + mark.error), low, high)
                     axes.vlines(mark.x, *ends, color=colour(mark.look), linewidth=1.0)
             case Area():
-                axes.fill_between(mark.x, mark.low, mark.high, **_fill_style(mark))
+                edges = np.clip((mark.low, mark.high), low, high)
+                axes.fill_between(mark.x, *edges, **_fill_style(mark))
             case Rule():
                 draw = axes.axvline if mark.axis == "x" else axes.axhline
                 draw(mark.at, label=mark.name or None, **_rule_style(mark))

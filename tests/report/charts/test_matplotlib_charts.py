@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from support.pages import every_mark, many_panels
 
 import lbt_synth as lbt
+from lbt_synth.report.charts.description import Area, Axis, Curve, Panel
 from lbt_synth.report.charts.matplotlib_charts import chart_svg, draw_figure
 
 
@@ -38,6 +40,20 @@ def test_titles_of_panels_stay_in_their_drawing():
             assert "…" in shown
             ends = axes._left_title.get_window_extent()
             assert ends.x1 <= axes.get_window_extent().x1 + 1
+
+
+def test_areas_and_errors_end_at_the_edges_of_their_panel():
+    """Programs that draw an SVG need not cut them off there."""
+    x = np.array([1.0, 2.0, 3.0])
+    area = Area(name="", x=x, low=x * 1e-9, high=x)
+    curve = Curve(name="", x=x, y=x, error=2 * x)
+    panel = Panel(x=Axis(label="x"), y=Axis(label="y", low=0.1, high=2.5), marks=(area, curve))
+    (axes,) = draw_figure([panel]).axes
+    assert axes.get_ylim() == (0.1, 2.5)
+    for drawn in axes.collections:
+        heights = np.concatenate([path.vertices[:, 1] for path in drawn.get_paths()])
+        assert heights.min() == 0.1
+        assert heights.max() == 2.5
 
 
 def test_a_figure_on_axes_of_the_user():
