@@ -174,7 +174,7 @@ def _residual_check(
     else:
         shown = _with_signals(loops[1], rounding.signals)
         found = mode_variances(design, shown, slice(None))
-        sizes = np.sqrt(np.maximum(found, 0.0))  # below zero by rounding
+        sizes = np.sqrt(np.abs(found))  # where it is below zero, the size of its rounding
         variance = rounding.variance(gain, sizes[n + m :], sizes[n : n + m])
         left = _rounding_left(hardware, written, rounding.entry, variance, gain)
         after = found[:n] + left

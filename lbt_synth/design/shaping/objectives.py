@@ -105,7 +105,7 @@ def _measured_left(
 ) -> float:
     """Return the variance that the real loop leaves of a spectrum and noise, exactly [nm^2]."""
     truth = Truth(turbulence=spectrum, noise_nm=noise_nm, sensor_gain=sensor_gain)
-    return residual_budget(loop.at(sensor_gain), truth).rms_nm ** 2
+    return float(np.trace(residual_budget(loop.at(sensor_gain), truth).total_nm2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
