@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.report.charts.description import Axis, Chart, Curve, Mark, Panel, Rule
 from lbt_synth.report.explore.evaluation import LoopCurves, Performance
 from lbt_synth.report.figures.loop import frequency_panel, vibration_rules
-from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
+from lbt_synth.report.figures.robustness import SHORT_FREQUENCY_ERROR, strehl_axis
 from lbt_synth.report.figures.simulation import spectra_panel
 from lbt_synth.report.page.words import chart
 
@@ -73,9 +73,11 @@ def _strehl_panel(left: Mapping[str, Performance], looks: Mapping[str, int], now
         Curve(name=name, x=one.shift_hz, y=100 * one.strehls, look=looks[name])
         for name, one in left.items()
     ]
-    y = Axis(label="Strehl ratio", unit="%", low=0.0, high=100.0)
     return Panel(
-        x=FREQUENCY_ERROR, y=y, marks=(*marks, Rule(name="now", at=now, dash=1)), height_in=2.1
+        x=SHORT_FREQUENCY_ERROR,
+        y=strehl_axis(marks),
+        marks=(*marks, Rule(name="now", at=now, dash=1)),
+        height_in=2.1,
     )
 
 

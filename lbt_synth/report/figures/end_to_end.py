@@ -11,7 +11,7 @@ from lbt_synth.interop import EndToEndRun
 from lbt_synth.methods.registry import design_label
 from lbt_synth.report.charts.description import Axis, Curve, Map, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
-from lbt_synth.report.figures.robustness import FREQUENCY_ERROR
+from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, SHORT_FREQUENCY_ERROR
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import EndToEndEntry
 
@@ -114,7 +114,7 @@ def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
     methods = list(dict.fromkeys(e.method for e in rows))
     x = FREQUENCY_ERROR
     if len(methods) > _MOST_WITH_LONG_LABEL:
-        x = Axis(label="frequency error", unit="Hz")
+        x = SHORT_FREQUENCY_ERROR
     y = Axis(label="Strehl ratio at 2.2 µm", unit="%", low=0, high=100)
     panels = [
         Panel(

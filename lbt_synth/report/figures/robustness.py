@@ -15,6 +15,7 @@ from lbt_synth.report.charts.scales import STREHL_LEVELS, count_columns, strehl_
 from lbt_synth.studies import RobustnessMap, RobustnessRow
 
 FREQUENCY_ERROR = Axis(label="frequency error, truth less design", unit="Hz")
+SHORT_FREQUENCY_ERROR = Axis(label="frequency error", unit="Hz")  # of narrow panels
 
 
 def robustness_figure(
@@ -88,12 +89,17 @@ def robustness_figure(
 
 def strehl_panel(curves: Sequence[Curve]) -> Panel:
     """Return curves of the Strehl ratio over the frequency error, on a scale that they fill."""
+    return Panel(x=FREQUENCY_ERROR, y=strehl_axis(curves), marks=tuple(curves), height_in=2.5)
+
+
+def strehl_axis(curves: Sequence[Curve]) -> Axis:
+    """Return the axis of Strehl ratios, from a multiple of 10 % or 1 % below the least on."""
     values = np.concatenate([curve.y for curve in curves] or [np.zeros(0)])
     values = values[np.isfinite(values)]
     least, most = (values.min(), values.max()) if values.size else (0.0, 100.0)
     step = 10.0 if most - least > 10 else 1.0  # of the lower end
-    y = Axis(label="Strehl ratio", unit="%", low=max(0.0, step * np.floor(least / step - 0.5)))
-    return Panel(x=FREQUENCY_ERROR, y=y, marks=tuple(curves), height_in=2.5)
+    low = max(0.0, step * np.floor(least / step - 0.5))
+    return Axis(label="Strehl ratio", unit="%", low=low)
 
 
 def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = None) -> Figure:
@@ -154,7 +160,7 @@ def map_panels(
     low, high = strehl_scale([found.strehl for found in maps.values()])
     delays = next(iter(maps.values())).delay_errors_frames
     # the long name of the axis does not fit three columns
-    x = FREQUENCY_ERROR if len(maps) in (1, 2, 4) else Axis(label="frequency error", unit="Hz")
+    x = FREQUENCY_ERROR if len(maps) in (1, 2, 4) else SHORT_FREQUENCY_ERROR
     panels = []
     for row, delay in enumerate(delays):
         late = f", delay error {delay:+g} frames" if len(delays) > 1 or delay != 0 else ""

@@ -39,6 +39,14 @@ def test_rules_mark_the_lines_and_the_slider(view):
     assert [rule.at for rule in found["strehl"].select(Rule)] == [1.0]
 
 
+def test_the_strehl_scale_is_that_of_what_is_there(view):
+    panel = panels(view)["strehl"]
+    least = min(float(np.min(c.y)) for c in panel.select(Curve))
+    assert least > 15
+    assert least - 15 < panel.y.low <= least
+    assert len(panel.x.text) < 25  # the panels are narrow
+
+
 def test_scales_end_at_decades(view):
     for key, decades in (("rejection", 4), ("noise", 2), ("spectrum", 4), ("sigma", 2)):
         panel = panels(view)[key]
