@@ -81,8 +81,8 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
 def try_other_gains(search: Search, model: FittedModel) -> tuple[FittedModel, float]:
     """Return the likeliest model from several gains, and how far others of nearly its cost are.
 
-    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves. The distance
-    is that of the logarithms of the gains.
+    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
+    lines cannot. The distance is that of the logarithms of the gains.
     """
     spectrum, found = model.spectrum, [model]
     for gain, colour in product(_STARTING_GAINS, sorted({spectrum.colour, 0.0})):
@@ -90,7 +90,8 @@ def try_other_gains(search: Search, model: FittedModel) -> tuple[FittedModel, fl
             continue
         begin = replace(search, gain=gain, colour=colour)
         try:
-            held = find_components(begin, replace(spectrum, colour=colour), rounds=_FEW_ROUNDS)
+            known = replace(spectrum, colour=colour)
+            held = find_components(begin, known, rounds=_FEW_ROUNDS, moves=False)
         except NumericalError:
             continue
         free = fitting.fit(search, held.spectrum)
@@ -105,9 +106,13 @@ def try_other_gains(search: Search, model: FittedModel) -> tuple[FittedModel, fl
 
 
 def find_components(
-    search: Search, start: SpectrumModel | None, *, rounds: int = _MOST_ROUNDS
+    search: Search,
+    start: SpectrumModel | None,
+    *,
+    rounds: int = _MOST_ROUNDS,
+    moves: bool = True,
 ) -> FittedModel:
-    """Find the model: add components, move them, prune them."""
+    """Find the model: add components, prune them, and move lines (with ``moves``)."""
     model = None if start is None else fitting.refit(search, start)
     if model is None:
         model = _begin(search)
@@ -117,16 +122,16 @@ def find_components(
         )
     model = _add_announced(search, fitting.prune(search, model))
     for _ in range(rounds):
-        better = _improve(search, model)
+        better = _improve(search, model, moves)
         if better is None:
             break
         model = better
     return _restore_turbulence(search, fitting.prune(search, fitting.simplify(search, model)))
 
 
-def _improve(search: Search, model: FittedModel) -> FittedModel | None:
+def _improve(search: Search, model: FittedModel, moves: bool) -> FittedModel | None:
     """Return the first model that is clearly better; None if none is."""
-    for trial, least in _trials(search, model.spectrum):
+    for trial, least in _trials(search, model.spectrum, moves):
         made = fitting.fit(search, trial, better_than=model)
         if made is not None:
             made = fitting.prune(search, made)
@@ -135,7 +140,9 @@ def _improve(search: Search, model: FittedModel) -> FittedModel | None:
     return None
 
 
-def _trials(search: Search, spectrum: SpectrumModel) -> Iterator[tuple[SpectrumModel, float]]:
+def _trials(
+    search: Search, spectrum: SpectrumModel, moves: bool
+) -> Iterator[tuple[SpectrumModel, float]]:
     """Yield models with new components or other places of lines, and what each must save."""
     overdamped = spectrum.components[0].damping_ratio > _OVERDAMPED
     # where no line can be added, a second turbulence would take the place of one
@@ -148,7 +155,7 @@ def _trials(search: Search, spectrum: SpectrumModel) -> Iterator[tuple[SpectrumM
         yield _add_candidates(search, spectrum, found), _LITTLE
         found = found[: len(found) // 2]
     for i, component in enumerate(spectrum.components):
-        if component.kind == "line":
+        if moves and component.kind == "line":
             yield from ((trial, _CLEARLY) for trial in _line_moves(search, spectrum, i))
     if room and overdamped and not any(c.kind == "slow" for c in spectrum.components):
         yield from ((trial, _LITTLE) for trial in _add_first_order(search, spectrum))
