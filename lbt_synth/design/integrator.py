@@ -14,12 +14,8 @@ from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_cert
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.scalar_search import find_least
-from lbt_synth.loop import (
-    LoopEnsemble,
-    close_loop,
-    model_budget,
-    stable_sensor_gains,
-)
+from lbt_synth.loop import LoopEnsemble, close_loop, stable_sensor_gains
+from lbt_synth.loop.budget import noise_covariance
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
@@ -309,14 +305,7 @@ def optimal_integrator(
         vibrations=tuple(map(ensemble_vibration, stationary_vibrations(truth.vibrations))),
     )
 
-    A, B, C, D = textbook_matrices([law.controller(hardware, 1.0)])
-
-    def variances(gains: FloatArray) -> FloatArray:
-        factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
-        scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
-        loops = replace(ensemble, loops=gains.size)
-        return residuals_from_matrices(scaled, hardware, loops).rms_nm ** 2
-
+    variances = _ensemble_variances(hardware, law, ensemble)
     return _least_residual(hardware, law, variances, truth.sensor_gain)
 
 
@@ -353,14 +342,35 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     True
     """
     require_instance(plant, TipTiltPlant)
+    hardware, factor = plant.hardware, plant.D[:, -plant.hardware.n_measurements :]
+    lines = tuple(map(ensemble_vibration, plant.vibrations))
+    disturbed = _ensemble_variances(
+        hardware, law, LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
+    )
+
+    def from_noise(gain: float) -> float:
+        loop = close_loop(hardware, law.controller(hardware, gain))
+        return float(np.trace(noise_covariance(loop, factor))) if loop.is_stable else np.nan
 
     def variances(gains: FloatArray) -> FloatArray:
-        controllers = (law.controller(plant.hardware, gain) for gain in gains.tolist())
-        loops = (close_loop(plant.hardware, controller) for controller in controllers)
-        found = [model_budget(one, plant).rms_nm if one.is_stable else np.nan for one in loops]
-        return np.square(found)
+        return disturbed(gains) + [from_noise(gain) for gain in gains.tolist()]
 
-    return _least_residual(plant.hardware, law, variances, 1.0)
+    return _least_residual(hardware, law, variances, 1.0)
+
+
+def _ensemble_variances(
+    hardware: LoopHardware, law: IntegratorLaw, ensemble: LoopEnsemble
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the residual variance of loops under the same conditions, by their gains (k,)."""
+    A, B, C, D = textbook_matrices([law.controller(hardware, 1.0)])
+
+    def variances(gains: FloatArray) -> FloatArray:
+        factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
+        scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
+        loops = replace(ensemble, loops=gains.size)
+        return residuals_from_matrices(scaled, hardware, loops).rms_nm ** 2
+
+    return variances
 
 
 def _least_residual(

@@ -253,15 +253,20 @@ def _make_budget(
     lines: list[ComplexArray],
 ) -> ResidualBudget:
     """Add what white noise of covariance ``factor factor'`` leaves."""
-    n, s = loop.hardware.modes, loop.system.balanced()
-    B, D = s.B[:, n:] @ noise_factor, s.D[:n, n:] @ noise_factor
-    noise = s.C[:n] @ stationary_covariance(s.A, B @ B.T) @ s.C[:n].T + D @ D.T
+    shape = len(lines), loop.hardware.modes
     return ResidualBudget(
         turbulence_nm2=frozen_copy(turbulence),
-        noise_nm2=frozen_copy(noise),
+        noise_nm2=frozen_copy(noise_covariance(loop, noise_factor)),
         random_vibration_nm2=frozen_copy(random_vibration),
-        line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(len(lines), n),
+        line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(shape),
     )
+
+
+def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
+    """Covariance of the residual that white noise of covariance ``factor factor'`` leaves."""
+    n, s = loop.hardware.modes, loop.system.balanced()
+    B, D = s.B[:, n:] @ factor, s.D[:n, n:] @ factor
+    return np.asarray(s.C[:n] @ stationary_covariance(s.A, B @ B.T) @ s.C[:n].T + D @ D.T)
 
 
 def ar_covariance(loop: ClosedLoop, model: ARModel, directions: FloatArray) -> FloatArray:
