@@ -27,7 +27,7 @@ from lbt_synth.design.shaping.uncertainty import (
 )
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
-from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware, TipTiltPlant
@@ -170,18 +170,19 @@ def _residual_check(
     before = mode_variances(design, loops[0], slice(n))
     how = "Lyapunov equations, level sets" + (", and what is left out" if left_out else "")
     if rounding is None:
-        after = mode_variances(design, loops[1], slice(n))
+        after, left = mode_variances(design, loops[1], slice(n)), np.zeros(n)
     else:
         shown = _with_signals(loops[1], rounding.signals)
         found = mode_variances(design, shown, slice(None))
         sizes = np.sqrt(np.abs(found))  # where it is below zero, the size of its rounding
         variance = rounding.variance(gain, sizes[n + m :], sizes[n : n + m])
-        left = _rounding_left(hardware, written, rounding.entry, variance, gain)
-        after = found[:n] + left
-        how += f"; rounding at most {np.sqrt(np.max(left / before)):.1e} of it"
+        after, left = found[:n], _rounding_left(hardware, written, rounding.entry, variance, gain)
     with np.errstate(invalid="ignore"):  # not a number: no accuracy, and the check fails
-        after_nm = np.sqrt(after) + (left_out.residual_nm(gain) if left_out else 0.0)
+        after_nm = np.sqrt(after + left) + (left_out.residual_nm(gain) if left_out else 0.0)
         loss = float(np.max(after_nm / np.sqrt(before))) - 1
+        share = float(np.sqrt(np.max(left / before)))
+    if rounding is not None:
+        how += f"; rounding at most {share:.1e} of it"
     return Check(f"residual at sensor gain {gain:g}, loss", loss, _LOSS, how)
 
 
@@ -225,8 +226,8 @@ def _gaussian_variances(
     newest = block_diag(*(m.driving_rms_nm * np.eye(m.order, 1) for m, _ in sources))
     B = block_diag(s.B[:, n:] @ noise, newest)
     C, through = np.hstack([s.C, s.D[:, :n] @ shape]), s.D[:, n:] @ noise
-    X = stationary_covariance(A, B @ B.T)
-    return np.asarray(np.sum((C @ X) * C, axis=1) + np.sum(through**2, axis=1))
+    outputs = np.hstack([C @ stationary_root(A, B), through])
+    return np.asarray(np.sum(outputs**2, axis=1))
 
 
 def _shaped_variances(design: ShapedDesign, loop: ClosedLoop) -> FloatArray:
@@ -262,7 +263,7 @@ def _rounding_left(
     both = replace(written, B=np.hstack([written.B, entry.B]), D=np.hstack([written.D, entry.D]))
     s = close_loop(replace(hardware, sensor_matrix=blind), both, sensor_gain=gain).system
     B, C, D = s.B[:, n + q :] * np.sqrt(variance), s.C[:n], s.D[:n, n + q :] * np.sqrt(variance)
-    return np.asarray(np.diag(C @ stationary_covariance(s.A, B @ B.T) @ C.T + D @ D.T))
+    return np.asarray(np.sum(np.hstack([C @ stationary_root(s.A, B), D]) ** 2, axis=1))
 
 
 def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:

@@ -122,3 +122,41 @@ def smith_sum(A: FloatArray, Q: FloatArray) -> FloatArray:
             if not np.any(size > 1e-9):  # the rest is of the size of its square
                 return np.where((size <= 1)[:, None, None], X, np.nan)
     return np.where((size <= 1e-9)[:, None, None], X, np.nan)
+
+
+def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
+    """Return R (n, r) with ``R R'`` the covariance of ``x+ = A x + B w``, for white w.
+
+    By squaring, with sums of roots by QR: variances of outputs are sums of squares, with the error
+    of their rms a share of the largest rms of a state, where a covariance has that of its square.
+    Like any squaring, it loses digits as A nears the unit circle.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.lyapunov import stationary_root
+    >>> root = stationary_root(np.array([[0.6]]), np.array([[8.0]]))
+    >>> round(float(abs(root[0, 0])), 12)
+    10.0
+    """
+    root = B
+    with np.errstate(all="ignore"):
+        for _ in range(60):
+            root = join_roots(root, A @ root)
+            A = A @ A
+            if not np.linalg.norm(A) > 1e-16:
+                break
+    return root
+
+
+def join_roots(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return R (n, r) with ``R R' = one one' + other other'``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.lyapunov import join_roots
+    >>> round(float(abs(join_roots(np.array([[3.0]]), np.array([[4.0]]))[0, 0])), 12)
+    5.0
+    """
+    return np.asarray(np.linalg.qr(np.hstack([one, other]).T)[1].T)

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 import lbt_synth as lbt
-from lbt_synth.linear.lyapunov import stationary_covariances
+from lbt_synth.linear.lyapunov import stationary_covariances, stationary_root
 
 
 def test_stacked_lyapunov_is_scipys():
@@ -37,3 +37,19 @@ def test_a_slow_line_has_its_closed_form_variance(damping, limit):
     exact = Fraction(float(drive[0, 0, 0])) * (1 - a2) / ((1 + a2) * ((1 - a2) ** 2 - a1**2))
     assert X[0, 0, 0] == pytest.approx(float(exact), rel=limit)
     assert residuals[0] < 1e-14
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_root_is_that_of_the_covariance(seed):
+    rng = np.random.default_rng(seed)
+    A, B = rng.standard_normal((6, 6)), rng.standard_normal((6, 2))
+    A *= 0.97 / np.max(np.abs(np.linalg.eigvals(A)))
+    root = stationary_root(A, B)
+    np.testing.assert_allclose(root @ root.T, solve_discrete_lyapunov(A, B @ B.T), rtol=1e-9)
+
+
+def test_a_root_keeps_variances_that_a_covariance_loses():
+    """Two states that move alike but for 1e-9 of a noise of their own."""
+    A, B = np.diag([0.9, 0.9]), np.array([[1.0, 0.0], [1.0, 1e-9]])
+    difference = np.array([1.0, -1.0]) @ stationary_root(A, B)
+    assert np.sum(difference**2) == pytest.approx(1e-18 / (1 - 0.81), rel=1e-6)

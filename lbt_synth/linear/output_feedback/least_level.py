@@ -96,7 +96,7 @@ class TwoRiccati:
         upper = hinf_norm(loop).upper if loop.spectral_radius < 1 else np.inf
         floors = self.control.floor(), self.estimation.floor()
         lower = max(*floors, _NOTHING * upper) * (1 - 1e-12) if np.isfinite(upper) else 0.0
-        for growth in np.geomspace(1e-9, 10.0, 12):
+        for growth in np.geomspace(1e-9, 1e9, 19):  # next to nothing rounding is larger
             if not np.isfinite(upper) or slack(upper * (1 + growth)) > 0:
                 break
         if not found:

@@ -28,7 +28,7 @@ from scipy.linalg import eigh, null_space
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.lyapunov import join_roots, stationary_covariance, stationary_root
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import (
     Side,
@@ -44,7 +44,6 @@ _STEPS = 64  # of the recursion that bounds the storage matrix
 _STEADY = 1e-12  # part of the states' moments by which those of an oscillation may change
 _STRAYED = 1e-9  # share of the successors that may lie outside of its range
 _RANKS = (1e-12, 1e-8, 1e-7, 1e-6)  # shares of the largest root of a cost that count as none
-_SUMMED = 1e-16  # what is left of a sum by squaring
 _WIDEST = 12.0  # logarithm of the relative weight of the two sides
 
 
@@ -213,17 +212,12 @@ def storage_root(side: Side) -> FloatArray:
     R, S = side.D12.T @ side.D12, side.C1.T @ side.D12
     with suppress(ProblemError, SynthesisError):  # a singular problem has no stabilising law
         law = solve_dare(A, B, Q, R, S).gain_feedback
-        root, step = (side.C1 - side.D12 @ law).T, (A - B @ law).T
-        for _ in range(_STEPS):
-            root, step = _joined(root, step @ root), step @ step
-            if np.linalg.norm(step) < _SUMMED:
-                break
-        return root
+        return stationary_root((A - B @ law).T, (side.C1 - side.D12 @ law).T)
     root = np.zeros((len(A), 1))
     for _ in range(_STEPS):
         BX = B.T @ root @ root.T
         law = np.asarray(np.linalg.lstsq(R + BX @ B, BX @ A + S.T, rcond=1e-13)[0], dtype=float)
-        root = _joined((A - B @ law).T @ root, (side.C1 - side.D12 @ law).T)
+        root = join_roots((A - B @ law).T @ root, (side.C1 - side.D12 @ law).T)
     return root
 
 
@@ -231,11 +225,6 @@ def storage_root(side: Side) -> FloatArray:
 def _storage_root_of(plant: GeneralizedPlant, side_of: _SideOf) -> FloatArray:
     """Return the root of a side once for all that may prove something of it."""
     return storage_root(side_of(plant))
-
-
-def _joined(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return a root of the sum of two matrices from their roots."""
-    return np.asarray(np.linalg.qr(np.hstack([one, other]).T)[1].T)
 
 
 def last_step(worst: WorstCase, X: FloatArray) -> Witness:

@@ -66,6 +66,14 @@ def test_least_level_of_nothing_left():
     assert lbt.hinf_controller(plant).gamma_least < 1e-9
 
 
+@pytest.mark.parametrize("seed", [5, 18, 27, 34])
+def test_a_least_variance_of_nothing(seed):
+    """Zeros are stable and D12, D21 square: the least variance leaves rounding."""
+    plant = random_plant(seed, n=3, dt_s=None)
+    assert plant.D12.shape[0] == plant.D12.shape[1] and plant.D21.shape[0] == plant.D21.shape[1]
+    assert lbt.hinf_controller(plant).gamma_least < 1e-9
+
+
 @pytest.mark.parametrize("seed", [14, 23])
 def test_oscillation_limits_the_level(seed):
     """No controller makes good what happens at one frequency: the response there says so."""
