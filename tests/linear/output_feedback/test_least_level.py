@@ -70,7 +70,8 @@ def test_least_level_of_nothing_left():
 def test_a_least_variance_of_nothing(seed):
     """Zeros are stable and D12, D21 square: the least variance leaves rounding."""
     plant = random_plant(seed, n=3, dt_s=None)
-    assert plant.D12.shape[0] == plant.D12.shape[1] and plant.D21.shape[0] == plant.D21.shape[1]
+    assert plant.D12.shape[0] == plant.D12.shape[1]
+    assert plant.D21.shape[0] == plant.D21.shape[1]
     assert lbt.hinf_controller(plant).gamma_least < 1e-9
 
 
