@@ -107,12 +107,10 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
 
 
 def _print_tables(tables: Iterable[Table]) -> list[Table]:
-    """Return tables with the signs of print."""
+    """Return tables with the signs of print in their words, too."""
     return [
         replace(
             table,
-            caption=print_text(table.caption),
-            headings=tuple(map(print_text, table.headings)),
             rows=tuple(
                 tuple(print_text(cell) if isinstance(cell, str) else cell for cell in row)
                 for row in table.rows

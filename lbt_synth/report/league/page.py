@@ -11,6 +11,7 @@ import numpy as np
 from lbt_synth.identification import LoopRecord
 from lbt_synth.report import provenance
 from lbt_synth.report.charts.description import Axis, Bars, Chart, Panel
+from lbt_synth.report.number_text import print_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import chart, paragraph
@@ -139,7 +140,7 @@ def _table_section(found: LeagueResult) -> Section:
         for name, why in found.failures.items()
     ]
     blocks += [
-        Paragraph(text=verdict_text(found.standings)),
+        Paragraph(text=print_text(verdict_text(found.standings))),
         row_table("Standings", found.standings, without=("records", "note")),
         *(Notice(text=text) for text in standing_notes(found)),
         _residual_chart(found.standings),

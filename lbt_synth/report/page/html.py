@@ -10,7 +10,7 @@ from lbt_synth.report.charts.bokeh_charts import bokeh_script, embed_charts
 from lbt_synth.report.charts.line_styles import PALE, SHADE, colour, dashes, marker_name
 from lbt_synth.report.charts.matplotlib_charts import chart_svg
 from lbt_synth.report.charts.scales import legend_entries
-from lbt_synth.report.number_text import unbroken_text
+from lbt_synth.report.number_text import print_text, unbroken_text
 from lbt_synth.report.page.blocks import Page
 
 # in a box of 34 times 14, around its middle
@@ -43,6 +43,7 @@ def page_html(page: Page) -> bytes:
         "colour": colour,
         "strokes": lambda look: " ".join(f"{2 * stroke:g}" for stroke in dashes(look)) or "none",
         "marker_path": lambda curve: _MARKER_PATHS[marker_name(curve.marker, curve.look)],
+        "printed": print_text,
         "unbroken": unbroken_text,
         "shade": SHADE,
         "pale": PALE,

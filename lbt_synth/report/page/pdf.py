@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from lbt_synth.report.charts.description import Chart, Map, Panel
 from lbt_synth.report.charts.matplotlib_charts import chart_png, chart_svg
 from lbt_synth.report.charts.paper_layout import lay_out
-from lbt_synth.report.number_text import unbroken_text
+from lbt_synth.report.number_text import print_text, unbroken_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
 from lbt_synth.storage.tables import Cell, Table
 
@@ -194,9 +194,9 @@ def _write_table(pdf: FPDF, table: Table) -> None:
     from fpdf.fonts import FontFace
 
     rows = list(table.cells())
-    head = tuple(Cell(text=text) for text in table.headings)
+    head = tuple(Cell(text=print_text(text)) for text in table.headings)
     _make_room(pdf, 0.2 * (2 + min(len(rows), 3 if len(rows) > _TOGETHER else len(rows))))
-    _write(pdf, table.caption, 9, bold=True, after=0.03)
+    _write(pdf, print_text(table.caption), 9, bold=True, after=0.03)
     _set_style(pdf, 8)
     widths = _column_widths(pdf, [head, *rows])
     left = {0, *table.words}

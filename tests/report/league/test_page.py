@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -75,6 +76,8 @@ def test_files(league, tmp_path):
     source.write_bytes(b"x")
     (page,) = lbt.report.write_league_page(found, records, tmp_path / "a.html", sources=[source])
     text = page.read_text()
+    assert "± [nm]" in text
+    assert "+-" not in re.sub(r"(?s)<script.*?</script>", "", text)
     assert "best integrator in hindsight" in text
     assert "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881" in text  # of "x"
     with pytest.raises(OutputError, match=r"must end in \.html"):
