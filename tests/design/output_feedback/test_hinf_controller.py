@@ -203,3 +203,19 @@ def test_mass_without_noise():
     design = lbt.hinf_controller(plant)
     assert design.gamma_infeasible == pytest.approx(1.0, abs=1e-5)  # u must balance w at 0 Hz
     assert design.gamma == pytest.approx(1.0, abs=1e-3)
+
+
+def test_mass_with_a_weight_of_its_control():
+    """Octave 14 with 10 (s + 1) / (s + 100), the weight of the control that its thread shows."""
+    plant = GeneralizedPlant(
+        A=[[0, 1, 0], [0, 0, 0], [0, 0, -100]],
+        B1=[[0.0], [1.0], [0.0]],
+        B2=[[0.0], [1.0], [1.0]],
+        C1=[[1, 0, 0], [0, 0, -990]],
+        C2=[[1.0, 0.0, 0.0]],
+        D12=[[0.0], [10.0]],
+        dt_s=None,
+    )
+    design = lbt.hinf_controller(plant)
+    assert design.gamma_infeasible == pytest.approx(design.gamma_least, rel=5e-3)
+    assert design.regularised > 0  # the measurement has no noise
