@@ -136,7 +136,7 @@ def test_a_short_record_is_refused_in_the_words_of_the_command_line(tmp_path, ca
         (
             ("--delay-frames", 2),
             "the record needs 8000 usable frames (8 s at 1000 Hz) in stretches of at least 256; "
-            "got 4994 (4.99 s), the longest stretch 4994.",
+            "got 4996 (5 s), the longest stretch 4996.",
         ),
         (("--delay-frames", 0.2), "--delay-frames must be"),
         ((), "not known; give --delay-frames, from the middle"),
@@ -168,7 +168,5 @@ def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
     )
     assert (status, error) == (0, "")
     assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()
-    assert (
-        "note: the record is short (8.99 s): it does not tell lines less than 0.11 Hz apart" in text
-    )
+    assert "note: the record is short (9 s): it does not tell lines less than 0.11 Hz apart" in text
     assert "Half a minute shows more" in text
