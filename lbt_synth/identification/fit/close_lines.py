@@ -14,7 +14,7 @@ import numpy as np
 
 from lbt_synth.identification.fit.fitting import Search, lies_in_skirts
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.scoring import Priors
+from lbt_synth.identification.fit.scoring import SEARCHED, Priors
 from lbt_synth.identification.fit.whittle import (
     WIDE_DAMPING,
     SpectrumModel,
@@ -76,7 +76,7 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
         width = np.zeros(start.pack().size)
         width[-2 * _TRIPLE :] = 2 * (np.inf, _LIKE, np.inf)
         priors = Priors(centre=start.pack(), width=width)
-        found = minimise(data, start, priors, held=rest, bound=best)
+        found = minimise(data, start, priors, held=rest, bound=best, accuracy=SEARCHED)
         if found is not None:
             away = (found.spectrum.pack() - priors.centre)[[1 - 2 * _TRIPLE, 1 - _TRIPLE]]
             best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)

@@ -348,7 +348,7 @@ def derivatives(
     cross, square = 2 * gain * data.crossed, 2 * gain**2 * data.corrected
     by_gain = (cross + square) / model
     gradient[GAIN] = np.sum(count * by_gain)
-    information[GAIN] = information[:, GAIN] = -rows @ (root * by_gain)
+    information[GAIN] = information[:, GAIN] = -(rows @ (root * by_gain))
     information[GAIN, GAIN] = np.sum(count * (cross + 2 * square) / model)
     return float(np.sum(count * (np.log(model) + ratio))), gradient, information
 
