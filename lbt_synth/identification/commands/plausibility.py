@@ -74,17 +74,17 @@ def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: b
     """Return how much likelier a guess is than the record as given, by the model of the fit.
 
     Both have the lines and the wide resonances that they need, at the price of the criterion: the
-    coarse spectrum has few. A guess that does not decide must be likelier with those of the record
-    as given. Before a saving is clear, that is fitted from other gains as well.
+    coarse spectrum has few. A guess that does not decide must first be likelier with the clear
+    ones of the record as given. Before a saving is clear, that is fitted from other gains as well.
     """
     as_given = Guess(kind="as given")
-    given = _fit_axes(coarse, as_given)
     if not decides:
-        saving = _cost(given) - _cost(_fit_axes(coarse, guess, starts=given))
+        begun = _fit_axes(coarse, as_given, rounds=0)
+        saving = _cost(begun) - _cost(_fit_axes(coarse, guess, starts=begun, rounds=0))
         if saving < 0:
             return saving
     other = _cost(_fit_axes(coarse, guess))
-    saving = _cost(given) - other
+    saving = _cost(_fit_axes(coarse, as_given)) - other
     if saving < clear:
         return saving
     return _cost(_fit_axes(coarse, as_given, other_gains=True)) - other
@@ -107,6 +107,7 @@ def _fit_axes(
     gain: float | None = None,
     *,
     starts: Sequence[_Fit] = (),
+    rounds: int = _ROUNDS,
     other_gains: bool = False,
 ) -> list[_Fit]:
     """Return the best model of each axis for a guess, at any gain or at one."""
@@ -125,7 +126,7 @@ def _fit_axes(
         search = Search(data=data, gain=gain, most_lines=_LINES)
         found: FittedModel | None = None
         with suppress(NumericalError):
-            found = find_components(search, begin, rounds=0 if starts else _ROUNDS)
+            found = find_components(search, begin, rounds=rounds)
             if other_gains:
                 found, _ = try_other_gains(search, found)
         out.append((search, found))
