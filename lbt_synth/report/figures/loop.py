@@ -117,13 +117,13 @@ def frequency_grid(
     points: int = _POINTS,
     near: int = 60,
 ) -> FloatArray:
-    """Logarithmic grid up to Nyquist, denser around special frequencies.
+    """Logarithmic grid up to Nyquist, denser around special frequencies and below Nyquist.
 
     It has so many points, and so many more near each special one, on either side of it.
     """
     nyquist = rate_hz / 2
     grids = [np.geomspace(nyquist / 10**decades, nyquist, points)]
-    for centre in special_hz:
+    for centre in (*special_hz, nyquist):
         spread = np.geomspace(1e-4, 0.2, near)
         grids += [centre * (1 + spread), centre * (1 - spread), np.array([centre])]
     grid = np.unique(np.concatenate(grids))
