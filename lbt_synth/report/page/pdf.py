@@ -28,6 +28,7 @@ INSIDE = WIDTH - 2 * _SIDE
 _COLUMNS = 6  # that fit beside the first one of a table
 _ROOM = HEIGHT - _TOP - _BOTTOM - 0.5  # of a sheet below the heading of a section [inch]
 _TOGETHER = 12  # rows of a table that stay on one sheet
+_LISTING, _LEAST_LISTING = 7.0, 5.6  # points of the type of a listing
 _PAD = 0.05  # around the text of a cell [inch]
 _INKS = {"bad": "#a40e26", "good": "#116329", "note": "#6a4b00", "plain": "#1b1f24"}
 _TINTS = {"bad": "#fdecee", "good": "#e9f5ec", "note": "#fff6dc", "plain": "#f4f6f8"}
@@ -138,7 +139,8 @@ def _write_section(pdf: FPDF, section: Section, *, first: bool) -> None:
             case Listing():
                 _make_room(pdf, 0.8)  # not the heading alone
                 _write(pdf, block.caption, 9, bold=True, after=0.05)
-                _write(pdf, block.text.expandtabs(4), 7, family=_MONO, after=0.1)
+                text = block.text.expandtabs(4)
+                _write(pdf, text, _listing_size(pdf, text), family=_MONO, after=0.1)
             case Table():
                 for part in block.by_columns(_COLUMNS):
                     _write_table(pdf, part)
@@ -146,6 +148,16 @@ def _write_section(pdf: FPDF, section: Section, *, first: bool) -> None:
                 for chart in split_by_sheets(block, HEIGHT - _BOTTOM - pdf.y):
                     _write_chart(pdf, chart)
     pdf.y += 0.15
+
+
+def _listing_size(pdf: FPDF, text: str) -> float:
+    """Return the size of the type of a listing: smaller where it then ends on this sheet."""
+    _set_style(pdf, _LISTING, family=_MONO)
+    wide = int(INSIDE / pdf.get_string_width("0"))
+    lines = sum(max(1, math.ceil(len(line) / wide)) for line in text.splitlines())
+    room = HEIGHT - _BOTTOM - pdf.y
+    fitting = 0.999 * _LISTING * room / (max(lines, 1) * _leading(_LISTING))
+    return fitting if _LEAST_LISTING < fitting < _LISTING else _LISTING
 
 
 def _write_notice(pdf: FPDF, notice: Notice) -> None:

@@ -85,6 +85,13 @@ def test_long_listings_and_tables_continue_on_the_next_sheet():
     assert count(Listing(caption="l", text="line\n" * 1000)) == pytest.approx(
         np.ceil(used / inside), abs=1
     )
+    # fewer than 70 lines of 7 points fit; up to a fourth more do in smaller type
+    assert [count(Listing(caption="l", text="line\n" * n)) for n in (70, 76, 84, 94)] == [
+        1,
+        1,
+        1,
+        2,
+    ]
     rows = tuple((f"row {i}", "value") for i in range(200))
     assert 3 <= count(Table(caption="t", headings=("a", "b"), rows=rows)) <= 5
 
