@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
+from scipy.linalg import LinAlgWarning, schur, solve_discrete_lyapunov
 
 from lbt_synth.linear.batched import frobenius_norms, symmetrise, transpose
 from lbt_synth.storage.warning_filters import ignore_warnings
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray
 
 _SOLVED = 1e-14  # relative residual of an equation solved to rounding
 # A step of refinement that moves X by more than this part of it is repeated with the residual in
@@ -17,6 +17,8 @@ _SOLVED = 1e-14  # relative residual of an equation solved to rounding
 # itself and more.
 _SETTLED = 1e-11
 _REFINEMENTS = 6
+
+_Matrix = TypeVar("_Matrix", FloatArray, ComplexArray)
 
 
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
@@ -129,7 +131,8 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
 
     By squaring, with sums of roots by QR: variances of outputs are sums of squares, with the error
     of their rms a share of the largest rms of a state, where a covariance has that of its square.
-    Like any squaring, it loses digits as A nears the unit circle.
+    The triangular form of A keeps its eigenvalues in every power. Like any squaring, it loses
+    digits as A nears the unit circle.
 
     Examples
     --------
@@ -139,18 +142,20 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
     >>> round(float(abs(root[0, 0])), 12)
     10.0
     """
-    root = B
+    triangle, basis = schur(A, output="complex")
+    root = basis.conj().T @ B
     with np.errstate(all="ignore"):
         for _ in range(60):
-            root = join_roots(root, A @ root)
-            A = A @ A
-            if not np.linalg.norm(A) > 1e-16:
+            root = join_roots(root, triangle @ root)
+            triangle = triangle @ triangle
+            if not np.linalg.norm(triangle) > 1e-16:
                 break
-    return root
+    root = basis @ root
+    return np.asarray(join_roots(root.real, root.imag), dtype=np.float64)
 
 
-def join_roots(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return R (n, r) with ``R R' = one one' + other other'``.
+def join_roots(one: _Matrix, other: _Matrix) -> _Matrix:
+    """Return R (n, r) with ``R R' = one one' + other other'``, real or complex.
 
     Examples
     --------
@@ -159,4 +164,5 @@ def join_roots(one: FloatArray, other: FloatArray) -> FloatArray:
     >>> round(float(abs(join_roots(np.array([[3.0]]), np.array([[4.0]]))[0, 0])), 12)
     5.0
     """
-    return np.asarray(np.linalg.qr(np.hstack([one, other]).T)[1].T)
+    factor: _Matrix = np.linalg.qr(np.hstack([one, other]).conj().T)[1]
+    return factor.conj().T

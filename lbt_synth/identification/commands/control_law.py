@@ -21,7 +21,7 @@ from lbt_synth.identification.commands.law_search import (
 )
 from lbt_synth.identification.commands.loop_series import LoopSeries, prepare_series
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, matrix, read_only
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, matrix, read_only
 
 LawKind: TypeAlias = Literal[
     "pure integrator",
@@ -43,6 +43,7 @@ _LEAKY = 0.5  # least pole of a leaky one
 _PURE = 1e-6
 _ROUNDING = 1e-12
 _AS_GOOD = 0.9
+_COUNTS = 0.05  # of the largest weight of an axis
 _ROUGH = 0.05  # residual beyond which a law that knows the future is doubtful
 
 
@@ -119,6 +120,13 @@ class ControlLaw:
     def exact(self) -> bool:
         """Whether the law leaves nothing but rounding."""
         return self.kind != "none" and self.residual < _EXACT
+
+    @property
+    def axis_lags(self) -> IntArray:
+        """Lag of the first measurement that counts for each axis [frames], (axes,)."""
+        size = np.linalg.norm(self.taps, axis=2)
+        counts = size > _COUNTS * np.max(size, axis=1, keepdims=True)
+        return np.asarray(self.lag_frames + np.argmax(counts, axis=1))
 
 
 def record_control_law(record: LoopRecord) -> ControlLaw:

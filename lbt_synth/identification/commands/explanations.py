@@ -7,7 +7,7 @@ import numpy as np
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess, is_orthogonal
 from lbt_synth.identification.commands.repair import MIRROR, CommandRepair, rotation
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, IntArray
 
 _FINE_DEG = np.arange(-24.0, 25.0, 6.0)
 _SNAP_DEG = 10.0  # within which an angle is that of exchanged or turned axes
@@ -133,6 +133,16 @@ def _repair_matrix(matrix: FloatArray) -> tuple[CommandRepair, str]:
 def recorded_early(frames: int) -> str:
     """Return the words for commands that know the future."""
     return f"they are recorded {frames} frame{'s' * (frames > 1)} early, before their measurements"
+
+
+def axes_apart(lags: IntArray) -> str:
+    """Return the words for commands of two axes that follow their measurements differently."""
+    late = int(np.argmax(lags))
+    frames = int(np.ptp(lags))
+    return (
+        f"those of axis {late} follow their measurements {frames} frame{'s' * (frames > 1)} later "
+        f"than those of axis {1 - late}; move one of them"
+    )
 
 
 def wrong_scale(factor: float, gain: FloatArray) -> str:

@@ -30,6 +30,7 @@ _MARGIN = 5  # frames of a stretch, on either side, that no shift leaves
 _SHORTEST = 512
 _NATURAL_GAINS = np.array([0.2, 0.7, 2.0])  # starts, of the natural gain
 _NATURAL = 0.4
+_STEADY = 1e-24  # of the measured power
 _ORTHOGONAL = 1e-6
 _ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 
@@ -232,7 +233,8 @@ class CoarseRecord:
         high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
         level = np.mean(abs(self.measured[i][:, high]) ** 2)
         steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
-        natural = _NATURAL * np.sqrt(level / np.maximum(steps, np.finfo(float).tiny))
+        least = max(_STEADY * level, np.finfo(float).tiny)  # clipped commands may hardly move
+        natural = _NATURAL * np.sqrt(level / np.maximum(steps, least))
         starts = natural[:, None] * _NATURAL_GAINS if fixed is None else fixed[:, None]
         return fit_guesses(axis, starts, free=fixed is None)
 

@@ -12,6 +12,7 @@ from lbt_synth.identification.commands.axis_matrix import classify_matrix
 from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factor
 from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
 from lbt_synth.identification.commands.explanations import (
+    axes_apart,
     invert_axes,
     recorded_early,
     refine_guess,
@@ -41,6 +42,7 @@ _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
+_FOLLOWED = 0.5  # coherence of an axis whose lag counts
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _INSIDE = 8  # gains that are tried of the plausible ones
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
@@ -163,7 +165,14 @@ def explain_commands(
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     law = _find_law(record)
-    lag = law.lag_frames if law is not None and _is_sure(law) else 0
+    lag = 0
+    if law is not None and _is_sure(law):
+        lag, lags = law.lag_frames, law.axis_lags
+        if np.ptp(lags[law.axis_coherence > _FOLLOWED]):  # no real-time computer does that
+            nothing = np.full(record.axes, np.nan)
+            return CommandVerdict(
+                explanation=axes_apart(lags), accepted=False, gain=nothing, law=law
+            )
     early = max(-lag, 0)
     if early:  # corrections that follow from the future have no likelihood: they are moved first
         assert law is not None

@@ -60,6 +60,24 @@ def test_a_rotated_mirror_is_found_without_the_law() -> None:
     assert verdict.repair.rotation_deg == pytest.approx(30, abs=8)
 
 
+@pytest.mark.parametrize(("late", "words"), [(0, "axis 0 follow"), (1, "axis 1 follow")])
+def test_axes_that_are_a_frame_apart(late, words) -> None:
+    y, u = ordinary_loop(1)
+    u = np.array(u)
+    u[1:, late] = u[:-1, late].copy()
+    verdict = explain_commands(record(y[1:], u[1:]))
+    assert not verdict.accepted
+    assert verdict.options == ""
+    assert words in verdict.explanation
+    assert "1 frame later" in verdict.explanation
+
+
+def test_commands_far_from_zero() -> None:
+    """As guesses of clipped ones, they hardly move."""
+    y, u = ordinary_loop(1)
+    assert explain_commands(record(y, u + 1e5)).accepted
+
+
 def test_requests_that_were_not_applied() -> None:
     verdict = explain_commands(record(*requested_loop()))
     assert verdict.options.startswith("--command-limit-nm")
