@@ -124,16 +124,22 @@ class Loop:
 
 
 def decays(hardware, step):
-    """Whether a loop in any arithmetic comes back from a kick: ``step(y, last) -> u``."""
+    """Whether a loop in any arithmetic comes back from a kick: ``step(y, last) -> u``.
+
+    A slow line may still swing up when the first frames are over.
+    """
     m = hardware.modes
     past, residual = [np.zeros(m)] * len(taps(hardware)), 100.0 * np.ones(m)
-    sizes = np.zeros(FRAMES)
-    for k in range(FRAMES):
-        past = [step(residual, past[0]), *past[:-1]]
-        residual = -sum(c * v for c, v in zip(taps(hardware), past, strict=True))
-        sizes[k] = np.max(np.abs(residual))
-    late = np.max(sizes[-FRAMES // 4 :])
-    return bool(np.isfinite(sizes).all() and late <= 1.001 * np.max(sizes[: -FRAMES // 4]))
+    sizes = []
+    for frames in (FRAMES, 16 * FRAMES):
+        while len(sizes) < frames:
+            past = [step(residual, past[0]), *past[:-1]]
+            residual = -sum(c * v for c, v in zip(taps(hardware), past, strict=True))
+            sizes.append(np.max(np.abs(residual)))
+        late = np.max(sizes[-frames // 4 :])
+        if np.isfinite(sizes).all() and late <= 1.001 * np.max(sizes[: -frames // 4]):
+            return True
+    return False
 
 
 def judge_c(files, design, options):
