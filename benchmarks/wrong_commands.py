@@ -40,6 +40,7 @@ FAULTS = {  # and the beginning of what repairs it
     "increments": "--command-increments",
     "other night": "",
     "clipped": "--command-limit-nm",
+    "axis late": "",
 }
 KINDS = (
     *("wide", "eris", "fraction", "ar1", "leaky", "double", "kalman", "unequal", "low"),
@@ -139,6 +140,8 @@ def spoil(loop: Loop, fault: str) -> tuple[np.ndarray, np.ndarray]:
         return y, u @ turn.T
     if fault == "shift":
         return y[5:-5], np.roll(u, (-2, -1, 1, 2)[loop.seed % 4], axis=0)[5:-5]
+    if fault == "axis late":
+        return y[1:], np.column_stack([u[1:, 0], u[:-1, 1]])
     if fault == "clipped":
         part = (0.7, 0.9, 0.97)[loop.seed % 3]
         return run_clipped(loop, np.quantile(abs(u), part, axis=0))
@@ -185,17 +188,18 @@ def judge(
         verdict = explain_commands(record)
         seconds = time.perf_counter() - start
         right = verdict.options.startswith(options) and verdict.accepted == (fault == "none")
-        if fault == "other night":
-            right = not verdict.accepted and "nothing to do" in verdict.explanation
-        words = "" if right else f"{seed}: {verdict.explanation} {verdict.options}"
+        words = {"other night": "nothing to do", "axis late": "later than those of axis 0"}
+        if fault in words:
+            right = not verdict.accepted and words[fault] in verdict.explanation
+        said = "" if right else f"{seed}: {verdict.explanation} {verdict.options}"
         made = try_design(loop, record) if design and verdict.accepted else ("", np.nan)
         if made[0].startswith("named:"):  # by the gains of the fit
             right = bool(options) and made[0].startswith(f"named: {options}")
-            words = "" if right else f"{seed}: {made[0]}"
+            said = "" if right else f"{seed}: {made[0]}"
             accepted, seconds = False, time.perf_counter() - start
         else:
             accepted = verdict.accepted
-        out.append((fault, right, accepted, seconds, words, *made))
+        out.append((fault, right, accepted, seconds, said, *made))
         print(seed, *out[-1], sep="; ", file=sys.stderr, flush=True)
     return out
 
