@@ -344,9 +344,8 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     require_instance(plant, TipTiltPlant)
     hardware, factor = plant.hardware, plant.D[:, -plant.hardware.n_measurements :]
     lines = tuple(map(ensemble_vibration, plant.vibrations))
-    disturbed = _ensemble_variances(
-        hardware, law, LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
-    )
+    conditions = LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
+    disturbed = _ensemble_variances(hardware, law, conditions)
 
     def from_noise(gain: float) -> float:
         loop = close_loop(hardware, law.controller(hardware, gain))
@@ -390,14 +389,12 @@ def _least_residual(
         found = variances(np.exp(log_gains))
         return np.where(np.isnan(found), np.inf, found)
 
-    values = left(trials)
-    walls = np.concatenate([[np.inf], values, [np.inf]])
-    low = np.flatnonzero((values < walls[:-2]) & (values <= walls[2:])).tolist()
+    walls = np.concatenate([[np.inf], left(trials), [np.inf]])
+    low = np.flatnonzero((walls[1:-1] < walls[:-2]) & (walls[1:-1] <= walls[2:])).tolist()
     ends = [(max(i - 1, 0), min(i + 1, trials.size - 1)) for i in low]
     refined = [find_least(left, *trials[list(pair)].tolist(), width=1e-7) for pair in ends]
     best = int(np.argmin([least for _, least in refined]))
-    limited = low[best] == trials.size - 1  # the largest gain that was tried
+    gain, last = float(np.exp(refined[best][0])), low[best] == trials.size - 1
     limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
-    status = f"limited by {limit}" if limited else "least residual"
-    gain = float(np.exp(refined[best][0]))
+    status = f"limited by {limit}" if last else "least residual"
     return _design_with_gain(hardware, gain, law, route="search", status=status)

@@ -24,7 +24,8 @@ from lbt_synth.identification.prediction.comparison import (
 )
 from lbt_synth.identification.record_drift import note_drift
 from lbt_synth.identification.records.line_priors import LinePrior
-from lbt_synth.identification.records.record import LoopRecord, require_length
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.records.record_length import require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop

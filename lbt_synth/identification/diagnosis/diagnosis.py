@@ -35,7 +35,8 @@ from lbt_synth.identification.prediction.comparison import (
     prediction_against_data,
 )
 from lbt_synth.identification.prediction.residual_row import ResidualRow
-from lbt_synth.identification.records.record import LoopRecord, require_length
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.records.record_length import require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop

@@ -24,7 +24,8 @@ from lbt_synth.identification.fit.physical_parameters import (
     parameter_covariance,
     standard_errors,
 )
-from lbt_synth.identification.fit.whittle import WIDE_DAMPING, FittedModel
+from lbt_synth.identification.fit.spectrum_model import WIDE_DAMPING
+from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.stretches import StretchesLike, checked_stretches
 from lbt_synth.validation import FloatArray, number, real_array, require_instance
 

@@ -15,13 +15,8 @@ import numpy as np
 from lbt_synth.identification.fit.fitting import Search, lies_in_skirts
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.scoring import SEARCHED, Priors
-from lbt_synth.identification.fit.whittle import (
-    WIDE_DAMPING,
-    SpectrumModel,
-    contrast,
-    density,
-    minimise,
-)
+from lbt_synth.identification.fit.spectrum_model import WIDE_DAMPING, SpectrumModel
+from lbt_synth.identification.fit.whittle import contrast, density, minimise
 
 _LIKELY = 5.5  # log-likelihood that a split rarely adds to a single line
 _WEAK = 40.0  # the same of a line in the skirts of another whose errors are too small

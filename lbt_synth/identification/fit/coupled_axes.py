@@ -22,12 +22,8 @@ from lbt_synth.identification.fit.physical_parameters import (
     gain_error_covariance,
 )
 from lbt_synth.identification.fit.shared_lines import find_shared
-from lbt_synth.identification.fit.whittle import (
-    GAIN,
-    FittedModel,
-    contrast,
-    invert_information,
-)
+from lbt_synth.identification.fit.spectrum_model import GAIN
+from lbt_synth.identification.fit.whittle import FittedModel, contrast, invert_information
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.validation import FloatArray

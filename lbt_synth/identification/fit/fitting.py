@@ -11,15 +11,17 @@ import numpy as np
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import EXACT, SEARCHED, Priors
-from lbt_synth.identification.fit.whittle import (
+from lbt_synth.identification.fit.spectrum_model import (
     NO_CORNER,
     Component,
-    FittedModel,
     Kind,
     SpectrumModel,
+    damping_parameter,
+)
+from lbt_synth.identification.fit.whittle import (
+    FittedModel,
     component_densities,
     contrast,
-    damping_parameter,
     density,
     minimise,
     observe_information,

@@ -20,13 +20,8 @@ import numpy as np
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import Priors, scoring_minimum
-from lbt_synth.identification.fit.whittle import (
-    Component,
-    SpectrumModel,
-    densities,
-    invert_information,
-    log_slopes,
-)
+from lbt_synth.identification.fit.spectrum_model import Component, SpectrumModel
+from lbt_synth.identification.fit.whittle import densities, invert_information, log_slopes
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 

@@ -20,17 +20,14 @@ from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.excesses import Candidate, find_candidates, measure_excess
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.scoring import SEARCHED
-from lbt_synth.identification.fit.whittle import (
+from lbt_synth.identification.fit.spectrum_model import (
     NO_CORNER,
     WIDE_DAMPING,
-    FittedModel,
     Kind,
     SpectrumModel,
-    contrast,
     damping_parameter,
-    density,
-    minimise,
 )
+from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
 from lbt_synth.validation import FloatArray
 
 _STARTING_GAINS = (0.6, 0.35, 1.0)

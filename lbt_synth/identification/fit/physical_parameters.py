@@ -16,11 +16,9 @@ from lbt_synth.identification.fit.identified_model import (
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import Priors
+from lbt_synth.identification.fit.spectrum_model import GAIN, WIDE_DAMPING, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
-    GAIN,
-    WIDE_DAMPING,
     FittedModel,
-    SpectrumModel,
     densities,
     derivatives,
     invert_information,

@@ -28,11 +28,8 @@ from lbt_synth.identification.fit.joint_whittle import (
     joint_density,
 )
 from lbt_synth.identification.fit.physical_parameters import parameter_covariance, standard_errors
-from lbt_synth.identification.fit.whittle import (
-    Component,
-    FittedModel,
-    damping_parameter,
-)
+from lbt_synth.identification.fit.spectrum_model import Component, damping_parameter
+from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import ComplexArray, FloatArray
 

@@ -11,7 +11,8 @@ import lbt_synth as lbt
 from lbt_synth.identification.fit.close_lines import describe_close_lines, split_gain
 from lbt_synth.identification.fit.fitting import Search, fit
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.whittle import NO_CORNER, SpectrumModel, contrast, density
+from lbt_synth.identification.fit.spectrum_model import NO_CORNER, SpectrumModel
+from lbt_synth.identification.fit.whittle import contrast, density
 
 RATE, DURATION_S = 500.0, 60.0
 DAMPING = 0.005

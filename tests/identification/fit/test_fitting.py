@@ -9,7 +9,8 @@ import pytest
 
 from lbt_synth.identification.fit.fitting import Search, fit, prune
 from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.whittle import SpectrumModel, contrast
+from lbt_synth.identification.fit.spectrum_model import SpectrumModel
+from lbt_synth.identification.fit.whittle import contrast
 
 RATE = 1000.0
 

@@ -20,7 +20,8 @@ from lbt_synth.identification.fit.joint_whittle import (
     joint_derivatives,
 )
 from lbt_synth.identification.fit.periodogram import cross_periodogram, loop_periodogram
-from lbt_synth.identification.fit.whittle import Component, SpectrumModel, contrast
+from lbt_synth.identification.fit.spectrum_model import Component, SpectrumModel
+from lbt_synth.identification.fit.whittle import contrast
 
 W = 2 * np.pi / RATE
 LINE = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=50, direction=(0.8, -0.6))

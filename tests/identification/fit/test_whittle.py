@@ -10,14 +10,8 @@ from scipy.optimize import approx_fprime
 from support.recorded_loops import integrator_loop
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
-from lbt_synth.identification.fit.whittle import (
-    GAIN,
-    Component,
-    SpectrumModel,
-    contrast,
-    density,
-    derivatives,
-)
+from lbt_synth.identification.fit.spectrum_model import GAIN, Component, SpectrumModel
+from lbt_synth.identification.fit.whittle import contrast, density, derivatives
 
 RATE = 1000.0
 
@@ -32,19 +26,6 @@ def case() -> tuple[LoopPeriodogram, SpectrumModel]:
     turbulence = Component("turbulence", np.log(1.1 * w), np.log(0.5), np.log(200.0**2))
     line = Component("line", np.log(39 * w), np.log(0.02 / 0.98), np.log(15.0**2))
     return data, SpectrumModel(np.log(0.7), np.log(30), 0.3, np.log(20 * w), (turbulence, line))
-
-
-def test_parameters_keep_their_names_in_a_vector() -> None:
-    _, spectrum = case()
-    theta = spectrum.pack()
-    assert spectrum.unpack(theta) == spectrum
-    named = spectrum.unpack(np.arange(10.0))
-    assert (named.log_gain, named.log_noise, named.colour, named.log_corner) == (0, 1, 2, 3)
-    turbulence, line = named.components
-    assert (turbulence.log_frequency, turbulence.damping, turbulence.log_power) == (4, 5, 6)
-    assert (line.log_frequency, line.damping, line.log_power) == (7, 8, 9)
-    with pytest.raises(ValueError, match="zip"):
-        spectrum.unpack(theta[:-3])
 
 
 def test_gradient_and_information_of_the_likelihood() -> None:
