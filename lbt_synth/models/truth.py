@@ -135,6 +135,17 @@ class Truth(Summarised):
             )
         return tuple(errors)
 
+    def frequency_shifts_hz(self, error_hz: float) -> FloatArray:
+        """Return how far each vibration moves, (vibrations,), if the one that moves most does so.
+
+        Each moves by its own share of the error [Hz].
+        """
+        sizes = self.frequency_errors_hz
+        if sizes is None:
+            sizes = tuple(line.frequency_hz for line in stationary_vibrations(self.vibrations))
+        largest = max([*sizes, np.finfo(float).tiny])
+        return np.array([error_hz * size / largest for size in sizes])
+
     def frequency_shift_hz(self, frequency_hz: float, error_hz: float) -> float:
         """Return how far a line moves with an error of the vibration that moves most [Hz].
 
@@ -145,16 +156,15 @@ class Truth(Summarised):
         if not lines:
             return error_hz
         places = np.array([line.frequency_hz for line in lines])
-        given = self.frequency_errors_hz
-        sizes = places if given is None else np.array(given)
-        share = sizes / max(float(np.max(sizes)), np.finfo(float).tiny)
-        return error_hz * float(share[np.argmin(np.abs(np.log(places / frequency_hz)))])
+        nearest = np.argmin(np.abs(np.log(places / frequency_hz)))
+        return float(self.frequency_shifts_hz(error_hz)[nearest])
 
     def with_frequency_error(self, error_hz: float) -> Truth:
         """Return a truth whose vibrations have moved, the one that moves most by an error [Hz]."""
         moved = []
-        for line in stationary_vibrations(self.vibrations):
-            frequency_hz = line.frequency_hz + self.frequency_shift_hz(line.frequency_hz, error_hz)
+        lines = stationary_vibrations(self.vibrations)
+        for line, shift in zip(lines, self.frequency_shifts_hz(error_hz), strict=True):
+            frequency_hz = line.frequency_hz + float(shift)
             if not frequency_hz > 0:
                 raise ProblemError(
                     f"errors_hz must leave each vibration above 0 Hz; got an error of "

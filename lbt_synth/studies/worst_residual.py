@@ -30,6 +30,7 @@ from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_v
 from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_BOXES = 120  # halved
+_PLACES = 17  # of a resonance in its band
 _COUPLED = 1e-9  # of the largest transfer between axes; less is rounding
 
 Box = tuple[FloatArray, FloatArray]  # least and largest gain of each measurement
@@ -235,18 +236,20 @@ def _left_of_skirts(loop: ClosedLoop, response: StateSpace, line: _Line) -> floa
     """Return what is left of a resonance outside its band, at most [nm^2]; 0 for a sinusoid."""
     if not isinstance(line.vibration, Vibration):
         return 0.0
+    low, high, rate = line.low_hz, line.high_hz, loop.hardware.frame_rate_hz
     skirts = Skirts(
-        low_hz=line.low_hz,
-        high_hz=line.high_hz,
-        rms_nm=line.vibration.rms_nm,
-        damping=line.vibration.damping,
+        low_hz=low, high_hz=high, rms_nm=line.vibration.rms_nm, damping=line.vibration.damping
     )
-    nyquist = loop.hardware.frame_rate_hz / 2
+    centres = np.linspace(low, high, _PLACES if low < high else 1).tolist()
+    models = [replace(line.vibration, frequency_hz=c).ar_model(rate) for c in centres]
 
     def density(f: FloatArray) -> FloatArray:
         power = np.sum(np.abs(response.frequency_response(f)[:, :, 0]) ** 2, axis=1)
-        return np.asarray((skirts.psd(f) * power)[:, None, None])
+        largest = np.max([model.psd(f) for model in models], axis=0)
+        outside = (f < low) | (f > high)
+        return np.asarray((outside * largest * power)[:, None, None])
 
+    nyquist = rate / 2
     edges = np.concatenate([resonance_edges(loop), np.clip(skirts.breakpoints_hz, 0, nyquist)])
     return float(adaptive_integral(density, np.unique(edges))[0, 0])
 
@@ -287,9 +290,10 @@ def _moving_lines(
     if first > last:
         raise ProblemError(f"error_hz must be one number, or (low, high); got {error_hz!r}.")
     lines, nyquist = [], hardware.frame_rate_hz / 2
-    for vibration in stationary_vibrations(truth.vibrations):
+    shifts = zip(*(truth.frequency_shifts_hz(end) for end in (first, last)), strict=True)
+    for vibration, moved in zip(stationary_vibrations(truth.vibrations), shifts, strict=True):
         f = vibration.frequency_hz
-        low, high = (f + truth.frequency_shift_hz(f, end) for end in (first, last))
+        low, high = (f + float(shift) for shift in moved)
         if not 0 < low <= high < nyquist:
             raise ProblemError(
                 f"error_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got the one "

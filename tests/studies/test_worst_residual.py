@@ -128,3 +128,36 @@ def test_what_is_refused(options, message) -> None:
     hardware, controller, truth = setting(coupled=False, sinusoids=True)
     with pytest.raises(lbt.errors.ProblemError, match=message):
         lbt.studies.guaranteed_residual(hardware, controller, truth, **options)
+
+
+@pytest.mark.parametrize(("frequency_hz", "damping"), [(60.0, 1e-3), (281.3, 0.0258)])
+def test_a_resonance_is_sampled(frequency_hz, damping):
+    """Its spectrum falls less steeply near half the frame rate than one in continuous time."""
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    air = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=0.01, frame_rate_hz=800)
+    line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=100, direction=(1.0,))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800, turbulence=air, vibrations=[line], noise_nm=1.0, modes=1
+    )
+    controller = lbt.kalman(plant).controller
+    truth = lbt.Truth(turbulence=air, noise_nm=0.01, vibrations=(line,))
+    upper = lbt.studies.guaranteed_residual(path, controller, truth).upper_nm
+    exact = lbt.residual_budget(lbt.close_loop(path, controller), truth).rms_nm
+    assert exact <= upper < 1.05 * exact
+
+
+def test_lines_at_one_frequency_move_by_their_own_errors():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=2)
+    lines = tuple(
+        lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=direction)
+        for direction in ((1, 0), (0, 1))
+    )
+    truth = lbt.Truth(
+        turbulence=None, noise_nm=5.0, vibrations=lines, frequency_errors_hz=(0.0, 3.0)
+    )
+    moved = truth.with_frequency_error(3.0)
+    assert [line.frequency_hz for line in moved.vibrations] == [20.0, 23.0]
+    controller = lbt.integrator(path, gain=0.3).controller
+    upper = lbt.studies.guaranteed_residual(path, controller, truth, error_hz=3.0).upper_nm
+    exact = lbt.residual_budget(lbt.close_loop(path, controller), moved).rms_nm
+    assert upper >= exact * (1 - 1e-9)
