@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NumericalError
 from lbt_synth.linear.continuous_system import ContinuousSystem, linear_system, require_same_time
@@ -187,8 +188,8 @@ class GeneralizedPlant(Summarised):
 
 
 def invert_well_posed(D22: FloatArray, D: FloatArray) -> FloatArray:
-    """Return ``(I - D22 D)^-1``, (p2, p2); refuse a singular one."""
-    loop = np.eye(len(D22)) - D22 @ D
+    """Return ``(I - D22 D)^-1``, (p2, p2); refuse a singular one, in any units of y."""
+    loop, (units, _) = matrix_balance(np.eye(len(D22)) - D22 @ D, permute=False, separate=True)
     size = max(1.0, float(np.linalg.norm(loop)))
     if np.linalg.svd(loop, compute_uv=False)[-1] < _ILL_POSED * size:
         raise NumericalError(
@@ -197,7 +198,7 @@ def invert_well_posed(D22: FloatArray, D: FloatArray) -> FloatArray:
             "plant.",
             status="ill posed",
         )
-    return np.asarray(np.linalg.inv(loop))
+    return np.asarray(units[:, None] * np.linalg.inv(loop) / units)
 
 
 def _partition(

@@ -115,7 +115,8 @@ def mu_controller(
 def _bounded(controller: System, form: DiscreteForm, blocks: Sequence[Block]) -> ControllerDesign:
     """Return a controller as a certified design of the plant, with its bound of mu."""
     assert isinstance(controller, StateSpace)  # the plant is in discrete time
-    design = certified_controller(form, controller, method="mu", route="D-K iteration")
+    own = form.scaled(controller)
+    design = certified_controller(form, own, method="mu", route="D-K iteration")
     return replace(design, mu=mu_bound(design.closed_loop, blocks).upper)
 
 

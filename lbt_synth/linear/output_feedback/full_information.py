@@ -90,28 +90,35 @@ class FullInformation:
         ordered Schur form keeps them, and its slack goes on below that level. Where its eigenvalues
         lie on the circle its X solves nothing, and where the equation is ill scaled it has none.
         """
-        equation = self._equation(gamma)
-        m, unit = self.B.shape[1], gamma**2 / max(float(np.sum(self.B**2)), 1e-300)
+        equation, m = self._equation(gamma), self.B.shape[1]
         if np.linalg.eigvalsh(equation.R[0, :m, :m])[-1] >= 0:
             return -1.0, None
+        slack = -1.0
         for route in (solve_by_schur, solve_by_doubling):
-            found, _ = route(equation)
-            gains, residual, relative = equation.evaluate(found)
-            nothing = float(np.linalg.norm(residual)) < _ROUNDING * unit
-            if nothing or relative[0] < _ROUNDING:
-                break
-        else:
+            slack, X = self._judge(equation, route(equation)[0], gamma)
+            if X is not None:
+                return slack, self.least + X
+        return slack, None
+
+    def _judge(
+        self, equation: Equations, found: FloatArray, gamma: float
+    ) -> tuple[float, FloatArray | None]:
+        """Return the slack of a solution, and its X if it is one that a controller can have."""
+        m, unit = self.B.shape[1], gamma**2 / max(float(np.sum(self.B**2)), 1e-300)
+        gains, residual, relative = equation.evaluate(found)
+        nothing = float(np.linalg.norm(residual)) < _ROUNDING * unit
+        if not (nothing or relative[0] < _ROUNDING):
             return -1.0, None
         if np.max(np.abs(equation.poles(gains))) >= 1:
             return -1.0, None
-        X, weights = found[0], equation.weights(found)[0]
+        weights = equation.weights(found)[0]
         answer = np.linalg.solve(weights[m:, m:], weights[m:, :m])
         slack = -float(np.linalg.eigvalsh(weights[:m, :m] - weights[:m, m:] @ answer)[-1])
         if slack <= 0:
             return slack, None
-        sizes = np.linalg.eigvalsh(X)
+        sizes = np.linalg.eigvalsh(found[0])
         negative = sizes[0] < -_ROUNDING * max(sizes[-1], unit)
-        return (-1.0, None) if negative else (slack, self.least + X)
+        return (-1.0, None) if negative else (slack, found[0])
 
     def _equation(self, gamma: float) -> Equations:
         """Return the equation of the excess; disturbances are in units of the level."""

@@ -28,7 +28,7 @@ from scipy.linalg import eigh, null_space
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lyapunov import join_roots, stationary_covariance, stationary_root
+from lbt_synth.linear.lyapunov import stationary_covariance, stationary_root
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import (
     Side,
@@ -44,6 +44,7 @@ _STEPS = 64  # of the recursion that bounds the storage matrix
 _STEADY = 1e-12  # part of the states' moments by which those of an oscillation may change
 _STRAYED = 1e-9  # share of the successors that may lie outside of its range
 _RANKS = (1e-12, 1e-8, 1e-7, 1e-6)  # shares of the largest root of a cost that count as none
+_SINGULAR = 1e-15  # of what the largest control moves, that counts as none
 _WIDEST = 12.0  # logarithm of the relative weight of the two sides
 
 
@@ -208,16 +209,20 @@ def storage_root(side: Side) -> FloatArray:
 
     A root has costs to the square of rounding, which still limit what a storage matrix may be.
     """
-    A, B, Q = side.A, side.B2, side.C1.T @ side.C1
-    R, S = side.D12.T @ side.D12, side.C1.T @ side.D12
+    size = np.linalg.norm(np.vstack([side.B2, side.D12]), axis=0)
+    moves = size > 0
+    A, B, D12 = side.A, side.B2[:, moves] / size[moves], side.D12[:, moves] / size[moves]
+    C1, Q = side.C1, side.C1.T @ side.C1
     with suppress(ProblemError, SynthesisError):  # a singular problem has no stabilising law
-        law = solve_dare(A, B, Q, R, S).gain_feedback
-        return stationary_root((A - B @ law).T, (side.C1 - side.D12 @ law).T)
+        law = solve_dare(A, B, Q, D12.T @ D12, C1.T @ D12).gain_feedback
+        return stationary_root((A - B @ law).T, (C1 - D12 @ law).T)
     root = np.zeros((len(A), 1))
-    for _ in range(_STEPS):
-        BX = B.T @ root @ root.T
-        law = np.asarray(np.linalg.lstsq(R + BX @ B, BX @ A + S.T, rcond=1e-13)[0], dtype=float)
-        root = join_roots((A - B @ law).T @ root, (side.C1 - side.D12 @ law).T)
+    for _ in range(_STEPS):  # what is left after any control lies beside all that controls move
+        moved, left = np.vstack([root.T @ B, D12]), np.vstack([root.T @ A, C1])
+        directions, sizes, _ = np.linalg.svd(moved, full_matrices=False)
+        basis = directions[:, sizes > _SINGULAR * sizes.max(initial=0.0)]
+        beside = left - basis @ (basis.T @ left)
+        root = np.asarray(np.linalg.qr(beside)[1].T)
     return root
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.generalized_plants import random_plant, stacked
@@ -50,6 +52,25 @@ def test_inequality_finds_the_same_level(seed):
     level, witness = least_level_lmi(plant, 2 * least)
     assert level == pytest.approx(least, rel=1e-6)
     assert lbt.linear.infeasible_control_level(plant, witness) == pytest.approx(least, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", [40, 42])
+def test_units_of_measurements_and_controls_do_not_matter(seed):
+    plant = random_plant(seed, n=2)
+    y, u = 10 ** np.linspace(-4, 4, len(plant.C2)), 10 ** np.linspace(3, -3, plant.B2.shape[1])
+    other = replace(
+        plant,
+        C2=y[:, None] * plant.C2,
+        D21=y[:, None] * plant.D21,
+        B2=plant.B2 * u,
+        D12=plant.D12 * u,
+        D22=y[:, None] * plant.D22 * u,
+    )
+    design, scaled = lbt.hinf_controller(plant), lbt.hinf_controller(other)
+    assert scaled.gamma_least == pytest.approx(design.gamma_least, rel=1e-7)
+    assert scaled.gamma_infeasible == pytest.approx(design.gamma_infeasible, rel=1e-6)
+    loop = other.closed_loop(scaled.controller)
+    assert float(lbt.hinf_norm(loop)) == pytest.approx(design.gamma_least, rel=1e-7)
 
 
 def test_unseen_disturbance_at_one_instant():

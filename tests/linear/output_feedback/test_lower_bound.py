@@ -45,3 +45,20 @@ def test_nothing_is_proved_by_nothing():
     plant = random_plant(4)
     nothing = ControlWitness(unseen=None, unmoved=None, reason="")
     assert infeasible_control_level(plant, nothing) == 0
+
+
+@pytest.mark.parametrize("size", [1.0, 3e3, 1e5])
+def test_measurements_in_other_units_prove_no_more(size):
+    """Both disturbances are measured, and a controller leaves nothing."""
+    plant = lbt.linear.GeneralizedPlant(
+        A=0.5,
+        B1=[[0.5, 0.3]],
+        B2=0.0,
+        C1=1.0,
+        C2=[[size], [1 / size]],
+        D12=1.0,
+        D21=np.diag([size, 1 / size]),
+    )
+    pair = Witness(states=np.ones((1, 1)), disturbances=-np.ones((2, 1)))
+    witness = ControlWitness(unseen=pair, unmoved=None, reason="none")
+    assert infeasible_control_level(plant, witness) < 1e-9
