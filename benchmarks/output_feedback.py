@@ -62,9 +62,9 @@ def slicot_norm(plant: GeneralizedPlant, gamma: float) -> float:
     try:
         if P.dt_s is None:
             parts = dict(zip("ABCD", slycot.sb10ad(*given, job=4)[1:5], strict=True))
-            return form.norm(ContinuousSystem(**parts).to_discrete(form.rate))
+            return form.norm(form.scaled(ContinuousSystem(**parts).to_discrete(form.rate)))
         parts = dict(zip("ABCD", slycot.sb10dd(*given)[1:5], strict=True))
-        return form.norm(StateSpace(**parts))
+        return form.norm(form.scaled(StateSpace(**parts)))
     except (slycot.exceptions.SlycotError, LbtSynthError):
         return np.inf
 
