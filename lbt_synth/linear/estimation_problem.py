@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
+from lbt_synth.linear.matrix_functions import nearest_powers_of_two
 from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
 from lbt_synth.validation import (
     FloatArray,
@@ -296,7 +297,7 @@ def error_units(covariance: FloatArray) -> FloatArray:
     """Units (n, 1) in which errors of this covariance have size one: powers of two, to be exact."""
     spread = np.sqrt(np.diag(covariance))
     usable = (spread > 1e-150) & (spread < 1e150)
-    return np.asarray(np.exp2(np.round(np.log2(np.where(usable, spread, 1.0)))))[:, None]
+    return nearest_powers_of_two(np.where(usable, spread, 1.0))[:, None]
 
 
 def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:

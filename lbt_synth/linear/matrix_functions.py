@@ -18,6 +18,19 @@ def relative_distance(own: FloatArray, other: FloatArray) -> float:
     return float(np.linalg.norm(own - other)) / max(float(np.linalg.norm(other)), 1e-300)
 
 
+def nearest_powers_of_two(sizes: FloatArray) -> FloatArray:
+    """Return the powers of two nearest to sizes, by which nothing is rounded; 1 for none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.matrix_functions import nearest_powers_of_two
+    >>> nearest_powers_of_two(np.array([0.9, 3.0, 0.0])).tolist()
+    [1.0, 4.0, 1.0]
+    """
+    return np.asarray(np.exp2(np.round(np.log2(np.where(sizes > 0, sizes, 1.0)))))
+
+
 def semidefinite_root(M: FloatArray) -> FloatArray:
     """Return R (n, n) with ``R R' = M``, for a semidefinite M but for rounding.
 

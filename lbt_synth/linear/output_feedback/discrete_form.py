@@ -11,6 +11,7 @@ import numpy as np
 from lbt_synth.errors import NumericalError, ProblemError, SynthesisError
 from lbt_synth.linear.continuous_system import ContinuousSystem
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.matrix_functions import nearest_powers_of_two
 from lbt_synth.linear.norms import hinf_norm
 from lbt_synth.linear.output_feedback.existence import require_stabilisable
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
@@ -125,7 +126,7 @@ def _in_units(controller: StateSpace, into: FloatArray, out: FloatArray) -> Stat
 def _units(into: FloatArray, through: FloatArray) -> FloatArray:
     """Return powers of two that make columns of two matrices together of size about one."""
     size = np.hypot(np.linalg.norm(into, axis=0), np.linalg.norm(through, axis=0))
-    return np.asarray(np.exp2(-np.round(np.log2(np.where(size > 0, size, 1.0)))))
+    return 1 / nearest_powers_of_two(size)
 
 
 def _map_rate(system: ContinuousSystem) -> float:

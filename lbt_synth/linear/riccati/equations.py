@@ -8,6 +8,7 @@ import numpy as np
 
 from lbt_synth.linear.batched import frobenius_norms, solve_stack, symmetrise, transpose
 from lbt_synth.linear.lyapunov import smith_sum
+from lbt_synth.linear.matrix_functions import nearest_powers_of_two
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Where the platform has it, the residual is formed with 64 bits of mantissa instead of 53:
@@ -56,7 +57,7 @@ class Equations:
         """
         sizes = [np.max(np.abs(part), axis=(-2, -1)) for part in (self.Q, self.R, self.S)]
         largest = np.max(sizes, axis=0)
-        factors = np.exp2(np.round(np.log2(np.where(largest > 0, largest, 1.0))))
+        factors = nearest_powers_of_two(largest)
         f, units = factors[:, None, None], self._balancing_units()
         column, row = units[:, None, :], units[:, :, None]
         scaled = Equations(
