@@ -114,9 +114,14 @@ def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArra
     spread = np.where(spread > 0, spread, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
     kept = values > _RANK_TOLERANCE * values[-1]
-    root = np.sqrt(values[kept])
-    basis = spread[:, None] * vectors[:, kept] * root
-    inverse = (vectors[:, kept] / root).T / spread
+    return scaled_basis(spread, vectors[:, kept], np.sqrt(values[kept]))
+
+
+def scaled_basis(
+    spread: FloatArray, directions: FloatArray, sizes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Orthonormal directions (n, r) of sizes (r,) in units (n,), as a basis; its left inverse."""
+    basis, inverse = spread[:, None] * directions * sizes, (directions / sizes).T / spread
     return np.asarray(basis, dtype=np.float64), np.asarray(inverse, dtype=np.float64)
 
 

@@ -27,7 +27,7 @@ from scipy.linalg import eigh, null_space
 
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.infeasibility_proof import Witness
+from lbt_synth.linear.infeasibility_proof import Witness, scaled_basis
 from lbt_synth.linear.lyapunov import stationary_covariance, stationary_root
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import (
@@ -200,8 +200,7 @@ def storage_coordinates(root: FloatArray, rank: float = _RANKS[2]) -> tuple[Floa
     spread = np.where(spread > 0, spread, 1.0)
     directions, sizes, _ = np.linalg.svd(root / spread[:, None], full_matrices=False)
     kept = sizes > rank * sizes[0]
-    basis = spread[:, None] * directions[:, kept] * sizes[kept]
-    return basis, (directions[:, kept] / sizes[kept]).T / spread
+    return scaled_basis(spread, directions[:, kept], sizes[kept])
 
 
 def storage_root(side: Side) -> FloatArray:
