@@ -394,7 +394,7 @@ def _least_residual(
     ends = [(max(i - 1, 0), min(i + 1, trials.size - 1)) for i in low]
     refined = [find_least(left, *trials[list(pair)].tolist(), width=1e-7) for pair in ends]
     best = int(np.argmin([least for _, least in refined]))
-    gain, last = float(np.exp(refined[best][0])), low[best] == trials.size - 1
+    gain, last = float(np.exp(refined[best][0])), low[best] == trials.size - 1  # of those tried
     limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
     status = f"limited by {limit}" if last else "least residual"
     return _design_with_gain(hardware, gain, law, route="search", status=status)

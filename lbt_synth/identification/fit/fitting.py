@@ -22,6 +22,7 @@ from lbt_synth.identification.fit.whittle import (
     FittedModel,
     component_densities,
     contrast,
+    contrasts,
     density,
     minimise,
     observe_information,
@@ -294,5 +295,5 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
     data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
     model = density(data, spectrum.exchange(i)) + component_densities(data, trials)
-    each = np.sum(data.count * (np.log(model) + data.power(spectrum.gain) / model), axis=1)
-    return spectrum.exchange(i, trials[int(np.argmin(each))])
+    best = int(np.argmin(contrasts(data, spectrum.gain, model)))
+    return spectrum.exchange(i, trials[best])

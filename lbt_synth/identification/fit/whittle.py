@@ -154,9 +154,12 @@ def contrast(
     data: LoopPeriodogram, spectrum: SpectrumModel, held: FloatArray | float = 0.0
 ) -> float:
     """Return L without the priors; ``held`` (f,) is a density beside the model's."""
-    model = held + density(data, spectrum)
-    power = data.power(spectrum.gain)
-    return float(np.sum(data.count * (np.log(model) + power / model)))
+    return float(contrasts(data, spectrum.gain, held + density(data, spectrum)))
+
+
+def contrasts(data: LoopPeriodogram, gain: float, model: FloatArray) -> FloatArray:
+    """Return L without the priors of densities (..., f), for one sensor gain."""
+    return np.asarray(np.sum(data.count * (np.log(model) + data.power(gain) / model), axis=-1))
 
 
 def log_slopes(
