@@ -19,7 +19,7 @@ from lbt_synth.design.shaping.channel import (
     laguerre_basis,
     mode_loop,
 )
-from lbt_synth.design.shaping.objectives import VibrationBand, leaves
+from lbt_synth.design.shaping.objectives import VibrationBand, leaves, spectrum_of
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
@@ -234,7 +234,8 @@ class ShapedDesign(Design):
 
     def expected_disturbance(self) -> tuple[ModeDisturbance, ...]:
         """Return what the specifications name on each mode."""
-        return tuple(map(_named_disturbance, self.specifications))
+        rate = self.loop_hardware.frame_rate_hz
+        return tuple(_named_disturbance(spec, rate) for spec in self.specifications)
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...]:
         """Return the demands that a controller violates, none where it couples the modes."""
@@ -285,12 +286,12 @@ class ShapedDesign(Design):
         return Check("whole loop against its modes", apart, 1e-6, how)
 
 
-def _named_disturbance(specification: Specification) -> ModeDisturbance:
+def _named_disturbance(specification: Specification, frame_rate_hz: float) -> ModeDisturbance:
     """Return what a specification names, at the first of its sensor gains."""
     every = leaves(specification.objective)
     parts = [part for part in every if part.sensor_gain == every[0].sensor_gain]
     bands = tuple(part for part in parts if isinstance(part, VibrationBand))
-    found = [part.skirts if isinstance(part, VibrationBand) else part.turbulence for part in parts]
+    found = [spectrum_of(part, frame_rate_hz) for part in parts]
     spectra = tuple(spectrum for spectrum in found if spectrum is not None)
     return ModeDisturbance(spectrum=SumSpectrum(parts=spectra) if spectra else None, bands=bands)
 

@@ -30,7 +30,6 @@ from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_v
 from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_BOXES = 120  # halved
-_PLACES = 17  # of a resonance in its band
 _COUPLED = 1e-9  # of the largest transfer between axes; less is rounding
 
 Box = tuple[FloatArray, FloatArray]  # least and largest gain of each measurement
@@ -237,17 +236,12 @@ def _left_of_skirts(loop: ClosedLoop, response: StateSpace, line: _Line) -> floa
     if not isinstance(line.vibration, Vibration):
         return 0.0
     low, high, rate = line.low_hz, line.high_hz, loop.hardware.frame_rate_hz
-    skirts = Skirts(
-        low_hz=low, high_hz=high, rms_nm=line.vibration.rms_nm, damping=line.vibration.damping
-    )
-    centres = np.linspace(low, high, _PLACES if low < high else 1).tolist()
-    models = [replace(line.vibration, frequency_hz=c).ar_model(rate) for c in centres]
+    size = {"rms_nm": line.vibration.rms_nm, "damping": line.vibration.damping}
+    skirts = Skirts(low_hz=low, high_hz=high, frame_rate_hz=rate, **size)
 
     def density(f: FloatArray) -> FloatArray:
         power = np.sum(np.abs(response.frequency_response(f)[:, :, 0]) ** 2, axis=1)
-        largest = np.max([model.psd(f) for model in models], axis=0)
-        outside = (f < low) | (f > high)
-        return np.asarray((outside * largest * power)[:, None, None])
+        return np.asarray((skirts.psd(f) * power)[:, None, None])
 
     nyquist = rate / 2
     edges = np.concatenate([resonance_edges(loop), np.clip(skirts.breakpoints_hz, 0, nyquist)])

@@ -35,7 +35,7 @@ def test_a_shaped_design_expects_its_spectra_bands_and_skirts():
     (found,) = design.expected_disturbance()
     assert found.bands == (band,)
     f = np.array([10.0, 20.0, 40.0])
-    expected = plant.turbulence[0].psd(f) + band.skirts.psd(f)
+    expected = plant.turbulence[0].psd(f) + band.skirts(800).psd(f)
     np.testing.assert_allclose(found.spectrum.psd(f), expected)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, ClassVar, TypeAlias
 
 import numpy as np
@@ -13,7 +14,14 @@ from lbt_synth.design.shaping.frequencies import Band, CheckedFields, Grid
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function
 from lbt_synth.loop import residual_budget
-from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth
+from lbt_synth.models import (
+    ARModel,
+    Atmosphere,
+    Spectrum,
+    TabulatedSpectrum,
+    Truth,
+    Vibration,
+)
 from lbt_synth.validation import (
     FloatArray,
     NotNegative,
@@ -24,6 +32,7 @@ from lbt_synth.validation import (
     set_fields,
 )
 
+_PLACES = 17  # of a resonance in its band
 _RECORDED = Atmosphere | ARModel | TabulatedSpectrum | None  # what a gain file can hold
 
 
@@ -108,18 +117,18 @@ def _measured_left(
     return float(np.trace(residual_budget(loop.at(sensor_gain), truth).total_nm2))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Skirts:
-    """Spectrum outside a band of a resonance that may be anywhere in it: at most this.
+    """Spectrum outside a band of a resonance that may be anywhere in it: the largest of them.
 
-    Below the band it is that of the resonance at the lower end, above it at the upper end; white
-    noise drives the resonance.
+    The resonance is sampled: at high frequencies it has more power than one in continuous time.
     """
 
     low_hz: float
     high_hz: float
     rms_nm: float
     damping: float
+    frame_rate_hz: float
 
     @property
     def breakpoints_hz(self) -> FloatArray:
@@ -127,15 +136,24 @@ class Skirts:
         steps = self.damping * np.array([0.0, 1.0, 3.0, 9.0, 27.0])
         return np.concatenate([self.low_hz * (1 - steps), self.high_hz * (1 + steps)])
 
+    @cached_property
+    def _models(self) -> tuple[ARModel, ...]:
+        """Resonances in the band."""
+        places = np.linspace(
+            self.low_hz, self.high_hz, _PLACES if self.low_hz < self.high_hz else 1
+        )
+        lines = (
+            Vibration(frequency_hz=f, damping=self.damping, rms_nm=self.rms_nm)
+            for f in places.tolist()
+        )
+        return tuple(line.ar_model(self.frame_rate_hz) for line in lines)
+
     def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """Return the spectrum at frequencies [Hz], zero inside the band [nm^2/Hz]."""
         f = real_array(frequency_hz, "frequency_hz")
-        centre = np.where(f < self.low_hz, self.low_hz, self.high_hz)
-        width = 2 * self.damping * centre
-        shape = (centre**2 - f**2) ** 2 + (width * f) ** 2
         outside = (f < self.low_hz) | (f > self.high_hz)
-        height = 2 * self.rms_nm**2 * width * centre**2 / np.pi
-        return np.asarray(np.where(outside, height / shape, 0.0))
+        largest = np.max([model.psd(f) for model in self._models], axis=0)
+        return np.asarray(np.where(outside, largest, 0.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,14 +190,12 @@ class VibrationBand(Band):
     sensor_gain: Positive = 1.0
     damping: Annotated[float, ("at_least", 0), ("below", 1)] = 0.0
 
-    @property
-    def skirts(self) -> Skirts | None:
-        """What a resonance leaves outside the band; None for a sinusoid."""
+    def skirts(self, frame_rate_hz: float) -> Skirts | None:
+        """Return what a resonance has outside the band; None for a sinusoid."""
         if not self.damping:
             return None
-        return Skirts(
-            low_hz=self.low_hz, high_hz=self.high_hz, rms_nm=self.rms_nm, damping=self.damping
-        )
+        ends = {"low_hz": self.low_hz, "high_hz": self.high_hz}
+        return Skirts(**ends, rms_nm=self.rms_nm, damping=self.damping, frame_rate_hz=frame_rate_hz)
 
     def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""
@@ -190,17 +206,19 @@ class VibrationBand(Band):
         inside = Fractions(
             frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=True
         )
-        if self.skirts is None:
+        skirts = self.skirts(2 * channel.nyquist_hz)
+        if skirts is None:
             return inside
-        outside = _left_of(self.skirts, self.sensor_gain, channel, grid)
+        outside = _left_of(skirts, self.sensor_gain, channel, grid)
         return CombinedFunction(parts=(inside, outside), weights=(1.0, 1.0), worst=False)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets, and that of the skirts."""
         inside = (self.rms_nm * self.peak(loop.at(self.sensor_gain).rejection())) ** 2
-        if self.skirts is None:
+        skirts = self.skirts(loop.hardware.frame_rate_hz)
+        if skirts is None:
             return inside
-        return inside + _measured_left(self.skirts, 0.0, self.sensor_gain, loop)
+        return inside + _measured_left(skirts, 0.0, self.sensor_gain, loop)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -316,14 +334,19 @@ def leaves(term: Term) -> tuple[Leaf, ...]:
     return (term,)
 
 
-def frequency_costs(term: Term, frequency_hz: FloatArray) -> FloatArray:
+def spectrum_of(leaf: Leaf, frame_rate_hz: float) -> Spectrum | None:
+    """Return the spectrum of a leaf: its turbulence, or the skirts of a band."""
+    return leaf.skirts(frame_rate_hz) if isinstance(leaf, VibrationBand) else leaf.turbulence
+
+
+def frequency_costs(term: Term, frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:
     """Cost of an error of T at each frequency, up to a factor: spectra and bands."""
     cost = np.zeros(frequency_hz.size)
     for leaf in leaves(term):
         if isinstance(leaf, VibrationBand):
             inside = (frequency_hz >= leaf.low_hz) & (frequency_hz <= leaf.high_hz)
             cost += np.where(inside, 3 * leaf.rms_nm**2 / (leaf.high_hz - leaf.low_hz), 0.0)
-        spectrum = leaf.skirts if isinstance(leaf, VibrationBand) else leaf.turbulence
+        spectrum = spectrum_of(leaf, frame_rate_hz)
         if spectrum is not None:
             cost += spectrum.psd(frequency_hz)
     return cost

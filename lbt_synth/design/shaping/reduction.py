@@ -110,7 +110,8 @@ def reduce_poles(
 def response_to_fit(spec: Specification, long: SequenceSolution) -> WeightedResponse:
     """Response of the long parameter at the nodes, weighted by the spectra and a constant."""
     f, w, nyquist = long.grid.nodes_hz, long.grid.weights_hz, long.channel.nyquist_hz
-    cost = w * (frequency_costs(spec.objective, f) + noise_level(spec.objective) ** 2 / nyquist)
+    noise = noise_level(spec.objective) ** 2 / nyquist
+    cost = w * (frequency_costs(spec.objective, f, 2 * nyquist) + noise)
     weight = np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist)
     target = long.channel.command_rows(f) @ long.coefficients
     z = np.exp(1j * (2 * np.pi * f * long.channel.hardware.dt_s))

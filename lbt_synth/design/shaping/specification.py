@@ -23,6 +23,7 @@ from lbt_synth.design.shaping.objectives import (
     Worst,
     leaves,
     require_term,
+    spectrum_of,
 )
 from lbt_synth.design.shaping.uncertainty import SensorGainRange, Uncertainty
 from lbt_synth.errors import ProblemError
@@ -101,12 +102,10 @@ class Specification:
         """Bands of the objective and of the demands [Hz]."""
         return distinct_bands(self._parts)
 
-    @property
-    def spectra(self) -> tuple[Spectrum, ...]:
-        """Spectra of the objective and of the demands."""
-        kinds = ResidualVariance | CommandRms
-        found = [part.turbulence for part in self._parts if isinstance(part, kinds)]
-        found += [part.skirts for part in self._parts if isinstance(part, VibrationBand)]
+    def spectra(self, frame_rate_hz: float) -> tuple[Spectrum, ...]:
+        """Return the spectra of the objective and of the demands."""
+        found = [part.turbulence for part in self.demands if isinstance(part, CommandRms)]
+        found += [spectrum_of(leaf, frame_rate_hz) for leaf in leaves(self.objective)]
         return tuple(spectrum for spectrum in found if spectrum is not None)
 
     def require_fitting(self, hardware: LoopHardware) -> None:
@@ -122,13 +121,13 @@ class Specification:
             if high > nyquist:
                 nearest = f"the Nyquist frequency {nyquist:.6g} Hz"
                 raise ProblemError(f"a band must lie below {nearest}; got {low:g} to {high:g} Hz.")
-        for spectrum in self.spectra:
+        for spectrum in self.spectra(hardware.frame_rate_hz):
             if isinstance(spectrum, ARModel):
                 require_loop_rate(spectrum.frame_rate_hz, hardware)
 
     def grid(self, channel: Channel, *, fineness: int = 1) -> Grid:
         """Return the first grid of frequencies for a channel."""
-        return first_grid(channel, self.bands_hz, self.spectra, fineness)
+        return first_grid(channel, self.bands_hz, self.spectra(2 * channel.nyquist_hz), fineness)
 
     def compile(
         self, channel: Channel, grid: Grid

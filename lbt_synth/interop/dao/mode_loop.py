@@ -7,7 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.design.shaping.channel import Channel, laguerre_basis
-from lbt_synth.design.shaping.objectives import ResidualVariance, VibrationBand, leaves
+from lbt_synth.design.shaping.objectives import (
+    ResidualVariance,
+    VibrationBand,
+    leaves,
+    spectrum_of,
+)
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.design.shaping.uncertainty import SensorGainRange
 from lbt_synth.interop.written_loop import ROUNDOFF
@@ -140,7 +145,7 @@ def shaped_mode_loop(
         for term in terms:
             if term.sensor_gain != gain:
                 continue
-            spectrum = term.turbulence if isinstance(term, ResidualVariance) else term.skirts
+            spectrum = spectrum_of(term, single.frame_rate_hz)
             phase += 0.0 if spectrum is None else width * spectrum.psd(f)
             if isinstance(term, ResidualVariance):
                 noise += width / channel.nyquist_hz * term.noise_nm**2
