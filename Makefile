@@ -64,7 +64,8 @@ test-all:                ## the check on each supported Python that is found
 lowest:                  ## the default tests with the lowest versions of all dependencies; needs uv
 	$(UV) venv --quiet --allow-existing --python $(PYTHON) $(VENV)-lowest
 	$(UV) pip install --quiet --python $(VENV)-lowest/bin/python --resolution lowest-direct -e .
-	$(UV) pip install --quiet --python $(VENV)-lowest/bin/python -e . --group test
+	$(UV) pip freeze --quiet --python $(VENV)-lowest/bin/python --exclude-editable > $(VENV)-lowest/lowest.txt
+	$(UV) pip install --quiet --python $(VENV)-lowest/bin/python -e . --group test --constraint $(VENV)-lowest/lowest.txt
 	$(VENV)-lowest/bin/python -m pytest -n 2 -m "not study and not e2e and not browser" tests
 
 e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT, Dask, Parquet, pyRTC; a test that is skipped, or none at all, fails

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.validation import BoolArray, IntArray
+from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 
 def connected_parts(links: ArrayLike, *, both_ways: bool = False) -> IntArray:
@@ -34,6 +34,27 @@ def connected_parts(links: ArrayLike, *, both_ways: bool = False) -> IntArray:
             part[own] = number
             number += 1
     return part
+
+
+def system_parts(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the numbers of the parts of a system's states, inputs and outputs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.connected_parts import system_parts
+    >>> states, inputs, outputs = system_parts(*(np.eye(2) for _ in range(4)))
+    >>> states.tolist(), inputs.tolist(), outputs.tolist()
+    ([0, 1], [0, 1], [0, 1])
+    """
+    (n, m), p = B.shape, len(C)
+    links = np.zeros((n + m + p, n + m + p), dtype=np.bool_)
+    links[:n, : n + m] = np.hstack([A, B]) != 0
+    links[n + m :, : n + m] = np.hstack([C, D]) != 0
+    label = connected_parts(links)
+    return label[:n], label[n : n + m], label[n + m :]
 
 
 def _reached(links: BoolArray, start: int) -> BoolArray:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import eigh, null_space
 
+from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.estimation_problem import (
     EstimationProblem,
     decorrelate,
@@ -109,12 +110,23 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
 
 
 def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Basis T with ``covariance = T T'``, and its left inverse; null directions are dropped."""
+    """Basis T with ``covariance = T T'``, and its left inverse; null directions are dropped.
+
+    A vector of the basis is of states that are correlated: it joins no independent parts.
+    """
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     spread = np.where(spread > 0, spread, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
-    kept = values > _RANK_TOLERANCE * values[-1]
-    return scaled_basis(spread, vectors[:, kept], np.sqrt(values[kept]))
+    label = connected_parts(covariance)
+    sizes: list[FloatArray] = []
+    directions: list[FloatArray] = []
+    for part in range(np.max(label) + 1):
+        own = np.flatnonzero(label == part)
+        units = spread[own]
+        values, vectors = np.linalg.eigh(covariance[np.ix_(own, own)] / np.outer(units, units))
+        kept = values > _RANK_TOLERANCE * values[-1]
+        sizes.append(np.sqrt(values[kept]))
+        directions.append(np.eye(len(label))[:, own] @ vectors[:, kept])
+    return scaled_basis(spread, np.hstack(directions), np.concatenate(sizes))
 
 
 def scaled_basis(

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
 
 from lbt_synth.errors import NumericalError, UnstableLoopError
-from lbt_synth.linear.connected_parts import connected_parts
+from lbt_synth.linear.connected_parts import system_parts
 from lbt_synth.linear.state_space import StateSpace, pointwise_response, schur_response
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -96,15 +96,10 @@ def hinf_norm(system: Any) -> HinfNorm:
 
 def independent_parts(G: StateSpace) -> list[StateSpace]:
     """Return the parts of a system that share no state, input or output, equal ones once."""
-    (n, m), p = G.B.shape, len(G.C)
-    x, u, y = np.split(np.arange(n + m + p), [n, n + m])
-    links = np.zeros((n + m + p, n + m + p), dtype=np.bool_)
-    links[:n, : n + m] = np.hstack([G.A, G.B]) != 0
-    links[n + m :, : n + m] = np.hstack([G.C, G.D]) != 0
-    label = connected_parts(links)
+    labels = system_parts(G.A, G.B, G.C, G.D)
     parts = {}
-    for part in range(np.max(label) + 1):
-        states, inputs, outputs = (np.flatnonzero(label[nodes] == part) for nodes in (x, u, y))
+    for part in range(np.max(np.concatenate(labels)) + 1):
+        states, inputs, outputs = (np.flatnonzero(label == part) for label in labels)
         if inputs.size and outputs.size:
             if not states.size:
                 return [G]

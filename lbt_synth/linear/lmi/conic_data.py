@@ -80,10 +80,11 @@ def dual_matrix(multipliers: FloatArray) -> FloatArray:
 
 
 class SymmetricUnknown:
-    """A symmetric matrix whose upper triangle is unknown, by rows."""
+    """A symmetric matrix whose upper triangle is unknown, by rows, between rows of one part."""
 
-    def __init__(self, n: int) -> None:
-        self.row, self.column = np.triu_indices(n)
+    def __init__(self, parts: IntArray) -> None:
+        self.n = len(parts)
+        self.row, self.column = np.nonzero(np.triu(parts[:, None] == parts))
         self.trace = np.where(self.row == self.column, 1.0, 0.0)
         self.size = self.row.size
 
@@ -95,7 +96,7 @@ class SymmetricUnknown:
 
     def matrix(self, x: FloatArray) -> FloatArray:
         """Return the matrix of the unknowns (size,)."""
-        matrix = np.zeros((self.row[-1] + 1, self.row[-1] + 1))
+        matrix = np.zeros((self.n, self.n))
         matrix[self.row, self.column] = matrix[self.column, self.row] = x
         return matrix
 

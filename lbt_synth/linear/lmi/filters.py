@@ -22,6 +22,7 @@ from scipy import sparse
 from scipy.linalg import block_diag, null_space
 
 from lbt_synth.errors import InfeasibleError, NumericalError
+from lbt_synth.linear.connected_parts import system_parts
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.linear.lmi.conic_data import (
@@ -31,7 +32,7 @@ from lbt_synth.linear.lmi.conic_data import (
     require_optimum,
 )
 from lbt_synth.linear.matrix_functions import semidefinite_root
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.validation import FloatArray, IntArray, frozen_copy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,7 +129,7 @@ def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: fl
     """
     scaled = balance(problem, coordinates, scale)
     A, B, C = scaled.problem.A, scaled.problem.B, scaled.problem.C
-    P = SymmetricUnknown(len(A))
+    P = SymmetricUnknown(_parts(scaled.problem)[0])
     seen, kept = np.vstack([A, C]), np.eye(len(A) + len(C), len(A))
     programme = ConicProgramme(P.size)
     rows = P.congruence(seen) - P.congruence(kept)
@@ -147,7 +148,7 @@ def least_gamma_lmi(
 ) -> LmiSolution:
     """Find the least gamma, and a filter that reaches it."""
     scaled = balance(problem, coordinates, scale)
-    basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
+    basis, parts = _invisible_basis(scaled.problem)
     P, programme = _storage_programme(scaled.problem, basis)
     programme.add_nonnegative(np.eye(1, P.size + 1, P.size), np.zeros(1))
     found = programme.minimize(np.append(np.zeros(P.size), 1.0))
@@ -155,7 +156,8 @@ def least_gamma_lmi(
     require_optimum(run, "the least gamma's semidefinite programme", _ADVICE)
     level = float(found.x[-1])
     d = basis.shape[1]
-    witness = scaled.witness(dual_matrix(found.dual[: d * (d + 1) // 2]), basis)
+    moments = dual_matrix(found.dual[: d * (d + 1) // 2])
+    witness = scaled.witness(np.where(parts[:, None] == parts, moments, 0.0), basis)
     return _unpack(scaled, P.matrix(found.x[:-1]) / level, level, run, witness=witness)
 
 
@@ -165,7 +167,7 @@ def hinf_lmi(
     """Find the central filter of a given gamma, which has the greatest storage matrix."""
     scaled = balance(problem, coordinates, scale)
     level = (gamma / scale) ** 2
-    basis = null_space(np.hstack([scaled.problem.C, scaled.problem.D]))
+    basis, _ = _invisible_basis(scaled.problem)
     P, programme = _storage_programme(scaled.problem, basis, level)
     found = programme.minimize(-P.trace)
     run = found.status, found.iterations
@@ -190,7 +192,7 @@ def _storage_programme(
     A, B, L = problem.A, problem.B, problem.L
     Nx, Nw = basis[: len(A)], basis[len(A) :]
     step, seen = A @ Nx + B @ Nw, L @ Nx
-    P = SymmetricUnknown(len(A))
+    P = SymmetricUnknown(_parts(problem)[0])
     dissipation, storage = P.congruence(Nx.T) - P.congruence(step.T), P.congruence(np.eye(len(A)))
     weight, own = 1.0, np.zeros_like(seen.T @ seen)
     if level is None:
@@ -202,6 +204,30 @@ def _storage_programme(
     _require_positive(programme, dissipation, own - weight * (seen.T @ seen))
     _require_positive(programme, storage, -weight * (L.T @ L))
     return P, programme
+
+
+def _parts(problem: EstimationProblem) -> tuple[IntArray, IntArray]:
+    """Return the numbers of the parts of the states and of the disturbances.
+
+    The blocks of a solution that belong to the parts are a solution as well: they are the mean of
+    ``S P S`` over all signs S of the parts, under which the problem stays the same.
+    """
+    outputs = np.vstack([problem.C, problem.L])
+    direct = np.vstack([problem.D, np.zeros((len(problem.L), problem.D.shape[1]))])
+    return system_parts(problem.A, problem.B, outputs, direct)[:2]
+
+
+def _invisible_basis(problem: EstimationProblem) -> tuple[FloatArray, IntArray]:
+    """Return a basis (n + w, d) of the null space of ``[C D]``, and the part of each vector."""
+    label, seen = np.concatenate(_parts(problem)), np.hstack([problem.C, problem.D])
+    basis = np.zeros((len(label), 0))
+    parts: IntArray = np.zeros(0, dtype=np.int64)
+    for part in np.unique(label):
+        own = label == part
+        vectors = np.eye(len(label))[:, own] @ null_space(seen[:, own])
+        basis = np.hstack([basis, vectors])
+        parts = np.append(parts, np.full(vectors.shape[1], part))
+    return basis, parts
 
 
 def _require_positive(programme: ConicProgramme, rows: FloatArray, offset: FloatArray) -> None:

@@ -17,7 +17,7 @@ def random_symmetric(rng, n):
 def test_rows_of_a_congruence():
     rng = np.random.default_rng(0)
     for n, d in ((1, 1), (3, 2), (4, 6)):
-        unknown, P = SymmetricUnknown(n), random_symmetric(rng, n)
+        unknown, P = SymmetricUnknown(np.zeros(n, dtype=int)), random_symmetric(rng, n)
         x = P[np.triu_indices(n)]
         M = rng.standard_normal((d, n))
         np.testing.assert_allclose(unknown.congruence(M) @ x, M @ P @ M.T, atol=1e-12)
@@ -43,7 +43,7 @@ def test_greatest_matrix_below_another():
     rng = np.random.default_rng(2)
     M, root = np.eye(3) + 0.3 * rng.standard_normal((3, 3)), rng.standard_normal((3, 3))
     H = root @ root.T
-    unknown = SymmetricUnknown(3)
+    unknown = SymmetricUnknown(np.zeros(3, dtype=int))
     programme = ConicProgramme(unknown.size)
     rows = -unknown.congruence(M).reshape(9, -1)
     programme.add_semidefinite(sparse.csr_matrix(rows), H[None])

@@ -1,0 +1,53 @@
+"""Filters by inequalities, part by part."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+import lbt_synth as lbt
+
+
+def random_axis(rng):
+    """One axis: a drift, a line, and noise of one's own."""
+    turn = rng.uniform(0.1, 1.0)
+    line = 0.99 * np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    A = block_diag(rng.uniform(0.9, 0.99), line)
+    B = np.hstack([np.diag(rng.uniform(0.5, 2, 3)), np.zeros((3, 1))])
+    C = np.array([[1.0, 1.0, 0.0]])
+    return A, B, C, np.array([[0.0, 0.0, 0.0, rng.uniform(0.5, 2)]])
+
+
+def problem_of(axes, turn=None):
+    A, B, C, D = (block_diag(*parts) for parts in zip(*axes, strict=True))
+    turn = np.arange(len(A)) if turn is None else turn
+    A, B, C = A[np.ix_(turn, turn)], B[turn], C[:, turn]
+    return lbt.EstimationProblem(A=A, B=B, C=C, D=D, L=C)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_axes_that_have_nothing_in_common_stay_apart(seed):
+    """Exactly, whatever the solver leaves; equal axes included, at odd seeds."""
+    rng = np.random.default_rng(seed)
+    axes = [random_axis(rng), random_axis(rng)]
+    if seed % 2:
+        axes[1] = axes[0]
+    turn = rng.permutation(6)
+    whole = problem_of(axes, turn)
+    other = (turn[:, None] // 3) != np.arange(2)
+    for design in (
+        lbt.kalman(whole, route="sdp"),
+        lbt.hinf(whole, route="lmi"),
+        lbt.hinf(whole, gamma_ratio=1.1, route="lmi"),
+    ):
+        assert not np.any(design.gain_predictor[other])
+        assert not np.any(design.gain_filter[other])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_least_gamma_is_that_of_the_worst_axis(seed):
+    rng = np.random.default_rng(100 + seed)
+    axes = [random_axis(rng), random_axis(rng)]
+    alone = [lbt.hinf(problem_of([axis]), route="riccati").gamma_least for axis in axes]
+    both = lbt.hinf(problem_of(axes), route="lmi")
+    assert both.gamma_least == pytest.approx(max(alone), rel=1e-6)
+    assert both.gamma_infeasible == pytest.approx(max(alone), rel=1e-6)
