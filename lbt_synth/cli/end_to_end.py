@@ -15,6 +15,7 @@ from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.design import Design, FusedFilter
+from lbt_synth.errors import UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import Calibration, EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.cases import summarise_run
@@ -26,6 +27,7 @@ from lbt_synth.report.number_text import listing_text
 from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
 from lbt_synth.storage.rows import column, fill_row, percent_column, table_row
 
+_LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
 _FILES = ("run.png", "telemetry.fits", "summary.json")
 
 
@@ -70,6 +72,7 @@ def run(arguments: Namespace) -> Report:
     total = setup.frames + setup.settle_frames
     with count_progress(total=total, what="frames", quiet=arguments.json) as count:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
+    _require_seen(loop_run)
     system = loop_run.system
     facts = fill_row(
         EndToEndFacts,
@@ -101,6 +104,19 @@ def run(arguments: Namespace) -> Report:
         ]
     )
     return report
+
+
+def _require_seen(loop_run: EndToEndRun) -> None:
+    """Refuse a run in which the pyramid no longer sees tip and tilt."""
+    if not loop_run.tip_tilt_gain > _LEAST_GAIN:
+        tip, tilt, *_ = loop_run.rms_nm
+        pixels = loop_run.system.pixels
+        raise UnstableLoopError(
+            "the pyramid must see tip and tilt; got an optical gain of "
+            f"{loop_run.tip_tilt_gain:.2g} at residuals of {tip:.3g} and {tilt:.3g} nm rms: the "
+            f"loop ran away. Try more than {pixels} pixels (--pixels), brighter light, or lower "
+            "gains."
+        )
 
 
 def load_setup(arguments: Namespace) -> EndToEndSetup:

@@ -98,6 +98,23 @@ def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
     assert "with the mirror taps c" in seen.convention
 
 
+def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys, setup):
+    """A pyramid out of its range returns the same slopes whatever the tilt."""
+    run = make_run(replace(setup.system, modes=3), frames=100)
+    lost = replace(run, residual_nm=1e9 * (1 + run.residual_nm), measurements=run.measurements)
+    gain = lbt.save_gain(
+        tmp_path / "i.fits", lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.1)
+    )
+    monkeypatch.setattr(end_to_end_commands, "specula_version", lambda: "1.1")
+    monkeypatch.setattr(end_to_end_commands, "calibrate_setup", lambda *_: None)
+    monkeypatch.setattr(lbt.interop.EndToEndSetup, "run", lambda *_, **__: lost)
+    assert main(["end-to-end", CONFIG, str(gain), "-o", str(tmp_path / "run")]) == 1
+    captured = capsys.readouterr()
+    assert "the loop ran away. Try more than 60 pixels" in captured.err
+    assert captured.out == ""
+    assert not list((tmp_path / "run").iterdir())
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
