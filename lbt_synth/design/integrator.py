@@ -271,9 +271,9 @@ def optimal_integrator(
     Returns
     -------
     IntegratorDesign
-        Certified design. The gain is within a relative 1e-6 of the best among those that at
-        unit sensor gain are stable and keep the margins; ``solver.status`` says when that limit,
-        not the truth, decided.
+        Certified design. The gain is within a relative 1e-6 of the best among those from 1e-4 to
+        0.999 of the largest stable one at unit sensor gain that keep the margins;
+        ``solver.status`` says when an end of that range, not the truth, decided.
 
     Raises
     ------
@@ -394,7 +394,10 @@ def _least_residual(
     ends = [(max(i - 1, 0), min(i + 1, trials.size - 1)) for i in low]
     refined = [find_least(left, *trials[list(pair)].tolist(), width=1e-7) for pair in ends]
     best = int(np.argmin([least for _, least in refined]))
-    gain, last = float(np.exp(refined[best][0])), low[best] == trials.size - 1  # of those tried
-    limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
-    status = f"limited by {limit}" if last else "least residual"
+    gain, status = float(np.exp(refined[best][0])), "least residual"
+    if low[best] == trials.size - 1:
+        limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
+        status = f"limited by {limit}"
+    elif low[best] == 0 and not law.demands:
+        status = "limited by the least gain tried: a loop that hardly acts leaves least"
     return _design_with_gain(hardware, gain, law, route="search", status=status)

@@ -150,3 +150,11 @@ def test_the_least_of_two_minima():
     found = residual(lbt.design.optimal_integrator(path, truth).gain)
     assert residual(0.0117) < min(residual(0.005), residual(0.03))  # the other minimum
     assert found <= min(map(residual, np.linspace(0.005, 0.615, 123)))
+
+
+def test_where_no_loop_is_best_the_status_says_so():
+    """White noise alone: each gain adds to it, the least that is tried adds least."""
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    idle = lbt.design.optimal_integrator(path, lbt.Truth(turbulence=None, noise_nm=20.0))
+    assert idle.solver.status.startswith("limited by the least gain tried")
+    assert idle.gain == pytest.approx(1e-4, rel=1e-3)

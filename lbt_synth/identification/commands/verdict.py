@@ -25,6 +25,7 @@ from lbt_synth.identification.commands.guesses import (
     Guess,
     list_guesses,
 )
+from lbt_synth.identification.commands.held_commands import held_while_moving
 from lbt_synth.identification.commands.plausibility import (
     already_integrates,
     could_have_run,
@@ -164,12 +165,12 @@ def explain_commands(
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
-    law = _find_law(record)
-    lag = 0
+    law, lag, nothing = _find_law(record), 0, np.full(record.axes, np.nan)
+    if held := held_while_moving(record):
+        return CommandVerdict(explanation=held, accepted=False, gain=nothing, law=law)
     if law is not None and _is_sure(law):
         lag, lags = law.lag_frames, law.axis_lags
         if np.ptp(lags[law.axis_coherence > _FOLLOWED]):  # no real-time computer does that
-            nothing = np.full(record.axes, np.nan)
             return CommandVerdict(
                 explanation=axes_apart(lags), accepted=False, gain=nothing, law=law
             )
@@ -181,7 +182,6 @@ def explain_commands(
     coarse = CoarseRecord(record)
     if not coarse.stretches:
         note = "the commands were not tested: no stretch of usable frames is long enough"
-        nothing = np.full(record.axes, np.nan)
         return CommandVerdict(
             explanation=AS_GIVEN, accepted=True, gain=nothing, law=law, notes=(note,)
         )
