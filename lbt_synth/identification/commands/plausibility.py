@@ -61,13 +61,14 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     """Return the largest modulus of the poles of a loop that depend on its sensor gain.
 
     A law that was found from series has poles and zeros that cancel, outside of the circle too.
+    Infinite where the gain is so small that nothing depends on it: that loop was open.
     """
     weaker = replace(path, sensor_matrix=0.8 * path.sensor)
     poles, others = (
         np.linalg.eigvals(close_loop(each, controller).system.A) for each in (path, weaker)
     )
     moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
-    return float(np.max(abs(poles[moves]), initial=0.0))
+    return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
 
 
 def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: bool) -> float:

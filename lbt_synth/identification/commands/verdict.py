@@ -46,6 +46,7 @@ _RELATED = 60.0  # nats by which commands without a law must be likelier than no
 _FOLLOWED = 0.5  # coherence of an axis whose lag counts
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _INSIDE = 8  # gains that are tried of the plausible ones
+_NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
@@ -322,9 +323,8 @@ def _score(
             surprising |= ~possible
     if surprising[0] and not surprising.all():  # the law says what is wrong
         score[1:][surprising[1:]] = np.inf
-        low, high = PLAUSIBLE_GAINS
-        plausible = np.all((compared.gain >= low) & (compared.gain <= high), axis=0)
-        if not plausible[0] and np.any(plausible & ~surprising):  # and so does the sensor
+        away = abs(np.log(compared.gain / np.clip(compared.gain, *PLAUSIBLE_GAINS))).max(axis=0)
+        if np.min(away[~surprising]) < _NEARER * away[0]:  # and so does the sensor
             score[0] = np.inf
     return score, surprising
 

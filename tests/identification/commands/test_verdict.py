@@ -156,6 +156,40 @@ def test_the_law_decides_where_the_lines_hide_the_gain(sign_only) -> None:
     assert verdict.options == ("--command-sign -1" if sign_only else "--command-shift-frames -1")
 
 
+@pytest.mark.parametrize("fault", ["turned", "exchanged", "increments"])
+def test_a_gain_of_nothing_is_no_loop(fault) -> None:
+    """Five lines hide the gain; without it every law is stable, and a scale of 1e10 was named."""
+    lines = [
+        (54.64424, 0.005755, 99.198, 2.6251),
+        (85.62763, 0.00237, 97.3185, 2.5953),
+        (138.1022, 0.007609, 67.0161, 2.1391),
+        (14.33819, 0.006963, 62.747, 0.6919),
+        (46.26571, 0.003005, 94.616, 2.6261),
+    ]
+    truth = lbt.Truth(
+        turbulence=lbt.models.ARModel(
+            coefficients=[1.99939396, -0.99939555], driving_rms_nm=0.0192647, frame_rate_hz=1000
+        ),
+        vibrations=[
+            lbt.Vibration(
+                frequency_hz=f, damping=damping, rms_nm=rms, direction=(np.cos(a), np.sin(a))
+            )
+            for f, damping, rms, a in lines
+        ],
+        noise_nm=2.40625,
+        sensor_gain=0.456086,
+    )
+    path = lbt.LoopHardware(frame_rate_hz=1000)
+    law = lbt.integrator(path, gain=0.208776).controller
+    run = lbt.simulate(law, truth, hardware=path, frames=31_000, seed=46)
+    spoil, options = FAULTS[fault]
+    y, u = spoil(run.measurements[0, 1000:], run.commands[0, 1000:])
+    verdict = explain_commands(
+        lbt.identification.loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm")
+    )
+    assert verdict.options == options
+
+
 def test_a_known_gain_decides_on_the_scale() -> None:
     y, u = ordinary_loop()
     assert explain_commands(record(y, u / 2), sensor_gain=1.4).accepted
