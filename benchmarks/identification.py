@@ -255,7 +255,7 @@ def deviations(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, l
             (x.rms_nm - np.sum(power) ** 0.5) / x.rms_error_nm for x, _, power in merged
         ],
         "one for several, strongest": [
-            (x.frequency_hz - f[int(np.argmax(power))]) / x.frequency_error_hz
+            (x.frequency_hz - f[int(np.argmax(power))]) / x.frequency_error_if_several_hz
             for x, f, power in merged
         ],
     }
@@ -291,6 +291,10 @@ def only_errors(seed: int, frames: int, **options: Any) -> dict:
 def show_errors(results: list[dict]) -> None:
     """Print the coverage, large deviations, and how many records have a warning."""
     coverage(results)
+    unwarned = [r for r in results if not r["warned"]]
+    if 0 < len(unwarned) < len(results):
+        print(f"of the {len(unwarned)} records without a warning:")
+        coverage(unwarned)
     for r in results:
         far = {name: np.round(v, 1) for name, v in r["errors"].items() if np.any(np.abs(v) > 4)}
         if far:

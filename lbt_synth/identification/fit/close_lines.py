@@ -3,6 +3,7 @@
 The sum of two resonances within some half widths has nearly the spectrum of one, and the fit gives
 one: at the mean of their frequencies, with the sum of their power. Its standard errors hold for
 these. Here each line becomes two of like damping, and what that adds to the likelihood decides.
+Below some separation it adds too little, and nobody can know.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ _NARROWER = -0.25  # of the logarithm of the damping
 _LIKE = 0.5  # width of the prior around that
 _REACH = 20.0  # half widths around a line that are fitted
 _TRIPLE = 3  # parameters of a component, the last in a packed vector
+_NEAR = 0.2  # of the logarithm of what a pair adds, where a separation is near enough
+_MOST_STEPS = 8
+_STEEPNESS = 4.0  # of what a pair adds with its separation, where nothing is known
 
 
 def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
@@ -76,3 +80,40 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
             away = (found.spectrum.pack() - priors.centre)[[1 - 2 * _TRIPLE, 1 - _TRIPLE]]
             best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)
     return single - best
+
+
+def separable_hz(search: Search, spectrum: SpectrumModel, i: int) -> float:
+    """Return how far apart two like lines have to be to be seen as two in the place of line i.
+
+    There the likelihood expects as much of a pair as a split rarely adds to a single line [Hz]. At
+    most some half widths: beyond, a line is hardly seen.
+    """
+    line = spectrum.components[i]
+    centre, half = search.place(line)
+    data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
+    rest, zero = density(data, spectrum.exchange(i)), np.zeros_like(data.measured)
+    data = replace(data, measured=density(data, spectrum), crossed=zero, corrected=zero)
+    single = contrast(data, spectrum)
+    start = spectrum.alone(*(line.shift(0.0, _NARROWER, float(np.log(0.5))) for _ in range(2)))
+    places = start.pack().size - _TRIPLE * np.array([2, 1])
+    width = np.zeros(start.pack().size)
+    width[-2 * _TRIPLE :] = 2 * (0.0, np.inf, np.inf)
+    most = min(centre, _REACH * half)
+    apart, known = min(3 * half, most), []
+    for _ in range(_MOST_STEPS):
+        theta = start.pack()
+        theta[places] = line.log_frequency + np.log1p(np.array([-0.5, 0.5]) * apart / centre)
+        at = start.unpack(theta)
+        found = minimise(data, at, Priors(centre=theta, width=width), held=rest, accuracy=SEARCHED)
+        if found is None:
+            break
+        start = found.spectrum
+        known.append((np.log(apart), np.log(max(found.contrast - single, 1e-9) / _LIKELY)))
+        if abs(known[-1][1]) < _NEAR or (apart == most and known[-1][1] < 0):
+            break
+        slope = _STEEPNESS
+        if len(known) > 1:
+            run, rise = np.subtract(known[-1], known[-2])
+            slope = max(rise / run, 1.0)
+        apart = min(apart * float(np.exp(np.clip(-known[-1][1] / slope, -1, 1))), most)
+    return apart

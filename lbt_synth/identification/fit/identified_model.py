@@ -37,6 +37,9 @@ class IdentifiedLine:
         the spectrum; a part of the turbulence, below the lowest frequency of lines.
     frequency_hz, frequency_error_hz : float
         Natural frequency and its standard error [Hz].
+    separable_hz : float or None
+        How far apart two like lines have to be here to be seen as two [Hz]; closer ones look like
+        one at their mean frequency, by power. None for what is no narrow line.
     damping, damping_error : float
         Damping ratio and its standard error. If the line is not resolved, both are the largest
         damping that the record cannot distinguish from none.
@@ -61,6 +64,7 @@ class IdentifiedLine:
     kind: Kind
     frequency_hz: float
     frequency_error_hz: float
+    separable_hz: float | None
     damping: float
     damping_error: float
     resolved: bool
@@ -71,6 +75,13 @@ class IdentifiedLine:
     announced: bool
     direction: tuple[float, ...] | None = None
     direction_error_deg: float | None = None
+
+    @property
+    def frequency_error_if_several_hz(self) -> float | None:
+        """Standard error for the strongest of several lines that look like this one [Hz]."""
+        if self.separable_hz is None:
+            return None
+        return float(np.hypot(self.frequency_error_hz, self.separable_hz / 4))
 
     @property
     def direction_deg(self) -> float | None:

@@ -26,6 +26,7 @@ class VibrationRow:
     axis: str = column("axis")  # or the direction
     frequency_hz: float = column("f", unit="Hz", format=".3f")
     frequency_error_hz: float = column("+-", unit="Hz", format=".2g")
+    frequency_error_if_several_hz: float | None = column("if several", unit="Hz", format=".2g")
     damping: str = column("damping")  # one that is not resolved has a bound, and no error
     damping_error: float | None = column("+-", format=".2g")
     rms_nm: float = nm_column("rms", format=".2f")

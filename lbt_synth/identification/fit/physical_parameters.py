@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from lbt_synth.identification.fit.close_lines import separable_hz
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
     IdentifiedTurbulence,
+    Kind,
     Whiteness,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
@@ -153,10 +155,12 @@ def _describe_line(
     rest = float(np.interp(frequency, data.frequency_hz, density.sum(axis=0))) - own
     narrow = damping < WIDE_DAMPING and own > rest
     slow = frequency < search.lowest_line_hz
+    kind: Kind = "turbulence" if slow else "line" if narrow else "broad"
     return IdentifiedLine(
-        kind="turbulence" if slow else "line" if narrow else "broad",
+        kind=kind,
         frequency_hz=frequency,
         frequency_error_hz=frequency * error.log_frequency,
+        separable_hz=separable_hz(search, spectrum, i) if kind == "line" else None,
         damping=damping,
         damping_error=damping_error,
         resolved=resolved,

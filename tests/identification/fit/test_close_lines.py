@@ -6,9 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit.close_lines import describe_close_lines, split_gain
+from lbt_synth.identification.fit.close_lines import (
+    describe_close_lines,
+    separable_hz,
+    split_gain,
+)
 from lbt_synth.identification.fit.fitting import Search, fit
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import NO_CORNER, SpectrumModel
@@ -18,10 +23,10 @@ RATE, DURATION_S = 500.0, 60.0
 DAMPING = 0.005
 
 
-def exact(separation: float):
+def exact(separation: float, second_nm2: float = 500.0):
     """Return the exact spectrum of a pair as data, its model, and that of one line fitted to it.
 
-    The separation is in half widths; the second line has half the power.
+    The separation is in half widths; the second line has half the power of the first.
     """
     f = np.arange(1, int(RATE / 2 * DURATION_S)) / DURATION_S
     data = LoopPeriodogram(
@@ -37,7 +42,7 @@ def exact(separation: float):
     search = Search(data=data)
     slow = search.component("turbulence", 1.0, 0.5, 1e4)
     ground = SpectrumModel(0.0, 0.0, 0.0, float(np.log(2 * NO_CORNER)), (slow,))
-    places = ((40.0, 1000.0), (40.0 * (1 + separation * DAMPING), 500.0))
+    places = ((40.0, 1000.0), (40.0 * (1 + separation * DAMPING), second_nm2))
     pair = ground.add(*(search.component("line", hz, DAMPING, power) for hz, power in places))
     data = replace(data, measured=density(data, pair))
     search = Search(data=data)
@@ -58,6 +63,25 @@ def test_a_split_gains_what_the_pair_is_likelier(separation: float) -> None:
 def test_a_single_line_gains_nothing() -> None:
     search, _, single = exact(0.0)
     assert split_gain(search, single, 1) == pytest.approx(0, abs=0.1)
+
+
+def test_lines_can_be_separated_where_a_split_tells_the_exact_pair() -> None:
+    def gain(separation: float) -> float:
+        search, pair, single = exact(separation, 1000.0)
+        return contrast(search.data, single) - contrast(search.data, pair)
+
+    there = brentq(lambda x: gain(x) - 5.5, 1.0, 6.0, xtol=0.01)
+    search, _, single = exact(there, 1000.0)
+    assert separable_hz(search, single, 1) == pytest.approx(40.0 * DAMPING * there, rel=0.08)
+
+
+def test_a_longer_record_or_one_of_less_noise_separates_closer_lines() -> None:
+    search, _, single = exact(0.0)
+    first = separable_hz(search, single, 1)
+    longer = replace(search, data=replace(search.data, count=10 * search.data.count))
+    loud = replace(single, log_noise=single.log_noise + np.log(1e6))
+    assert separable_hz(longer, single, 1) < 0.8 * first
+    assert separable_hz(search, loud, 1) > 1.2 * first
 
 
 def test_a_line_beside_zero_is_not_split() -> None:
