@@ -62,9 +62,11 @@ def slicot_norm(plant: GeneralizedPlant, gamma: float) -> float:
     try:
         if P.dt_s is None:
             parts = dict(zip("ABCD", slycot.sb10ad(*given, job=4)[1:5], strict=True))
-            return form.norm(form.scaled(ContinuousSystem(**parts).to_discrete(form.rate)))
-        parts = dict(zip("ABCD", slycot.sb10dd(*given)[1:5], strict=True))
-        return form.norm(form.scaled(StateSpace(**parts)))
+            K = ContinuousSystem(**parts).to_discrete(form.rate)
+        else:
+            K = StateSpace(**dict(zip("ABCD", slycot.sb10dd(*given)[1:5], strict=True)))
+        loop = form.closed_loop(form.scaled(K))[2]
+        return lbt.hinf_norm(loop).upper if loop.spectral_radius < 1 else np.inf
     except (slycot.exceptions.SlycotError, LbtSynthError):
         return np.inf
 

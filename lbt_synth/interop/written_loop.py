@@ -27,7 +27,7 @@ from lbt_synth.design.shaping.uncertainty import (
 )
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
-from lbt_synth.linear.lyapunov import stationary_root
+from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware, TipTiltPlant
@@ -226,8 +226,7 @@ def _gaussian_variances(
     newest = block_diag(*(m.driving_rms_nm * np.eye(m.order, 1) for m, _ in sources))
     B = block_diag(s.B[:, n:] @ noise, newest)
     C, through = np.hstack([s.C, s.D[:, :n] @ shape]), s.D[:, n:] @ noise
-    outputs = np.hstack([C @ stationary_root(A, B), through])
-    return np.asarray(np.sum(outputs**2, axis=1))
+    return output_variances(C, through, stationary_root(A, B))
 
 
 def _shaped_variances(design: ShapedDesign, loop: ClosedLoop) -> FloatArray:
@@ -263,7 +262,7 @@ def _rounding_left(
     both = replace(written, B=np.hstack([written.B, entry.B]), D=np.hstack([written.D, entry.D]))
     s = close_loop(replace(hardware, sensor_matrix=blind), both, sensor_gain=gain).system
     B, C, D = s.B[:, n + q :] * np.sqrt(variance), s.C[:n], s.D[:n, n + q :] * np.sqrt(variance)
-    return np.asarray(np.sum(np.hstack([C @ stationary_root(s.A, B), D]) ** 2, axis=1))
+    return output_variances(C, D, stationary_root(s.A, B))
 
 
 def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:

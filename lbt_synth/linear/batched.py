@@ -18,10 +18,10 @@ def symmetrise(stack: FloatArray) -> FloatArray:
     return np.asarray((stack + transpose(stack)) / 2, dtype=np.float64)
 
 
-def frobenius_norms(stack: FloatArray) -> FloatArray:
+def frobenius_norms(stack: npt.NDArray[Entry]) -> FloatArray:
     """Frobenius norm of each matrix of a stack, (N,)."""
-    squares = np.einsum("...ij,...ij->...", stack, stack)
-    return np.asarray(np.sqrt(squares), dtype=np.float64)
+    squares = np.einsum("...ij,...ij->...", stack, stack.conj())  # type: ignore[arg-type]
+    return np.asarray(np.sqrt(squares.real), dtype=np.float64)
 
 
 def solve_stack(matrices: npt.NDArray[Entry], right: npt.NDArray[Entry]) -> npt.NDArray[Entry]:

@@ -26,8 +26,7 @@ from lbt_synth.linear.estimation_problem import (
     error_units,
     scale_states,
 )
-from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.linear.matrix_functions import semidefinite_root
+from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
@@ -157,7 +156,9 @@ def worst_invisible_disturbance(
     backward = np.asarray(np.linalg.solve(np.eye(len(A)) + W @ P, A.T), dtype=np.float64)
     worst = np.linalg.eigh(L @ P @ L.T)[1][:, -1]
     end = L.T @ worst
-    costates = semidefinite_root(stationary_covariance(backward, np.outer(end, end)))
+    costates = stationary_root(backward, end[:, None])
+    if not np.all(np.isfinite(costates)):  # a recursion that rounding makes unstable
+        costates = end[:, None]
     candidates = [_hide(problem, P @ backward @ costates, B.T @ costates)]
     poles = np.linalg.eigvals(backward)
     slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.linalg import LinAlgWarning, schur, solve_discrete_lyapunov
+from scipy.linalg import matrix_balance
 
 from lbt_synth.linear.batched import frobenius_norms, symmetrise, transpose
-from lbt_synth.storage.warning_filters import ignore_warnings
+from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _SOLVED = 1e-14  # relative residual of an equation solved to rounding
@@ -24,8 +24,8 @@ _Matrix = TypeVar("_Matrix", FloatArray, ComplexArray)
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Solve ``X = A X A' + Q`` for a stable A, with iterative refinement.
 
-    By squaring, or by a bilinear transformation if that leaves a smaller residual. The latter
-    inverts ``A + I``, which is all but singular for states in very different units.
+    By squaring, or by squaring the triangular form of A if that leaves a smaller residual: its
+    powers keep the eigenvalues of a matrix that is far from normal.
 
     Parameters
     ----------
@@ -49,12 +49,23 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     squared, residuals = stationary_covariances(A[None], Q[None])
     if residuals[0] < _SOLVED:
         return np.asarray(squared[0])
-    # from states of very different sizes; the residual is measured below
-    with ignore_warnings(LinAlgWarning, RuntimeWarning):
-        X = solve_discrete_lyapunov(A, Q)
-        X = X + solve_discrete_lyapunov(A, A @ X @ A.T - X + Q)
-    X = symmetrise(np.asarray(X, dtype=np.float64))
-    return np.asarray(squared[0]) if residuals[0] <= lyapunov_residual(A, Q, X) else X
+    triangle, into, back = _triangular_form(A)
+    X = np.zeros_like(Q)
+    with np.errstate(all="ignore"):  # the residual is measured below
+        for _ in range(2):
+            rest = into @ (A @ X @ A.T - X + Q) @ into.conj().T
+            X = symmetrise(
+                X + (back @ smith_sum(triangle[None], rest[None])[0] @ back.conj().T).real
+            )
+    left = lyapunov_residual(A, Q, X)
+    return X if left < residuals[0] or np.isnan(residuals[0]) else np.asarray(squared[0])
+
+
+def _triangular_form(A: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """Return T, U and V with ``T = U A V`` upper triangular and ``U V = I``, in balanced units."""
+    balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
+    triangle, basis = complex_schur(np.asarray(balanced, dtype=np.float64))
+    return triangle, basis.conj().T / units, units[:, None] * basis
 
 
 def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -99,11 +110,11 @@ def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:
     """Relative residual of ``X = A X A' + Q`` in the 1-norm."""
     AXA = A @ X @ A.T
     scale = np.linalg.norm(X, 1) + np.linalg.norm(AXA, 1) + np.linalg.norm(Q, 1)
-    return float(np.linalg.norm(AXA - X + Q, 1) / scale) if scale > 0 else 0.0
+    return float(np.linalg.norm(AXA - X + Q, 1) / scale) if scale != 0 else 0.0
 
 
-def smith_sum(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Sum ``A^i Q A'^i`` over all i by squaring, for a stack of matrices.
+def smith_sum(A: _Matrix, Q: _Matrix) -> _Matrix:
+    """Sum ``A^i Q A'^i`` over all i by squaring, for a stack of matrices, real or complex.
 
     R. A. Smith, SIAM J. Appl. Math. 16, 198 (1968), doi:10.1137/0116017. Not finite where A is
     not stable. Good for corrections only: it loses digits as A nears the unit circle.
@@ -118,7 +129,7 @@ def smith_sum(A: FloatArray, Q: FloatArray) -> FloatArray:
     X = Q
     with np.errstate(all="ignore"):
         for _ in range(60):
-            X = X + A @ X @ transpose(A)
+            X = X + A @ X @ transpose(A).conj()
             A = A @ A
             size = frobenius_norms(A)
             if not np.any(size > 1e-9):  # the rest is of the size of its square
@@ -142,16 +153,29 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
     >>> round(float(abs(root[0, 0])), 12)
     10.0
     """
-    triangle, basis = schur(A, output="complex")
-    root = basis.conj().T @ B
+    triangle, into, back = _triangular_form(A)
+    root = into @ B
     with np.errstate(all="ignore"):
         for _ in range(60):
             root = join_roots(root, triangle @ root)
             triangle = triangle @ triangle
             if not np.linalg.norm(triangle) > 1e-16:
                 break
-    root = basis @ root
+    root = back @ root
     return np.asarray(join_roots(root.real, root.imag), dtype=np.float64)
+
+
+def output_variances(C: FloatArray, D: FloatArray, root: FloatArray) -> FloatArray:
+    """Return the variances of ``C x + D w``, for a root of the covariance of x, as sums of squares.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.lyapunov import output_variances
+    >>> output_variances(np.array([[0.3]]), np.array([[4.0]]), np.array([[10.0]])).tolist()
+    [25.0]
+    """
+    return np.asarray(np.sum(np.hstack([C @ root, D]) ** 2, axis=1))
 
 
 def join_roots(one: _Matrix, other: _Matrix) -> _Matrix:

@@ -193,6 +193,12 @@ def _climb(
     peak, angle = largest(fold_angles(seeds, low, high))
     if peak == 0:
         return peak, angle
+    if not np.isfinite(peak):
+        raise NumericalError(
+            f"the response at {angle / (2 * np.pi * G.dt_s):.6g} Hz is not finite to working "
+            "accuracy, so it has no norm. Scale states and signals to similar sizes.",
+            status="level sets",
+        )
     for _ in range(100):
         level = peak * (1 + _TOLERANCE)
         angles = fold_angles(level_angles(level), low, high)
@@ -247,7 +253,8 @@ def spectral_norms(matrices: ComplexArray) -> FloatArray:
         matrices = matrices.swapaxes(-1, -2)
     size = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
     scale = np.maximum(size, np.finfo(np.float64).tiny)  # by less, a quotient may overflow
-    scaled = matrices / scale[:, None, None]
+    with np.errstate(invalid="ignore"):  # a response that is not finite has no norm
+        scaled = matrices / scale[:, None, None]
     if scaled.shape[-2] == 1:
         largest = np.einsum("nij,nij->n", scaled, scaled.conj()).real
     elif scaled.shape[-2] == 2:

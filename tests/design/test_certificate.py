@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.exact_covariance import exact_covariance
 
 import lbt_synth as lbt
+from lbt_synth.design.certificate import certify_error
 
 
 def test_certificate_checks_are_independent(axis_plant):
@@ -50,6 +52,19 @@ def test_a_variance_that_rounding_has_spoilt_is_not_certified():
         check = next(c for c in design.certificate.checks if "adjoint" in c.name)
         assert check.value < 1e-6
     assert 0 < spoilt
+
+
+@pytest.mark.parametrize("apart", [2.0**-10, 2.0**-14])
+def test_variance_of_a_system_far_from_normal(apart):
+    """Two modes of nearly the same direction: coefficients of 6,500, and sums that cancel."""
+    modes = np.array([[1.0, 1.0], [1.0, 1.0 + apart]])
+    A = modes @ np.diag([0.9, 0.5]) @ np.linalg.inv(modes)
+    system = lbt.linear.StateSpace(A=A, B=[[1.0], [0.0]], C=[[1.0, 0.0]], D=[[0.0]])
+    certificate = certify_error(system)
+    assert certificate.passed
+    assert certificate.rms**2 == pytest.approx(
+        float(exact_covariance(A, np.eye(2, 1))[0, 0]), rel=2e-7
+    )
 
 
 def test_a_level_of_zero_claims_nothing():

@@ -195,6 +195,12 @@ def test_norms_over_a_band():
     )
 
 
+def test_a_pole_within_the_band_has_no_norm():
+    walk = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    with pytest.raises(lbt.errors.NumericalError, match="at 0 Hz is not finite"):
+        band_norm(walk, 0.0, 0.5)
+
+
 @pytest.mark.parametrize("through", [0.0, 3.0])
 def test_the_norm_ofindependent_parts_is_the_largest_of_theirs(through):
     """Two equal lags, a third one, a state that nothing moves, and a path without states."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from scipy.linalg import block_diag
 
 import lbt_synth as lbt
 
@@ -33,6 +36,24 @@ def random_plant(seed, *, n=None, dt_s=1.0, D22=True, D12=None, D21=None):
     if D21 is not None:
         parts["D21"] = D21 * parts["D21"]
     return lbt.linear.GeneralizedPlant(**parts, dt_s=dt_s)
+
+
+def lightly_damped_plant(seed):
+    """A plant of 2 to 8 states whose modes decay by 1e-8 to 1e-2 per sample, of many sizes."""
+    rng = np.random.default_rng(seed + 10**6)
+    plant = random_plant(seed, n=int(rng.integers(1, 9)), D22=False)
+    modes = max(len(plant.A) // 2, 1)
+    slow = rng.random(modes) < 0.3
+    angles = np.where(slow, 10 ** rng.uniform(-6, -1, modes), rng.uniform(0, np.pi, modes))
+    turns = [[[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]] for a in angles]
+    A = block_diag(*((1 - 10 ** rng.uniform(-8, -2)) * np.array(turn) for turn in turns))
+
+    def draw(size):
+        return rng.normal(size=(2 * modes, size)) * 10 ** rng.uniform(-4, 0, (2 * modes, 1))
+
+    m1, m2, p1, p2 = plant.sizes
+    B1, B2, C1, C2 = draw(m1), draw(m2), draw(p1).T, draw(p2).T
+    return replace(plant, A=A, B1=B1, B2=B2, C1=C1, C2=C2)
 
 
 def stacked(plant):

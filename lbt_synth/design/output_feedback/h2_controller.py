@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbt_synth.design.output_feedback.result import ControllerDesign, certified_controller
+from lbt_synth.design.output_feedback.result import (
+    ControllerDesign,
+    certified_controller,
+    checked_loop,
+    first_certified,
+)
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.output_feedback.discrete_form import discrete_form
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
@@ -54,15 +59,18 @@ def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
     5.0
     """
     form = discrete_form(plant, continuous=False)
-    equations, share = form.equations()
-    return certified_controller(
-        form,
-        equations.least_variance(),
-        method="h2",
-        route="riccati",
-        regularised=share,
-        least_rms=_least_rms(equations) if share == 0 else np.nan,
-    )
+
+    def design(equations: TwoRiccati, share: float) -> ControllerDesign:
+        return certified_controller(
+            form,
+            checked_loop(form, equations.least_variance()),
+            method="h2",
+            route="riccati",
+            regularised=share,
+            least_rms=_least_rms(equations) if share == 0 else np.nan,
+        )
+
+    return first_certified(form, design)
 
 
 def _least_rms(equations: TwoRiccati) -> float:

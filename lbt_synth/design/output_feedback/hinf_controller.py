@@ -6,10 +6,14 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from lbt_synth.design.hinf import checked_bounds
-from lbt_synth.design.output_feedback.result import ControllerDesign, certified_controller
+from lbt_synth.design.output_feedback.result import (
+    CheckedLoop,
+    ControllerDesign,
+    certified_controller,
+    checked_loop,
+    first_certified,
+)
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
@@ -99,41 +103,37 @@ def hinf_controller(
     far_above = "the controller is that of least variance"
     gamma, gamma_ratio = checked_bounds(gamma, gamma_ratio, far_above=far_above)
     form = discrete_form(plant)
-    equations, share = form.equations()
-    bracket = _Bracket(form, equations, route)
-    requested = bracket.least * (gamma_ratio or 1.0) if gamma is None else gamma
-    if requested < bracket.least * (1 - _AT_LEAST):
-        raise InfeasibleError(
-            f"no controller was found at gamma = {requested:.9g}: the least is "
-            f"{bracket.least:.9g}, and none reaches {bracket.infeasible:.9g}, because "
-            f"{bracket.witness.reason}. Try gamma_ratio=1.1.",
-            gamma=requested,
+
+    def design(equations: TwoRiccati, share: float) -> ControllerDesign:
+        bracket = Bracket(form, equations, route)
+        requested = bracket.least * (gamma_ratio or 1.0) if gamma is None else gamma
+        bracket.require(requested)
+        above = None
+        if requested > bracket.least * (1 + _AT_LEAST):
+            above = _central(equations, requested)
+        return certified_controller(
+            form,
+            bracket.reached if above is None else checked_loop(form, above),
+            method="hinf",
+            route=route,
+            gamma_requested=max(requested, bracket.least),
             gamma_least=bracket.least,
+            gamma_infeasible=bracket.infeasible,
+            witness=bracket.witness,
+            regularised=share,
+            hint="Try a larger gamma_ratio.",
         )
-    controller = bracket.controller
-    if requested > bracket.least * (1 + _AT_LEAST):
-        above = _central(equations, requested)
-        controller = controller if above is None else above
-    return certified_controller(
-        form,
-        controller,
-        method="hinf",
-        route=route,
-        gamma_requested=max(requested, bracket.least),
-        gamma_least=bracket.least,
-        gamma_infeasible=bracket.infeasible,
-        witness=bracket.witness,
-        regularised=share,
-        hint="Try a larger gamma_ratio.",
-    )
+
+    return first_certified(form, design)
 
 
-class _Bracket:
+class Bracket:
     """The least gamma between the norm of a controller and a level that is proved infeasible."""
 
-    def __init__(self, form: DiscreteForm, equations: TwoRiccati, route: str) -> None:
+    def __init__(self, form: DiscreteForm, equations: TwoRiccati, route: str = "riccati") -> None:
         solution = equations.least_level()
-        self.controller, self.least = _least_controller(form, equations, solution.gamma)
+        self.reached = _least_controller(form, equations, solution.gamma)
+        self.least = self.reached.certificate.gamma
         candidates = [NO_PROOF, *equations.proofs(solution, form.plant)]
         levels = [(infeasible_control_level(form.plant, each), each) for each in candidates]
         proofs = [max(levels, key=lambda each: each[0])]
@@ -154,6 +154,17 @@ class _Bracket:
             )
         self.infeasible = min(proved, self.least)
 
+    def require(self, gamma: float) -> None:
+        """Refuse a level that no controller was found at, with the reason."""
+        if gamma < self.least * (1 - _AT_LEAST):
+            raise InfeasibleError(
+                f"no controller was found at gamma = {gamma:.9g}: the least is {self.least:.9g}, "
+                f"and none reaches {self.infeasible:.9g}, because {self.witness.reason}. Try "
+                "gamma_ratio=1.1.",
+                gamma=gamma,
+                gamma_least=self.least,
+            )
+
 
 def _inequality_proof(plant: GeneralizedPlant, gamma: float) -> tuple[float, ControlWitness]:
     """Return the level that the dual of the matrix inequalities proves, and the proof."""
@@ -163,27 +174,28 @@ def _inequality_proof(plant: GeneralizedPlant, gamma: float) -> tuple[float, Con
     return infeasible_control_level(plant, witness), witness
 
 
-def _least_controller(
-    form: DiscreteForm, equations: TwoRiccati, least: float
-) -> tuple[StateSpace, float]:
-    """Return a controller next to the least level, as near as its numbers allow, and its norm."""
-    best: tuple[float, StateSpace] | None = None
+def _least_controller(form: DiscreteForm, equations: TwoRiccati, least: float) -> CheckedLoop:
+    """Return the loop next to the least level, as near as its numbers allow."""
+    best: CheckedLoop | None = None
     for apart in _APART:
         controller = _central(equations, least * (1 + apart))
         if controller is None:
             continue
-        norm = form.norm(controller)
-        if best is None or norm < best[0]:
-            best = norm, controller
-        if norm <= least * (1 + 2 * apart):
-            break
-    if best is None or not np.isfinite(best[0]):
+        with suppress(NumericalError):  # a loop that is not well posed
+            found = checked_loop(form, controller)
+            if not found.certificate.passed:
+                continue
+            if best is None or found.certificate.gamma < best.certificate.gamma:
+                best = found
+            if found.certificate.gamma <= least * (1 + 2 * apart):
+                break
+    if best is None:
         raise NumericalError(
-            f"no controller next to the least gamma, {least:.9g}, is stable in working accuracy. "
-            "Scale states and signals to similar sizes.",
+            f"no controller next to the least gamma, {least:.9g}, is stable and passes its checks "
+            "in working accuracy. Scale states and signals to similar sizes.",
             status="search",
         )
-    return best[1], best[0]
+    return best
 
 
 def _central(equations: TwoRiccati, gamma: float) -> StateSpace | None:

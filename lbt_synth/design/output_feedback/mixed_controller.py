@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbt_synth.design.output_feedback.hinf_controller import hinf_controller
-from lbt_synth.design.output_feedback.result import ControllerDesign, certified_controller
+from lbt_synth.design.output_feedback.hinf_controller import Bracket
+from lbt_synth.design.output_feedback.result import (
+    ControllerDesign,
+    certified_controller,
+    checked_loop,
+    first_certified,
+)
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.norms import hinf_norm
-from lbt_synth.linear.output_feedback.discrete_form import discrete_form
+from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
 from lbt_synth.linear.output_feedback.free_parameter import free_parameter
+from lbt_synth.linear.output_feedback.least_level import TwoRiccati
+from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import integer, number
 
 _POINTS = 33  # frequencies of the first programme, from 0 to the Nyquist frequency
@@ -72,37 +79,46 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
     gamma = number(gamma, "gamma", above=0)
     taps = integer(taps, "taps", at_least=1, at_most=400)
     form = discrete_form(plant, continuous=False)
-    equations, share = form.equations()
-    loop = free_parameter(equations)
-    controller = equations.least_variance()
-    if form.norm(controller) > gamma:
-        least = hinf_controller(plant, gamma=gamma)  # refuses what no controller reaches
-        frequency_hz = np.linspace(0, 0.5 / loop.T11.dt_s, _POINTS)
-        from lbt_synth.linear.lmi.mixed_control import least_variance_below
 
-        for _ in range(_ROUNDS):
-            try:
-                found = least_variance_below(loop, gamma * (1 - _INSIDE), taps, frequency_hz)
-            except NumericalError as error:
-                raise InfeasibleError(
-                    f"no controller with {taps} taps was found below gamma = {gamma:.6g}; the "
-                    f"least gamma of any controller is {least.gamma_least:.6g}. Try more taps, "
-                    "or a larger gamma.",
-                    gamma=gamma,
-                    gamma_least=least.gamma_least,
-                ) from error
-            controller = loop.controller(found)
-            closed = form.plant.closed_loop(controller)
-            peak = hinf_norm(closed)
-            if peak.upper <= gamma:
-                break
-            frequency_hz = np.unique(np.append(frequency_hz, peak.peak_frequency_hz))
-    return certified_controller(
-        form,
-        controller,
-        method="mixed",
-        route="free parameter",
-        gamma_requested=gamma,
-        regularised=share,
-        hint="Try a larger gamma, or more taps.",
-    )
+    def design(equations: TwoRiccati, share: float) -> ControllerDesign:
+        checked = checked_loop(form, equations.least_variance())
+        if checked.certificate.gamma > gamma:
+            checked = checked_loop(form, _quietest(form, equations, gamma, taps))
+        return certified_controller(
+            form,
+            checked,
+            method="mixed",
+            route="free parameter",
+            gamma_requested=gamma,
+            regularised=share,
+            hint="Try a larger gamma, or more taps.",
+        )
+
+    return first_certified(form, design)
+
+
+def _quietest(form: DiscreteForm, equations: TwoRiccati, gamma: float, taps: int) -> StateSpace:
+    """Return the controller of least variance below a level, if there is one."""
+    bracket = Bracket(form, equations)
+    bracket.require(gamma)
+    loop = free_parameter(equations)
+    frequency_hz = np.linspace(0, 0.5 / loop.T11.dt_s, _POINTS)
+    from lbt_synth.linear.lmi.mixed_control import least_variance_below
+
+    for _ in range(_ROUNDS):
+        try:
+            found = least_variance_below(loop, gamma * (1 - _INSIDE), taps, frequency_hz)
+        except NumericalError as error:
+            raise InfeasibleError(
+                f"no controller with {taps} taps was found below gamma = {gamma:.6g}; the "
+                f"least gamma of any controller is {bracket.least:.6g}. Try more taps, "
+                "or a larger gamma.",
+                gamma=gamma,
+                gamma_least=bracket.least,
+            ) from error
+        controller = loop.controller(found)
+        peak = hinf_norm(form.plant.closed_loop(controller))
+        if peak.upper <= gamma:
+            break
+        frequency_hz = np.unique(np.append(frequency_hz, peak.peak_frequency_hz))
+    return controller

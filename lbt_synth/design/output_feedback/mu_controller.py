@@ -9,7 +9,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lbt_synth.design.output_feedback.hinf_controller import hinf_controller
-from lbt_synth.design.output_feedback.result import ControllerDesign, System, certified_controller
+from lbt_synth.design.output_feedback.result import (
+    ControllerDesign,
+    System,
+    certified_controller,
+    checked_loop,
+)
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.linear import Block, GeneralizedPlant, StateSpace, mu_bound
 from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
@@ -115,8 +120,8 @@ def mu_controller(
 def _bounded(controller: System, form: DiscreteForm, blocks: Sequence[Block]) -> ControllerDesign:
     """Return a controller as a certified design of the plant, with its bound of mu."""
     assert isinstance(controller, StateSpace)  # the plant is in discrete time
-    own = form.scaled(controller)
-    design = certified_controller(form, own, method="mu", route="D-K iteration")
+    checked = checked_loop(form, form.scaled(controller))
+    design = certified_controller(form, checked, method="mu", route="D-K iteration")
     return replace(design, mu=mu_bound(design.closed_loop, blocks).upper)
 
 

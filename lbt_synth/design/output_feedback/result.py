@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -16,13 +17,22 @@ from lbt_synth.design.certificate import (
     Check,
     certify_error,
 )
+from lbt_synth.errors import (
+    CertificateError,
+    NumericalError,
+    ProblemError,
+    SynthesisError,
+)
 from lbt_synth.linear.continuous_system import ContinuousSystem
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm
+from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.lower_bound import ControlWitness, infeasible_control_level
 from lbt_synth.linear.state_space import StateSpace, sigma_sparkline
 from lbt_synth.storage.rows import column, fact_table, row_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
+
+_SHARES = (0.0, 1e-6, 1e-5, 1e-4)  # of the errors and disturbances, added in turn
 
 System: TypeAlias = StateSpace | ContinuousSystem
 
@@ -70,8 +80,8 @@ class ControllerDesign(Summarised):
     mu : float
         Bound of the structured singular value of the closed loop (nan where no blocks were given).
     regularised : float
-        Share of the errors and disturbances that was added to solve a singular problem; 0 for
-        a regular one. The certificate is that of the plant as given.
+        Share of the errors and disturbances that was added because the plant's own equations are
+        singular, or leave rounding alone; mostly 0. The certificate is that of the plant as given.
     """
 
     plant: GeneralizedPlant
@@ -121,9 +131,54 @@ def _given(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CheckedLoop:
+    """A controller and its loop, in the time that was given, with the checks of the loop."""
+
+    controller: System
+    loop: System
+    certificate: Certificate
+
+
+def checked_loop(form: DiscreteForm, controller: StateSpace) -> CheckedLoop:
+    """Close the loop of a controller in the discrete form, and check it."""
+    K, loop, discrete = form.closed_loop(controller)
+    name = "spectral radius of the closed loop"
+    certificate = certify_error(discrete, stability=name, white=form.rate is None)
+    return CheckedLoop(controller=K, loop=loop, certificate=certificate)
+
+
+def first_certified(
+    form: DiscreteForm, design: Callable[[TwoRiccati, float], ControllerDesign]
+) -> ControllerDesign:
+    """Return the design of the first equations that lead to one, the plant's own or next to it.
+
+    Equations are singular where a control costs nothing or a measurement has no noise. Where
+    perfect control leaves rounding alone, no norm can be certified either.
+    """
+    refusal: ValueError | SynthesisError
+    for share in _SHARES:
+        try:
+            equations = form.equations(share)
+        except (ProblemError, SynthesisError, np.linalg.LinAlgError) as error:
+            refusal = error
+            continue
+        try:
+            return design(equations, share)
+        except (NumericalError, CertificateError, np.linalg.LinAlgError) as error:
+            refusal = error
+    if isinstance(refusal, np.linalg.LinAlgError):
+        raise NumericalError(
+            f"the plant and all next to it are singular to working accuracy: {refusal}. Scale "
+            "states and signals to similar sizes.",
+            status="singular",
+        ) from refusal
+    raise refusal
+
+
 def certified_controller(
     form: DiscreteForm,
-    controller: StateSpace,
+    checked: CheckedLoop,
     *,
     method: str,
     route: str,
@@ -135,14 +190,12 @@ def certified_controller(
     least_rms: float = np.nan,
     hint: str = "",
 ) -> ControllerDesign:
-    """Close the loop, check every claim from the matrices, and return the design.
+    """Check what is claimed of a loop, and return the design.
 
-    The controller is in the discrete form; ``least_rms`` is what the least variance is known to
-    be. Raises a CertificateError if a check fails.
+    ``least_rms`` is what the least variance is known to be. Raises a CertificateError if a check
+    fails.
     """
-    K, loop, discrete = form.closed_loop(controller)
-    name = "spectral radius of the closed loop"
-    certificate = certify_error(discrete, stability=name, white=form.rate is None)
+    certificate = checked.certificate
     checks = list(certificate.checks)
     if np.isfinite(certificate.gamma):
         if np.isfinite(gamma_requested):
@@ -161,8 +214,8 @@ def certified_controller(
     certificate = replace(certificate, checks=tuple(checks)).require(hint)
     return ControllerDesign(
         plant=form.given,
-        controller=K,
-        closed_loop=loop,
+        controller=checked.controller,
+        closed_loop=checked.loop,
         gamma=certificate.gamma,
         rms=certificate.rms if form.rate is None else np.nan,
         gamma_requested=gamma_requested,

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import NumericalError, ProblemError, SynthesisError
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear.continuous_system import ContinuousSystem
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two
-from lbt_synth.linear.norms import hinf_norm
 from lbt_synth.linear.output_feedback.existence import require_stabilisable
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.regularised import regularise
@@ -20,7 +18,6 @@ from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import FloatArray, require_instance
 
 _RATES = (1.0, 1.37, 0.73, 2.91)  # tried in turn, where a pole is in the way of the map
-_SHARES = (1e-6, 1e-5, 1e-4)  # of the errors and disturbances, for singular problems
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,24 +47,9 @@ class DiscreteForm:
         loop = self.given.closed_loop(K)
         return K, loop, loop if self.rate is None else loop.to_discrete(self.rate)
 
-    def norm(self, controller: StateSpace) -> float:
-        """Return the norm of the loop, from above; infinite if it is not stable."""
-        try:
-            loop = self.closed_loop(controller)[2]
-        except NumericalError:
-            return np.inf
-        return hinf_norm(loop).upper if loop.spectral_radius < 1 else np.inf
-
-    def equations(self) -> tuple[TwoRiccati, float]:
-        """Return the equations of the plant, or of the one next to it if it is singular.
-
-        The second value is the share of errors and disturbances that was added.
-        """
-        for share in (0.0, *_SHARES[:-1]):
-            with suppress(ProblemError, SynthesisError):
-                plant = regularise(self.plant, share) if share else self.plant
-                return TwoRiccati(plant, self.rate), share
-        return TwoRiccati(regularise(self.plant, _SHARES[-1]), self.rate), _SHARES[-1]
+    def equations(self, share: float) -> TwoRiccati:
+        """Return the equations of the plant, with a share of errors and disturbances added."""
+        return TwoRiccati(regularise(self.plant, share) if share else self.plant, self.rate)
 
 
 def discrete_form(plant: GeneralizedPlant, *, continuous: bool = True) -> DiscreteForm:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.errors import NumericalError
+from lbt_synth.errors import NonFiniteError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.norms import hinf_norm
@@ -129,12 +129,15 @@ class TwoRiccati:
             control = self.control.worst_case(solution.X, solution.gamma)
             estimation = self.estimation.worst_case(solution.Y, solution.gamma)
             if plant is self.plant:
-                unseen, unmoved = coupled_bursts(control, solution.X, estimation, solution.Y)
-                out.append(ControlWitness(unseen=unseen, unmoved=unmoved, reason=_COUPLED))
-                unmoved = last_step(control, solution.X)
-                out.append(ControlWitness(unseen=None, unmoved=unmoved, reason=_CONTROL))
-                unseen = last_step(estimation, solution.Y)
-                out.append(ControlWitness(unseen=unseen, unmoved=None, reason=_ESTIMATION))
+                with suppress(NonFiniteError):  # of a worst case that rounding makes unstable
+                    unmoved = last_step(control, solution.X)
+                    out.append(ControlWitness(unseen=None, unmoved=unmoved, reason=_CONTROL))
+                with suppress(NonFiniteError):
+                    unseen = last_step(estimation, solution.Y)
+                    out.append(ControlWitness(unseen=unseen, unmoved=None, reason=_ESTIMATION))
+                with suppress(NonFiniteError):
+                    unseen, unmoved = coupled_bursts(control, solution.X, estimation, solution.Y)
+                    out.append(ControlWitness(unseen=unseen, unmoved=unmoved, reason=_COUPLED))
             for angle in _slow_angles(control):
                 pairs = steady_oscillation(control_side(plant), angle)
                 words = f"{_CONTROL_AT} {self._frequency_text(angle)}"

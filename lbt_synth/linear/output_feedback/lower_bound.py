@@ -28,7 +28,7 @@ from scipy.linalg import eigh, null_space
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness, scaled_basis
-from lbt_synth.linear.lyapunov import stationary_covariance, stationary_root
+from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import (
     Side,
@@ -243,7 +243,7 @@ def last_step(worst: WorstCase, X: FloatArray) -> Witness:
 
 def _burst(worst: WorstCase, X: FloatArray, seed: FloatArray) -> Witness:
     """Return the pairs along the worst trajectory from a seed (n, 1)."""
-    roots = semidefinite_root(stationary_covariance(worst.A, seed @ seed.T))
+    roots = stationary_root(worst.A, seed)
     return Witness(states=X @ worst.A @ roots, disturbances=worst.C @ roots)
 
 

@@ -26,7 +26,7 @@ def test_never_worse_than_one_lyapunov_matrix(seed):
 
 def test_variance_is_least_variance_and_size_of_the_filter():
     form = discrete_form(random_plant(3, n=4))
-    equations, _ = form.equations()
+    equations = form.equations(0.0)
     loop = free_parameter(equations)
     taps = 0.3 * np.random.default_rng(0).normal(size=(5, *loop.through.shape))
     closed = form.plant.closed_loop(loop.controller(taps))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.generalized_plants import random_plant, stacked
+from support.generalized_plants import lightly_damped_plant, random_plant, stacked
 
 import lbt_synth as lbt
 from lbt_synth.linear.lmi.output_feedback import least_level_lmi
@@ -96,6 +96,48 @@ def test_a_least_variance_of_nothing(seed):
     assert plant.D12.shape[0] == plant.D12.shape[1]
     assert plant.D21.shape[0] == plant.D21.shape[1]
     assert lbt.hinf_controller(plant).gamma_least < 1e-9
+
+
+# the loop of the first is far from normal, the second is refused next to its least level
+@pytest.mark.parametrize("seed", [291, 156])
+def test_lightly_damped_modes_are_certified(seed):
+    plant = lightly_damped_plant(seed)
+    least = lbt.hinf_controller(plant).gamma_least
+    assert slicot_norm(plant, least * (1 - 2e-6)) > least * (1 - 2e-6)
+    assert slicot_norm(plant, least * 1.01) < least * 1.01
+
+
+@pytest.mark.parametrize("seed", [126, 194, 288, 322, 365])
+def test_perfect_control_of_lightly_damped_modes_is_certified(seed):
+    """What perfect control leaves is rounding: a controller next to it leaves a certified part."""
+    plant = lightly_damped_plant(seed)
+    design = lbt.hinf_controller(plant)
+    assert design.gamma_infeasible < 1e-12
+    assert design.gamma_least < 1e-4 * np.linalg.norm(plant.D11, 2)
+    assert design.regularised > 0
+
+
+@pytest.mark.parametrize("hidden", [1e-5, 1e-6, 1e-7, 1e-9])
+@pytest.mark.parametrize("noise", [0.01, 0.3])
+def test_a_disturbance_seen_through_a_hidden_state(hidden, noise):
+    """The state that is seen gets a small part of the disturbance, and almost no noise.
+
+    Its measurement over that part is the disturbance of the last step and noise, so that
+    ``u = -x_1`` leaves twice the noise; nothing at all leaves 2.
+    """
+    turn = np.array([[1.0, 1.0], [1.0, -1.0]])
+    plant = lbt.linear.GeneralizedPlant(
+        A=turn @ np.diag([0.5, 0.0]) @ turn / 2,
+        B1=turn @ [[1.0, 0.0], [hidden, 0.0]],
+        B2=np.zeros((2, 1)),
+        C1=[[1.0, 0.0]] @ turn / 2,
+        C2=[[0.0, 1.0]] @ turn / 2,
+        D12=1.0,
+        D21=[[0.0, hidden * noise]],
+    )
+    design = lbt.hinf_controller(plant)
+    assert design.gamma_infeasible <= 2 * noise
+    assert design.gamma_infeasible <= design.gamma_least < 2
 
 
 @pytest.mark.parametrize("seed", [14, 23])
