@@ -22,6 +22,7 @@ from lbt_synth.validation import FloatArray, number, require_instance
 
 _POLE = (2 - np.pi) / (2 + np.pi)
 _SLOPE = 2 * np.pi / (2 + np.pi)  # V = slope (z - 1) / (z - pole)
+_LARGEST = 1000.0  # size of an error; no loop is near it
 _TOLERANCE = 2e-3
 
 
@@ -88,7 +89,7 @@ def structured_robustness(
     Raises
     ------
     ProblemError
-        If all sizes are zero or one is negative, or the design knows no hardware.
+        If all sizes are zero, one is negative or above 1000, or the design knows no hardware.
     UnstableLoopError
         If the loop is not stable without errors.
 
@@ -107,7 +108,7 @@ def structured_robustness(
     loop.require_stable()
     sizes = {"mirror": mirror, "delay_frames": delay_frames, "gain": gain}
     for name, size in sizes.items():
-        number(size, name, at_least=0)
+        number(size, name, at_least=0, at_most=_LARGEST, hint="1 is an error of 100 %, or a frame.")
     if not any(sizes.values()):
         raise ProblemError("at least one of gain, delay_frames and mirror must be above 0.")
     q = loop.hardware.n_measurements

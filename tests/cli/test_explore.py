@@ -45,7 +45,11 @@ def test_a_design_for_another_loop_is_refused(capsys, tmp_path):
 
 @pytest.mark.parametrize(
     ("host", "message"),
-    [("localhost", "--port {port} is in use"), ("no.such.host.invalid", "cannot serve at --host")],
+    [
+        ("localhost", "--port {port} is in use"),
+        ("no.such.host.invalid", "cannot serve at --host"),
+        (64 * "a", "cannot serve at --host"),
+    ],
 )
 def test_a_place_that_is_not_free_is_said(capsys, host, message):
     with socket.socket() as taken:

@@ -60,3 +60,12 @@ def test_the_system_is_the_chain_written_out():
 def test_no_error_at_all_is_refused():
     with pytest.raises(lbt.errors.ProblemError, match="above 0"):
         lbt.studies.structured_robustness(LOOP, gain=0, delay_frames=0, mirror=0)
+
+
+@pytest.mark.parametrize("name", ["gain", "delay_frames", "mirror"])
+def test_an_absurd_error_is_refused(name):
+    sizes = {"gain": 0.3, "delay_frames": 0.2, "mirror": 0.1, name: 1e300}
+    with pytest.raises(lbt.errors.ProblemError, match=f"{name} must be at most 1000"):
+        lbt.studies.structured_robustness(LOOP, **sizes)
+    found = lbt.studies.structured_robustness(LOOP, **sizes | {name: 1000})
+    assert 0 < found.proved < 0.01

@@ -258,10 +258,11 @@ def _require_free(host: str, port: int) -> int:
         for family, *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
             with socket.create_server((address[0], port), family=family) as probe:
                 port = probe.getsockname()[1]
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
+    except (OSError, UnicodeError) as error:  # a name of another alphabet, or too long
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
             text = f"--port {port} is in use; give another one, or 0 for any that is free."
         else:
-            text = f"cannot serve at --host {host} --port {port}: {error.strerror}."
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            text = f"cannot serve at --host {host} --port {port}: {reason}."
         raise ProblemError(text) from error
     return port
