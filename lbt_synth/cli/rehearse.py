@@ -26,10 +26,10 @@ from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, integer
 
 _FRAMES = 8000  # of a drawn disturbance
-_FEWEST = 256  # of a record
+_FEWEST, _MOST = 256, 10_000_000  # of a record, and of a drawn disturbance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -174,7 +174,9 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     config = config_from_text(design.configuration, Path(arguments.gain))
     choose_config_unit(arguments, config)
     truth, rng = config.truth, np.random.default_rng(arguments.seed)
-    frames = arguments.frames or _FRAMES
+    frames = _FRAMES
+    if arguments.frames is not None:
+        frames = integer(arguments.frames, "--frames", at_least=1, at_most=_MOST)
     return _Series(
         source=f"{frames} frames of its own truth",
         total_nm=draw_disturbance(truth, config.hardware, frames=frames, cases=1, rng=rng)[0],

@@ -139,7 +139,7 @@ def rehearse(
             f"{total.shape} and {seen.shape}."
         )
     gain = number(sensor_gain, "sensor_gain", above=0)
-    limit = np.inf if stroke is None else number(stroke, "stroke", above=0)
+    limit = np.inf if stroke is None else number(stroke, "stroke", above=0, at_most=1e30)
     loop = close_loop(path, controller, sensor_gain=gain)
     loop.require_stable()
     settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * len(total)))

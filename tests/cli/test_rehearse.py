@@ -65,6 +65,9 @@ def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files
         (("bare.fits", "--for", "dao"), "holds no configuration to draw"),
         (("gain.fits", "--for", "dao", "--record", "none.fits"), "none.fits"),
         (("gain.fits", "--for", "doa"), "invalid choice"),
+        (("gain.fits", "--for", "dao", "--frames", "-1"), "--frames must be at least 1; got -1"),
+        (("gain.fits", "--for", "dao", "--stroke", "1e300"), "--stroke must be at most 1e+30"),
+        (("gain.fits", "--for", "dao", "--frames", "0"), "--frames must be at least 1; got 0"),
     ],
 )
 def test_what_is_missing_is_said(capsys, monkeypatch, files, words, message):

@@ -27,6 +27,7 @@ from lbt_synth.identification.fit.periodogram import half_angle_square, tukey
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 _SEGMENT_S = 6.0
+_SHORTEST = 512  # frames of a segment, where the record has them
 _MOST_SEGMENTS = 24
 _BAND, _WIDEST_BAND = 0.06, 0.02  # of its frequency, and of the frame rate
 _SLOWEST_HZ, _FASTEST_HZ = 0.15, 6.0  # corners of the turbulence
@@ -94,7 +95,8 @@ def segment_transforms(
     from scipy.fft import rfft
 
     longest = max(stop - start for start, stop in stretches)
-    length = int(min(_SEGMENT_S * frame_rate_hz, max(longest // 2, 512), longest))
+    usual = max(_SEGMENT_S * frame_rate_hz, _SHORTEST)
+    length = int(min(usual, max(longest // 2, _SHORTEST), longest))
     starts = [
         start + i * length for start, stop in stretches for i in range((stop - start) // length)
     ]

@@ -17,6 +17,7 @@ _SAME_FRAMES = 3.0  # by which it may differ over the record, if that is more
 _SAID_FRAMES = 0.5  # over the record, beyond which a difference is noted
 _MOST_UNEVEN = 0.1  # of the steps, longer than a frame, if the times give the rate
 _FEW_ROWS = 20  # too few for that share
+_HIGHEST_HZ = 1e9  # far beyond any loop
 _MOST_HOLES = 9  # missing frames over those that are there
 _CLEAR = 0.3  # of a frame, by which a step may differ from a whole number of frames
 _LEAST_GAP = 0.1  # of a frame, between the latest and the earliest row of a frame
@@ -47,7 +48,9 @@ def build_clock(
     frame_numbers: ArrayLike | None = None,
 ) -> Clock:
     """Lay rows on a regular grid, by their times (rows,) or frame numbers (rows,)."""
-    rate = None if frame_rate_hz is None else number(frame_rate_hz, "frame_rate_hz", above=0)
+    rate = None
+    if frame_rate_hz is not None:
+        rate = number(frame_rate_hz, "frame_rate_hz", above=0, at_most=_HIGHEST_HZ)
     notes: list[str] = []
     frame = np.arange(rows)
     times = None if times_s is None else _check_rising(times_s, "times_s", rows)

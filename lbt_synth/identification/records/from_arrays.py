@@ -19,6 +19,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
 _LARGEST_NM = 1e100  # a larger number is none: its square would overflow
+_SMALLEST_NM = 1e-30  # squares of less are lost to rounding
 _OPEN_FRAMES = 20  # of zero or equal commands
 _TREND = 2.0  # ratio of scatters
 _LEAST_QUARTER = 64  # pairs of frames that show a trend
@@ -163,7 +164,9 @@ def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
         raise DimensionError(f"{name} must have one or two axes; got {out.shape}.{turn}")
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = scale * out
-        return np.where(np.abs(scaled) < _LARGEST_NM, scaled, np.nan)
+        size = np.abs(scaled)
+        scaled = np.where(size < _LARGEST_NM, scaled, np.nan)
+        return np.where(size < _SMALLEST_NM, 0.0, scaled)
 
 
 def _lay_on_grid(

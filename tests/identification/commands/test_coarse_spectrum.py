@@ -112,3 +112,15 @@ def test_the_coherence_of_two_axes_is_credited() -> None:
     mixed = 0.6 * z[0] + 0.8 * z[1]
     saved = f.size * n * np.log(1 - 0.36)
     assert coherence_credit(z[0], mixed, f, **options) == pytest.approx(saved, rel=0.1)
+
+
+@pytest.mark.parametrize("rate_hz", [1e-3, 0.8, 10.0])
+def test_slow_loops_have_whole_segments(rate_hz):
+    """Six seconds are few frames there, or none: 0.8 may be a rate in kHz."""
+    series = np.random.default_rng(0).standard_normal((2000, 1))
+    f, z, independent = segment_transforms(series, [(0, 1500)], rate_hz)
+    assert z.shape == (1, 2, f.size)
+    assert f.size == 255
+    density = np.mean(np.abs(z) ** 2)
+    assert density == pytest.approx(2 / rate_hz, rel=0.1)  # of white noise of variance 1
+    assert independent > 1
