@@ -47,6 +47,7 @@ _FOLLOWED = 0.5  # coherence of an axis whose lag counts
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _INSIDE = 8  # gains that are tried of the plausible ones
 _NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
+_NEAR = 0.4  # such a distance that a coarse gain may have
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
@@ -324,7 +325,9 @@ def _score(
     if surprising[0] and not surprising.all():  # the law says what is wrong
         score[1:][surprising[1:]] = np.inf
         away = abs(np.log(compared.gain / np.clip(compared.gain, *PLAUSIBLE_GAINS))).max(axis=0)
-        if np.min(away[~surprising]) < _NEARER * away[0]:  # and so does the sensor
+        nearest = np.min(away[~surprising])
+        memoryless = law is not None and law.order == 0  # it would hold nothing
+        if nearest < (_NEAR if memoryless else _NEARER * away[0]):  # and so does the sensor
             score[0] = np.inf
     return score, surprising
 

@@ -190,6 +190,38 @@ def test_a_gain_of_nothing_is_no_loop(fault) -> None:
     assert verdict.options == options
 
 
+def test_a_law_without_memory_is_one_of_increments() -> None:
+    """By its coarse spectrum, the record as given is likelier by 43, and its gain is plausible."""
+    lines = [
+        (85.426096, 0.00512946, 56.493765, 2.7277),
+        (121.701398, 0.00509154, 58.279039, 0.35261),
+        (122.030597, 0.00410202, 23.611942, 3.07193),
+        (113.772492, 0.00672471, 33.835397, 2.32831),
+        (24.777701, 0.00274722, 78.039304, 0.61008),
+    ]
+    truth = lbt.Truth(
+        turbulence=lbt.models.ARModel(
+            coefficients=[1.99129794, -0.99132268], driving_rms_nm=0.40117194, frame_rate_hz=1000
+        ),
+        vibrations=[
+            lbt.Vibration(
+                frequency_hz=f, damping=damping, rms_nm=rms, direction=(np.cos(a), np.sin(a))
+            )
+            for f, damping, rms, a in lines
+        ],
+        noise_nm=5.276812,
+        sensor_gain=0.6162827,
+    )
+    path = lbt.LoopHardware(frame_rate_hz=1000)
+    law = lbt.integrator(path, gain=0.26524450).controller
+    run = lbt.simulate(law, truth, hardware=path, frames=31_000, seed=92)
+    y, u = run.measurements[0, 1000:], np.diff(run.commands[0, 999:], axis=0)
+    verdict = explain_commands(
+        lbt.identification.loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm")
+    )
+    assert verdict.options == "--command-increments"
+
+
 def test_a_known_gain_decides_on_the_scale() -> None:
     y, u = ordinary_loop()
     assert explain_commands(record(y, u / 2), sensor_gain=1.4).accepted
