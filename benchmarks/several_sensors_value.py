@@ -4,6 +4,7 @@ Run ``python benchmarks/several_sensors_value.py``. It prints, over the seeing, 
 of tip with the Kalman filter of the wavefront alone and with an accelerometer whose noise is a
 tenth of what the line moves, and the same of a simulation; the least residual of any controller
 where there is no line; and the ratio of acceleration and noise at which the residual is halved.
+Then the same over the damping of the line.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ sensors:
 model:
   turbulence: {turbulence}
   vibrations:
-    - {{axis: tip, frequency_hz: 20, damping: 0.01, rms_nm: 563.6,
+    - {{axis: tip, frequency_hz: 20, damping: {damping}, rms_nm: 563.6,
        accelerometers: {{m1: {{motion_nm_per_nm: 1.0}}}}}}
 truth: {{vibrations: model{truth}}}
 """
@@ -42,16 +43,17 @@ AIR = {
     for seeing, wind in ((0.4, 5), (0.6, 10), (0.8, 20))
 } | {"none": ("", "{kind: ar, coefficients: [0.99], driving_rms_nm: 0.001}", ", turbulence: none")}
 ACCELERATION = 8.9e-3  # of the line [m/s^2 rms]
+DAMPING, DAMPINGS = 0.01, (0.003, 0.01, 0.02, 0.03, 0.1)
 FRAMES, CASES = 20_000, 4
 
 
-def load(air: str, ratio: float) -> lbt.config.Config:
+def load(air: str, ratio: float, damping: float) -> lbt.config.Config:
     """Return the loop in some air, with an accelerometer of a signal-to-noise ratio."""
     atmosphere, turbulence, truth = AIR[air]
     parts = {"air": atmosphere, "turbulence": turbulence, "truth": truth}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "loop.yaml"
-        path.write_text(CONFIG.format(noise=ACCELERATION / ratio, **parts))
+        path.write_text(CONFIG.format(noise=ACCELERATION / ratio, damping=damping, **parts))
         return lbt.load_config(path)
 
 
@@ -60,26 +62,36 @@ def tip_nm(config: lbt.config.Config, loop: lbt.loop.AnyLoop) -> float:
     return float(np.sqrt(lbt.residual_budget(loop, config.truth).total_nm2[0, 0]))
 
 
-def fused_tip_nm(air: str, ratio: float) -> float:
+def fused_tip_nm(air: str, ratio: float, damping: float) -> float:
     """Return what the Kalman filter of both sensors leaves of tip."""
-    config = load(air, ratio)
+    config = load(air, ratio, damping)
     plant = config.fused_plant
     controller = plant.controller(lbt.linear.periodic_kalman(plant).gains)
     return tip_nm(config, lbt.loop.close_fused_loop(config.hardware, plant.suite, controller))
 
 
-def halving_excess(ratio: float, *, air: str, half_nm: float) -> float:
+def halving_excess(ratio: float, *, air: str, damping: float, half_nm: float) -> float:
     """Return by how much a filter of both sensors misses half of the residual of one."""
-    return fused_tip_nm(air, ratio) - half_nm
+    return fused_tip_nm(air, ratio, damping) - half_nm
 
 
 def main() -> int:
-    """Print the table."""
-    print("| air | own sensor [nm] | of it the line | with accelerometer | of it the line ", end="")
-    print("| ratio | in a run | no line, least | halved at |")
+    """Print the tables."""
+    print_table("air", [(air, air, DAMPING) for air in AIR])
+    print_table("damping", [(str(damping), "0.6 arcsec, 10 m/s", damping) for damping in DAMPINGS])
+    return 0
+
+
+def print_table(what: str, cases: list[tuple[str, str, float]]) -> None:
+    """Print what both sensors leave in some cases: name, air, damping."""
+    print(
+        f"| {what} | own sensor [nm] | of it the line | with accelerometer | of it the line ",
+        end="",
+    )
+    print("| of it the line | ratio | in a run | no line, least | halved at |")
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
-    for air in AIR:
-        config = load(air, 10)
+    for name, air, damping in cases:
+        config = load(air, 10, damping)
         fused, plain = config.design("kalman"), lbt.kalman(config.plant)
         loops = lbt.close_loop(config.hardware, plain), fused.loop()
         own, both = (tip_nm(config, loop) for loop in loops)
@@ -95,13 +107,12 @@ def main() -> int:
         simulated = float(np.sqrt(np.mean(run.residual_nm[:, :, 0] ** 2)))
         calm = replace(config.truth, vibrations=(), motions=())
         least = np.sqrt(lbt.loop.least_residual(config.hardware, calm).variance_nm2[0])
-        excess = partial(halving_excess, air=air, half_nm=own / 2)
-        halved = brentq(excess, 5, 50, xtol=0.01)
+        excess = partial(halving_excess, air=air, damping=damping, half_nm=own / 2)
+        halved = brentq(excess, 2, 100, xtol=0.01)
         print(
-            f"| {air} | {own:.1f} | {lines[0]:.1f} | {both:.1f} | {lines[1]:.1f} "
+            f"| {name} | {own:.1f} | {lines[0]:.1f} | {both:.1f} | {lines[1]:.1f} "
             f"| {both / own:.2f} | {simulated:.1f} | {least:.1f} | {halved:.1f} |"
         )
-    return 0
 
 
 if __name__ == "__main__":

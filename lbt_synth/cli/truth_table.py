@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from lbt_synth.cli.output import Report
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.model_limits import limit_or_none
-from lbt_synth.loop import ResidualLimit, least_residual
+from lbt_synth.loop import ResidualLimit, least_fused_residual
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import compare_in_truth
 
@@ -23,12 +21,13 @@ def say_limit(limit: ResidualLimit, config: Config) -> str:
     if fused is None:
         return f"least residual of any linear controller in the truth: {least}"
     said = f"least residual of any linear controller of the loop's own sensor in the truth: {least}"
-    if fused.suite.wavefront:
+    floor = limit_or_none(lambda: least_fused_residual(config.hardware, config.truth, fused.suite))
+    if floor is None:
         return f"{said}; with the other sensors it is less"
-    calm = replace(config.truth, vibrations=(), motions=(), frequency_errors_hz=None)
-    floor = limit_or_none(lambda: least_residual(config.hardware, calm))
-    known = "" if floor is None else nm_text(floor.rms_nm, ".6g", unit="nm rms")
-    return f"{said}; with accelerometers not less than {known}, that of a truth without vibrations"
+    why = ", even if accelerometers knew all vibrations in advance" * bool(fused.suite.channels)
+    return (
+        f"{said}; of all sensors not less than {nm_text(floor.rms_nm, '.6g', unit='nm rms')}{why}"
+    )
 
 
 def add_truth(report: Report, design: Design, config: Config) -> None:

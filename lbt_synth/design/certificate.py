@@ -33,6 +33,7 @@ RESIDUAL_TOLERANCE = 1e-8
 INFEASIBLE_TOLERANCE = 1e-9
 VARIANCE_TOLERANCE = 1e-6
 LEVEL_SETS = "level sets on the symplectic pencil"
+BY_DISTURBANCES = "disturbances that no measurement shows"
 _GRID = 513  # frequencies from 0 to the Nyquist frequency
 _NOTHING = 1e-14  # part of a system's size that counts as rounding
 _TINY = 1e-300  # keeps a quotient finite where the denominator is zero
@@ -317,9 +318,8 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     claimed = number(level, "level", at_least=0)
     proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
     above = claimed / max(proved, _TINY) - 1
-    how = "disturbances that no measurement shows"
     name = "infeasible level over the level proved, less 1"
-    return Check(name, above, INFEASIBLE_TOLERANCE, how)
+    return Check(name, above, INFEASIBLE_TOLERANCE, BY_DISTURBANCES)
 
 
 def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:

@@ -14,7 +14,9 @@ a point. If rounding breaks the "at least", the price of the shortfall is added 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from scipy.linalg import eigh, null_space
@@ -87,24 +89,43 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
     >>> infeasible_level(p, push, np.eye(1))
     1.0
     """
-    basis, inverse = whitening_coordinates(covariance)
-    x = basis @ (inverse @ witness.states)  # the space of a filter's error
-    w = witness.disturbances
-    w = w - problem.D.T @ np.linalg.solve(problem.R, problem.C @ x + problem.D @ w)
-    after = problem.A @ x + problem.B @ w
-    deviation = np.sqrt(np.diag(covariance))
-    scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
-    scale = np.where(scale > 0, scale, 1.0)
-    strayed = np.linalg.norm((after - basis @ (inverse @ after)) / scale)
-    if strayed > _STRAYED * np.linalg.norm(after / scale):
-        return 0.0
-    # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
-    growth = inverse @ (after @ after.T - x @ x.T) @ inverse.T
-    values, vectors = np.linalg.eigh((growth + growth.T) / 2)
-    growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
-    shortfall = -float(values[values < 0].sum())
-    gained = float(np.sum((problem.L @ x) ** 2) + np.sum((problem.L @ growth_root) ** 2))
-    spent = float(np.sum(w**2)) + shortfall
+    return infeasible_periodic_level([problem], [witness], [covariance])
+
+
+def infeasible_periodic_level(
+    phases: Sequence[EstimationProblem],
+    witnesses: Sequence[Witness],
+    covariances: Sequence[FloatArray],
+) -> float:
+    """Level of gamma below which a witness for each phase of a period proves that no filter exists.
+
+    Successors of the states of a phase must have the moments of the states of the next one; a
+    problem of one rate has one phase. Arguments and result as of :func:`infeasible_level`.
+    """
+    spaces = [whitening_coordinates(covariance) for covariance in covariances]
+    states = [
+        basis @ (inverse @ witness.states)  # in the space of a filter's error
+        for witness, (basis, inverse) in zip(witnesses, spaces, strict=True)
+    ]
+    gained = spent = 0.0
+    for t, (problem, x, witness) in enumerate(zip(phases, states, witnesses, strict=True)):
+        onward = (t + 1) % len(phases)
+        (basis, inverse), covariance, then = spaces[onward], covariances[onward], states[onward]
+        w = witness.disturbances
+        w = w - problem.D.T @ np.linalg.solve(problem.R, problem.C @ x + problem.D @ w)
+        after = problem.A @ x + problem.B @ w
+        deviation = np.sqrt(np.diag(covariance))
+        scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
+        scale = np.where(scale > 0, scale, 1.0)
+        strayed = np.linalg.norm((after - basis @ (inverse @ after)) / scale)
+        if strayed > _STRAYED * np.linalg.norm(after / scale):
+            return 0.0
+        # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
+        growth = inverse @ (after @ after.T - then @ then.T) @ inverse.T
+        values, vectors = np.linalg.eigh((growth + growth.T) / 2)
+        growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+        gained += float(np.sum((problem.L @ then) ** 2) + np.sum((problem.L @ growth_root) ** 2))
+        spent += float(np.sum(w**2)) - float(values[values < 0].sum())
     return float(np.sqrt(gained / spent)) if spent > 0 else 0.0
 
 
@@ -141,30 +162,57 @@ def worst_invisible_disturbance(
 ) -> Witness:
     """Return the disturbance that proves most against levels below gamma.
 
-    Two kinds are tried. One is a burst that ends in the direction in which
-    ``gamma^2 I - L P L'`` is least: with the costate p, ``p(j) = (I + W P)^-1 A' p(j+1)``,
-    ``x(j) = P p(j)``, ``w(j) = B' p(j+1)`` is the worst past that leads there. The other is a
-    sinusoid at the frequency of the slowest pole of that recursion, for problems in which a
-    steady oscillation limits gamma. P and covariance are (n, n).
+    Two kinds are tried: the burst of :func:`worst_invisible_bursts`, and a sinusoid at the
+    frequency of the slowest pole of its recursion, for problems in which a steady oscillation
+    limits gamma. P and covariance are (n, n).
     """
     units = error_units(covariance)
     problem = scale_states(problem, units)
     P, covariance = P / units / units.T, covariance / units / units.T
-    A, B, _ = decorrelate(problem)
-    C, L = problem.C, problem.L
-    W = C.T @ np.linalg.solve(problem.R, C) - L.T @ L / gamma**2
-    backward = np.asarray(np.linalg.solve(np.eye(len(A)) + W @ P, A.T), dtype=np.float64)
-    worst = np.linalg.eigh(L @ P @ L.T)[1][:, -1]
-    end = L.T @ worst
-    costates = stationary_root(backward, end[:, None])
-    if not np.all(np.isfinite(costates)):  # a recursion that rounding makes unstable
-        costates = end[:, None]
-    candidates = [_hide(problem, P @ backward @ costates, B.T @ costates)]
-    poles = np.linalg.eigvals(backward)
+    candidates = worst_invisible_bursts([problem], [P], gamma)
+    poles = np.linalg.eigvals(_backward(problem, P, gamma)[0])
     slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
     candidates += [_sinusoid(problem, float(np.angle(pole))) for pole in slow]
     best = max(candidates, key=lambda witness: infeasible_level(problem, witness, covariance))
     return replace(best, states=units * best.states)
+
+
+def worst_invisible_bursts(
+    phases: Sequence[EstimationProblem], P: Sequence[FloatArray], gamma: float
+) -> list[Witness]:
+    """Return the witness of each phase of a burst that ends where ``gamma^2 I - L P L'`` is least.
+
+    With the costate p, ``p(j) = (I + W P)^-1 A' p(j+1)``, ``x(j) = P p(j)``, ``w(j) = B' p(j+1)``
+    is the worst past that leads there.
+    """
+    count = len(phases)
+    top = [np.linalg.eigh(each.L @ S @ each.L.T) for each, S in zip(phases, P, strict=True)]
+    last = int(np.argmax([values[-1] for values, _ in top]))
+    end = phases[last].L.T @ top[last][1][:, -1]
+    steps = [_backward(problem, S, gamma) for problem, S in zip(phases, P, strict=True)]
+    order = [(last + k) % count for k in range(count)]
+    around = reduce(np.matmul, (steps[t][0] for t in order))
+    costates = stationary_root(around, end[:, None])  # of the phase where the burst ends
+    if not np.all(np.isfinite(costates)):  # a recursion that rounding makes unstable
+        costates = end[:, None]
+    witnesses: dict[int, Witness] = {}
+    for t in reversed(order):
+        backward, B = steps[t]
+        before = backward @ costates
+        witnesses[t] = _hide(phases[t], P[t] @ before, B.T @ costates)
+        costates = before
+    return [witnesses[t] for t in range(count)]
+
+
+def _backward(
+    problem: EstimationProblem, P: FloatArray, gamma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``(I + W P)^-1 A'`` of the costates' recursion, and B, without correlation."""
+    A, B, _ = decorrelate(problem)
+    C, L = problem.C, problem.L
+    W = C.T @ np.linalg.solve(problem.R, C) - L.T @ L / gamma**2
+    backward = np.linalg.solve(np.eye(len(A)) + W @ P, A.T)
+    return np.asarray(backward, dtype=np.float64), B
 
 
 def _hide(problem: EstimationProblem, states: FloatArray, disturbances: FloatArray) -> Witness:

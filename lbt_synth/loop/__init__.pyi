@@ -18,6 +18,7 @@ from .fusion.fused_loop import fused_budget as fused_budget
 from .least_residuals.band_limit import BandLimit as BandLimit
 from .least_residuals.band_limit import least_worst_residual as least_worst_residual
 from .least_residuals.residual_limit import ResidualLimit as ResidualLimit
+from .least_residuals.residual_limit import least_fused_residual as least_fused_residual
 from .least_residuals.residual_limit import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design.certificate import (
+    BY_DISTURBANCES,
     GAIN_TOLERANCE,
+    INFEASIBLE_TOLERANCE,
     NORM_TOLERANCE,
     Certificate,
     Check,
@@ -26,6 +28,7 @@ from lbt_synth.linear.periodic.riccati import (
     kalman_gain,
     periodic_hinf,
     periodic_kalman,
+    proved_periodic_gamma,
 )
 from lbt_synth.linear.periodic.system import PeriodicController
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
@@ -59,6 +62,7 @@ class FusedFacts:
     gamma: float = column("estimation error, H-infinity norm over a period", unit="nm")
     gamma_requested: float | None = column("bound asked for", unit="nm")
     gamma_least: float | None = column("least norm of any filter", unit="nm", format=".9g")
+    gamma_infeasible: float | None = column("no filter has a norm below", unit="nm", format=".9g")
     loop_radius: float = column("spectral radius of the loop, over a period", format=".6f")
     gain_low: float = column("stable sensor gains, from", format=".4g")
     gain_high: float = column("stable sensor gains, to", format=".4g")
@@ -85,6 +89,8 @@ class FusedFilter(Design):
         Bound that an H-infinity design was given.
     gamma_least : float or None
         Norm that a filter of the problem achieves, the least one to 1e-9.
+    gamma_infeasible : float or None
+        Norm that no filter reaches, proved by disturbances that no measurement shows.
     gamma_central : float or None
         Level of the central filter that just meets the bound, of a mixed design.
     """
@@ -95,6 +101,7 @@ class FusedFilter(Design):
     fallbacks: tuple[Fallback, ...] = ()
     gamma_requested: float | None = None
     gamma_least: float | None = None
+    gamma_infeasible: float | None = None
     gamma_central: float | None = None
 
     def __post_init__(self) -> None:
@@ -161,6 +168,7 @@ class FusedFilter(Design):
             gamma=self.gamma,
             gamma_requested=self.gamma_requested,
             gamma_least=self.gamma_least,
+            gamma_infeasible=self.gamma_infeasible,
             loop_radius=self.loop().spectral_radius,
             gain_low=low,
             gain_high=high,
@@ -218,6 +226,10 @@ class FusedFilter(Design):
             off = 0.0 if meets == [False, True] else np.inf
             how = "gamma-Riccati equation on both sides"
             checks.append(Check("least norm of any filter, error", off, NORM_TOLERANCE, how))
+            proved = proved_periodic_gamma(self.problem, start, self.gamma_least)
+            above = (self.gamma_infeasible or 0.0) / max(proved, 1e-300) - 1
+            name, how = "infeasible level over the level proved, less 1", BY_DISTURBANCES
+            checks.append(Check(name, above, INFEASIBLE_TOLERANCE, how))
         level = self.gamma_central or bound
         central = periodic_hinf(self.problem, level, start)
         apart = np.inf if central is None else relative_distance(self.gains, central.gains)
@@ -327,7 +339,7 @@ def fused_hinf(
     """
     level = find_level(plant, gamma, gamma_ratio)
     found = central_filter(plant, level.bound, level.start)
-    return make_design(plant, found, gamma_requested=level.bound, gamma_least=level.least)
+    return make_design(plant, found, **level.claims)
 
 
 def make_design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> FusedFilter:

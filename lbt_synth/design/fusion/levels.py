@@ -12,6 +12,7 @@ from lbt_synth.linear.periodic.riccati import (
     least_periodic_gamma,
     periodic_hinf,
     periodic_kalman,
+    proved_periodic_gamma,
 )
 from lbt_synth.models.fusion.plant import FusedPlant
 from lbt_synth.validation import require_instance
@@ -19,12 +20,22 @@ from lbt_synth.validation import require_instance
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Level:
-    """A bound of the norm, beside the least one and the Kalman filter's."""
+    """A bound of the norm, beside the least one, one that no filter meets, and the Kalman's."""
 
     bound: float
     least: float
+    infeasible: float | None  # that no filter reaches; None where nothing is proved
     start: PeriodicRiccati  # the Kalman filter
     kalman: float  # its norm
+
+    @property
+    def claims(self) -> dict[str, float | None]:
+        """What a design of the level says of its norm."""
+        return {
+            "gamma_requested": self.bound,
+            "gamma_least": self.least,
+            "gamma_infeasible": self.infeasible,
+        }
 
 
 def find_level(plant: FusedPlant, gamma: float | None, gamma_ratio: float | None) -> Level:
@@ -35,10 +46,16 @@ def find_level(plant: FusedPlant, gamma: float | None, gamma_ratio: float | None
     )
     start = periodic_kalman(plant)
     norm = error_norm(plant, start)
-    least = least_periodic_gamma(plant, start, norm)[1]
+    least = least_periodic_gamma(plant, start, norm)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
     require_reachable(requested, least)
-    return Level(bound=max(requested, least), least=least, start=start, kalman=norm)
+    return Level(
+        bound=max(requested, least),
+        least=least,
+        infeasible=proved_periodic_gamma(plant, start, least) or None,
+        start=start,
+        kalman=norm,
+    )
 
 
 def error_norm(plant: FusedPlant, solution: PeriodicRiccati) -> float:

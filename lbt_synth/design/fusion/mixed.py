@@ -68,7 +68,6 @@ def fused_mixed(
     return make_design(
         plant,
         central_filter(plant, central, level.start),
-        gamma_requested=level.bound,
-        gamma_least=level.least,
+        **level.claims,
         gamma_central=central,
     )

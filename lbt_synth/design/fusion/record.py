@@ -20,7 +20,7 @@ from lbt_synth.models.fusion.sensors import (
 )
 from lbt_synth.validation import float_array, number
 
-_CLAIMS = ("gamma_requested", "gamma_least", "gamma_central")
+_CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "gamma_central")
 _KINDS: dict[str, type[Sensor]] = {"wavefront": WavefrontSensor, "accelerometer": Accelerometer}
 _ARRAYS = ("noise_nm", "sensor_matrix", "noise_m_s2")
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import DefinitenessError, DimensionError
+from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.periodic.system import PeriodicSystem
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, read_only, set_fields
 
@@ -85,6 +86,17 @@ class PeriodicProblem(PeriodicSystem):
         """Return A, B, and the rows of C and D that are read at a phase."""
         rows = self.read[t]
         return self.A[t], self.B[t], self.C[t][rows], self.D[t][rows]
+
+    def phase(self, t: int) -> EstimationProblem:
+        """Return the problem of a phase, with the measurements that are read in it.
+
+        Where nothing is read, there is a measurement of nothing but noise.
+        """
+        A, B, C, D = self.parts(t)
+        if len(C) == 0:
+            B, C = np.pad(B, ((0, 0), (0, 1))), np.zeros((1, self.n_states))
+            D = np.eye(1, B.shape[1], B.shape[1] - 1)
+        return EstimationProblem(A=A, B=B, C=C, D=D, L=self.L, dt_s=self.dt_s)
 
     def restricted(self, measurements: BoolArray) -> PeriodicProblem:
         """Return the problem without the measurements that are not marked, (q,)."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.batched import symmetrise
-from lbt_synth.linear.estimation_problem import EstimationProblem
+from lbt_synth.linear.estimation_problem import EstimationProblem, error_units, scale_states
+from lbt_synth.linear.infeasibility_proof import infeasible_periodic_level, worst_invisible_bursts
 from lbt_synth.linear.matrix_functions import is_stable, relative_distance
 from lbt_synth.linear.periodic.problem import PeriodicProblem
 from lbt_synth.linear.riccati.filtering import require_detectable
@@ -268,10 +269,23 @@ def _central_gain(problem: PeriodicProblem, t: int, gamma: float, P: FloatArray)
     return gain
 
 
-def least_periodic_gamma(
-    problem: PeriodicProblem, start: PeriodicRiccati, upper: float
-) -> tuple[float, float]:
-    """Bracket the least gamma: a level that the equation refuses, and one that it meets.
+def proved_periodic_gamma(problem: PeriodicProblem, start: PeriodicRiccati, level: float) -> float:
+    """Return a level of gamma that no filter reaches, proved by disturbances that none can see.
+
+    The worst of a level that is met, next to the least one; 0 if the equation does not meet it.
+    """
+    met = periodic_hinf(problem, level, start)
+    if met is None:
+        return 0.0
+    units = error_units(start.P.max(axis=0))
+    both = units * units.T
+    phases = [scale_states(problem.phase(t), units) for t in range(problem.period)]
+    bursts = worst_invisible_bursts(phases, list(met.P / both), level)
+    return infeasible_periodic_level(phases, bursts, list(start.P / both))
+
+
+def least_periodic_gamma(problem: PeriodicProblem, start: PeriodicRiccati, upper: float) -> float:
+    """Return the least gamma that the equation meets, to 1e-9.
 
     ``upper`` is a level that is met, such as the norm of the Kalman filter's error.
     """
@@ -295,4 +309,4 @@ def least_periodic_gamma(
             lower = middle
         else:
             upper = middle
-    return lower, upper
+    return upper

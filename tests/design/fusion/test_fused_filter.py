@@ -80,7 +80,15 @@ def test_an_hinf_filter(hinf):
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_a_least_gamma_that_is_wrong(hinf, factor):
     design = replace(hinf, gamma_least=factor * hinf.gamma_least)
-    assert failed(design) == {"least norm of any filter, error"}
+    proof = "infeasible level over the level proved, less 1"  # the worst of that level
+    assert failed(design) == {"least norm of any filter, error", proof}
+
+
+def test_a_level_that_filters_reach(hinf):
+    assert hinf.gamma_infeasible == pytest.approx(hinf.gamma_least, rel=1e-6)
+    design = replace(hinf, gamma_infeasible=1.001 * hinf.gamma_least)
+    assert failed(design) == {"infeasible level over the level proved, less 1"}
+    assert failed(replace(hinf, gamma_infeasible=0.9 * hinf.gamma_least)) == set()
 
 
 def test_a_bound_that_is_not_met(hinf):

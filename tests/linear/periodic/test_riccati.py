@@ -58,8 +58,8 @@ def test_hinf_of_one_rate(seed):
         problem = of_one_rate(one, period)
         start = periodic_kalman(problem)
         upper = lbt.hinf_norm(one.error_system(start.gains[0])).upper
-        low, high = riccati.least_periodic_gamma(problem, start, upper)
-        assert low < high
+        high = riccati.least_periodic_gamma(problem, start, upper)
+        assert high * (1 - 1e-6) < riccati.proved_periodic_gamma(problem, start, high) <= high
         assert high == pytest.approx(expected.gamma_least, rel=1e-8)
         central = periodic_hinf(problem, 1.1 * high, start)
         gain = lbt.linear.gamma_riccati(one, 1.1 * high).gain_predictor
@@ -72,7 +72,9 @@ def test_the_error_of_an_hinf_filter_is_below_its_level(seed):
     problem = random_periodic_problem(seed)
     start = periodic_kalman(problem)
     kalman = lbt.hinf_norm(problem.error_system(start.gains).lifted()).upper
-    _, least = riccati.least_periodic_gamma(problem, start, kalman)
+    least = riccati.least_periodic_gamma(problem, start, kalman)
+    assert 0.99 * least < riccati.proved_periodic_gamma(problem, start, least) <= least
+    assert riccati.proved_periodic_gamma(problem, start, 0.99 * least) == 0
     assert least <= kalman * (1 + 1e-9)
     for level in (1.001 * least, 1.3 * least):
         found = periodic_hinf(problem, level, start)

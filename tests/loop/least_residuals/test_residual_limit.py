@@ -285,3 +285,78 @@ def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
 def test_coupled_modes_without_a_limit_are_refused():
     with pytest.raises(lbt.errors.CoupledModesError, match="modes that decouple"):
         least_model_residual(coupled_plant(delay_frames=2.4))
+
+
+def fused_variances(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=20.0):
+    """Return what the Kalman filter of several sensors leaves, and the bound [nm^2]."""
+    slow = ar(0.995, driving=8.0)
+    own = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE,
+        turbulence=slow,
+        vibrations=[line for line, _ in lines] or None,
+        noise_nm=own_noise,
+        delay_frames=delay,
+        sensor_matrix=[[sensor_gain]],
+        modes=1,
+    )
+    suite = lbt.models.SensorSuite(sensors=tuple(sensors))
+    motions = tuple(moves for _, moves in lines)
+    plant = lbt.models.fused_plant(own, suite, motions)
+    controller = plant.controller(lbt.linear.periodic_kalman(plant).gains)
+    loop = lbt.loop.close_fused_loop(own.hardware, suite, controller)
+    truth = lbt.Truth(
+        turbulence=slow,
+        vibrations=tuple(line for line, _ in lines),
+        motions=motions,
+        noise_nm=own_noise,
+    )
+    limit = lbt.loop.least_fused_residual(own.hardware, truth, suite)
+    left = float(np.trace(lbt.residual_budget(loop, truth).total_nm2))
+    return left, float(limit.variance_nm2.sum())
+
+
+def second(rate_hz, delay_frames, noise_nm):
+    return lbt.models.WavefrontSensor(
+        name="second", rate_hz=rate_hz, delay_frames=delay_frames, noise_nm=noise_nm
+    )
+
+
+@pytest.mark.parametrize("sensor_gain", [1.0, 0.6])
+def test_the_bound_of_two_sensors_of_each_frame_is_met(sensor_gain):
+    left, least = fused_variances([second(RATE, 2, 9.0)], sensor_gain=sensor_gain)
+    assert least == pytest.approx(left, rel=1e-7)
+
+
+@pytest.mark.parametrize(("divisor", "delay_frames"), [(2, 2), (5, 2), (5, 3.2), (20, 2)])
+def test_no_filter_of_a_slow_sensor_passes_the_bound(divisor, delay_frames):
+    left, least = fused_variances([second(RATE / divisor, delay_frames, 3.0)])
+    alone = fused_variances([second(RATE / divisor, delay_frames, 1e4)])[0]
+    assert least < left < alone
+    assert least > 0.3 * left  # it is no empty bound
+
+
+def test_accelerometers_cannot_do_more_than_know_the_vibrations():
+    line = lbt.Vibration(frequency_hz=25, damping=0.02, rms_nm=100, direction=(1,))
+    moves = {"m1": lbt.models.Motion(size=1.0)}
+    seen = [
+        lbt.models.Accelerometer(
+            name="a", rate_hz=RATE, delay_frames=1, channels=("m1",), noise_m_s2=noise
+        )
+        for noise in (1e-6, 1e-2)
+    ]
+    known, hidden = (fused_variances([each], lines=[(line, moves)]) for each in seen)
+    assert known[1] == hidden[1]
+    assert known[1] < known[0] < hidden[0]
+    assert known[0] < 1.6 * known[1]
+
+
+def test_a_sensor_without_noise_gains_nothing():
+    truth = lbt.Truth(turbulence=ar(0.99), noise_nm=0.0)
+    suite = lbt.models.SensorSuite(sensors=(second(RATE / 5, 2, 3.0),))
+    both = lbt.loop.least_fused_residual(path(2.0), truth, suite)
+    assert both.rms_nm == lbt.loop.least_residual(path(2.0), truth).rms_nm
+
+
+def test_an_exposure_that_ends_within_a_frame_has_no_bound():
+    with pytest.raises(lbt.errors.ProblemError, match="ends within a frame of the loop"):
+        fused_variances([second(RATE / 5, 2.1, 3.0)])
