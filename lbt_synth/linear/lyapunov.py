@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from lbt_synth.linear.batched import frobenius_norms, symmetrise, transpose
+from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -71,7 +72,8 @@ def _triangular_form(A: FloatArray) -> tuple[ComplexArray, ComplexArray, Complex
 def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Solve ``X = A X A' + Q`` for a stack (N, n, n); return X and its residuals (N,).
 
-    By squaring with refinement.
+    By squaring with refinement; by roots (:func:`stationary_root`) where that does not settle, as
+    with several poles next to each other and to the unit circle.
 
     Examples
     --------
@@ -90,6 +92,9 @@ def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
             last = step[poor]
             X[poor], step[poor] = _refine(A[poor], Q[poor], X[poor], np.longdouble)
             poor = poor[(step[poor] > _SETTLED) & (step[poor] < last / 2)]
+        for i in np.flatnonzero(~(step <= _SETTLED) & np.isfinite(X).all(axis=(1, 2))):
+            root = stationary_root(A[i], semidefinite_root(Q[i]))
+            X[i] = root @ root.T
         AXA = A @ X @ transpose(A)
         size = frobenius_norms(X) + frobenius_norms(AXA) + frobenius_norms(Q)
         residuals = frobenius_norms(AXA - X + Q) / np.where(size > 0, size, 1.0)
