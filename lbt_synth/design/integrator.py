@@ -344,8 +344,8 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     require_instance(plant, TipTiltPlant)
     hardware, factor = plant.hardware, plant.D[:, -plant.hardware.n_measurements :]
     lines = tuple(map(ensemble_vibration, plant.vibrations))
-    conditions = LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
-    disturbed = _ensemble_variances(hardware, law, conditions)
+    air = LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
+    disturbed = _ensemble_variances(hardware, law, air)
 
     def from_noise(gain: float) -> float:
         loop = close_loop(hardware, law.controller(hardware, gain))
@@ -366,7 +366,7 @@ def _ensemble_variances(
     def variances(gains: FloatArray) -> FloatArray:
         factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
         scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
-        loops = replace(ensemble, loops=gains.size)
+        loops = replace(ensemble, loops=len(gains))
         return residuals_from_matrices(scaled, hardware, loops).rms_nm ** 2
 
     return variances
@@ -378,26 +378,21 @@ def _least_residual(
     variances: Callable[[FloatArray], FloatArray],
     sensor_gain: float,
 ) -> IntegratorDesign:
-    """Refine each local minimum over a grid of gains, and design with the least.
-
-    ``variances`` are those that loops of many gains leave, nan of an unstable one.
-    """
+    """Refine each local minimum of ``variances`` over gains, nan if unstable; take the least."""
     gains = _TRIALS * hardware_gain_limit(hardware, law) / max(1.0, sensor_gain)
     trials = _allowed_gains(hardware, law, gains) if law.demands else np.log(gains)
 
     def left(log_gains: FloatArray) -> FloatArray:
-        found = variances(np.exp(log_gains))
-        return np.where(np.isnan(found), np.inf, found)
+        return np.nan_to_num(variances(np.exp(log_gains)), nan=np.inf, posinf=np.inf)
 
     walls = np.concatenate([[np.inf], left(trials), [np.inf]])
     low = np.flatnonzero((walls[1:-1] < walls[:-2]) & (walls[1:-1] <= walls[2:])).tolist()
-    ends = [(max(i - 1, 0), min(i + 1, trials.size - 1)) for i in low]
-    refined = [find_least(left, *trials[list(pair)].tolist(), width=1e-7) for pair in ends]
+    pairs = [[max(i - 1, 0), min(i + 1, trials.size - 1)] for i in low]
+    refined = [find_least(left, *trials[pair].tolist(), width=1e-7) for pair in pairs]
     best = int(np.argmin([least for _, least in refined]))
-    gain, status = float(np.exp(refined[best][0])), "least residual"
-    if low[best] == trials.size - 1:
-        limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
-        status = f"limited by {limit}"
-    elif low[best] == 0 and not law.demands:
-        status = "limited by the least gain tried: a loop that hardly acts leaves least"
+    limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
+    ends = {trials.size - 1: f"limited by {limit}"}
+    if not law.demands:
+        ends[0] = "limited by the least gain tried: a loop that hardly acts leaves least"
+    gain, status = float(np.exp(refined[best][0])), ends.get(low[best], "least residual")
     return _design_with_gain(hardware, gain, law, route="search", status=status)
