@@ -22,6 +22,7 @@ from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _PANELS = 100  # of the contrast
 _FREQUENCIES, _DAMPINGS = (0.25, 0.5, 1.0), (0.01, 0.05, 0.2, 0.6)  # starts; the first in V / D
+_LEAST_DAMPING = 1e-6  # less is no turbulence
 
 
 def le_roux_pole(
@@ -176,19 +177,22 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
         return float(np.log(numerator) + weight @ (np.log(model) - shape + target / model))
 
     starts = [_pack(f * crossing_hz, z) for f in _FREQUENCIES for z in _DAMPINGS]
-    fit = minimize(
-        contrast,
-        min(starts, key=contrast),
-        method="Nelder-Mead",
-        options={"xatol": 1e-8, "fatol": 1e-13, "maxiter": 2000, "maxfev": 2000},
-    )
-    if not fit.success:
+    with np.errstate(all="ignore"):  # noise far above the turbulence leaves nothing to fit
+        fit = minimize(
+            contrast,
+            min(starts, key=contrast),
+            method="Nelder-Mead",
+            options={"xatol": 1e-8, "fatol": 1e-13, "maxiter": 2000, "maxfev": 2000},
+        )
+    angle, damping = _unpack(fit.x, rate)
+    if not (fit.success and damping > _LEAST_DAMPING):
+        reason = "the noise hides the turbulence." if fit.success else str(fit.message)
         raise NumericalError(
-            f"the AR2 fit to the turbulence spectrum did not converge: {fit.message} "
+            f"the AR2 fit to the turbulence spectrum did not converge: {reason} "
             "Try the AR1 model, or check that the noise is not above the turbulence.",
             status=str(fit.message),
         )
-    a1, a2, drive = coefficients(*_unpack(fit.x, rate))
+    a1, a2, drive = coefficients(angle, damping)
     return ARModel(
         coefficients=frozen_copy([a1, a2]), driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
     )

@@ -66,3 +66,13 @@ def test_ar2_fit_of_an_atmosphere_that_takes_many_steps():
         air, frame_rate_hz=1771.8517360710612, noise_nm=71.35054707271983
     )
     assert found.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-6)
+
+
+def test_noise_that_hides_the_turbulence_is_named():
+    """A line without damping would explain it as well: nothing is left to fit."""
+    air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
+    for noise_nm in (1e5, 1e12):
+        with pytest.raises(lbt.errors.NumericalError, match="the noise hides the turbulence"):
+            lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise_nm)
+    loud = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=1e4)
+    assert loud.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-5)
