@@ -117,12 +117,12 @@ def infeasible_periodic_level(
         deviation = np.sqrt(np.diag(covariance))
         scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
         scale = np.where(scale > 0, scale, 1.0)
-        strayed = np.linalg.norm((after - basis @ (inverse @ after)) / scale)
+        own, own_then = inverse @ after, inverse @ then  # squares would double their rounding
+        strayed = np.linalg.norm((after - basis @ own) / scale)
         if strayed > _STRAYED * np.linalg.norm(after / scale):
             return 0.0
         # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
-        growth = inverse @ (after @ after.T - then @ then.T) @ inverse.T
-        values, vectors = np.linalg.eigh((growth + growth.T) / 2)
+        values, vectors = np.linalg.eigh(own @ own.T - own_then @ own_then.T)
         growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
         gained += float(np.sum((problem.L @ then) ** 2) + np.sum((problem.L @ growth_root) ** 2))
         spent += float(np.sum(w**2)) - float(values[values < 0].sum())

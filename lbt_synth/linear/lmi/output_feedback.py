@@ -27,6 +27,7 @@ from lbt_synth.linear.output_feedback.lower_bound import (
 )
 from lbt_synth.validation import FloatArray
 
+_RANK = 1e-7  # share of the largest root of a cost that counts as none for the solver
 _REASON = "the dual of the matrix inequalities has a point there"
 
 
@@ -57,7 +58,7 @@ class _Storage:
 
     def __init__(self, side: Side) -> None:
         self.side = side
-        self.basis, self.inverse = storage_coordinates(storage_root(side))
+        self.basis, self.inverse = storage_coordinates(storage_root(side), _RANK)
         if not self.basis.size:  # old versions of cvxpy have no empty variables
             self.basis, self.inverse = np.zeros((len(side.A), 1)), np.zeros((1, len(side.A)))
         self.size = self.basis.shape[1]

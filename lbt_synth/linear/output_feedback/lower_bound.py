@@ -42,8 +42,8 @@ from lbt_synth.validation import FloatArray
 
 _STEPS = 64  # of the recursion that bounds the storage matrix
 _STEADY = 1e-12  # part of the states' moments by which those of an oscillation may change
-_STRAYED = 1e-9  # share of the successors that may lie outside of its range
-_RANKS = (1e-12, 1e-8, 1e-7, 1e-6)  # shares of the largest root of a cost that count as none
+_STRAYED = 1e-10  # share of the successors that may lie outside of the storage's range
+_RANK = 1e-8  # share of the largest root of a cost that counts as none
 _SINGULAR = 1e-15  # of what the largest control moves, that counts as none
 _WIDEST = 12.0  # logarithm of the relative weight of the two sides
 
@@ -112,12 +112,10 @@ def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -
     2.0
     """
     pairs = (witness.unseen, estimation_side), (witness.unmoved, control_side)
-    levels = []
     sides = [_moments(plant, side_of, each) for each, side_of in pairs if each is not None]
-    for found in zip(*sides, strict=True):  # each rank gives a proof
-        levels += [np.sqrt(m.gained / m.spent) for m in found if m.spent > 0]
-        if len(found) == 2:
-            levels.append(_coupled_level(*found))
+    levels = [np.sqrt(side.gained / side.spent) for side in sides if side.spent > 0]
+    if len(sides) == 2:
+        levels.append(_coupled_level(*sides))
     return float(max(levels, default=0.0))
 
 
@@ -138,8 +136,8 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
     return float(np.max(levels(np.array([best, refined]))))
 
 
-def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> list[_Moments]:
-    """Evaluate pairs against the side in whose equation they are the costates, for each rank."""
+def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> _Moments:
+    """Evaluate pairs against the side in whose equation they are the costates."""
     side = side_of(plant)
     steady = _hidden(side, pairs.states, pairs.disturbances)
     growth = steady.after @ steady.after.T - pairs.states @ pairs.states.T
@@ -147,20 +145,21 @@ def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> list[
     turning = pairs.states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
     if steady.hidden and turning:
         none = np.zeros((len(pairs.states), 1))
-        return [_Moments(steady.gained, steady.spent, none)] * len(_RANKS)
-    root = _storage_root_of(plant, side_of)
-    return [_moments_within(side, pairs, *storage_coordinates(root, rank)) for rank in _RANKS]
+        return _Moments(steady.gained, steady.spent, none)
+    basis, inverse = storage_coordinates(_storage_root_of(plant, side_of), _RANK)
+    return _moments_within(side, pairs, basis, inverse)
 
 
 def _moments_within(side: Side, pairs: Witness, basis: FloatArray, inverse: FloatArray) -> _Moments:
     """Evaluate pairs in the range of a storage matrix."""
-    states = basis @ (inverse @ pairs.states)
+    before = inverse @ pairs.states
+    states = basis @ before
     found = _hidden(side, states, pairs.disturbances)
-    strayed = np.linalg.norm(found.after - basis @ (inverse @ found.after))
+    after = inverse @ found.after  # before any square, which would double its rounding
+    strayed = np.linalg.norm(found.after - basis @ after)
     if strayed > _STRAYED * np.linalg.norm(found.after) or not found.hidden:
         return _Moments(0.0, 1.0, np.zeros((len(states), 1)))
-    growth = inverse @ (found.after @ found.after.T - states @ states.T) @ inverse.T
-    values, vectors = np.linalg.eigh((growth + growth.T) / 2)
+    values, vectors = np.linalg.eigh(after @ after.T - before @ before.T)
     spent = found.spent - float(values[values < 0].sum())
     return _Moments(found.gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
 
@@ -190,11 +189,10 @@ def _hidden(side: Side, states: FloatArray, signals: FloatArray) -> _Hidden:
     )
 
 
-def storage_coordinates(root: FloatArray, rank: float = _RANKS[2]) -> tuple[FloatArray, FloatArray]:
+def storage_coordinates(root: FloatArray, rank: float) -> tuple[FloatArray, FloatArray]:
     """Return T (n, r) with ``T T'`` the storage of a root, and its left inverse.
 
-    Directions below a share of the largest are left out: few, and rounding costs a proof; many, and
-    its successors leave the range.
+    Directions below a share of the largest are left out.
     """
     spread = np.linalg.norm(root, axis=1)
     spread = np.where(spread > 0, spread, 1.0)
@@ -206,7 +204,8 @@ def storage_coordinates(root: FloatArray, rank: float = _RANKS[2]) -> tuple[Floa
 def storage_root(side: Side) -> FloatArray:
     """Return a root (n, r) of what any law leaves: the least cost, or some steps to it.
 
-    A root has costs to the square of rounding, which still limit what a storage matrix may be.
+    A root has costs to the square of rounding, which still limit what a storage matrix may be. The
+    law is improved by the root itself: what an inaccurate law leaves is too much.
     """
     size = np.linalg.norm(np.vstack([side.B2, side.D12]), axis=0)
     moves = size > 0
@@ -214,7 +213,11 @@ def storage_root(side: Side) -> FloatArray:
     C1, Q = side.C1, side.C1.T @ side.C1
     with suppress(ProblemError, SynthesisError):  # a singular problem has no stabilising law
         law = solve_dare(A, B, Q, D12.T @ D12, C1.T @ D12).gain_feedback
-        return stationary_root((A - B @ law).T, (C1 - D12 @ law).T)
+        root = stationary_root((A - B @ law).T, (C1 - D12 @ law).T)
+        moved, left = np.vstack([root.T @ B, D12]), np.vstack([root.T @ A, C1])
+        law = np.linalg.lstsq(moved, left, rcond=_SINGULAR)[0]
+        improved = stationary_root((A - B @ law).T, (C1 - D12 @ law).T)
+        return improved if np.all(np.isfinite(improved)) else root
     root = np.zeros((len(A), 1))
     for _ in range(_STEPS):  # what is left after any control lies beside all that controls move
         moved, left = np.vstack([root.T @ B, D12]), np.vstack([root.T @ A, C1])

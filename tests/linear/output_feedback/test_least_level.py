@@ -117,13 +117,13 @@ def test_perfect_control_of_lightly_damped_modes_is_certified(seed):
     assert design.regularised > 0
 
 
-@pytest.mark.parametrize("hidden", [1e-5, 1e-6, 1e-7, 1e-9])
-@pytest.mark.parametrize("noise", [0.01, 0.3])
+@pytest.mark.parametrize("hidden", [1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
+@pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
 def test_a_disturbance_seen_through_a_hidden_state(hidden, noise):
     """The state that is seen gets a small part of the disturbance, and almost no noise.
 
-    Its measurement over that part is the disturbance of the last step and noise, so that
-    ``u = -x_1`` leaves twice the noise; nothing at all leaves 2.
+    Its measurement over that part is the disturbance of the last step and noise, the best estimate
+    of which leaves ``2 noise / sqrt(1 + noise^2)`` at 0 Hz; no control at all leaves 2.
     """
     turn = np.array([[1.0, 1.0], [1.0, -1.0]])
     plant = lbt.linear.GeneralizedPlant(
@@ -136,7 +136,7 @@ def test_a_disturbance_seen_through_a_hidden_state(hidden, noise):
         D21=[[0.0, hidden * noise]],
     )
     design = lbt.hinf_controller(plant)
-    assert design.gamma_infeasible <= 2 * noise
+    assert design.gamma_infeasible < 2 * noise / np.hypot(1, noise) * (1 + 1e-6)
     assert design.gamma_infeasible <= design.gamma_least < 2
 
 
