@@ -284,7 +284,8 @@ def only_errors(seed: int, frames: int, **options: Any) -> dict:
         "errors": deviations(it, model.axes[0]),
         "seconds": time.process_time() - begin,
         "coloured": model.axes[0].noise_correlation != 0,
-        "warned": any("warning" in note for note in model.notes),
+        "warned": any("warning" in note for note in model.notes)
+        or model.axes[0].sensor_gain_error is None,
     }
 
 

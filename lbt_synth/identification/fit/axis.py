@@ -12,7 +12,11 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import GAINS, LOWEST_LINE_HZ, MOST_LINES, Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
-from lbt_synth.identification.fit.order_search import search_model, try_other_gains
+from lbt_synth.identification.fit.order_search import (
+    search_model,
+    search_models,
+    try_other_gains,
+)
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -125,7 +129,7 @@ def identify_axis(
     assumed = number(assumed_gain, "assumed_gain", **GAINS)
     if start is not None:
         require_instance(start, IdentifiedAxis)
-    model = search_model(search, None if start is None else start.fitted_model.spectrum)
+    model, *rivals = search_models(search, None if start is None else start.fitted_model.spectrum)
     if sensor_gain is not None:
         relative = given_error / sensor_gain
         if relative:
@@ -134,21 +138,27 @@ def identify_axis(
         return describe_axis(search, model, relative or None, note)
     if not data.closed:
         return describe_axis(search, model, None, "1: of an open loop it has no meaning")
-    model, away = _compare_gains(search, model)
+    model, near = _compare_gains(search, model, rivals)
+    own = model.spectrum
+    away = max((abs(each.spectrum.log_gain - own.log_gain) for each in near), default=0.0)
+    colours = np.tanh([own.colour, *(each.spectrum.colour for each in near)])
+    unknown = float(np.ptp(colours))  # correlation of the noise
     own_error = standard_errors(model.spectrum, parameter_covariance(model)).log_gain
     error = max(own_error, away)
     if error <= _GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
         if error > own_error:  # what the gain moves is as ambiguous
             model = hold_gain(search, model, error)
-        return describe_axis(search, model, error, f"found in the closed loop's data{poor}")
+        note = f"found in the closed loop's data{poor}"
+        return describe_axis(search, model, error, note, colour_error=unknown)
     search = replace(search, gain=assumed)
     by = f" by {100 * error:.0f} %" if error < 1 else ""
     note = (
         f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
-    return describe_axis(search, search_model(search, model.spectrum), None, note)
+    model = search_model(search, model.spectrum)
+    return describe_axis(search, model, None, note, colour_error=unknown)
 
 
 def _checked_periodogram(
@@ -296,9 +306,11 @@ def estimate_averages(density: FloatArray) -> float | None:
     return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))
 
 
-def _compare_gains(search: Search, model: FittedModel) -> tuple[FittedModel, float]:
-    """Return the likeliest model, and how far the gain of another is that is nearly as likely."""
+def _compare_gains(
+    search: Search, model: FittedModel, rivals: Sequence[FittedModel]
+) -> tuple[FittedModel, list[FittedModel]]:
+    """Return the likeliest model, and those of other gains that are nearly as likely."""
     spectrum = model.spectrum
     if spectrum.drop_wide(WIDE_DAMPING) == spectrum and not spectrum.colour:
-        return model, 0.0
-    return try_other_gains(search, model)
+        return model, []
+    return try_other_gains(search, model, rivals)

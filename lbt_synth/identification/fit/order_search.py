@@ -9,7 +9,7 @@ Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise, product
 
@@ -47,11 +47,16 @@ _COLOUR = 0.3  # of the noise, where a fit begins
 
 def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
     """Find the model of one axis."""
-    model = find_components(search, start)
-    if start is None and _may_be_coloured(search, model):
-        trials = [model, find_components(replace(search, colour=_COLOUR), None)]
-        model = min(trials, key=lambda trial: _cost_of_noise(search, trial))
-    return fitting.add_evidence(search, model)
+    return search_models(search, start)[0]
+
+
+def search_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
+    """Find the model of one axis, and its rival where noise of another colour may explain it."""
+    models = [find_components(search, start)]
+    if start is None and _may_be_coloured(search, models[0]):
+        models.append(find_components(replace(search, colour=_COLOUR), None))
+        models.sort(key=lambda trial: _cost_of_noise(search, trial))
+    return [fitting.add_evidence(search, models[0]), *models[1:]]
 
 
 def _may_be_coloured(search: Search, model: FittedModel) -> bool:
@@ -75,13 +80,15 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
     return fitting.cost(search, model) + search.price * wide + coloured
 
 
-def try_other_gains(search: Search, model: FittedModel) -> tuple[FittedModel, float]:
-    """Return the likeliest model from several gains, and how far others of nearly its cost are.
+def try_other_gains(
+    search: Search, model: FittedModel, rivals: Sequence[FittedModel] = ()
+) -> tuple[FittedModel, list[FittedModel]]:
+    """Return the likeliest model from several gains, and the others of nearly its cost.
 
     Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
-    lines cannot. The distance is that of the logarithms of the gains.
+    lines cannot.
     """
-    spectrum, found = model.spectrum, [model]
+    spectrum, found = model.spectrum, [model, *rivals]
     for gain, colour in product(_STARTING_GAINS, sorted({spectrum.colour, 0.0})):
         if colour == spectrum.colour and abs(np.log(gain) - spectrum.log_gain) < _SAME_GAIN:
             continue
@@ -94,12 +101,14 @@ def try_other_gains(search: Search, model: FittedModel) -> tuple[FittedModel, fl
         free = fitting.fit(search, held.spectrum)
         found += [] if free is None else [free]
     best = min(found, key=lambda each: _cost_of_noise(search, each))
-    least, away = fitting.cost(search, best), 0.0
+    near, costs = [], (fitting.cost, _cost_of_noise)
+    least = [cost(search, best) for cost in costs]
     for each in found:
         same = bool(each.spectrum.colour) == bool(best.spectrum.colour)
-        if fitting.cost(search, each) < least + (search.price if same else _OTHER_NOISE):
-            away = max(away, abs(each.spectrum.log_gain - best.spectrum.log_gain))
-    return (model if best is model else fitting.add_evidence(search, best)), away
+        above = min(cost(search, each) - low for cost, low in zip(costs, least, strict=True))
+        if above < (search.price if same else _OTHER_NOISE):
+            near.append(each)
+    return (model if best is model else fitting.add_evidence(search, best)), near
 
 
 def find_components(

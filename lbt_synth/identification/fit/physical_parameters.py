@@ -82,11 +82,17 @@ def _colour_error(search: Search, spectrum: SpectrumModel) -> float:
 
 
 def describe_axis(
-    search: Search, model: FittedModel, gain_error: float | None, note: str
+    search: Search,
+    model: FittedModel,
+    gain_error: float | None,
+    note: str,
+    *,
+    colour_error: float = 0.0,
 ) -> IdentifiedAxis:
     """Return a fitted model in the units of the phase.
 
-    ``gain_error`` is the standard error of the logarithm of the gain, None where it is unknown.
+    ``gain_error`` is the standard error of the logarithm of the gain, None where it is unknown;
+    ``colour_error`` by how much the noise's correlation differs in models that are as likely.
     """
     data, spectrum, gain = search.data, model.spectrum, model.spectrum.gain
     rate = data.frame_rate_hz
@@ -113,8 +119,11 @@ def describe_axis(
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
         noise_correlation=correlation,
-        noise_correlation_error=(1 - correlation**2)
-        * (errors.colour if spectrum.colour else _colour_error(search, spectrum)),
+        noise_correlation_error=max(
+            colour_error,
+            (1 - correlation**2)
+            * (errors.colour if spectrum.colour else _colour_error(search, spectrum)),
+        ),
         sensor_gain=gain,
         sensor_gain_error=None if gain_error is None else gain * gain_error,
         sensor_gain_note=note,
