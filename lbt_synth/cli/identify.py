@@ -45,6 +45,7 @@ def run(arguments: Namespace) -> Report:
             earlier=earlier,
         )
         loop_records.add_accelerometers(report, found)
+        report.notes += [f"note: {note}." for note in readings.notes]
     report.notes += [loop_records.marked_note(note) for note in notes]
     loop_records.write_files(report, places, arguments, record, model, accelerometers=found)
     return report

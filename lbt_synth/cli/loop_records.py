@@ -171,7 +171,7 @@ def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
         arguments.accelerometers,
         record.frame_rate_hz,
         rate_hz=arguments.accelerometer_rate_hz,
-        unit=arguments.acceleration_unit or "m/s2",
+        unit=arguments.acceleration_unit,
     )
 
 

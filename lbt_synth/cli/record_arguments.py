@@ -61,9 +61,9 @@ def add_prior_knowledge(parser: ArgumentParser) -> None:
         "coherent with it is expected as a line"
     )
     add_option(known, "--accelerometers", str, text)
-    text = "their rate, a whole multiple of the frame rate (default: the frame rate) [Hz]"
+    text = "their rate (default: that of the file's times or header, else the frame rate) [Hz]"
     add_option(known, "--accelerometer-rate-hz", float, text)
-    text = f"their unit: {', '.join(M_S2)} (default m/s2)"
+    text = f"their unit: {', '.join(M_S2)} (default: that of the headings, else m/s2)"
     add_option(known, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
     add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
     add_option(known, "--most-lines", int, "most vibrations per axis", 20)

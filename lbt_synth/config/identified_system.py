@@ -161,6 +161,8 @@ def _accelerometer_section(
     if age < 0 or not 0 < age + delay_frames - 1 <= LONGEST_DELAY:
         comments[path] = f"not known: the clocks were {age - 1} frames apart; give the real delay"
         age = 1
+    elif found.clock_ppm:
+        comments[path] += f" in the middle; the clocks drift by {found.clock_ppm:.3g} ppm"
     return {
         "kind": "accelerometer",
         "rate_hz": float(found.rate_hz),

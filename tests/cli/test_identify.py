@@ -167,9 +167,11 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     (moving,) = [each.accelerometers for each in settings.model.vibrations if each.accelerometers]
     assert moving["m1"].motion_nm_per_nm == line["motion_nm_per_nm"]
     status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 1500)
+    assert status == 0  # a rate that is wrong shows no line
+    assert "check the rate of the readings" in text
+    status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 500)
     assert status == 2
-    assert "whole multiple of the frame rate" in error
-    assert "1.5 times" in error
+    assert "at least once a frame, 1000 Hz; got 500 Hz" in error
 
 
 def test_exchanged_channels_are_named_against_an_earlier_model(

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from lbt_synth.identification.records.faults import find_saturated
 from lbt_synth.validation import FloatArray
 
 _FEWEST_VALUES = 4  # a series of no more different numbers is rounding
 _ROUNDING = 1e-12  # of the largest number
-_CLIPPED = 10  # frames at either end, at least
+_CLIPPED = 10  # frames at the ends, at least
 _DRIFT = 100.0  # power at low frequencies over the median
 _SLOW_HZ = 1.0
 
 
 def channel_fault(readings: FloatArray, rate_hz: float) -> str:
     """Return dead, saturated, drifting, or an empty text, for the readings (frames,) of one."""
-    values, counts = np.unique(readings, return_counts=True)
-    spread = float(values[-1] - values[0])
-    if values.size <= _FEWEST_VALUES or spread <= _ROUNDING * float(np.max(np.abs(values))):
+    readings = readings[np.isfinite(readings)]
+    values = np.unique(readings)
+    if values.size <= _FEWEST_VALUES or np.ptp(values) <= _ROUNDING * np.max(np.abs(values)):
         return "dead"
-    ends = (counts[0], counts[1]), (counts[-1], counts[-2])
-    if all(end >= _CLIPPED and end > 2 * inner for end, inner in ends):
+    if np.sum(find_saturated(readings, np.ones(readings.size, dtype=np.bool_))) >= _CLIPPED:
         return "saturated"
     return "drifting" if _drifts(readings, rate_hz) else ""
 

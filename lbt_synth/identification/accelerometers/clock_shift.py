@@ -21,6 +21,7 @@ _STEP = 0.5  # frames
 _FINE = 0.01
 _RIVAL = 6.9  # of the logarithm of the likelihood: 1000 times less likely
 _CHANCE = 1e-3  # of phases as far from 0 and 180 degrees
+_TURN = 0.3  # rad, of the edges of a band from one lag that is tried to the next
 _CLEARLY = 10.0  # by which a shift must be likelier than none before readings are moved by it
 
 Pair = tuple[LineBand, BandFit, int, int]  # band, fit of the channel, line of the band, channel
@@ -50,12 +51,17 @@ def likeliest_lag(bands: Sequence[LineBand], largest: int) -> int:
     lags = np.arange(-largest, largest + 1.0)
     total = np.zeros(lags.size)
     for band in bands:
-        turns = np.exp(1j * lags[:, None] * band.angle)
+        middle = float(np.mean(band.angle[[0, -1]]))
+        away = band.angle - middle  # a product changes over lags as slowly as the band is narrow
+        step = max(int(_TURN / float(np.max(np.abs(away), initial=_TURN / lags.size))), 1)
+        tried = np.append(np.arange(-largest, largest, step), largest).astype(float)
+        turns = np.exp(1j * tried[:, None] * away)
         for line in band.lines:
             products = band.expected[:, line, None].conj() * band.readings
             power = np.sum(np.abs(products) ** 2, axis=0)
             seen = power > 0
-            total += np.sum(np.abs(turns @ products[:, seen]) ** 2 / power[seen], axis=1)
+            sizes = np.sum(np.abs(turns @ products[:, seen]) ** 2 / power[seen], axis=1)
+            total += np.interp(lags, tried, sizes)
     best = int(np.argmax(total))
     return int(lags[best]) if total[best] > total[largest] + _CLEARLY else 0
 

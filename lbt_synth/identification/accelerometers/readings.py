@@ -12,12 +12,20 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
 from lbt_synth.identification.accelerometers.units import M_S2
+from lbt_synth.identification.records.clock import build_clock
 from lbt_synth.identification.records.column_selection import CLOCKS
-from lbt_synth.identification.records.contents import read_contents
-from lbt_synth.validation import BoolArray, FloatArray, float_array
+from lbt_synth.identification.records.columns import Column, seconds_per
+from lbt_synth.identification.records.contents import Contents, read_contents
+from lbt_synth.identification.records.faults import fill, find_outliers, find_stuck, mark, runs
+from lbt_synth.linear.cubic_spline import cubic_spline
+from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
+_BRIDGED = 3  # frames of a gap
 _NAME = re.compile(r"\w[\w .+-]*$")
+_SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
+_SAME = 1e-7  # relative, between rates that are one
+_FEWEST_READINGS = 4  # that a spline needs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,6 +34,7 @@ class Readings:
 
     channels: tuple[str, ...]
     values: FloatArray  # (frames, channels) [m/s^2], NaN where one is missing
+    notes: tuple[str, ...] = ()
 
     def beside(self, frames: int) -> FloatArray:
         """Return them beside a record of so many frames, NaN beyond their end."""
@@ -40,16 +49,18 @@ def load_readings(
     frame_rate_hz: float,
     *,
     rate_hz: float | None = None,
-    unit: str = "m/s2",
+    unit: str | None = None,
 ) -> Readings:
     """Read accelerations from a file of any format that records have, one column per channel.
 
-    Readings at a whole multiple of the frame rate are averaged.
+    Their rate is that of their times or of the header, if it is not given. At another rate than
+    the loop's they are laid on its frames.
     """
     source = Path(path)
-    found = [each for each in read_contents(source).columns if each.role not in CLOCKS]
-    sizes = sorted({each.values.size for each in found})
-    if len(sizes) != 1:
+    contents = read_contents(source)
+    found = [each for each in contents.columns if each.role not in CLOCKS]
+    sizes = sorted({each.values.size for each in contents.columns})
+    if not found or len(sizes) != 1:
         raise TelemetryError(
             f"{source} must hold columns of one length, a sensor each; got {len(found)} of "
             f"{sizes} rows.",
@@ -58,29 +69,134 @@ def load_readings(
     names = [each.name.strip() for each in found]
     if not all(_NAME.match(name) for name in names) or len(set(names)) < len(names):
         names = [f"channel{c + 1}" for c in range(len(found))]
-    values = M_S2[unit] * np.stack([each.values for each in found], axis=1)
-    ratio = 1.0 if rate_hz is None else rate_hz / frame_rate_hz
-    many = round(ratio)
-    if many < 1 or abs(ratio - many) > 1e-6 * ratio:
-        raise ProblemError(
-            f"the rate of the accelerometers must be a whole multiple of the frame rate, "
-            f"{frame_rate_hz:g} Hz; got {rate_hz:g} Hz, {ratio:.6g} times. Resample them first."
+    values = np.stack([_m_s2(each, unit, source) * each.values for each in found], axis=1)
+    values, own_hz, notes = _on_own_clock(contents, values, rate_hz, frame_rate_hz)
+    if own_hz != frame_rate_hz:
+        values = resample(values, own_hz, frame_rate_hz)
+    shifted = [name for name, series in zip(names, values.T, strict=True) if _is_offset(series)]
+    if shifted:
+        notes.append(
+            f"readings of {', '.join(shifted)} have an offset, which a filter takes for motion: "
+            "subtract it before they reach the loop"
         )
-    whole = values[: len(values) // many * many].reshape(-1, many, len(names))
-    return Readings(channels=tuple(names), values=whole.mean(axis=1))
+    return Readings(channels=tuple(names), values=values, notes=tuple(notes))
+
+
+def _is_offset(series: FloatArray) -> bool:
+    """Whether the mean of readings is more than what they move by."""
+    good = series[np.isfinite(series)]
+    return bool(good.size and abs(good.mean()) > good.std() > 0)
+
+
+def _m_s2(column: Column, unit: str | None, source: Path) -> float:
+    """Return the m/s^2 of one unit of a column: as given, as its heading says, or one."""
+    said = _SPELLINGS.sub("/s2", (column.unit or "").strip()).replace("µ", "u").lower()
+    if said and said not in M_S2:
+        if unit is None:
+            raise TelemetryError(
+                f"accelerations must be in one of {', '.join(M_S2)}; {column.name} of {source} is "
+                f"in {column.unit!r}. Scale them, or give acceleration_unit.",
+                path=source,
+            )
+    elif said and unit is not None and M_S2[said] != M_S2[unit]:
+        raise TelemetryError(
+            f"{column.name} of {source} is in {column.unit}, and acceleration_unit says {unit}: "
+            "which is right? Leave the option away, or correct the heading.",
+            path=source,
+        )
+    return M_S2[unit or said or "m/s2"]
+
+
+def _on_own_clock(
+    contents: Contents, values: FloatArray, rate_hz: float | None, frame_rate_hz: float
+) -> tuple[FloatArray, float, list[str]]:
+    """Return readings without jumps in time, NaN where rows are missing, and their rate."""
+    stated = {rate_hz} if rate_hz else set(contents.facts.get("frame_rate_hz", {}).values())
+    if len(stated) > 1:
+        raise ProblemError(
+            "the file of the accelerometers gives several rates: "
+            f"{', '.join(f'{each:g}' for each in sorted(stated))} Hz. Give accelerometer_rate_hz."
+        )
+    own_hz = number(stated.pop(), "accelerometer_rate_hz", above=0) if stated else None
+    clocks = {each.role: each for each in contents.columns if each.role in CLOCKS}
+    times, counter = clocks.get("times"), clocks.get("frame_numbers")
+    if times is None and counter is None:
+        said = (
+            "" if own_hz else "no rate is given for the accelerometers: that of the loop is taken"
+        )
+        return values, own_hz or frame_rate_hz, [said] if said else []
+    clock = build_clock(
+        len(values),
+        frame_rate_hz=own_hz or (frame_rate_hz if times is None else None),
+        times_s=None if times is None else times.values * seconds_per(times.unit),
+        frame_numbers=None if counter is None else counter.values,
+    )
+    laid = np.full((int(clock.frame_of_row[-1]) + 1, values.shape[1]), np.nan)
+    laid[clock.frame_of_row] = values
+    return laid, clock.frame_rate_hz, [f"accelerometers: {note}" for note in clock.notes]
+
+
+def resample(values: FloatArray, rate_hz: float, frame_rate_hz: float) -> FloatArray:
+    """Return readings (n, channels) at the frames of a loop, faster ones averaged over each.
+
+    Between readings they follow a cubic spline; frames beside a missing reading are NaN.
+    """
+    ratio = rate_hz / frame_rate_hz
+    if ratio < 1 - _SAME:
+        raise ProblemError(
+            f"accelerations must come at least once a frame, {frame_rate_hz:g} Hz; got "
+            f"{rate_hz:g} Hz. Record them faster, or give accelerometer_rate_hz if that is wrong."
+        )
+    many = max(round(ratio), 1)
+    frames = int(np.floor(len(values) / ratio * (1 + _SAME)))
+    if abs(ratio - many) <= _SAME * many:
+        whole = values[: frames * many].reshape(-1, many, values.shape[1])
+        return np.asarray(whole.mean(axis=1))
+    place = (np.arange(frames * many) + 0.5) / many * ratio - 0.5  # of readings
+    each = at_places(values, place).reshape(frames, many, values.shape[1])
+    return np.asarray(each.mean(axis=1))
+
+
+def at_places(values: FloatArray, place: FloatArray) -> FloatArray:
+    """Return readings (n, channels) between their places, NaN beside missing ones."""
+    rows, out = np.arange(float(len(values))), np.empty((len(place), values.shape[1]))
+    below = np.clip(np.floor(place).astype(int), 0, len(values) - 2)
+    for c, series in enumerate(values.T):
+        good = np.isfinite(series)
+        if len(series) < _FEWEST_READINGS or not good.any():
+            out[:, c] = np.nan
+            continue
+        filled = np.interp(rows, rows[good], series[good])
+        sure = good[below] & good[below + 1]
+        out[:, c] = np.where(sure, cubic_spline(rows, filled)(place), np.nan)
+    return out
 
 
 def fill_missing(accelerations: ArrayLike) -> tuple[FloatArray, BoolArray]:
     """Return readings (frames, channels) with zeros in gaps, and the frames without one.
 
-    A channel that misses more than a tenth of the frames becomes zeros, and spoils no frame.
+    Held values and spikes are missing, too; gaps of a few frames are bridged. A channel that misses
+    more than a tenth of the frames becomes zeros, and spoils no frame.
     """
+    given = as_columns(accelerations)
+    good, filled = np.isfinite(given), np.zeros(given.shape)
+    ended = np.mean(good, axis=0) < 1 - _MISSING
+    for c, series in enumerate(given.T):
+        held = find_stuck(series, good[:, c])
+        good[:, c] &= ~held & ~find_outliers(series, good[:, c] & ~held)
+        filled[:, c] = fill(series, good[:, c])
+        gaps = runs(~good[:, c])
+        good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= _BRIDGED], len(given))
+    fine = np.mean(good, axis=0) >= 1 - _MISSING
+    if not fine.any() and ended.all():  # one that ends early may be whole until then
+        fine = good.any(axis=0)
+    return np.where(good & fine, filled, 0.0), np.asarray(good[:, fine].all(axis=1))
+
+
+def as_columns(accelerations: ArrayLike) -> FloatArray:
+    """Return accelerations as (frames, channels)."""
     given = float_array(accelerations, "accelerations")
     given = given[:, None] if given.ndim == 1 else given
     if given.ndim != 2 or given.size == 0:
         raise DimensionError(f"accelerations must be (frames, channels); got {given.shape}.")
-    good = np.isfinite(given)
-    fine = np.mean(good, axis=0) >= 1 - _MISSING
-    if not fine.any():  # one that ends early may be whole until then
-        fine = good.any(axis=0)
-    return np.where(good & fine, given, 0.0), np.asarray(good[:, fine].all(axis=1))
+    return given

@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.design.fusion.failures import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.band_fit import fit_band
 from lbt_synth.identification.accelerometers.channel_faults import channel_fault
 from lbt_synth.identification.accelerometers.clock_shift import (
     ClockShift,
     Pair,
     clock_shift,
-    likeliest_lag,
 )
-from lbt_synth.identification.accelerometers.line_bands import LineBand, line_bands
-from lbt_synth.identification.accelerometers.readings import fill_missing
+from lbt_synth.identification.accelerometers.laying import chance, lay_and_fit
+from lbt_synth.identification.accelerometers.line_bands import NM
+from lbt_synth.identification.accelerometers.readings import as_columns, fill_missing
 from lbt_synth.identification.accelerometers.swapped import Factor, swapped_channels
-from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
-from lbt_synth.identification.records.faults import runs
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import Table
-from lbt_synth.validation import BoolArray, FloatArray, number
+from lbt_synth.validation import number
 
 _SHORTEST = 256  # frames side by side
 _ERRORS = 5.0  # between the shifts of two channels that differ
 _LEAST_SHIFT = 0.2  # frames, that are worth a word
 _PASSES = 3
+_NEAR_S = 1.0
 _ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
+_TINY = 1e-300
+_EXTRA = f"left out, because others show more and a design takes {MOST_UNITS - 1} channels"
 LEFT_OUT = ("dead", "saturated")
 
 
@@ -99,6 +102,9 @@ class AccelerometerTransfers:
         measurement of the same frame.
     rate_hz : float
         Readings per second, after averaging [Hz].
+    clock_ppm : float
+        By how much the clock of the readings runs faster than the loop's [1e-6]; 0 where the
+        record shows no difference. Motions and phases are those without it.
     """
 
     transfers: tuple[TransferRow, ...]
@@ -106,6 +112,7 @@ class AccelerometerTransfers:
     shift: ClockShift
     age_frames: int
     rate_hz: float
+    clock_ppm: float = 0.0
 
     @property
     def used(self) -> tuple[ChannelRow, ...]:
@@ -117,14 +124,27 @@ class AccelerometerTransfers:
     def shift_text(self) -> str:
         """The shift of the clocks in words."""
         if not self.used:
-            return "no channel shows a line, so the clocks were not compared."
+            return (
+                "no channel shows a line, so the clocks were not compared. If lines should show, "
+                "check the rate of the readings, and when they began (accelerometer_rate_hz)."
+            )
         size = f"{self.shift.frames:.3g} +- {self.shift.error_frames:.2g} frames"
+        rate = ""
+        if self.clock_ppm:
+            way = "faster" if self.clock_ppm > 0 else "slower"
+            rate = (
+                f" Their clock runs {abs(self.clock_ppm):.3g} ppm {way} than the loop's: motions "
+                "and phases hold for readings that do not drift against the frames."
+            )
         if self.shift.by_phases:
-            return f"the accelerometers lag behind the wavefront by {size}, by the phases of lines."
+            return (
+                f"the accelerometers lag behind the wavefront by {size}, by the phases of lines."
+                f"{rate}"
+            )
         return (
             f"the phases of the lines do not tell the shift of the clocks from motions out of "
             f"phase; the slope within the lines says {size}. Phases hold for a shift of "
-            f"{self.age_frames - 1}."
+            f"{self.age_frames - 1}.{rate}"
         )
 
     def tables(self) -> list[Table]:
@@ -142,7 +162,7 @@ def accelerometer_transfers(
     *,
     channels: Sequence[str] | None = None,
     false_alarm: float = 1e-3,
-    largest_shift_s: float = 1.0,
+    largest_shift_s: float = 10.0,
     earlier: Sequence[tuple[float, Mapping[str, complex]]] = (),
 ) -> AccelerometerTransfers:
     r"""Find how the channels of accelerometers move with the lines of an identified model.
@@ -203,7 +223,8 @@ def accelerometer_transfers(
     >>> round(found.transfers[0].motion_nm_per_nm, 1), found.channels[0].verdict
     (2.0, 'used for 31 Hz')
     """
-    readings, good = fill_missing(accelerations)
+    given = as_columns(accelerations)
+    readings, good = fill_missing(given)
     names = _names(channels, readings.shape[1])
     if len(model.axes) != record.axes:
         raise DimensionError(
@@ -211,7 +232,10 @@ def accelerometer_transfers(
         )
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
     largest = int(number(largest_shift_s, "largest_shift_s", at_least=0) * model.frame_rate_hz)
-    faults = [channel_fault(each[good], model.frame_rate_hz) for each in readings.T]
+    faults = [
+        channel_fault(raw, model.frame_rate_hz) if filled.any() else "dead"
+        for raw, filled in zip(given.T, readings.T, strict=True)
+    ]
     live = [c for c, fault in enumerate(faults) if fault not in LEFT_OUT]
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
     if not live or not places:
@@ -229,11 +253,16 @@ def accelerometer_transfers(
     widest = max(line.damping * line.frequency_hz for line in lines)
     tried = len(live) * len(lines) * (1 + np.ceil(4 * widest * largest / model.frame_rate_hz))
     limit = alarm / tried
-    lag, fits = _lay_and_fit(model, record, readings[:, live], good, lines, largest, limit)
-    shift, odd = _shifts([fit for fit in fits if _chance(fit) < limit], largest)
+    laid = lay_and_fit(model, record, readings[:, live], good, lines, largest, limit)
+    lag, fits = laid.lag, laid.fits
+    shift, odd = laid.shift, laid.odd
     rows = [_row(fit, names[live[fit[3]]], places, model, limit) for fit in fits]
     rows.sort(key=lambda row: (names.index(row.channel), row.frequency_hz))
     noises = {live[c]: _noise(fits, c, model.frame_rate_hz, limit) for c in range(len(live))}
+    shown = [row for row in rows if row.useful]
+    best = _best_channels(shown, {names[c]: noise for c, noise in noises.items()}, model)
+    extra = {row.channel for row in shown if row.channel not in best}
+    rows = [replace(row, useful=row.useful and row.channel in best) for row in rows]
     swapped = swapped_channels(_factors(rows), earlier) if earlier else {}
     wrong = {live[c]: f"shifted by {frames:.3g} frames against others" for c, frames in odd.items()}
     return AccelerometerTransfers(
@@ -243,7 +272,12 @@ def accelerometer_transfers(
                 channel=name,
                 noise_m_s2=noises.get(c, float("nan")),
                 verdict=_verdict(
-                    name, rows, faults[c], wrong.get(c, ""), _swap_text(swapped.get(name))
+                    name,
+                    rows,
+                    faults[c],
+                    wrong.get(c, ""),
+                    _swap_text(swapped.get(name)),
+                    _EXTRA if name in extra else "",
                 ),
             )
             for c, name in enumerate(names)
@@ -251,6 +285,7 @@ def accelerometer_transfers(
         shift=replace(shift, frames=shift.frames + lag),
         age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
+        clock_ppm=1e6 * laid.faster,
     )
 
 
@@ -261,85 +296,6 @@ def _names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
             f"channels must be {count} different names, one per column; got {', '.join(names)}."
         )
     return names
-
-
-def _lay_and_fit(
-    model: IdentifiedModel,
-    record: LoopRecord,
-    readings: FloatArray,
-    good: BoolArray,
-    lines: Sequence[IdentifiedLine],
-    largest: int,
-    limit: float,
-) -> tuple[int, list[Pair]]:
-    """Return the whole frames by which readings come late, and fits of them without that."""
-    gains, lag = np.array(model.sensor_gains), 0
-    errors = np.array([axis.sensor_gain_error or 0.0 for axis in model.axes])
-    series = record.pseudo_open_loop(gains)
-    moved = record.pseudo_open_loop(gains + errors) - series
-    for step in range(_PASSES):
-        frames = np.arange(record.frames) + lag
-        known = (frames >= 0) & (frames < len(readings))
-        index = np.where(known, frames, 0)
-        usable = record.usable & known & good[index]
-        stretches = [(int(a), int(b)) for a, b in runs(usable) if b - a >= _SHORTEST]
-        if not stretches:
-            raise ProblemError(
-                f"record and accelerations must have {_SHORTEST} usable frames in a row side by "
-                f"side; they have {record.frames} and {len(readings)} frames."
-            )
-        bands = line_bands(model, lines, series, moved, readings[index], stretches)
-        if step == 0 and (extra := likeliest_lag(bands, largest)):
-            lag += extra
-            continue
-        fits = fit_pairs(bands)
-        shift, _ = _shifts([fit for fit in fits if _chance(fit) < limit], largest)
-        sure = shift.by_phases or abs(shift.frames) > 3 * shift.error_frames
-        if step == _PASSES - 1 or not sure or not round(shift.frames):
-            break
-        lag += round(shift.frames)
-    return lag, fits
-
-
-def fit_pairs(bands: Sequence[LineBand]) -> list[Pair]:
-    """Return the fit of every channel with every line."""
-    out: list[Pair] = []
-    for channel in range(bands[0].readings.shape[1]):
-        factors = np.zeros(bands[0].expected.shape[1], dtype=complex)
-        for _ in range(_ROUNDS):
-            fits = [fit_band(band, channel, factors) for band in bands]
-            for band, fit in zip(bands, fits, strict=True):
-                factors[list(band.lines)] = fit.factors
-        out += [
-            (band, fit, j, channel)
-            for band, fit in zip(bands, fits, strict=True)
-            for j in range(len(band.lines))
-        ]
-    return out
-
-
-def _chance(pair: Pair) -> float:
-    return float(pair[1].chances[pair[2]])
-
-
-def _shifts(pairs: Sequence[Pair], largest: int) -> tuple[ClockShift, dict[int, float]]:
-    """Return the shift of the channels, and of those that have another, against the first."""
-    own = {
-        channel: clock_shift([pair for pair in pairs if pair[3] == channel], largest)
-        for channel in sorted({pair[3] for pair in pairs})
-    }
-    known = {channel: shift for channel, shift in own.items() if shift.by_phases}
-    if not known:
-        return clock_shift(pairs, largest), {}
-    middle = sorted(known.values(), key=lambda shift: shift.frames)
-    common = min(middle[(len(middle) - 1) // 2 : len(middle) // 2 + 1], key=lambda s: abs(s.frames))
-    odd = {
-        channel: shift.frames - common.frames
-        for channel, shift in known.items()
-        if abs(shift.frames - common.frames)
-        > max(_ERRORS * np.hypot(shift.error_frames, common.error_frames), _LEAST_SHIFT)
-    }
-    return clock_shift([pair for pair in pairs if pair[3] not in odd], largest), odd
 
 
 def _row(
@@ -355,18 +311,42 @@ def _row(
         motion_nm_per_nm=float(abs(factor)),
         motion_error_nm_per_nm=error,
         phase_deg=float(np.degrees(np.angle(factor))),
-        phase_error_deg=float(min(np.degrees(across / max(abs(factor), 1e-300)), 180.0)),
+        phase_error_deg=float(min(np.degrees(across / max(abs(factor), _TINY)), 180.0)),
         coherence=float(fit.coherences[j]),
-        chance=_chance(pair),
-        useful=_chance(pair) < limit,
+        chance=chance(pair),
+        useful=chance(pair) < limit,
     )
 
 
 def _noise(pairs: Sequence[Pair], channel: int, rate: float, limit: float) -> float:
     """Return the noise of a reading near the lines that a channel shows, or near all [m/s^2]."""
     own = [pair for pair in pairs if pair[3] == channel]
-    shown = [pair for pair in own if _chance(pair) < limit] or own
+    shown = [pair for pair in own if chance(pair) < limit] or own
     return float(np.sqrt(np.mean([pair[1].noise[pair[2]] for pair in shown]) * rate / 2))
+
+
+def _best_channels(
+    rows: Sequence[TransferRow], noises: Mapping[str, float], model: IdentifiedModel
+) -> list[str]:
+    """Return the channels that tell most of the lines' power, as many as a design takes."""
+    known: dict[str, dict[int, float]] = {row.channel: {} for row in rows}
+    for row in rows:
+        line = model.parts[row.line]
+        size = NM * (2 * np.pi * line.frequency_hz) ** 2 * line.rms_nm * row.motion_nm_per_nm
+        known[row.channel][row.line] = float((size / max(noises[row.channel], _TINY)) ** 2)
+    best: list[str] = []
+
+    def worth(channel: str) -> float:
+        chosen = [*best, channel]
+        return sum(
+            model.parts[line].rms_nm ** 2
+            * math.log1p(sum(known[each].get(line, 0.0) for each in chosen))
+            for line in {row.line for row in rows}
+        )
+
+    while len(best) < min(len(known), MOST_UNITS - 1):
+        best.append(max((each for each in known if each not in best), key=worth))
+    return best
 
 
 def _factors(rows: Sequence[TransferRow]) -> dict[str, list[Factor]]:

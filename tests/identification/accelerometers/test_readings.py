@@ -1,0 +1,118 @@
+"""Readings of accelerometers from files: units, rates, clocks, and what is missing."""
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.identification.accelerometers.readings import (
+    fill_missing,
+    load_readings,
+    resample,
+)
+
+RATE = 1000.0
+FRAMES = 4000
+
+
+def shaking(time_s):
+    """Return two channels at some times."""
+    return np.column_stack(
+        [np.sin(2 * np.pi * 31 * time_s), 0.3 * np.cos(2 * np.pi * 77 * time_s + 1)]
+    )
+
+
+def middles(rate_hz, count):
+    """Return the times at the middle of the periods of a clock [s]."""
+    return (np.arange(count) + 0.5) / rate_hz
+
+
+@pytest.mark.parametrize("rate_hz", [1000.2, 1024.0, 1280.0])
+def test_readings_of_any_rate_lie_on_the_frames(rate_hz):
+    own = shaking(middles(rate_hz, int(FRAMES * rate_hz / RATE) + 1))
+    laid = resample(own, rate_hz, RATE)
+    assert len(laid) == FRAMES
+    inner = slice(10, -10)
+    np.testing.assert_allclose(laid[inner], shaking(middles(RATE, FRAMES))[inner], atol=1e-3)
+
+
+def test_faster_readings_are_averaged():
+    own = np.random.default_rng(0).standard_normal((3 * 500, 2))
+    np.testing.assert_allclose(
+        resample(own, 3 * RATE, RATE), own.reshape(500, 3, 2).mean(axis=1), rtol=1e-12
+    )
+    fast = middles(2.5 * RATE, int(2.5 * FRAMES))
+    assert np.abs(resample(shaking(fast), 2.5 * RATE, RATE)).max() < 1.01
+
+
+def test_slower_readings_are_refused():
+    with pytest.raises(lbt.errors.ProblemError, match="at least once a frame"):
+        resample(np.zeros((100, 1)), 999, RATE)
+
+
+def test_frames_beside_a_missing_reading_are_missing():
+    own = shaking(middles(1024, 2000))
+    own[700, 1] = np.nan
+    gone = np.flatnonzero(np.isnan(resample(own, 1024, RATE)[:, 1]))
+    assert 1 <= len(gone) <= 2
+    assert abs(gone[0] - 700 / 1.024) < 2
+    assert np.isfinite(resample(own, 1024, RATE)[:, 0]).all()
+
+
+def write(path, heading, *columns):
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=heading, comments="")
+    return path
+
+
+def test_times_give_the_rate_and_the_gaps(tmp_path):
+    time_s = np.delete(middles(1024, 4100), slice(2000, 2040))
+    path = write(tmp_path / "a.csv", "t,m1,m2", 1e3 + time_s, *shaking(time_s).T)
+    found = load_readings(path, RATE)
+    assert found.channels == ("m1", "m2")
+    missing = np.isnan(found.values[:, 0])
+    assert 38 <= missing.sum() <= 42
+    good = slice(2200, 3900)
+    expected = shaking(middles(RATE, len(found.values)))
+    np.testing.assert_allclose(found.values[good], expected[good], atol=1e-3)
+    assert any("1024" in note for note in found.notes)
+
+
+def test_units_of_headings_count(tmp_path):
+    series = shaking(middles(RATE, 200))
+    for unit, factor in (("g", 9.80665), ("m/s^2", 1.0), ("m s-2", 1.0), ("mm/s2", 1e-3)):
+        path = write(tmp_path / "a.csv", f"m1 [{unit}],m2 [{unit}]", *series.T)
+        np.testing.assert_allclose(load_readings(path, RATE).values, factor * series, rtol=1e-9)
+    with pytest.raises(lbt.errors.TelemetryError, match="which is right"):
+        load_readings(path, RATE, unit="g")
+    path = write(tmp_path / "a.csv", "m1 [mV],m2 [mV]", *series.T)
+    with pytest.raises(lbt.errors.TelemetryError, match="'mV'. Scale them"):
+        load_readings(path, RATE)
+    np.testing.assert_allclose(load_readings(path, RATE, unit="mg").values, 9.80665e-3 * series)
+
+
+def test_an_offset_is_said(tmp_path):
+    series = shaking(middles(RATE, 2000)) + np.array([9.81, 0])
+    found = load_readings(write(tmp_path / "a.csv", "m1,m2", *series.T), RATE)
+    (note,) = (note for note in found.notes if "offset" in note)
+    assert "m1 have an offset" in note
+
+
+def test_held_values_and_spikes_are_missing_and_short_gaps_bridged():
+    rng = np.random.default_rng(1)
+    truth = shaking(middles(RATE, FRAMES)) + 0.01 * rng.standard_normal((FRAMES, 2))
+    given = truth.copy()
+    given[1000:1300] = 0.0
+    given[2000, 0], given[3000, 1] = np.nan, 50.0
+    values, good = fill_missing(given)
+    assert not good[1000:1300].any()
+    assert good[:1000].all()
+    assert good[1300:].all()
+    np.testing.assert_allclose(values[1300:], truth[1300:], atol=0.2)
+
+
+def test_a_channel_that_stops_spoils_no_frame_of_the_others():
+    given = np.random.default_rng(1).standard_normal((FRAMES, 2))
+    given[1000:, 1] = given[1000, 1]
+    values, good = fill_missing(given)
+    assert good.all()
+    assert not values[:, 1].any()
+    np.testing.assert_array_equal(values[:, 0], given[:, 0])
