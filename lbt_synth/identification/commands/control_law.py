@@ -43,6 +43,7 @@ _LEAKY = 0.5  # least pole of a leaky one
 _PURE = 1e-6
 _ROUNDING = 1e-12
 _AS_GOOD = 0.9
+_SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _COUNTS = 0.05  # of the largest weight of an axis
 _ROUGH = 0.05  # residual beyond which a law that knows the future is doubtful
 
@@ -120,6 +121,11 @@ class ControlLaw:
     def exact(self) -> bool:
         """Whether the law leaves nothing but rounding."""
         return self.kind != "none" and self.residual < _EXACT
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it explains so much that its lag counts."""
+        return self.kind != "none" and self.residual < _SURE
 
     @property
     def axis_lags(self) -> IntArray:

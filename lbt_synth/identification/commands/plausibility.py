@@ -10,8 +10,10 @@ from typing import TypeAlias
 import numpy as np
 
 from lbt_synth.errors import NumericalError
+from lbt_synth.identification.commands.axis_matrix import classify_matrix
+from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS
 from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
+from lbt_synth.identification.commands.guesses import CoarseRecord, Comparison, Guess
 from lbt_synth.identification.commands.law_controller import law_controller
 from lbt_synth.identification.fit.fitting import Search, cost
 from lbt_synth.identification.fit.order_search import find_components, try_other_gains
@@ -21,11 +23,16 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import BoolArray, FloatArray
 
 _NEAR_ONE = 0.2  # distance from 1 of the pole of a law that adds up
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _STABLE = 1 - 1e-9  # spectral radius below which a loop has run
+_UNUSUAL = 10.0  # nats that a law asks for which no one would run
+_GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
+_TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
+_NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
+_NEAR = 0.4  # such a distance that a coarse gain may have
 _SEGMENT_S = 6.0
 _ROUNDS, _LINES = 3, 10  # of the search for lines
 
@@ -69,6 +76,60 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     )
     moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
+
+
+def score_guesses(
+    compared: Comparison, record: LoopRecord, law: ControlLaw | None, lag: int
+) -> tuple[FloatArray, BoolArray]:
+    """Return the contrast of guesses with what their laws cost, and which laws are surprising.
+
+    A loop that would have been unstable has not run.
+    """
+    surprising = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
+    assert record.delay_frames is not None
+    simple = np.array(
+        [
+            guess.is_simple and (record.delay_frames + guess.shift_frames) % 1 == 0
+            for guess in compared.guesses
+        ]
+    )
+    simple[0] = True
+    score = compared.contrast + _UNUSUAL * surprising + _GENERAL * ~simple
+    if law is not None and law.is_sure:
+        ones = np.ones((1, record.axes))
+        each = zip(compared.guesses, compared.gain.T, strict=True)
+        possible = np.array(
+            [
+                could_have_run(guess, np.vstack([gain, 0.3 * gain, *_TRIED * ones]), record, law)
+                for guess, gain in each
+            ]
+        )
+        if possible.any():
+            score = np.where(possible, score, np.inf)
+            surprising |= ~possible
+    if surprising[0] and not surprising.all():  # the law says what is wrong
+        score[1:][surprising[1:]] = np.inf
+        away = abs(np.log(compared.gain / np.clip(compared.gain, *PLAUSIBLE_GAINS))).max(axis=0)
+        nearest = np.min(away[~surprising])
+        memoryless = law is not None and law.order == 0  # it would hold nothing
+        if nearest < (_NEAR if memoryless else _NEARER * away[0]):  # and so does the sensor
+            score[0] = np.inf
+    return score, surprising
+
+
+def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
+    """Return whether a guess makes the control law one that no one would run."""
+    if law is None or law.kind == "none":
+        return guess.shift_frames != 0
+    if guess.kind == "shift":
+        return guess.shift_frames != -lag or lag == 0
+    if guess.kind in ("as given", "clipped") and lag:
+        return True
+    if (guess.kind == "increments") == already_integrates(law):
+        return True
+    matrix = np.eye(len(law.gain)) if guess.matrix is None else guess.matrix
+    turned = classify_matrix(matrix @ law.gain)
+    return turned.kind != "diagonal" or min(turned.signs) < 0
 
 
 def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: bool) -> float:

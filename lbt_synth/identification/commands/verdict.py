@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import ProblemError, RecordError
-from lbt_synth.identification.commands.axis_matrix import classify_matrix
 from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factor
 from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
 from lbt_synth.identification.commands.explanations import (
@@ -27,28 +26,22 @@ from lbt_synth.identification.commands.guesses import (
 )
 from lbt_synth.identification.commands.held_commands import held_while_moving
 from lbt_synth.identification.commands.plausibility import (
-    already_integrates,
     could_have_run,
     finer_saving,
     finer_saving_of_gain,
+    score_guesses,
 )
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each, require_instance
+from lbt_synth.validation import FloatArray, frozen_copy, one_or_each, require_instance
 
 AS_GIVEN = "as given"
 _CLEAR = 20.0  # nats that decide
 _CLEAR_FINER = 8.0  # the same by the criterion of the fit, where a shift is of whole frames
 _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
-_UNUSUAL = 10.0  # nats that a law asks for which no one would run
-_GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
 _FOLLOWED = 0.5  # coherence of an axis whose lag counts
-_SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _INSIDE = 8  # gains that are tried of the plausible ones
-_NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
-_NEAR = 0.4  # such a distance that a coarse gain may have
-_TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 
@@ -170,7 +163,7 @@ def explain_commands(
     law, lag, nothing = _find_law(record), 0, np.full(record.axes, np.nan)
     if held := held_while_moving(record):
         return CommandVerdict(explanation=held, accepted=False, gain=nothing, law=law)
-    if law is not None and _is_sure(law):
+    if law is not None and law.is_sure:
         lag, lags = law.lag_frames, law.axis_lags
         if np.ptp(lags[law.axis_coherence > _FOLLOWED]):  # no real-time computer does that
             return CommandVerdict(
@@ -227,10 +220,6 @@ def _find_law(record: LoopRecord) -> ControlLaw | None:
         return None
 
 
-def _is_sure(law: ControlLaw) -> bool:
-    return law.kind != "none" and law.residual < _SURE
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Best:
     """The best explanation of a record, and what decides about it."""
@@ -255,8 +244,14 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     if any(guess.kind == "clipped" for guess in guesses):
         guesses.append(_best_limits(compared))
         compared = compared.join(coarse.compare(guesses[-1:]))
-    score, surprising = _score(compared, record, law, lag)
+    score, surprising = score_guesses(compared, record, law, lag)
     best = int(np.argmin(score))
+    asked = np.flatnonzero(~surprising)  # what the law asks for, which the coarse spectrum may miss
+    if surprising[[0, best]].all() and asked.size:
+        other = int(asked[np.argmin(score[asked])])
+        saving = finer_saving(coarse, guesses[other], clear=_CLEAR_FINER, decides=True)
+        if saving >= _CLEAR_FINER:
+            best, score[0] = other, np.inf
     clear = _CLEAR * compared.dispersion(best)
     if law is None or law.kind == "none":
         unrelated = coarse.compare(guesses[:1], np.zeros((record.axes, 1)))
@@ -293,66 +288,12 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     )
 
 
-def _score(
-    compared: Comparison, record: LoopRecord, law: ControlLaw | None, lag: int
-) -> tuple[FloatArray, BoolArray]:
-    """Return the contrast of guesses with what their laws cost, and which laws are surprising.
-
-    A loop that would have been unstable has not run.
-    """
-    surprising = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
-    assert record.delay_frames is not None
-    simple = np.array(
-        [
-            guess.is_simple and (record.delay_frames + guess.shift_frames) % 1 == 0
-            for guess in compared.guesses
-        ]
-    )
-    simple[0] = True
-    score = compared.contrast + _UNUSUAL * surprising + _GENERAL * ~simple
-    if law is not None and _is_sure(law):
-        ones = np.ones((1, record.axes))
-        each = zip(compared.guesses, compared.gain.T, strict=True)
-        possible = np.array(
-            [
-                could_have_run(guess, np.vstack([gain, 0.3 * gain, *_TRIED * ones]), record, law)
-                for guess, gain in each
-            ]
-        )
-        if possible.any():
-            score = np.where(possible, score, np.inf)
-            surprising |= ~possible
-    if surprising[0] and not surprising.all():  # the law says what is wrong
-        score[1:][surprising[1:]] = np.inf
-        away = abs(np.log(compared.gain / np.clip(compared.gain, *PLAUSIBLE_GAINS))).max(axis=0)
-        nearest = np.min(away[~surprising])
-        memoryless = law is not None and law.order == 0  # it would hold nothing
-        if nearest < (_NEAR if memoryless else _NEARER * away[0]):  # and so does the sensor
-            score[0] = np.inf
-    return score, surprising
-
-
 def _best_limits(compared: Comparison) -> Guess:
     """Return the guess of clipped commands with the best limit of each axis."""
     places = [i for i, guess in enumerate(compared.guesses) if guess.limit_nm is not None]
     limits = np.array([compared.guesses[i].limit_nm for i in places])
     best = np.argmin(compared.axis_contrast[:, places], axis=1)
     return Guess(kind="clipped", limit_nm=limits[best, np.arange(best.size)])
-
-
-def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
-    """Return whether a guess makes the control law one that no one would run."""
-    if law is None or law.kind == "none":
-        return guess.shift_frames != 0
-    if guess.kind == "shift":
-        return guess.shift_frames != -lag or lag == 0
-    if guess.kind in (AS_GIVEN, "clipped") and lag:
-        return True
-    if (guess.kind == "increments") == already_integrates(law):
-        return True
-    matrix = np.eye(len(law.gain)) if guess.matrix is None else guess.matrix
-    turned = classify_matrix(matrix @ law.gain)
-    return turned.kind != "diagonal" or min(turned.signs) < 0
 
 
 def _find_scale(
@@ -371,7 +312,7 @@ def _find_scale(
     gain = float(np.exp(np.mean(np.log(found.gain))))
     tried = inside[:, None] * np.ones(len(bounded))
     record = coarse.record
-    if law is not None and _is_sure(law):
+    if law is not None and law.is_sure:
         if not could_have_run(found.guess, tried, record, law):
             return factor
         if gain < low:  # commands that are too large come from a law that is too strong
