@@ -15,6 +15,7 @@ from lbt_synth.identification import (
     accelerometer_transfers,
     identify,
 )
+from lbt_synth.identification.accelerometers.replayed_channels import drop_harmful
 
 
 def run(arguments: Namespace) -> Report:
@@ -44,6 +45,7 @@ def run(arguments: Namespace) -> Report:
             channels=readings.channels,
             earlier=earlier,
         )
+        found = drop_harmful(found, model, record, readings.values)
         loop_records.add_accelerometers(report, found)
         report.notes += [f"note: {note}." for note in readings.notes]
     report.notes += [loop_records.marked_note(note) for note in notes]

@@ -14,7 +14,6 @@ from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import AccelerometerTransfers, IdentifiedModel
-from lbt_synth.models.fusion.sensors import LONGEST_DELAY
 from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")
@@ -156,11 +155,11 @@ def _accelerometer_section(
     found: AccelerometerTransfers, delay_frames: float, comments: dict[str, str]
 ) -> dict[str, Any]:
     """Return the section of the channels that are used, and comment on their delay."""
-    age, path = found.age_frames, f"sensors.{_NAME}.delay_frames"
+    age, path = found.loop_age(delay_frames), f"sensors.{_NAME}.delay_frames"
     comments[path] = f"readings come {age - 1} frames after the wavefront's"
-    if age < 0 or not 0 < age + delay_frames - 1 <= LONGEST_DELAY:
-        comments[path] = f"not known: the clocks were {age - 1} frames apart; give the real delay"
-        age = 1
+    if age != found.age_frames:
+        apart = found.age_frames - 1
+        comments[path] = f"not known: the clocks were {apart} frames apart; give the real delay"
     elif found.clock_ppm:
         comments[path] += f" in the middle; the clocks drift by {found.clock_ppm:.3g} ppm"
     return {

@@ -76,7 +76,7 @@ def lay_and_fit(
 
     lag = likeliest_lag(bands(side_by_side()), largest)
     if faster := clock_rate(bands, side_by_side()):
-        readings, good = _at_rate(readings, good, faster, lag + record.frames / 2)
+        readings, good = at_loop_rate(readings, good, faster, lag + record.frames / 2)
         lag += likeliest_lag(bands(side_by_side()), _near(model))
     for step in range(_PASSES):
         fits = fit_pairs(bands(side_by_side()))
@@ -93,7 +93,7 @@ def _near(model: IdentifiedModel) -> int:
     return round(_NEAR_S * model.frame_rate_hz)
 
 
-def _at_rate(
+def at_loop_rate(
     readings: FloatArray, good: BoolArray, faster: float, middle: float
 ) -> tuple[FloatArray, BoolArray]:
     """Return readings as a clock of the loop's rate gives them, the same in the middle."""

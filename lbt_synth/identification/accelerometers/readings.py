@@ -21,6 +21,7 @@ from lbt_synth.linear.cubic_spline import cubic_spline
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
+_MOST_M_S2 = 1e12
 _BRIDGED = 3  # frames of a gap
 _NAME = re.compile(r"\w[\w .+-]*$")
 _SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
@@ -69,7 +70,9 @@ def load_readings(
     names = [each.name.strip() for each in found]
     if not all(_NAME.match(name) for name in names) or len(set(names)) < len(names):
         names = [f"channel{c + 1}" for c in range(len(found))]
-    values = np.stack([_m_s2(each, unit, source) * each.values for each in found], axis=1)
+    values = as_columns(
+        np.stack([_m_s2(each, unit, source) * each.values for each in found], axis=1)
+    )
     values, own_hz, notes = _on_own_clock(contents, values, rate_hz, frame_rate_hz)
     if own_hz != frame_rate_hz:
         values = resample(values, own_hz, frame_rate_hz)
@@ -111,7 +114,9 @@ def _on_own_clock(
     contents: Contents, values: FloatArray, rate_hz: float | None, frame_rate_hz: float
 ) -> tuple[FloatArray, float, list[str]]:
     """Return readings without jumps in time, NaN where rows are missing, and their rate."""
-    stated = {rate_hz} if rate_hz else set(contents.facts.get("frame_rate_hz", {}).values())
+    stated = (
+        {rate_hz} if rate_hz is not None else set(contents.facts.get("frame_rate_hz", {}).values())
+    )
     if len(stated) > 1:
         raise ProblemError(
             "the file of the accelerometers gives several rates: "
@@ -149,6 +154,11 @@ def resample(values: FloatArray, rate_hz: float, frame_rate_hz: float) -> FloatA
         )
     many = max(round(ratio), 1)
     frames = int(np.floor(len(values) / ratio * (1 + _SAME)))
+    if frames < 1:
+        raise ProblemError(
+            f"accelerations must last a frame of the loop, {1 / frame_rate_hz:g} s; got "
+            f"{len(values)} readings at {rate_hz:g} Hz. Is the rate right?"
+        )
     if abs(ratio - many) <= _SAME * many:
         whole = values[: frames * many].reshape(-1, many, values.shape[1])
         return np.asarray(whole.mean(axis=1))
@@ -199,4 +209,10 @@ def as_columns(accelerations: ArrayLike) -> FloatArray:
     given = given[:, None] if given.ndim == 1 else given
     if given.ndim != 2 or given.size == 0:
         raise DimensionError(f"accelerations must be (frames, channels); got {given.shape}.")
+    largest = float(np.max(np.abs(given), initial=0.0, where=np.isfinite(given)))
+    if largest > _MOST_M_S2:
+        raise ProblemError(
+            f"accelerations must be at most {_MOST_M_S2:g} m/s^2; got {largest:.3g}. Is the unit "
+            "right?"
+        )
     return given

@@ -23,6 +23,7 @@ from lbt_synth.identification.accelerometers.readings import as_columns, fill_mi
 from lbt_synth.identification.accelerometers.swapped import Factor, swapped_channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.models.fusion.sensors import LONGEST_DELAY
 from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import Table
 from lbt_synth.validation import number
@@ -34,6 +35,7 @@ _PASSES = 3
 _NEAR_S = 1.0
 _ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
 _TINY = 1e-300
+_USED = "used for"
 _EXTRA = f"left out, because others show more and a design takes {MOST_UNITS - 1} channels"
 LEFT_OUT = ("dead", "saturated")
 
@@ -119,6 +121,32 @@ class AccelerometerTransfers:
         """The channels that show a line."""
         names = {row.channel for row in self.transfers if row.useful}
         return tuple(row for row in self.channels if row.channel in names)
+
+    def loop_age(self, delay_frames: float) -> int:
+        """Return the age of a reading in a loop of some delay: 1 where the clocks hide it."""
+        known = self.age_frames >= 0 and 0 < self.age_frames + delay_frames - 1 <= LONGEST_DELAY
+        return self.age_frames if known else 1
+
+    def noisier(self, factor: float) -> AccelerometerTransfers:
+        """Return the same with so many times the noise."""
+        rows = (replace(row, noise_m_s2=factor * row.noise_m_s2) for row in self.channels)
+        return replace(self, channels=tuple(rows))
+
+    def without(self, channels: Sequence[str], why: str) -> AccelerometerTransfers:
+        """Return the same with some channels not used, for a reason."""
+        return replace(
+            self,
+            transfers=tuple(
+                replace(row, useful=row.useful and row.channel not in channels)
+                for row in self.transfers
+            ),
+            channels=tuple(
+                replace(row, verdict=f"{why}; {row.verdict.replace(_USED, 'shows')}")
+                if row.channel in channels
+                else row
+                for row in self.channels
+            ),
+        )
 
     @property
     def shift_text(self) -> str:
@@ -262,10 +290,9 @@ def accelerometer_transfers(
     shown = [row for row in rows if row.useful]
     best = _best_channels(shown, {names[c]: noise for c, noise in noises.items()}, model)
     extra = {row.channel for row in shown if row.channel not in best}
-    rows = [replace(row, useful=row.useful and row.channel in best) for row in rows]
     swapped = swapped_channels(_factors(rows), earlier) if earlier else {}
     wrong = {live[c]: f"shifted by {frames:.3g} frames against others" for c, frames in odd.items()}
-    return AccelerometerTransfers(
+    found = AccelerometerTransfers(
         transfers=tuple(rows),
         channels=tuple(
             ChannelRow(
@@ -277,7 +304,6 @@ def accelerometer_transfers(
                     faults[c],
                     wrong.get(c, ""),
                     _swap_text(swapped.get(name)),
-                    _EXTRA if name in extra else "",
                 ),
             )
             for c, name in enumerate(names)
@@ -287,6 +313,7 @@ def accelerometer_transfers(
         rate_hz=model.frame_rate_hz,
         clock_ppm=1e6 * laid.faster,
     )
+    return found.without(sorted(extra), _EXTRA) if extra else found
 
 
 def _names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
@@ -366,5 +393,5 @@ def _swap_text(other: str | None) -> str:
 def _verdict(name: str, rows: Sequence[TransferRow], *wrong: str) -> str:
     """Return what a channel is used for, and what is wrong with it, in words."""
     lines = [f"{row.frequency_hz:.3g}" for row in rows if row.channel == name and row.useful]
-    use = f"used for {', '.join(lines)} Hz" if lines else "adds nothing"
+    use = f"{_USED} {', '.join(lines)} Hz" if lines else "adds nothing"
     return "; ".join([*(text for text in wrong if text), use])

@@ -49,6 +49,13 @@ def test_slower_readings_are_refused():
         resample(np.zeros((100, 1)), 999, RATE)
 
 
+def test_rates_that_leave_no_frame_are_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((100, 2)))
+    for rate_hz, words in ((1e9, "Is the rate right"), (0, "above 0")):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            load_readings(tmp_path / "a.npy", RATE, rate_hz=rate_hz)
+
+
 def test_frames_beside_a_missing_reading_are_missing():
     own = shaking(middles(1024, 2000))
     own[700, 1] = np.nan

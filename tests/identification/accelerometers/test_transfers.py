@@ -153,6 +153,15 @@ def test_channels_that_fail_are_named_and_left_out():
     assert [row.channel for row in found.used] == ["channel1", "channel6"]
 
 
+def test_a_channel_that_is_cut_off_on_one_side_is_left_out():
+    good = reading(2.0, -0.7, 1.3, noise=1e-3)
+    found = find(good, np.minimum(good, 1.5 * good.std()) + 9.81, 1e-200 * good)
+    assert [row.verdict for row in found.channels[1:]] == [
+        "saturated; adds nothing",
+        "dead; adds nothing",
+    ]
+
+
 def test_a_channel_with_another_clock_is_named():
     channels = [reading(2.0, -0.7, 1.3, noise=1e-3, seed=k, age=1 + 4 * (k == 2)) for k in range(3)]
     found = find(*channels)
@@ -220,6 +229,7 @@ def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used(
         (np.ones((100, 2, 2)), {}, r"must be \(frames, channels\)"),
         (np.ones((FRAMES, 2)), {"channels": ["a", "a"]}, "2 different names"),
         (np.ones(FRAMES), {"false_alarm": 2}, "false_alarm"),
+        (1e200 * np.ones(FRAMES), {}, "Is the unit right"),
         (np.random.default_rng(0).standard_normal(100), {}, "usable frames in a row"),
     ],
 )
