@@ -269,10 +269,7 @@ def accelerometer_transfers(
     if not live or not places:
         return AccelerometerTransfers(
             transfers=(),
-            channels=tuple(
-                ChannelRow(channel=name, noise_m_s2=float("nan"), verdict=_verdict(name, (), fault))
-                for name, fault in zip(names, faults, strict=True)
-            ),
+            channels=_channel_rows(names, (), {}, [(fault,) for fault in faults]),
             shift=clock_shift((), largest),
             age_frames=1,
             rate_hz=model.frame_rate_hz,
@@ -282,8 +279,7 @@ def accelerometer_transfers(
     tried = len(live) * len(lines) * (1 + np.ceil(4 * widest * largest / model.frame_rate_hz))
     limit = alarm / tried
     laid = lay_and_fit(model, record, readings[:, live], good, lines, largest, limit)
-    lag, fits = laid.lag, laid.fits
-    shift, odd = laid.shift, laid.odd
+    lag, fits, shift, odd = laid.lag, laid.fits, laid.shift, laid.odd
     rows = [_row(fit, names[live[fit[3]]], places, model, limit) for fit in fits]
     rows.sort(key=lambda row: (names.index(row.channel), row.frequency_hz))
     noises = {live[c]: _noise(fits, c, model.frame_rate_hz, limit) for c in range(len(live))}
@@ -292,28 +288,35 @@ def accelerometer_transfers(
     extra = {row.channel for row in shown if row.channel not in best}
     swapped = swapped_channels(_factors(rows), earlier) if earlier else {}
     wrong = {live[c]: f"shifted by {frames:.3g} frames against others" for c, frames in odd.items()}
+    troubles = [
+        (fault, wrong.get(c, ""), _swap_text(swapped.get(names[c])))
+        for c, fault in enumerate(faults)
+    ]
     found = AccelerometerTransfers(
         transfers=tuple(rows),
-        channels=tuple(
-            ChannelRow(
-                channel=name,
-                noise_m_s2=noises.get(c, float("nan")),
-                verdict=_verdict(
-                    name,
-                    rows,
-                    faults[c],
-                    wrong.get(c, ""),
-                    _swap_text(swapped.get(name)),
-                ),
-            )
-            for c, name in enumerate(names)
-        ),
+        channels=_channel_rows(names, rows, noises, troubles),
         shift=replace(shift, frames=shift.frames + lag),
         age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
         clock_ppm=1e6 * laid.faster,
     )
     return found.without(sorted(extra), _EXTRA) if extra else found
+
+
+def _channel_rows(
+    names: Sequence[str],
+    rows: Sequence[TransferRow],
+    noises: Mapping[int, float],
+    troubles: Sequence[Sequence[str]],
+) -> tuple[ChannelRow, ...]:
+    return tuple(
+        ChannelRow(
+            channel=name,
+            noise_m_s2=noises.get(c, float("nan")),
+            verdict=_verdict(name, rows, *own),
+        )
+        for c, (name, own) in enumerate(zip(names, troubles, strict=True))
+    )
 
 
 def _names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
