@@ -344,8 +344,8 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     require_instance(plant, TipTiltPlant)
     hardware, factor = plant.hardware, plant.D[:, -plant.hardware.n_measurements :]
     lines = tuple(map(ensemble_vibration, plant.vibrations))
-    air = LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
-    disturbed = _ensemble_variances(hardware, law, air)
+    conditions = LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
+    disturbed = _ensemble_variances(hardware, law, conditions)
 
     def from_noise(gain: float) -> float:
         loop = close_loop(hardware, law.controller(hardware, gain))
@@ -366,7 +366,7 @@ def _ensemble_variances(
     def variances(gains: FloatArray) -> FloatArray:
         factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
         scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
-        loops = replace(ensemble, loops=len(gains))
+        loops = replace(ensemble, loops=gains.size)
         return residuals_from_matrices(scaled, hardware, loops).rms_nm ** 2
 
     return variances

@@ -28,8 +28,10 @@ def held_while_moving(record: LoopRecord) -> str:
     assert record.commands is not None
     corrections = past_corrections(record.mirror_taps, record.commands)
     still = np.array([_still(column, record.usable) for column in corrections.T])
+    if not np.any(still):
+        return ""
     moving = CoarseRecord(replace(record, usable=record.usable & ~np.any(still, axis=0)))
-    if not (np.any(still) and moving.stretches):
+    if not moving.stretches:
         return ""
     gains = moving.compare([Guess(kind="as given")]).gain[:, 0]
     opened = record.measurements + gains * corrections
