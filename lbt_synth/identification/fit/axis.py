@@ -13,6 +13,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import GAINS, LOWEST_LINE_HZ, MOST_LINES, Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.order_search import (
+    find_coloured_rival,
     search_model,
     search_models,
     try_other_gains,
@@ -140,10 +141,12 @@ def identify_axis(
         return describe_axis(search, model, None, "1: of an open loop it has no meaning")
     model, near = _compare_gains(search, model, rivals)
     own = model.spectrum
+    own_error = standard_errors(own, parameter_covariance(model)).log_gain
+    coloured = find_coloured_rival(search, model, own_error)
+    near += [] if coloured is None else [coloured]
     away = max((abs(each.spectrum.log_gain - own.log_gain) for each in near), default=0.0)
     colours = np.tanh([own.colour, *(each.spectrum.colour for each in near)])
     unknown = float(np.ptp(colours))  # correlation of the noise
-    own_error = standard_errors(model.spectrum, parameter_covariance(model)).log_gain
     error = max(own_error, away)
     if error <= _GAIN_ERROR:
         poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""

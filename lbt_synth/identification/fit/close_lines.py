@@ -16,7 +16,7 @@ import numpy as np
 from lbt_synth.identification.fit.fitting import Search, lies_in_skirts
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.scoring import SEARCHED, Priors
-from lbt_synth.identification.fit.spectrum_model import WIDE_DAMPING, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import SpectrumModel
 from lbt_synth.identification.fit.whittle import contrast, density, minimise
 
 _LIKELY = 5.5  # log-likelihood that a split rarely adds to a single line
@@ -36,11 +36,7 @@ def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
     """Yield notes on lines that may be several, and on lines that are hardly separate."""
     search, model = Search(data=axis.data), axis.fitted_model
     spectrum = model.spectrum
-    lines = [
-        i
-        for i, c in enumerate(spectrum.components)
-        if c.kind == "line" and c.damping_ratio < WIDE_DAMPING
-    ]
+    lines = [i for i, c in enumerate(spectrum.components) if c.is_narrow]
     for i in lines:
         place = (
             f"warning: the line of axis {name} at {search.place(spectrum.components[i])[0]:.4g} Hz"

@@ -249,13 +249,16 @@ def required_gain(
 def lies_in_skirts(
     search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
 ) -> bool:
-    """Whether a component is a line close to another (with ``earlier``, to one before it)."""
+    """Whether a component is a line close to another (with ``earlier``, to one before it).
+
+    All lie in the skirts of a wide resonance, which says nothing about where to look for them.
+    """
     component = spectrum.components[i]
-    if component.kind != "line":
+    if not component.is_narrow:
         return False
     centre, half = search.place(component)
     others = spectrum.components[:i] if earlier else spectrum.exchange(i).components
-    places = [search.place(other) for other in others if other.kind == "line"]
+    places = [search.place(other) for other in others if other.is_narrow]
     return any(abs(centre - at) < 4 * (half + its_half) for at, its_half in places)
 
 

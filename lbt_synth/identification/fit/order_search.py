@@ -22,7 +22,6 @@ from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import (
     NO_CORNER,
-    WIDE_DAMPING,
     Kind,
     SpectrumModel,
     damping_parameter,
@@ -41,6 +40,8 @@ _MOST_ROUNDS = 12
 _HALF = float(np.log(0.5))
 _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
+_SIGNIFICANT = 1.92  # log-likelihood that one parameter too many adds in 5 % of the cases
+_FAR_GAIN = 3.0  # standard errors by which a colour of the noise moves a gain that is doubted
 _OTHER_NOISE = 5.0  # log-likelihood by which white noise or a coloured one is excluded
 _COLOUR = 0.3  # of the noise, where a fit begins
 
@@ -62,8 +63,7 @@ def search_models(search: Search, start: SpectrumModel | None = None) -> list[Fi
 def _may_be_coloured(search: Search, model: FittedModel) -> bool:
     """Whether noise that is not white may be what wide components, or a wrong gain, explain."""
     spectrum = model.spectrum
-    narrow = [c for c in spectrum.lines if c.damping_ratio <= WIDE_DAMPING]
-    if len(narrow) < len(spectrum.components) - 1:
+    if not all(c.is_narrow for c in spectrum.components[1:]):
         return True
     near = fitting.fit(search, replace(spectrum, colour=_COLOUR))
     return near is not None and model.contrast - near.contrast > fitting.COLOUR_PRICE
@@ -75,7 +75,7 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
     A wide resonance fits most spectra that fall, and counts twice.
     """
     spectrum = model.spectrum
-    wide = sum(c.damping_ratio > WIDE_DAMPING for c in spectrum.lines)
+    wide = sum(not c.is_narrow for c in spectrum.lines)
     coloured = fitting.COLOUR_PRICE * bool(spectrum.colour)
     return fitting.cost(search, model) + search.price * wide + coloured
 
@@ -109,6 +109,25 @@ def try_other_gains(
         if above < (search.price if same else _OTHER_NOISE):
             near.append(each)
     return (model if best is model else fitting.add_evidence(search, best)), near
+
+
+def find_coloured_rival(
+    search: Search, model: FittedModel, gain_error: float
+) -> FittedModel | None:
+    """Return the likelier model of coloured noise, if it moves the gain of a white one far.
+
+    Sensors and filters make neighbouring frames alike, hardly ever opposite.
+    """
+    spectrum = model.spectrum
+    if spectrum.colour:
+        return None
+    made = fitting.fit(search, replace(spectrum, colour=_COLOUR))
+    if made is None or made.spectrum.colour < 0:
+        return None
+    if model.contrast - made.contrast < _SIGNIFICANT:
+        return None
+    away = abs(made.spectrum.log_gain - spectrum.log_gain)
+    return made if away > _FAR_GAIN * gain_error else None
 
 
 def find_components(

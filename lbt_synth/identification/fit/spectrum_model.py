@@ -50,6 +50,11 @@ class Component:
         return 1 / (1 + math.exp(-self.damping))
 
     @property
+    def is_narrow(self) -> bool:
+        """Whether it is a line, not a wide resonance or a part of the turbulence."""
+        return self.kind == "line" and self.damping_ratio <= WIDE_DAMPING
+
+    @property
     def damping_slope(self) -> float:
         """Derivative of the logarithm of the damping ratio by ``damping``."""
         ratio = self.damping_ratio
