@@ -13,6 +13,7 @@ from lbt_synth.storage.input_files import LARGEST_BYTES
 
 BLOCK, CARD = 2880, 80
 _MOST = {"NAXIS": 999, "ZNAXIS": 999, "TFIELDS": 999}  # the standard's own limits
+_ONCE = {*_MOST, "BITPIX", "ZBITPIX", "GCOUNT", "PCOUNT", "DATASUM", "CHECKSUM"}
 _MOST_CARDS = 20_000  # of one header
 _MOST_UNITS = 5_000
 ONES = 2**32 - 1
@@ -73,8 +74,10 @@ def _read_header(content: bytes, start: int) -> tuple[dict[str, str], int]:
         if card.rstrip() == b"END":
             return cards, start + whole_blocks(at + CARD - start)
         if card[8:10] == b"= ":
-            value = card[10:].split(b"/")[0].decode("latin-1").strip()
-            cards.setdefault(card[:8].decode("latin-1").rstrip(), value)
+            keyword = card[:8].decode("latin-1").rstrip()
+            if keyword in cards and keyword.rstrip("0123456789") in _ONCE:
+                raise ValueError(f"the second {keyword}")  # readers differ in which counts
+            cards[keyword] = card[10:].split(b"/")[0].decode("latin-1").strip()
     raise ValueError("the end of the header")
 
 

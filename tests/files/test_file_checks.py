@@ -29,7 +29,7 @@ def test_a_few_damaged_files(tmp_path):
 
 @pytest.mark.study
 def test_20_000_damaged_files(tmp_path, capsys):
-    """Bar: no traceback, one silent change, 20 s and 4 GB for each; prints the table of the docs."""
+    """Bar: no traceback, no silent change, 20 s and 4 GB for each; prints the table of the docs."""
     folders = [tmp_path / str(seed) for seed in range(4)]
     for folder in folders:
         folder.mkdir()
@@ -52,6 +52,4 @@ def test_20_000_damaged_files(tmp_path, capsys):
             print("|", " | ".join(map(str, (name, sum(row), *row))), "|")
         print("peak MB:", max(part["", "", "peak MB"] for part in parts))
     assert sum(found[c] for c in columns) == 20_000
-    # FITS sums in one's complement, to which four bytes of zeros and of ones are the same
-    assert found["silent changes"] <= 1
-    assert {what: found[what] for what in BAD[:2]} == {"hangs": 0, "tracebacks": 0}
+    assert {what: found[what] for what in BAD} == dict.fromkeys(BAD, 0)

@@ -72,6 +72,19 @@ def test_headers_that_promise_what_is_not_there(tmp_path, card, value, reader, n
         reader(path)
 
 
+def test_a_second_card_for_the_size_is_refused():
+    """Astropy takes the last one and lists its axes one by one, for ever."""
+    unit = fits.PrimaryHDU(np.zeros(3))
+    unit.header["SPARE"] = 1
+    stream = io.BytesIO()
+    unit.writeto(stream)
+    content = stream.getvalue()
+    check_fits(content)
+    lie = content.replace(b"SPARE   =                    1", b"NAXIS   =            100000000")
+    with pytest.raises(ValueError, match="the second NAXIS of its HDU 0 is wrong"):
+        check_fits(lie)
+
+
 def test_a_compressed_image_larger_than_anything_is_refused():
     stream = io.BytesIO()
     packed = fits.CompImageHDU(np.zeros((4, 4), dtype=np.int16))
