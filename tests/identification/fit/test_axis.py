@@ -95,6 +95,26 @@ def test_noise_that_is_not_white_leaves_the_gain(colour: float) -> None:
     assert len(found.lines) == len(found.parts) == 1
 
 
+def test_a_colour_that_falls_short_of_its_price_widens_the_error_of_the_gain() -> None:
+    """White noise and a gain of 0.85 for 0.6, ten errors off, are nearly as likely."""
+    own = lbt.models.ARModel(
+        coefficients=[0.1], driving_rms_nm=11.5 / 0.6 * np.sqrt(0.99), frame_rate_hz=RATE
+    )
+    y, c = integrator_loop(
+        lines=((31.0, 0.004, 30.0),),
+        noise=1e-3,
+        gain=0.3,
+        turbulence=lbt.models.SumSpectrum(parts=[slow(), own]),
+        frames=20_000,
+        seed=7,
+    )
+    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    assert found.sensor_gain_error is not None
+    assert found.sensor_gain == pytest.approx(0.6, abs=2 * found.sensor_gain_error)
+    assert found.noise_correlation == 0
+    assert found.noise_correlation_error > 0.05
+
+
 @given(scale=st.sampled_from([1e-3, 0.02, 50.0]))
 @settings(max_examples=3, deadline=None)
 def test_units_do_not_matter(scale: float) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lbt_synth.identification.fit.fitting import Search, fit, prune
+from lbt_synth.identification.fit.fitting import Search, fit, prune, required_gain
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import SpectrumModel
 from lbt_synth.identification.fit.whittle import contrast
@@ -29,6 +29,21 @@ def test_a_line_that_leaves_the_band_is_dropped() -> None:
     found = fit(search, replace(start, components=(slow, away)))
     assert found is not None
     assert len(found.spectrum.components) == 1
+
+
+def test_a_line_in_the_skirts_of_a_wide_resonance_costs_as_much_as_any_other() -> None:
+    """Only the place of a line close to another narrow one need not be searched for."""
+    white = np.random.default_rng(0).standard_normal(8192)
+    data = loop_periodogram(white, None, frame_rate_hz=RATE, stretches=[(0, white.size)])
+    search = Search(data=data, gain=1.0)
+    slow = search.component("turbulence", 1.0, 0.5, 0.1)
+    line = search.component("line", 100.0, 0.01, 0.1)
+    wide = search.component("line", 90.0, 0.5, 1.0)
+    start = SpectrumModel(0.0, 0.0, 0.0, search.log_angle(50.0), (slow, line))
+    assert required_gain(search, start.add(wide), 1) == search.price
+    assert required_gain(search, start.add(wide), 2) == search.price
+    close = search.component("line", 102.0, 0.01, 0.1)
+    assert required_gain(search, start.add(close), 1) < search.price
 
 
 def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:
