@@ -11,7 +11,6 @@ from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, SynthesisError
 from lbt_synth.identification.commands.gain_interval import unstable_gains
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.likeliest_gain import agrees
 from lbt_synth.loop import close_loop, residual_budget
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray
@@ -33,18 +32,15 @@ class SafeDesign:
 
 
 def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
-    """Return the interval of gains of each axis that the record and its models allow.
+    """Return the interval of gains of each axis that the record or its models allow.
 
-    Where the fit finds the gains, near those that the record allows, its errors decide.
+    What a model leaves out moves its gain by more than its errors say.
     """
-    found = []
+    found = list(allowed.T)
     for each in models:
         errors = [_APART * (axis.sensor_gain_error or 0.0) for axis in each.axes]
         gains = np.array(each.sensor_gains)
         found += [gains - np.minimum(errors, gains / 2), gains + errors]
-    known = all(axis.sensor_gain_error is not None for each in models for axis in each.axes)
-    if not (known and all(agrees(each, allowed) for each in models)):
-        found += list(allowed.T)
     return np.column_stack([np.min(found, axis=0), np.max(found, axis=0)])
 
 

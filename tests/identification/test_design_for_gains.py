@@ -92,6 +92,15 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
         )
 
 
+def test_all_gains_count_that_the_record_or_a_model_allows(half):
+    """A fit of 0.36 +- 0.04, beside an interval of 0.37 to 0.76, had the truth at 0.6."""
+    gain, error = half.axes[0].sensor_gain, half.axes[0].sensor_gain_error
+    (interval,) = possible_gains(np.array([[gain, 2 * gain]]), half)
+    assert interval == pytest.approx([gain - 3 * error, 2 * gain])
+    (interval,) = possible_gains(np.array([[gain - error, gain + error]]), half)
+    assert interval == pytest.approx([gain - 3 * error, gain + 3 * error])
+
+
 def test_gains_that_are_too_far_apart_take_robust_synthesis_or_no_design(fit_model, half, models):
     wide = np.array([[0.02, 0.4]])  # the fit is outside: both count
     with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):
