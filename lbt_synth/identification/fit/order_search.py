@@ -44,6 +44,7 @@ _SIGNIFICANT = 1.92  # log-likelihood that one parameter too many adds in 5 % of
 _FAR_GAIN = 3.0  # standard errors by which a colour of the noise moves a gain that is doubted
 _OTHER_NOISE = 5.0  # log-likelihood by which white noise or a coloured one is excluded
 _COLOUR = 0.3  # of the noise, where a fit begins
+_MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, and a design must not take it white
 
 
 def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
@@ -99,7 +100,8 @@ def try_other_gains(
         except NumericalError:
             continue
         free = fitting.fit(search, held.spectrum)
-        found += [] if free is None else [free]
+        if free is not None and abs(free.spectrum.colour) < _MOST_COLOUR:
+            found.append(free)
     best = min(found, key=lambda each: _cost_of_noise(search, each))
     near, costs = [], (fitting.cost, _cost_of_noise)
     least = [cost(search, best) for cost in costs]
@@ -122,7 +124,7 @@ def find_coloured_rival(
     if spectrum.colour:
         return None
     made = fitting.fit(search, replace(spectrum, colour=_COLOUR))
-    if made is None or made.spectrum.colour < 0:
+    if made is None or not 0 < made.spectrum.colour < _MOST_COLOUR:
         return None
     if model.contrast - made.contrast < _SIGNIFICANT:
         return None
@@ -151,6 +153,9 @@ def find_components(
         if better is None:
             break
         model = better
+    if abs(model.spectrum.colour) > _MOST_COLOUR:
+        white = None if start is None else replace(start, colour=0.0)
+        return find_components(replace(search, colour=0.0), white, rounds=rounds, moves=moves)
     return _restore_turbulence(search, fitting.prune(search, fitting.simplify(search, model)))
 
 

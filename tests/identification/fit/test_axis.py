@@ -115,6 +115,25 @@ def test_a_colour_that_falls_short_of_its_price_widens_the_error_of_the_gain() -
     assert found.noise_correlation_error > 0.05
 
 
+def test_a_drift_is_not_taken_for_coloured_noise() -> None:
+    """It was: 73 nm of a correlation of 0.95, which a design would take for white noise."""
+    air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=12, diameter_m=8.22)
+    drift = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=30, frame_rate_hz=RATE)
+    y, c = integrator_loop(
+        lines=((30.0, 0.004, 60.0),),
+        noise=2.4,
+        sensor_gain=0.76,
+        turbulence=lbt.models.SumSpectrum(parts=[air, drift]),
+        frames=12_000,
+        seed=12,
+    )
+    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    assert found.noise_nm < 10
+    assert found.noise_correlation == 0
+    assert found.sensor_gain_error is not None
+    assert found.sensor_gain == pytest.approx(0.76, abs=3 * found.sensor_gain_error)
+
+
 @given(scale=st.sampled_from([1e-3, 0.02, 50.0]))
 @settings(max_examples=3, deadline=None)
 def test_units_do_not_matter(scale: float) -> None:
