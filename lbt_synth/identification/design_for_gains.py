@@ -16,6 +16,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray
 
 _APART = 3.0  # standard errors of a gain that are allowed
+_FARTHEST = 1.5  # factor by which a gain may be off that lies among those that a record allows
 _CAREFUL = (0.9, 0.8)  # of the fitted gain: slower designs at little cost
 _WIDE = 1.4  # by which the gain of a design is below the largest of a wide interval
 _HALF = 0.5  # of the gains are left of commands recorded at half their size
@@ -34,9 +35,16 @@ class SafeDesign:
 def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
     """Return the interval of gains of each axis that the record or its models allow.
 
-    What a model leaves out moves its gain by more than its errors say.
+    What a model leaves out moves its gain by more than its errors say. So all gains count that the
+    record allows; where those of the fits are among them, only the ones not too far from these.
     """
-    found = list(allowed.T)
+    gains = np.array([each.sensor_gains for each in models])
+    known = all(axis.sensor_gain_error is not None for each in models for axis in each.axes)
+    low, high = allowed.T
+    if known and np.all((low <= gains) & (gains <= high)):
+        low = np.maximum(low, gains.min(axis=0) / _FARTHEST)
+        high = np.minimum(high, gains.max(axis=0) * _FARTHEST)
+    found = [low, high]
     for each in models:
         errors = [_APART * (axis.sensor_gain_error or 0.0) for axis in each.axes]
         gains = np.array(each.sensor_gains)

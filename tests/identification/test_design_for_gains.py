@@ -95,8 +95,10 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
 def test_all_gains_count_that_the_record_or_a_model_allows(half):
     """A fit of 0.36 +- 0.04, beside an interval of 0.37 to 0.76, had the truth at 0.6."""
     gain, error = half.axes[0].sensor_gain, half.axes[0].sensor_gain_error
-    (interval,) = possible_gains(np.array([[gain, 2 * gain]]), half)
+    (interval,) = possible_gains(np.array([[1.01 * gain, 2 * gain]]), half)
     assert interval == pytest.approx([gain - 3 * error, 2 * gain])
+    (interval,) = possible_gains(np.array([[gain, 2 * gain]]), half)  # the fit is one of them
+    assert interval == pytest.approx([gain - 3 * error, 1.5 * gain])
     (interval,) = possible_gains(np.array([[gain - error, gain + error]]), half)
     assert interval == pytest.approx([gain - 3 * error, gain + 3 * error])
 
