@@ -36,6 +36,7 @@ GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 COLOUR_PRICE = 9.0  # the same of noise that is not white
 _SPLIT = 9.0  # the same of the second of two lines that lie in each other's skirts
+_SKIRTS = 8.0  # half widths of the narrower one within which two lines are close
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
@@ -249,17 +250,17 @@ def required_gain(
 def lies_in_skirts(
     search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
 ) -> bool:
-    """Whether a component is a line close to another (with ``earlier``, to one before it).
+    """Whether a line and another (with ``earlier``, one before it) lie in each other's skirts.
 
-    All lie in the skirts of a wide resonance, which says nothing about where to look for them.
+    All lines lie in the skirts of a wide resonance, which does not say where to look for them.
     """
     component = spectrum.components[i]
-    if not component.is_narrow:
+    if component.kind != "line":
         return False
     centre, half = search.place(component)
     others = spectrum.components[:i] if earlier else spectrum.exchange(i).components
-    places = [search.place(other) for other in others if other.is_narrow]
-    return any(abs(centre - at) < 4 * (half + its_half) for at, its_half in places)
+    places = [search.place(other) for other in others if other.kind == "line"]
+    return any(abs(centre - at) < _SKIRTS * min(half, its_half) for at, its_half in places)
 
 
 def cost(search: Search, model: FittedModel) -> float:
