@@ -31,14 +31,17 @@ def test_a_line_that_leaves_the_band_is_dropped() -> None:
     assert len(found.spectrum.components) == 1
 
 
-def test_a_line_in_the_skirts_of_a_wide_resonance_costs_as_much_as_any_other() -> None:
+@pytest.mark.parametrize("damping", [0.08, 0.5])
+def test_a_line_in_the_skirts_of_a_wide_resonance_costs_as_much_as_any_other(
+    damping: float,
+) -> None:
     """Only the place of a line close to another narrow one need not be searched for."""
     white = np.random.default_rng(0).standard_normal(8192)
     data = loop_periodogram(white, None, frame_rate_hz=RATE, stretches=[(0, white.size)])
     search = Search(data=data, gain=1.0)
     slow = search.component("turbulence", 1.0, 0.5, 0.1)
     line = search.component("line", 100.0, 0.01, 0.1)
-    wide = search.component("line", 90.0, 0.5, 1.0)
+    wide = search.component("line", 90.0, damping, 1.0)
     start = SpectrumModel(0.0, 0.0, 0.0, search.log_angle(50.0), (slow, line))
     assert required_gain(search, start.add(wide), 1) == search.price
     assert required_gain(search, start.add(wide), 2) == search.price
