@@ -73,20 +73,30 @@ def test_standard_errors_are_honest() -> None:
         assert 2.2 < np.sum(np.square(values)) < 32, name
 
 
-@pytest.mark.parametrize("colour", [0.1, 0.6])
-def test_noise_that_is_not_white_leaves_the_gain(colour: float) -> None:
-    """As white noise it moved the gain by 10 and by 25 of its standard errors."""
+def identify_coloured(
+    colour: float, noise: float, seed: int, gain: float = 0.4
+) -> lbt.identification.IdentifiedAxis:
+    """Identify a loop whose noise, of some nm and sensor gain 0.6, has a correlation."""
     own = lbt.models.ARModel(
-        coefficients=[colour], driving_rms_nm=10 * np.sqrt(1 - colour**2), frame_rate_hz=RATE
+        coefficients=[colour],
+        driving_rms_nm=noise / 0.6 * np.sqrt(1 - colour**2),
+        frame_rate_hz=RATE,
     )
     y, c = integrator_loop(
         lines=((31.0, 0.004, 30.0),),
         noise=1e-3,
+        gain=gain,
         turbulence=lbt.models.SumSpectrum(parts=[slow(), own]),
         frames=20_000,
-        seed=1,
+        seed=seed,
     )
-    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    return lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+
+
+@pytest.mark.parametrize("colour", [0.1, 0.6])
+def test_noise_that_is_not_white_leaves_the_gain(colour: float) -> None:
+    """As white noise it moved the gain by 10 and by 25 of its standard errors."""
+    found = identify_coloured(colour, 6, seed=1)
     assert found.sensor_gain_error is not None
     assert found.sensor_gain == pytest.approx(0.6, abs=3 * found.sensor_gain_error)
     assert found.sensor_gain_error < 0.04
@@ -97,18 +107,7 @@ def test_noise_that_is_not_white_leaves_the_gain(colour: float) -> None:
 
 def test_a_colour_that_falls_short_of_its_price_widens_the_error_of_the_gain() -> None:
     """White noise and a gain of 0.85 for 0.6, ten errors off, are nearly as likely."""
-    own = lbt.models.ARModel(
-        coefficients=[0.1], driving_rms_nm=11.5 / 0.6 * np.sqrt(0.99), frame_rate_hz=RATE
-    )
-    y, c = integrator_loop(
-        lines=((31.0, 0.004, 30.0),),
-        noise=1e-3,
-        gain=0.3,
-        turbulence=lbt.models.SumSpectrum(parts=[slow(), own]),
-        frames=20_000,
-        seed=7,
-    )
-    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    found = identify_coloured(0.1, 11.5, seed=7, gain=0.3)
     assert found.sensor_gain_error is not None
     assert found.sensor_gain == pytest.approx(0.6, abs=2 * found.sensor_gain_error)
     assert found.noise_correlation == 0
