@@ -152,10 +152,16 @@ def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: b
     return _cost(_fit_axes(coarse, as_given, other_gains=True)) - other
 
 
-def finer_saving_of_gain(coarse: CoarseRecord, guess: Guess, gains: Sequence[float]) -> float:
-    """Return how much likelier any gain is than the best of some, by the model of the fit."""
-    held = min(_cost(_fit_axes(coarse, guess, gain)) for gain in gains)
-    return held - _cost(_fit_axes(coarse, guess))
+def finer_saving_of_gain(
+    coarse: CoarseRecord, guess: Guess, plausible: tuple[float, float], usual: float
+) -> float:
+    """Return how much likelier any gain is than plausible ones, by the model of the fit."""
+    low, high = plausible
+    free = _fit_axes(coarse, guess)
+    if all(model is not None and low <= model.spectrum.gain <= high for _, model in free):
+        return 0.0
+    held = min(_cost(_fit_axes(coarse, guess, gain)) for gain in (low, usual, high))
+    return held - _cost(free)
 
 
 def _cost(fits: Sequence[_Fit]) -> float:

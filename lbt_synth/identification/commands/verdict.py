@@ -317,7 +317,7 @@ def _find_scale(
             return factor
         if gain < low:  # commands that are too large come from a law that is too strong
             return 1.0
-    shown = finer_saving_of_gain(coarse, found.guess, (low, usual, high)) >= found.clear
+    shown = finer_saving_of_gain(coarse, found.guess, plausible, usual) >= found.clear
     return factor if shown else 1.0
 
 
