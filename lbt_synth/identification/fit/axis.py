@@ -29,7 +29,6 @@ from lbt_synth.identification.fit.physical_parameters import (
     parameter_covariance,
     standard_errors,
 )
-from lbt_synth.identification.fit.spectrum_model import WIDE_DAMPING
 from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.stretches import StretchesLike, checked_stretches
 from lbt_synth.validation import FloatArray, number, real_array, require_instance
@@ -314,6 +313,6 @@ def _compare_gains(
 ) -> tuple[FittedModel, list[FittedModel]]:
     """Return the likeliest model, and those of other gains that are nearly as likely."""
     spectrum = model.spectrum
-    if spectrum.drop_wide(WIDE_DAMPING) == spectrum and not spectrum.colour:
+    if all(line.is_narrow for line in spectrum.lines) and not spectrum.colour:
         return model, []
     return try_other_gains(search, model, rivals)

@@ -160,7 +160,3 @@ class SpectrumModel:
             return self.exchange(i)
         slow = [j for j, c in enumerate(self.components) if c.kind == "slow"]
         return self.promote(self.strongest(slow)) if slow else None
-
-    def drop_wide(self, most: float) -> SpectrumModel:
-        """Return the model without lines of a larger damping ratio."""
-        return self.keep(lambda c: c.kind != "line" or c.damping_ratio <= most)
