@@ -26,7 +26,7 @@ def run(arguments: Namespace) -> Report:
     if not arguments.host:
         raise ProblemError("--host must be a name or an address; got an empty text.")
     for origin in arguments.origin:
-        if not re.fullmatch(r"[^\s:/]+:\d+", origin):
+        if not re.fullmatch(r"[\w.*-]+:\d{1,5}", origin):
             raise ProblemError(f"--origin must be HOST:PORT, as localhost:8080; got {origin!r}.")
     folder = Path(arguments.output)
     require_writable(folder / "explored-1.yaml")

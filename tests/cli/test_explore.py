@@ -23,6 +23,8 @@ import lbt_synth as lbt
         (("--port", "-1"), "--port must be from 0 to 65535; got -1."),
         (("--host", ""), "--host must be a name or an address; got an empty text."),
         (("--origin", "http://a:8"), "--origin must be HOST:PORT, as localhost:8080; got"),
+        (("--origin", "a\x07b:8"), "--origin must be HOST:PORT, as localhost:8080; got"),
+        (("--origin", "a:123456"), "--origin must be HOST:PORT, as localhost:8080; got"),
         (("-o", "nowhere"), "no directory nowhere"),
         (("nothing.fits",), "nothing.fits"),
     ],
