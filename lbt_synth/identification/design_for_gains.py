@@ -45,10 +45,9 @@ def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
         low = np.maximum(low, gains.min(axis=0) / _FARTHEST)
         high = np.minimum(high, gains.max(axis=0) * _FARTHEST)
     found = [low, high]
-    for each in models:
+    for own, each in zip(gains, models, strict=True):
         errors = [_APART * (axis.sensor_gain_error or 0.0) for axis in each.axes]
-        gains = np.array(each.sensor_gains)
-        found += [gains - np.minimum(errors, gains / 2), gains + errors]
+        found += [own - np.minimum(errors, own / 2), own + errors]
     return np.column_stack([np.min(found, axis=0), np.max(found, axis=0)])
 
 

@@ -126,10 +126,9 @@ def find_coloured_rival(
     made = fitting.fit(search, replace(spectrum, colour=_COLOUR))
     if made is None or not 0 < made.spectrum.colour < _MOST_COLOUR:
         return None
-    if model.contrast - made.contrast < _SIGNIFICANT:
-        return None
-    away = abs(made.spectrum.log_gain - spectrum.log_gain)
-    return made if away > _FAR_GAIN * gain_error else None
+    is_likelier = model.contrast - made.contrast >= _SIGNIFICANT
+    is_far = abs(made.spectrum.log_gain - spectrum.log_gain) > _FAR_GAIN * gain_error
+    return made if is_likelier and is_far else None
 
 
 def find_components(
