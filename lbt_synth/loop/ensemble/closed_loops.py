@@ -20,7 +20,7 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
 _SAME = 1e-11  # relative difference up to which two subloops are the same
-_AT_ONCE = 256  # loops that share frequencies
+_SHARED, _OWN = 768, 256  # loops that share frequencies, and a controller or not
 _PER_LOOP = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
 
 
@@ -131,8 +131,9 @@ class LoopGroup:
         """Yield batches of the stable loops, sorted by their distance from instability."""
         found = np.flatnonzero(stable[self.rows])
         order = found[np.argsort(_radius(self.poles[found]), kind="stable")]
-        for start in range(0, order.size, _AT_ONCE):
-            yield self.take(order[start : start + _AT_ONCE])
+        most = _SHARED if self.subloop.is_shared else _OWN
+        for start in range(0, order.size, most):
+            yield self.take(order[start : start + most])
 
     def rejections(self, turn: FloatArray) -> ComplexArray:
         """Rejection (k, n, n) of each loop at its own frequency [radians per frame]."""

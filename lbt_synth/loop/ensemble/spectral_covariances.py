@@ -35,7 +35,7 @@ _NARROWEST = 1e-10  # pole width that panels are still refined to, as a fraction
 _PANEL = 2.0  # length of a panel over its distance from a pole, or over the pole's width
 _PROBES = 5  # frequencies at which partial fractions are checked by solving linear systems
 _AGREEMENT = 1e-9
-_IN_CACHE = 32  # loops whose spectra are integrated at once: more do not fit the processor's cache
+_IN_CACHE = 16  # loops whose spectra are integrated at once: more do not fit the processor's cache
 
 _Array = TypeVar("_Array", FloatArray, ComplexArray)
 
@@ -301,12 +301,17 @@ def _partial_fractions(
 
     In real numbers, which is several times faster than a division of complex ones.
     """
-    real, imaginary = np.zeros((2, len(poles), z.size))
-    for pole, residue in zip(poles.T[..., None], residues.T[..., None], strict=True):
-        x, y = z.real - pole.real, z.imag - pole.imag
-        scale = 1 / (x * x + y * y)
-        x *= scale
-        y *= scale
-        real += residue.real * x + residue.imag * y
-        imaginary += residue.imag * x - residue.real * y
-    return np.asarray(real + 1j * imaginary)
+    out = np.empty((len(poles), z.size), dtype=np.complex128)
+    for start in range(0, len(poles), _IN_CACHE):
+        rows = slice(start, start + _IN_CACHE)
+        real, imaginary = np.zeros((2, len(poles[rows]), z.size))
+        each = zip(poles[rows].T[..., None], residues[rows].T[..., None], strict=True)
+        for pole, residue in each:
+            x, y = z.real - pole.real, z.imag - pole.imag
+            scale = 1 / (x * x + y * y)
+            x *= scale
+            y *= scale
+            real += residue.real * x + residue.imag * y
+            imaginary += residue.imag * x - residue.real * y
+        out.real[rows], out.imag[rows] = real, imaginary
+    return out
