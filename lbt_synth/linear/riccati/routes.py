@@ -126,10 +126,11 @@ def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, I
     1.61803398875
     """
     X, going, n = H, np.arange(len(A)), A.shape[-1]
+    one = np.eye(n)
     found, steps = np.full_like(H, np.nan), np.zeros(len(A), dtype=np.int64)
     with np.errstate(all="ignore"):
         for step in range(1, _MOST_DOUBLINGS + 1):
-            solved = solve_stack(np.eye(n) + G @ X, np.concatenate([A, G], axis=-1))
+            solved = solve_stack(one + G @ X, np.concatenate([A, G], axis=-1))
             WA, WG = solved[..., :n], solved[..., n:]
             increment = symmetrise(transpose(A) @ X @ WA)
             G = symmetrise(G + A @ WG @ transpose(A))
