@@ -108,11 +108,13 @@ def _predicted_residuals(
             )
         loop = close_loop(model.hardware, controller)
         loop.require_stable()
-        out[name] = []
+        out[name], known = [], np.zeros(0)
         for i, axis in enumerate(model.axes):
             f = axis.frequency_hz
-            rejected = np.abs(loop.sensitivity(f)[:, i]) ** 2
-            passed = np.abs(loop.noise_transfer(f)[:, i]) ** 2
+            if not np.array_equal(f, known):  # the axes of a record share their frequencies
+                known = f
+                reject, let_through = np.abs(loop.sensitivity(f)), np.abs(loop.noise_transfer(f))
+            rejected, passed = reject[:, i] ** 2, let_through[:, i] ** 2
             density = np.zeros(f.size)
             for j, other in enumerate(model.axes):
                 white = _noise_density(other)
