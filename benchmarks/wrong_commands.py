@@ -42,6 +42,7 @@ FAULTS = {  # and the beginning of what repairs it
     "clipped": "--command-limit-nm",
     "axis late": "",
 }
+PART_SIZE = FAULTS["scale 0.5"]  # also named in a warning beside a design
 KINDS = (
     *("wide", "eris", "fraction", "ar1", "leaky", "double", "kalman", "unequal", "low"),
     "quantised",
@@ -159,19 +160,21 @@ def spoil(loop: Loop, fault: str) -> tuple[np.ndarray, np.ndarray]:
 def try_design(loop: Loop, record: lbt.identification.LoopRecord) -> tuple[str, float]:
     """Return what became of a design in the true loop, and its variance over the least one."""
     try:
-        design = lbt.design_from_record(record).design
+        made = lbt.design_from_record(record)
     except lbt.errors.RecordError as error:
         return f"named: {error.options}", np.nan
     except lbt.errors.LbtSynthError as error:
         return f"refused: {error}", np.nan
-    closed = lbt.close_loop(loop.path, design.controller, sensor_gain=loop.truth.sensor_gain)
+    warned = any(PART_SIZE in note for note in made.model.notes)
+    closed = lbt.close_loop(loop.path, made.controller, sensor_gain=loop.truth.sensor_gain)
     if not closed.is_stable:
         return "UNSTABLE", np.inf
     try:
         least_nm = lbt.loop.least_residual(loop.path, loop.truth).rms_nm
     except lbt.errors.CoupledModesError:  # lines at any angle: no limit is known
         least_nm = np.nan
-    return "stable", (lbt.residual_budget(closed, loop.truth).rms_nm / least_nm) ** 2
+    what = f"stable, warned of {PART_SIZE}" if warned else "stable"
+    return what, (lbt.residual_budget(closed, loop.truth).rms_nm / least_nm) ** 2
 
 
 def judge(
@@ -199,6 +202,8 @@ def judge(
             accepted, seconds = False, time.perf_counter() - start
         else:
             accepted = verdict.accepted
+            if PART_SIZE in made[0]:
+                right, said = options == PART_SIZE, f"{seed}: {made[0]}"
         out.append((fault, right, accepted, seconds, said, *made))
         print(seed, *out[-1], sep="; ", file=sys.stderr, flush=True)
     return out
@@ -288,7 +293,7 @@ def judge_good(seed: int, seconds: float) -> list[tuple[str, bool, bool, float, 
 
 def show_designs(designs: list[tuple[str, float]]) -> None:
     """Print what the designs of the accepted records do in the true loop."""
-    stable = [ratio for what, ratio in designs if what == "stable"]
+    stable = [ratio for what, ratio in designs if what.startswith("stable")]
     unstable = sum(what == "UNSTABLE" for what, _ in designs)
     refused = len(designs) - len(stable) - unstable
     print(f"    designs: {len(stable)} stable, {unstable} unstable, {refused} refused", end="")

@@ -193,14 +193,16 @@ def resonance(square: FloatArray, centre_hz: FloatArray | float, damping: float)
     return np.asarray(centre**2 / ((square - centre) ** 2 + 4 * damping**2 * centre * square))
 
 
-def fit_guesses(axis: CoarseAxis, starts: FloatArray, *, free: bool = True) -> CoarseFit:
-    """Fit spectrum and gain of each guess, from each of its starting gains (guesses, s).
+def fit_profile(axis: CoarseAxis, gains: FloatArray) -> CoarseFit:
+    """Fit the spectrum of an axis with a single guess at each of its gains (n,)."""
+    return _Fit(axis, np.zeros(gains.size, dtype=np.int64), free=False).minimise(gains)
 
-    The gains stay at their starts unless they are ``free``.
-    """
+
+def fit_guesses(axis: CoarseAxis, starts: FloatArray) -> CoarseFit:
+    """Fit spectrum and gain of each guess, from each of its starting gains (guesses, s)."""
     guesses, each = starts.shape
     guess = np.repeat(np.arange(guesses), each)
-    found = _Fit(axis, guess, free).minimise(starts.ravel())
+    found = _Fit(axis, guess, free=True).minimise(starts.ravel())
     best = np.argmin(found.contrast.reshape(guesses, each), axis=1) + each * np.arange(guesses)
     return CoarseFit(
         contrast=found.contrast[best], gain=found.gain[best], misfit=found.misfit[best]

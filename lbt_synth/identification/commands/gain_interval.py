@@ -70,8 +70,7 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel | None = None) -> F
     best = coarse.compare([given])
     far = np.geomspace(_LEAST, _MOST, _FAR_STEPS)
     grid = np.array([[*far, *(gain * _NEAR)] for gain in best.gain[:, 0]])
-    profile = coarse.compare([given] * grid.shape[1], grid)
-    excess = profile.axis_contrast - best.axis_contrast
+    excess = coarse.profile(given, grid) - best.axis_contrast
     allowed = excess < _FAR * best.dispersion(0)
     allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]

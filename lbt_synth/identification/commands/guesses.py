@@ -14,6 +14,7 @@ from lbt_synth.identification.commands.coarse_spectrum import (
     coarse_axis,
     coherence_credit,
     fit_guesses,
+    fit_profile,
     segment_transforms,
 )
 from lbt_synth.identification.commands.repair import MIRROR, rotation
@@ -197,32 +198,37 @@ class CoarseRecord:
             out = (1 - part) * out + part * guess.corrections(self.record, whole + 1)
         return out if guess.matrix is None else out @ guess.matrix.T
 
-    def compare(self, guesses: Sequence[Guess], gains: FloatArray | None = None) -> Comparison:
-        """Return the likelihood of each guess, at its best gains or at fixed ones (axes, guesses).
-
-        ``gains`` of 0 are those of commands that do not reach the measurements.
-        """
+    def compare(self, guesses: Sequence[Guess]) -> Comparison:
+        """Return the likelihood of each guess, at its best gains."""
         corrections = np.array([self.transform(guess) for guess in guesses])
-        fits = [
-            self._fit_axis(i, corrections[:, i], None if gains is None else gains[i])
-            for i in range(self.record.axes)
-        ]
+        fits = [self._fit_axis(i, corrections[:, i]) for i in range(self.record.axes)]
         gain = np.array([fit.gain for fit in fits])
         own = np.array([fit.contrast for fit in fits])
-        total = own.sum(axis=0)
-        if self.record.axes == 2:
-            total = total + [self._credit(c, g) for c, g in zip(corrections, gain.T, strict=True)]
+        credit = [self._credit(c, g) for c, g in zip(corrections, gain.T, strict=True)]
         return Comparison(
             guesses=tuple(guesses),
-            contrast=total,
+            contrast=own.sum(axis=0) + credit,
             axis_contrast=own,
             gain=gain,
             misfit=np.mean([fit.misfit for fit in fits], axis=0),
         )
 
-    def _fit_axis(self, i: int, corrections: ComplexArray, fixed: FloatArray | None) -> CoarseFit:
-        """Fit all guesses of one axis, each scaled to a natural gain of 1."""
-        axis: CoarseAxis = coarse_axis(
+    def profile(self, guess: Guess, gains: FloatArray) -> FloatArray:
+        """Return the contrasts (axes, n) at gains (axes, n), without the coherence of the axes."""
+        corrections = self.transform(guess)
+        each = zip(corrections, gains, strict=True)
+        fits = [fit_profile(self._axis(i, c[None]), g) for i, (c, g) in enumerate(each)]
+        return np.array([fit.contrast for fit in fits])
+
+    def unrelated(self) -> float:
+        """Return the contrast of commands that do not reach the measurements."""
+        given, nothing = Guess(kind="as given"), np.zeros(self.record.axes)
+        own = float(np.sum(self.profile(given, nothing[:, None])))
+        return own + self._credit(self.transform(given), nothing)
+
+    def _axis(self, i: int, corrections: ComplexArray) -> CoarseAxis:
+        """Return the bands of one axis, for all guesses of its corrections."""
+        return coarse_axis(
             self.frequency_hz,
             self.measured[i],
             corrections,
@@ -230,16 +236,20 @@ class CoarseRecord:
             frame_rate_hz=self.record.frame_rate_hz,
             resonances=self.resonances[i],
         )
+
+    def _fit_axis(self, i: int, corrections: ComplexArray) -> CoarseFit:
+        """Fit all guesses of one axis, each scaled to a natural gain of 1."""
         high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
         level = np.mean(abs(self.measured[i][:, high]) ** 2)
         steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
         least = max(_STEADY * level, np.finfo(float).tiny)  # clipped commands may hardly move
         natural = _NATURAL * np.sqrt(level / np.maximum(steps, least))
-        starts = natural[:, None] * _NATURAL_GAINS if fixed is None else fixed[:, None]
-        return fit_guesses(axis, starts, free=fixed is None)
+        return fit_guesses(self._axis(i, corrections), natural[:, None] * _NATURAL_GAINS)
 
     def _credit(self, corrections: ComplexArray, gain: FloatArray) -> float:
-        """Return what the coherence of the axes saves."""
+        """Return what the coherence of two axes saves."""
+        if self.record.axes == 1:
+            return 0.0
         one, other = self.measured + gain[:, None, None] * corrections
         return coherence_credit(
             one,

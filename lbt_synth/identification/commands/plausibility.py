@@ -15,7 +15,7 @@ from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.guesses import CoarseRecord, Comparison, Guess
 from lbt_synth.identification.commands.law_controller import law_controller
-from lbt_synth.identification.fit.fitting import Search, cost
+from lbt_synth.identification.fit.fitting import GAINS, Search, cost
 from lbt_synth.identification.fit.order_search import find_components, try_other_gains
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.whittle import FittedModel
@@ -33,6 +33,7 @@ _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, mus
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
 _NEAR = 0.4  # such a distance that a coarse gain may have
+_LIKE = 3.0  # factor between a coarse gain and the fitted one of the same record
 _SEGMENT_S = 6.0
 _ROUNDS, _LINES = 3, 10  # of the search for lines
 
@@ -141,7 +142,8 @@ def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: b
     """
     as_given = Guess(kind="as given")
     if not decides:
-        begun = _fit_axes(coarse, as_given, rounds=0)
+        likely = np.clip(coarse.compare([as_given]).gain[:, 0], *PLAUSIBLE_GAINS)
+        begun = _fit_axes(coarse, as_given, rounds=0, begin_at=likely)
         saving = _cost(begun) - _cost(_fit_axes(coarse, guess, starts=begun, rounds=0))
         if saving < 0:
             return saving
@@ -164,6 +166,18 @@ def finer_saving_of_gain(
     return held - _cost(free)
 
 
+def fit_gains(coarse: CoarseRecord, guess: Guess, gains: FloatArray) -> FloatArray:
+    """Return the gains (axes,) of a guess by the model of the fit; the coarse ones where it fails.
+
+    Wide resonances that the coarse spectrum lacks move its gains.
+    """
+    if not np.all((gains > GAINS["above"]) & (gains < GAINS["below"])):
+        return gains
+    fits = _fit_axes(coarse, guess, begin_at=gains)
+    fitted = np.array([np.nan if model is None else model.spectrum.gain for _, model in fits])
+    return np.where(np.abs(np.log(fitted / gains)) < np.log(_LIKE), fitted, gains)
+
+
 def _cost(fits: Sequence[_Fit]) -> float:
     """Return the criterion over all axes; infinite where a fit failed."""
     return sum(np.inf if model is None else cost(search, model) for search, model in fits)
@@ -177,8 +191,12 @@ def _fit_axes(
     starts: Sequence[_Fit] = (),
     rounds: int = _ROUNDS,
     other_gains: bool = False,
+    begin_at: FloatArray | None = None,
 ) -> list[_Fit]:
-    """Return the best model of each axis for a guess, at any gain or at one."""
+    """Return the best model of each axis for a guess, at any gain or at one.
+
+    Any gain is looked for from several, or from one for each axis (axes,) where they are given.
+    """
     record = coarse.record
     corrections = coarse.corrections(guess)
     length = int(_SEGMENT_S * record.frame_rate_hz)
@@ -189,9 +207,13 @@ def _fit_axes(
     ]
     begins = [model.spectrum if model else None for _, model in starts] or [None] * record.axes
     out: list[_Fit] = []
-    for y, c, begin in zip(record.measurements.T, corrections.T, begins, strict=True):
+    for i, (y, c, begin) in enumerate(
+        zip(record.measurements.T, corrections.T, begins, strict=True)
+    ):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         search = Search(data=data, gain=gain, most_lines=_LINES)
+        if begin_at is not None:
+            search = replace(search, starting_gains=(float(begin_at[i]),))
         found: FittedModel | None = None
         with suppress(NumericalError):
             found = find_components(search, begin, rounds=rounds)

@@ -29,6 +29,7 @@ from lbt_synth.identification.commands.plausibility import (
     could_have_run,
     finer_saving,
     finer_saving_of_gain,
+    fit_gains,
     score_guesses,
 )
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
@@ -253,10 +254,10 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
         if saving >= _CLEAR_FINER:
             best, score[0] = other, np.inf
     clear = _CLEAR * compared.dispersion(best)
-    if law is None or law.kind == "none":
-        unrelated = coarse.compare(guesses[:1], np.zeros((record.axes, 1)))
-        if unrelated.contrast[0] - np.min(compared.contrast) < _RELATED * clear / _CLEAR:
-            return None
+    no_law = law is None or law.kind == "none"
+    saved = coarse.unrelated() - np.min(compared.contrast) if no_law else np.inf
+    if saved < _RELATED * clear / _CLEAR:
+        return None
     given = _Best(
         guess=guesses[0],
         nats=0.0,
@@ -305,11 +306,12 @@ def _find_scale(
     if np.all(bounded == found.gain):
         return 1.0
     inside = np.geomspace(low, high, _INSIDE)
-    near = coarse.compare([found.guess] * _INSIDE, np.tile(inside, (len(bounded), 1)))
-    if np.sum(np.min(near.axis_contrast, axis=1)) - found.own_contrast < found.clear:
+    near = coarse.profile(found.guess, np.tile(inside, (len(bounded), 1)))
+    if np.sum(np.min(near, axis=1)) - found.own_contrast < found.clear:
         return 1.0
-    factor, usual = likely_factor(found.gain, plausible)
-    gain = float(np.exp(np.mean(np.log(found.gain))))
+    gains = fit_gains(coarse, found.guess, found.gain)
+    factor, usual = likely_factor(gains, plausible)
+    gain = float(np.exp(np.mean(np.log(gains))))
     tried = inside[:, None] * np.ones(len(bounded))
     record = coarse.record
     if law is not None and law.is_sure:

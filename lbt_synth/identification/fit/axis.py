@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.fit.close_lines import measure_separations
 from lbt_synth.identification.fit.fitting import GAINS, LOWEST_LINE_HZ, MOST_LINES, Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.order_search import (
@@ -117,14 +118,28 @@ def identify_axis(
     >>> [round(line.frequency_hz) for line in found.lines], round(found.noise_nm)
     ([40], 5)
     """
-    data = _checked_periodogram(measurement, correction, frame_rate_hz, stretches)
     search = Search(
-        data=data,
+        data=axis_periodogram(measurement, correction, frame_rate_hz, stretches),
         gain=sensor_gain,
         announced=announced,
         lowest_line_hz=lowest_line_hz,
         most_lines=most_lines,
     )
+    found = find_axis(
+        search, sensor_gain_error=sensor_gain_error, assumed_gain=assumed_gain, start=start
+    )
+    return measure_separations(found)
+
+
+def find_axis(
+    search: Search,
+    *,
+    sensor_gain_error: float = 0.0,
+    assumed_gain: float,
+    start: IdentifiedAxis | None,
+) -> IdentifiedAxis:
+    """Identify one axis from its periodogram, but for what its lines may hide."""
+    data, sensor_gain = search.data, search.gain
     given_error = number(sensor_gain_error, "sensor_gain_error", at_least=0)
     assumed = number(assumed_gain, "assumed_gain", **GAINS)
     if start is not None:
@@ -163,7 +178,15 @@ def identify_axis(
     return describe_axis(search, model, None, note, colour_error=unknown)
 
 
-def _checked_periodogram(
+def refit_axis(
+    axis: IdentifiedAxis, search: Search, error: float, note: str, *, moves: bool
+) -> IdentifiedAxis:
+    """Fit an axis again at the gain of a search, of a relative error; lines may get ``moves``."""
+    model = search_model(search, axis.fitted_model.spectrum, moves=moves)
+    return describe_axis(search, hold_gain(search, model, error), error, note)
+
+
+def axis_periodogram(
     measurement: ArrayLike,
     correction: ArrayLike | None,
     frame_rate_hz: float,
@@ -284,7 +307,7 @@ def identify_spectrum(
     )
     search = Search(data=data, gain=1.0, **options)
     note = "1: of a spectrum it has no meaning"
-    return describe_axis(search, search_model(search), None, note)
+    return measure_separations(describe_axis(search, search_model(search), None, note))
 
 
 def estimate_averages(density: FloatArray) -> float | None:

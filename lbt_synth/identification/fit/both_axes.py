@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import Any
@@ -11,10 +10,16 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.fit.axis import estimate_averages, identify_axis, identify_spectrum
-from lbt_synth.identification.fit.close_lines import describe_close_lines
+from lbt_synth.identification.fit.axis import (
+    axis_periodogram,
+    estimate_averages,
+    find_axis,
+    identify_spectrum,
+    refit_axis,
+)
+from lbt_synth.identification.fit.close_lines import describe_close_lines, measure_separations
 from lbt_synth.identification.fit.coupled_axes import couple_axes
-from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES
+from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES, Search
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
@@ -34,6 +39,8 @@ from lbt_synth.validation import real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
+_CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
+_GAIN_ERRORS = 3.0  # by which a gain must lie above that
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _APART = 3.0  # standard errors between gains that differ
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
@@ -133,8 +140,7 @@ def identify(
         if progress is not None:
             progress(next(fits), total)
 
-    options |= {"frame_rate_hz": record.frame_rate_hz, "assumed_gain": assumed_gain}
-    fit = partial(_fit_axes, record, step, options)
+    fit = partial(_fit_axes, record, step, options, assumed_gain)
     early = find_correction_jumps(record.corrections(), pieces)
     pieces, notes = cut_at_jumps(pieces, early, "commands")
     axes = fit(pieces, gains, [None] * record.axes if start is None else start.axes)
@@ -146,12 +152,14 @@ def identify(
     found_gain = [i for i, axis in enumerate(axes) if axis.sensor_gain_error is not None]
     notes += late_notes
     if len(axes) > 1 and found_gain and gains == [None] * len(axes):
-        axes, note = _pool_gains(axes, found_gain, partial(fit, cut))
+        axes, note = _pool_gains(axes, found_gain, step, options)
         notes.append(note)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == _BOTH:
         axes, shared, more = couple_axes(record, axes, cut, lowest_line_hz)
         notes += more
+    if not shared:
+        axes = [measure_separations(axis) for axis in axes]
     notes += _find_doubts(axes, found_gain, most_lines)
     if progress is not None and next(fits) <= total:
         progress(total, total)
@@ -170,17 +178,21 @@ def _fit_axes(
     record: LoopRecord,
     step: Callable[[], None],
     options: dict[str, Any],
+    assumed_gain: float,
     stretches: Stretches,
     gains: Sequence[float | None],
     starts: Sequence[IdentifiedAxis | None],
-    gain_error: float = 0.0,
 ) -> list[IdentifiedAxis]:
-    """Identify each axis, at its gain or at a free one, and from its start."""
+    """Identify each axis, at its gain or at a free one, and from its start.
+
+    ``options`` are those of a search.
+    """
     axes = []
     each = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
     for y, c, gain, start in each:
-        own: Any = {"sensor_gain": gain, "sensor_gain_error": gain_error, "start": start}
-        axes.append(identify_axis(y, c, stretches=stretches, **own, **options))
+        data = axis_periodogram(y, c, record.frame_rate_hz, stretches)
+        search = Search(data=data, gain=gain, **options)
+        axes.append(find_axis(search, assumed_gain=assumed_gain, start=start))
         step()
     return axes
 
@@ -234,10 +246,14 @@ def _gain_per_axis(given: Any, count: int) -> list[float | None]:
 
 
 def _pool_gains(
-    axes: list[IdentifiedAxis], found_gain: list[int], fit: Callable[..., list[IdentifiedAxis]]
+    axes: list[IdentifiedAxis],
+    found_gain: list[int],
+    step: Callable[[], None],
+    options: dict[str, Any],
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of the gains that were found, if they agree.
 
+    An axis whose gain was found has its lines where they are. ``options`` are those of a search.
     Where these scatter by more than their errors, so does the mean: its error is scaled by
     ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
     """
@@ -250,13 +266,31 @@ def _pool_gains(
         return axes, f"warning: the axes have different sensor gains, {values}"
     scatter = float(np.sum(weight * (log - mean) ** 2)) / max(len(found_gain) - 1, 1)
     gain, error = float(np.exp(mean)), float(np.sqrt(max(scatter, 1.0) / np.sum(weight)))
-    pooled = fit([gain] * len(axes), axes, gain * error)
-    notes = ["that of the other axis"] * len(axes)
-    for i in found_gain:
-        alone = len(found_gain) < len(axes)
-        notes[i] = "found in the closed loop's data" if alone else "mean of the axes"
-    pooled = [replace(a, sensor_gain_note=note) for a, note in zip(pooled, notes, strict=True)]
+    alone = len(found_gain) < len(axes)
+    own = "found in the closed loop's data" if alone else "mean of the axes"
+    pooled = []
+    for i, axis in enumerate(axes):
+        search, found = Search(data=axis.data, gain=gain, **options), i in found_gain
+        note = own if found else "that of the other axis"
+        pooled.append(refit_axis(axis, search, error, note, moves=not found))
+        step()
     return pooled, "one sensor gain for all axes"
+
+
+def _doubt_scale(axes: Sequence[IdentifiedAxis]) -> Iterator[str]:
+    """Yield that gains above 1 may be those of commands recorded at a part of their size."""
+    above = {
+        f"{axis.sensor_gain:.3f} +- {axis.sensor_gain_error:.3f}"
+        for axis in axes
+        if axis.sensor_gain_error is not None
+        and _CALIBRATED + _GAIN_ERRORS * axis.sensor_gain_error < axis.sensor_gain < _MOST_GAIN
+    }
+    if above:
+        yield (
+            f"warning: a calibrated sensor has a gain of at most 1; here it is "
+            f"{' and '.join(sorted(above))}. Commands recorded at a part of what was applied look "
+            "like that (--command-scale 2 if at half)"
+        )
 
 
 def _find_doubts(
@@ -269,6 +303,7 @@ def _find_doubts(
                 f"warning: axis {i} has a sensor gain of {axes[i].sensor_gain:.3g}: are the units, "
                 "signs and axes of the commands right?"
             )
+    yield from _doubt_scale([axes[i] for i in found_gain])
     for i, axis in enumerate(axes):
         if axis.noise_error_nm > _UNSEEN * axis.noise_nm:
             yield f"warning: the noise of axis {i} is not seen under the rest of its spectrum"

@@ -78,6 +78,20 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
     return single - best
 
 
+def measure_separations(axis: IdentifiedAxis) -> IdentifiedAxis:
+    """Return an axis each of whose lines knows how far apart two like it have to be."""
+    search, spectrum = Search(data=axis.data), axis.fitted_model.spectrum
+    components = spectrum.components
+    order = sorted(range(1, len(components)), key=lambda i: components[i].log_frequency)
+    parts = [
+        replace(part, separable_hz=separable_hz(search, spectrum, i))
+        if part.kind == "line"
+        else part
+        for part, i in zip(axis.parts, order, strict=True)
+    ]
+    return replace(axis, parts=tuple(parts))
+
+
 def separable_hz(search: Search, spectrum: SpectrumModel, i: int) -> float:
     """Return how far apart two like lines have to be to be seen as two in the place of line i.
 

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from lbt_synth.identification.fit.close_lines import measure_separations
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
 from lbt_synth.identification.fit.joint_whittle import (
@@ -132,7 +133,8 @@ def _describe_axis(
     )
     error = alone.sensor_gain_error
     relative = None if error is None else error / alone.sensor_gain
-    return describe_axis(search.searches[i], model, relative, alone.sensor_gain_note)
+    found = describe_axis(search.searches[i], model, relative, alone.sensor_gain_note)
+    return measure_separations(found)
 
 
 def _rank(fit: JointFit, axis: int, place: int) -> int:

@@ -72,6 +72,7 @@ class Search:
     most_lines: int = MOST_LINES
     announced: Sequence[tuple[float, float]] = ()  # (frequency, error) of known lines [Hz]
     colour: float = 0.0  # of the noise, where a fit begins; 0 for white noise
+    starting_gains: tuple[float, ...] = (0.6, 0.35, 1.0)  # of the sensor, where it is found
 
     def __post_init__(self) -> None:
         nyquist = self.data.frame_rate_hz / 2
@@ -159,13 +160,13 @@ def fit(
     """Fit all parameters; None if no fit settles.
 
     Components that leave the band, from the first bin to the Nyquist frequency, are dropped. A fit
-    is given up where its log-likelihood will hardly reach that of ``better_than`` less a margin.
+    is given up where its log-likelihood does not reach that of ``better_than`` less a margin.
     """
     data, bound = search.merge(start), float("inf")
     if better_than is not None:
         bound = contrast(data, better_than.spectrum) + margin
     found = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
-    if found is None:
+    if found is None or found.contrast > bound:
         return None
     inside = found.spectrum.keep(search.has_in_band)
     if len(inside.components) < len(start.components):

@@ -64,7 +64,6 @@ class IdentifiedLine:
     kind: Kind
     frequency_hz: float
     frequency_error_hz: float
-    separable_hz: float | None
     damping: float
     damping_error: float
     resolved: bool
@@ -73,6 +72,7 @@ class IdentifiedLine:
     prominence: float
     evidence: float
     announced: bool
+    separable_hz: float | None = None
     direction: tuple[float, ...] | None = None
     direction_error_deg: float | None = None
 

@@ -29,7 +29,6 @@ from lbt_synth.identification.fit.spectrum_model import (
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
 from lbt_synth.validation import FloatArray
 
-_STARTING_GAINS = (0.6, 0.35, 1.0)
 _STARTING_TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz], damping ratio
 _OVERDAMPED = 2.0  # damping ratio of a turbulence that is a drift already
 _LARGEST_DAMPING = 0.9  # of the turbulence beside a drift, when a fit begins
@@ -47,9 +46,13 @@ _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, and a design must not take it white
 
 
-def search_model(search: Search, start: SpectrumModel | None = None) -> FittedModel:
-    """Find the model of one axis."""
-    return search_models(search, start)[0]
+def search_model(
+    search: Search, start: SpectrumModel | None = None, *, moves: bool = True
+) -> FittedModel:
+    """Find the model of one axis; the lines of a start stay where they are without ``moves``."""
+    if start is None:
+        return search_models(search)[0]
+    return fitting.add_evidence(search, find_components(search, start, moves=moves))
 
 
 def search_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
@@ -90,7 +93,7 @@ def try_other_gains(
     lines cannot.
     """
     spectrum, found = model.spectrum, [model, *rivals]
-    for gain, colour in product(_STARTING_GAINS, sorted({spectrum.colour, 0.0})):
+    for gain, colour in product(search.starting_gains, sorted({spectrum.colour, 0.0})):
         if colour == spectrum.colour and abs(np.log(gain) - spectrum.log_gain) < _SAME_GAIN:
             continue
         begin = replace(search, gain=gain, colour=colour)
@@ -196,7 +199,7 @@ def _begin(search: Search) -> FittedModel | None:
     The first gain is held until the lines are there: a gain that is free while lines are missing
     runs away to what explains these. The others begin with those lines.
     """
-    gains = _STARTING_GAINS if search.finds_gain else (search.gain or 1.0,)
+    gains = search.starting_gains if search.finds_gain else (search.gain or 1.0,)
     known = replace(search, gain=gains[0])
     model = _fit_background(search, gains[0])
     for _ in range(_FEW_ROUNDS):

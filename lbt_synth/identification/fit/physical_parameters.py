@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from lbt_synth.identification.fit.close_lines import separable_hz
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
@@ -169,7 +168,6 @@ def _describe_line(
         kind=kind,
         frequency_hz=frequency,
         frequency_error_hz=frequency * error.log_frequency,
-        separable_hz=separable_hz(search, spectrum, i) if kind == "line" else None,
         damping=damping,
         damping_error=damping_error,
         resolved=resolved,

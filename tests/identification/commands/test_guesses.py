@@ -59,11 +59,17 @@ def test_the_record_as_given_is_the_likeliest(coarse) -> None:
 def test_other_gains_are_less_likely(coarse) -> None:
     given = Guess(kind="as given")
     best = coarse.compare([given])
-    fixed = coarse.compare([given] * 3, np.array([[0.35, 0.7, 1.4]] * 2))
-    assert fixed.gain.tolist() == [[0.35, 0.7, 1.4]] * 2
-    more = fixed.axis_contrast - best.axis_contrast
+    more = coarse.profile(given, np.array([[0.35, 0.7, 1.4]] * 2)) - best.axis_contrast
     assert np.all(more > -0.5)
     assert np.all(more[:, [0, 2]] > 25)
-    joined = best.join(fixed)
-    assert joined.contrast.tolist() == [*best.contrast, *fixed.contrast]
-    assert len(joined.guesses) == 4
+    own = coarse.profile(given, best.gain) - best.axis_contrast
+    np.testing.assert_allclose(own, 0, atol=0.02)  # what fits end within
+    assert coarse.unrelated() > np.sum(best.axis_contrast) + 100
+
+
+def test_comparisons_are_joined(coarse) -> None:
+    one, other = (coarse.compare([Guess(kind=kind)]) for kind in ("as given", "increments"))
+    joined = one.join(other)
+    assert joined.contrast.tolist() == [*one.contrast, *other.contrast]
+    assert joined.gain.tolist() == np.hstack([one.gain, other.gain]).tolist()
+    assert [guess.kind for guess in joined.guesses] == ["as given", "increments"]

@@ -84,6 +84,21 @@ def test_commands_in_other_units_are_doubted(factor: float) -> None:
     assert doubted or found.axes[0].sensor_gain_error is None
 
 
+@pytest.mark.parametrize(("factor", "doubted"), [(0.5, True), (0.7, False), (1.0, False)])
+def test_a_gain_above_one_is_named_as_commands_of_part_size(factor: float, doubted: bool) -> None:
+    record = spliced_record((0,), lines=LINE, frames=40_000)
+    given = lbt.identification.loop_record(
+        record.measurements,
+        factor * record.commands,
+        frame_rate_hz=RATE,
+        delay_frames=2,
+        unit="nm",
+    )
+    found = lbt.identify(given)
+    assert found.axes[0].sensor_gain == pytest.approx(0.6 / factor, rel=0.05)
+    assert any("--command-scale 2" in note for note in found.notes) == doubted
+
+
 def test_wide_resonances_that_hide_the_gain_are_noted() -> None:
     lines = ((20.0, 0.1, 60.0), (60.0, 0.3, 40.0), (130.0, 0.5, 40.0))
     axis = lbt.identify(spliced_record((1,), lines=lines, frames=60_000, noise=8.0)).axes[0]
