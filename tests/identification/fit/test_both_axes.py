@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import ModuleType
 from xml.etree import ElementTree
 
@@ -69,17 +70,17 @@ def test_identify_needs_what_it_needs() -> None:
         lbt.report.figures.identification_figure("model")
 
 
+def with_commands_of_size(
+    record: lbt.identification.LoopRecord, factor: float
+) -> lbt.identification.LoopRecord:
+    assert record.commands is not None
+    return replace(record, commands=factor * record.commands)
+
+
 @pytest.mark.parametrize("factor", [1 / 500, 100.0])
 def test_commands_in_other_units_are_doubted(factor: float) -> None:
     record = spliced_record((0,), lines=LINE, frames=20_000)
-    wrong = lbt.identification.loop_record(
-        record.measurements,
-        factor * record.commands,
-        frame_rate_hz=RATE,
-        delay_frames=2,
-        unit="nm",
-    )
-    found = lbt.identify(wrong)
+    found = lbt.identify(with_commands_of_size(record, factor))
     doubted = any("units, signs and axes of the commands" in note for note in found.notes)
     assert doubted or found.axes[0].sensor_gain_error is None
 
@@ -87,14 +88,7 @@ def test_commands_in_other_units_are_doubted(factor: float) -> None:
 @pytest.mark.parametrize(("factor", "doubted"), [(0.5, True), (0.7, False), (1.0, False)])
 def test_a_gain_above_one_is_named_as_commands_of_part_size(factor: float, doubted: bool) -> None:
     record = spliced_record((0,), lines=LINE, frames=40_000)
-    given = lbt.identification.loop_record(
-        record.measurements,
-        factor * record.commands,
-        frame_rate_hz=RATE,
-        delay_frames=2,
-        unit="nm",
-    )
-    found = lbt.identify(given)
+    found = lbt.identify(with_commands_of_size(record, factor))
     assert found.axes[0].sensor_gain == pytest.approx(0.6 / factor, rel=0.05)
     assert any("--command-scale 2" in note for note in found.notes) == doubted
 
