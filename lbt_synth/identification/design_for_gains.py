@@ -19,6 +19,7 @@ _APART = 3.0  # standard errors of a gain that are allowed
 _FARTHEST = 1.5  # factor by which a gain may be off that lies among those that a record allows
 _CAREFUL = (0.9, 0.8)  # of the fitted gain: slower designs at little cost
 _WIDE = 1.4  # by which the gain of a design is below the largest of a wide interval
+_UNEVEN = 1.3  # ratio of the gains of two axes that one sensor hardly has
 _HALF = 0.5  # of the gains are left of commands recorded at half their size
 
 
@@ -68,7 +69,9 @@ def design_for_gains(
     """Return a design that is stable at all possible gains of two models, for the first of them.
 
     Commands that were recorded at half their size look like twice the sensor gain, and no record
-    can tell; so half of the gains are possible, unless the scale of the commands is known.
+    can tell; so half of the gains are possible, unless the scale of the commands is known. Where
+    the axes have different gains, the commands of either may have another size than was recorded,
+    and each axis may have the gains of both.
     """
     model, _ = models
     made = design(model)
@@ -79,11 +82,16 @@ def design_for_gains(
         f"the sensor gain lies within {_words(intervals)}, as the record and its model allow; the "
         "loop is stable at all of these"
     )
+    known = intervals
     if command_scale_known:
         assumed += ". The commands were recorded at the size that was applied, as was stated"
     else:
-        intervals = intervals * [_HALF, 1.0]
+        intervals = known * [_HALF, 1.0]
         assumed += " and at half of them, should the commands be recorded at half their size"
+        if _are_uneven(model):
+            low = np.minimum(intervals[:, 0], known.min())
+            intervals = np.column_stack([low, np.full(len(low), known.max())])
+            assumed += ", and each axis at those of both, because they differ"
     bad = unstable_gains(made, intervals)
     if bad is None:
         return SafeDesign(model=model, design=made, assumptions=(assumed,))
@@ -95,7 +103,7 @@ def design_for_gains(
         f"{nm_text(_residual_nm(careful, model))} in the model; without that it would leave "
         f"{nm_text(_residual_nm(made, model))}"
     )
-    if not command_scale_known and unstable_gains(made, intervals / [_HALF, 1.0]) is None:
+    if not command_scale_known and unstable_gains(made, known) is None:
         note += " (--command-scale 1: the commands were recorded at the size that was applied)"
     return SafeDesign(model=used, design=careful, assumptions=(assumed,), notes=(note,))
 
@@ -110,7 +118,10 @@ def _design_carefully(
     low, high = float(np.min(intervals)), float(np.max(intervals))
     own = float(np.mean(model.sensor_gains))
     middle = float(np.sqrt(low * high))
-    for gain in (*(own * part for part in _CAREFUL), high / _WIDE, middle):
+    gains = [*(own * part for part in _CAREFUL), high / _WIDE, middle]
+    if _are_uneven(model):
+        gains.insert(0, max(model.sensor_gains))
+    for gain in gains:
         fitted = fit_model(start=model, sensor_gain=gain)
         made = design(fitted)
         if unstable_gains(made, intervals) is None:
@@ -146,6 +157,11 @@ def _robust(
         f"{_words(intervals)}. Record with a higher loop gain, look for jumps in the record, "
         f"give the sensor gain{advice}."
     )
+
+
+def _are_uneven(model: IdentifiedModel) -> bool:
+    """Return whether the axes have gains that one sensor hardly has."""
+    return max(model.sensor_gains) > _UNEVEN * min(model.sensor_gains)
 
 
 def _words(intervals: FloatArray) -> str:

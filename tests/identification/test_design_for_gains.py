@@ -6,7 +6,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from support.control_laws import ordinary_loop
 from support.recorded_loops import LINE, spliced_record
+from support.wrong_commands import record
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.gain_interval import unstable_gains
@@ -90,6 +92,18 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
             np.array([[0.8, 1.0]]),
             command_scale_known=False,
         )
+
+
+@pytest.mark.parametrize("size", [0.5, 2.0])
+def test_axes_of_different_gains_may_have_those_of_both(size: float) -> None:
+    """Commands of one axis at twice their size gave a design that was unstable in the loop."""
+    y, u = ordinary_loop()
+    made = lbt.design_from_record(record(y, u * [1.0, size]))
+    gains = made.model.sensor_gains
+    assert gains == pytest.approx((0.7, 0.7 / size), rel=0.15)
+    assert "each axis at those of both, because they differ" in made.design.assumptions[0]
+    assert unstable_gains(made.design, np.outer([1, 1], [min(gains), max(gains)])) is None
+    assert any("recorded at another size" in note for note in made.model.notes)
 
 
 def test_all_gains_count_that_the_record_or_a_model_allows(half):
