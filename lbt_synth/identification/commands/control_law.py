@@ -45,6 +45,7 @@ _ROUNDING = 1e-12
 _AS_GOOD = 0.9
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _COUNTS = 0.05  # of the largest weight of an axis
+FOLLOWED = 0.5  # coherence of an axis whose law counts
 _ROUGH = 0.05  # residual beyond which a law that knows the future is doubtful
 
 
@@ -126,6 +127,17 @@ class ControlLaw:
     def is_sure(self) -> bool:
         """Whether it explains so much that its lag counts."""
         return self.kind != "none" and self.residual < _SURE
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is sure, and each axis follows it."""
+        return self.is_sure and bool(np.all(self.axis_coherence > FOLLOWED))
+
+    @property
+    def is_ordinary(self) -> bool:
+        """Whether it is sure, without a lag, and each axis follows its own measurements."""
+        own = self.axis_matrix.kind == "diagonal" and min(self.axis_matrix.signs) > 0
+        return self.is_sure and self.lag_frames == 0 and own
 
     @property
     def axis_lags(self) -> IntArray:

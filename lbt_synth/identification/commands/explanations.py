@@ -145,8 +145,17 @@ def axes_apart(lags: IntArray) -> str:
     )
 
 
-def wrong_scale(factor: float, gain: FloatArray) -> str:
-    """Return the words for commands in another unit, a factor too large."""
-    size = f"{factor:g} times too large" if factor > 1 else f"{1 / factor:g} times too small"
+def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
+    """Return the words for commands that need a factor on each axis, (axes,)."""
+    sizes = [
+        f"{1 / factor:g} times too large" if factor < 1 else f"{factor:g} times too small"
+        for factor in scale
+    ]
+    words = f"they are {sizes[0]}"
+    if np.ptp(scale):
+        each = zip(sizes, scale, strict=True)
+        words = " and ".join(
+            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(each) if factor != 1
+        )
     gains = ", ".join(f"{value:.3g}" for value in gain)
-    return f"they are {size} (with them the sensor has a gain of {gains})"
+    return f"{words} (with them the sensor has a gain of {gains})"

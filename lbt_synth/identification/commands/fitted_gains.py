@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factor
+from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factors
 from lbt_synth.identification.commands.explanations import wrong_scale
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import AS_GIVEN, CommandVerdict
@@ -19,11 +19,11 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
     The fit shows gains beyond the plausible ones where the coarse model leaves them open.
     """
     accepted = not np.all(gains - _FIT_ERRORS * errors > PLAUSIBLE_GAINS[1])
-    factor = 1.0 if accepted else likely_factor(gains, PLAUSIBLE_GAINS)[0]
+    scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
     return CommandVerdict(
-        explanation=AS_GIVEN if accepted else wrong_scale(1 / factor, gains),
+        explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
         accepted=accepted,
-        repair=None if accepted else CommandRepair(scale=factor),
-        gain=frozen_copy(gains / factor),
+        repair=None if accepted else CommandRepair(scale=tuple(scale)),
+        gain=frozen_copy(gains / scale),
         law=None,
     )

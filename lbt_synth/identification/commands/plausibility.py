@@ -28,6 +28,7 @@ from lbt_synth.validation import BoolArray, FloatArray
 _NEAR_ONE = 0.2  # distance from 1 of the pole of a law that adds up
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _STABLE = 1 - 1e-9  # spectral radius below which a loop has run
+_SHORT = 3  # order of a law that does not couple axes
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
@@ -130,7 +131,10 @@ def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
         return True
     matrix = np.eye(len(law.gain)) if guess.matrix is None else guess.matrix
     turned = classify_matrix(matrix @ law.gain)
-    return turned.kind != "diagonal" or min(turned.signs) < 0
+    if turned.kind == "swapped" or min(turned.signs) < 0:
+        return True
+    # a long law may couple the axes, as a filter of lines along diagonals does
+    return turned.kind != "diagonal" and law.order <= _SHORT
 
 
 def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: bool) -> float:

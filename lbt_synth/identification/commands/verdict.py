@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError, RecordError
-from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factor
+from lbt_synth.identification.commands.coarse_steps import doubt_steps, gain_dilution, note_steps
+from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS
 from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
 from lbt_synth.identification.commands.explanations import (
-    axes_apart,
     invert_axes,
     recorded_early,
     refine_guess,
@@ -19,30 +20,31 @@ from lbt_synth.identification.commands.explanations import (
     wrong_scale,
 )
 from lbt_synth.identification.commands.guesses import (
+    SHIFTS,
     CoarseRecord,
     Comparison,
     Guess,
     list_guesses,
 )
 from lbt_synth.identification.commands.held_commands import held_while_moving
-from lbt_synth.identification.commands.plausibility import (
-    could_have_run,
-    finer_saving,
-    finer_saving_of_gain,
-    fit_gains,
-    score_guesses,
+from lbt_synth.identification.commands.law_doubts import (
+    doubt_axes,
+    doubt_law,
+    doubt_running,
+    find_slip,
+    moving_axes,
 )
+from lbt_synth.identification.commands.plausibility import finer_saving, score_guesses
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
+from lbt_synth.identification.commands.scale_search import find_scale
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import FloatArray, frozen_copy, one_or_each, require_instance
+from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each, require_instance
 
 AS_GIVEN = "as given"
 _CLEAR = 20.0  # nats that decide
 _CLEAR_FINER = 8.0  # the same by the criterion of the fit, where a shift is of whole frames
 _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
-_FOLLOWED = 0.5  # coherence of an axis whose lag counts
-_INSIDE = 8  # gains that are tried of the plausible ones
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 
@@ -161,15 +163,14 @@ def explain_commands(
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
-    law, lag, nothing = _find_law(record), 0, np.full(record.axes, np.nan)
-    if held := held_while_moving(record):
-        return CommandVerdict(explanation=held, accepted=False, gain=nothing, law=law)
-    if law is not None and law.is_sure:
-        lag, lags = law.lag_frames, law.axis_lags
-        if np.ptp(lags[law.axis_coherence > _FOLLOWED]):  # no real-time computer does that
-            return CommandVerdict(
-                explanation=axes_apart(lags), accepted=False, gain=nothing, law=law
-            )
+    law, nothing = _find_law(record), np.full(record.axes, np.nan)
+    moves = moving_axes(record)
+    if moves.any() and not moves.all():
+        return _explain_moving(record, moves, law, sensor_gain)
+    refuse = partial(CommandVerdict, accepted=False, gain=nothing, law=law)
+    if doubt := _doubt_series(record, law):
+        return refuse(explanation=doubt)
+    lag = law.lag_frames if law is not None and law.is_sure else 0
     early = max(-lag, 0)
     if early:  # corrections that follow from the future have no likelihood: they are moved first
         assert law is not None
@@ -181,36 +182,80 @@ def explain_commands(
         return CommandVerdict(
             explanation=AS_GIVEN, accepted=True, gain=nothing, law=law, notes=(note,)
         )
+    dilution = gain_dilution(coarse)
+    steps = doubt_steps(coarse, dilution) if sensor_gain is None else None
+    if law is not None and (doubt := _doubt_commands(coarse, law, steps)):
+        return refuse(explanation=doubt)
     gains = PLAUSIBLE_GAINS
     if sensor_gain is not None:
         known = one_or_each(sensor_gain, "sensor_gain", above=0)
         gains = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
     found = _find_best(coarse, law, max(lag, 0))
-    scale = 1.0 if found is None else _find_scale(coarse, law, found, gains)
+    one = np.ones(record.axes)
+    scale = one if found is None else found.scale(coarse, law, gains)
     no_law = law is None or law.kind == "none"
-    if found is None or (no_law and not 1 / _ABSURD < scale < _ABSURD):
-        return CommandVerdict(
+    if found is None or (no_law and np.max(np.abs(np.log(scale))) > np.log(_ABSURD)):
+        return refuse(
             explanation="they have nothing to do with the measurements, as if of another night",
-            accepted=False,
             gain=np.zeros(record.axes),
-            law=law,
         )
+    if found.guess.kind == "as given" and (doubt := doubt_running(record, law, found.gain)):
+        return refuse(explanation=doubt)
     words = [] if not early else [recorded_early(early)]
     repair, other_delay, why = repair_guess(found.guess, delay, max(lag, 0))
     words += why
-    if scale != 1:
-        words.append(wrong_scale(1 / scale, found.gain))
-    repair = replace(repair, shift_frames=repair.shift_frames or early, scale=scale)
+    if np.any(scale != 1):
+        words.append(wrong_scale(scale, found.gain))
+    if steps and not words:
+        words.append(steps)
+    repair = replace(repair, shift_frames=repair.shift_frames or early, scale=tuple(scale))
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
         accepted=not words,
         repair=repair if repair.options else None,
         delay_frames=other_delay,
         nats=max(found.nats, 0.0),
-        gain=frozen_copy(found.gain * scale),
+        gain=frozen_copy(found.gain / scale),
         law=law,
-        notes=_notes(found, delay, lag) if not words else (),
+        notes=(*_notes(found, delay, lag), *note_steps(coarse, dilution)) if not words else (),
     )
+
+
+def _explain_moving(
+    record: LoopRecord,
+    moves: BoolArray,
+    law: ControlLaw | None,
+    sensor_gain: float | Sequence[float] | None,
+) -> CommandVerdict:
+    """Explain the commands of the axis that moves; the loop of the other one was open."""
+    assert record.commands is not None
+    one = replace(
+        record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
+    )
+    known = sensor_gain
+    if sensor_gain is not None and np.ndim(sensor_gain):
+        known = np.asarray(sensor_gain)[moves].tolist()
+    found = explain_commands(one, sensor_gain=known)
+    gain = np.full(record.axes, np.nan)
+    gain[moves] = found.gain
+    note = f"the commands of axis {int(np.argmin(moves))} stand still: its loop was open"
+    return replace(found, gain=frozen_copy(gain), law=law, notes=(*found.notes, note))
+
+
+def _doubt_series(record: LoopRecord, law: ControlLaw | None) -> str | None:
+    """Return what is wrong with the series of a record whatever the sensor sees, in words."""
+    if held := held_while_moving(record):
+        return held
+    if law is not None and law.is_sure and (doubt := doubt_law(law)):
+        return doubt
+    return None if law is not None and law.is_whole else find_slip(record)
+
+
+def _doubt_commands(coarse: CoarseRecord, law: ControlLaw, steps: str | None) -> str | None:
+    """Return why commands do not show the sensor gain, in words; ``steps`` say so of theirs."""
+    if doubt := doubt_axes(coarse, law):
+        return steps or doubt
+    return steps if law.is_ordinary else None
 
 
 def _find_law(record: LoopRecord) -> ControlLaw | None:
@@ -233,11 +278,20 @@ class _Best:
     rival: Guess | None = None  # a likelier one that is not clearly so
     rival_nats: float = 0.0
 
+    def scale(
+        self, coarse: CoarseRecord, law: ControlLaw | None, plausible: tuple[float, float]
+    ) -> FloatArray:
+        """Return the factors of commands that make implausible gains plausible ones."""
+        decides = {"own_contrast": self.own_contrast, "clear": self.clear}
+        return find_scale(coarse, law, self.guess, self.gain, plausible=plausible, **decides)
+
 
 def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best | None:
     """Return the best explanation; None where commands do not reach the measurements."""
     record = coarse.record
     guesses = list_guesses(record, earliest_frames=1.0 - lag)
+    if lag > SHIFTS[-1]:
+        guesses.append(Guess(kind="shift", shift_frames=-float(lag)))
     if law is not None and law.axis_matrix.kind not in ("diagonal", "swapped", "zero"):
         inverse = invert_axes(law.gain)
         guesses += [] if inverse is None else [Guess(kind="matrix", matrix=inverse)]
@@ -295,32 +349,6 @@ def _best_limits(compared: Comparison) -> Guess:
     limits = np.array([compared.guesses[i].limit_nm for i in places])
     best = np.argmin(compared.axis_contrast[:, places], axis=1)
     return Guess(kind="clipped", limit_nm=limits[best, np.arange(best.size)])
-
-
-def _find_scale(
-    coarse: CoarseRecord, law: ControlLaw | None, found: _Best, plausible: tuple[float, float]
-) -> float:
-    """Return the factor of the commands that makes an implausible gain a plausible one."""
-    low, high = plausible
-    bounded = np.clip(found.gain, low, high)
-    if np.all(bounded == found.gain):
-        return 1.0
-    inside = np.geomspace(low, high, _INSIDE)
-    near = coarse.profile(found.guess, np.tile(inside, (len(bounded), 1)))
-    if np.sum(np.min(near, axis=1)) - found.own_contrast < found.clear:
-        return 1.0
-    gains = fit_gains(coarse, found.guess, found.gain)
-    factor, usual = likely_factor(gains, plausible)
-    gain = float(np.exp(np.mean(np.log(gains))))
-    tried = inside[:, None] * np.ones(len(bounded))
-    record = coarse.record
-    if law is not None and law.is_sure:
-        if not could_have_run(found.guess, tried, record, law):
-            return factor
-        if gain < low:  # commands that are too large come from a law that is too strong
-            return 1.0
-    shown = finer_saving_of_gain(coarse, found.guess, plausible, usual) >= found.clear
-    return factor if shown else 1.0
 
 
 def _notes(found: _Best, delay_frames: float, lag: int) -> tuple[str, ...]:

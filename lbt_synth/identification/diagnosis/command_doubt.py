@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.verdict import CommandVerdict
 from lbt_synth.storage.rows import column, table_row
@@ -26,7 +28,7 @@ def command_row(verdict: CommandVerdict) -> CommandRow:
     return CommandRow(
         explanation=verdict.explanation,
         nats=verdict.nats,
-        gain=", ".join(f"{value:.3g}" for value in verdict.gain),
+        gain=", ".join("-" if np.isnan(value) else f"{value:.3g}" for value in verdict.gain),
         repair=verdict.options,
     )
 
@@ -36,8 +38,10 @@ def doubt_commands(verdict: CommandVerdict | None) -> tuple[str, str]:
     if verdict is None:
         return "", ""
     if not verdict.accepted:
-        options = verdict.options
-        return verdict.explanation, f"read the record with {options}" if options else _FIND
+        if verdict.options:
+            return verdict.explanation, f"read the record with {verdict.options}"
+        what, _, advice = verdict.explanation.partition(". ")
+        return what, advice[:1].lower() + advice[1:] or _FIND
     return ("", "") if verdict.law is None else _doubt_law(verdict.law)
 
 

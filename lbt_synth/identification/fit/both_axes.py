@@ -263,7 +263,10 @@ def _pool_gains(
     mean = float(np.sum(weight * log) / np.sum(weight))
     if np.any(np.abs(log - mean) * gains > _APART * errors):
         values = ", ".join(f"{g:.3f} +- {e:.3f}" for g, e in zip(gains, errors, strict=True))
-        return axes, f"warning: the axes have different sensor gains, {values}"
+        return axes, (
+            f"warning: the axes have different sensor gains, {values}: the commands of one may be "
+            "recorded at another size (--command-scale takes a factor for each axis)"
+        )
     scatter = float(np.sum(weight * (log - mean) ** 2)) / max(len(found_gain) - 1, 1)
     gain, error = float(np.exp(mean)), float(np.sqrt(max(scatter, 1.0) / np.sum(weight)))
     alone = len(found_gain) < len(axes)

@@ -5,16 +5,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factor
+from lbt_synth.identification.commands.command_scale import (
+    PLAUSIBLE_GAINS,
+    likely_factors,
+    usual_gain,
+)
 
 
 @pytest.mark.parametrize("gain", [0.2, 0.7, 1.25, 1.64])
 @pytest.mark.parametrize("factor", [1e-9, 1e-3, 1e3])
 def test_units_are_powers_of_ten_however_coarse_the_gain(gain, factor) -> None:
-    found, usual = likely_factor(factor * gain * np.array([0.9, 1.1]), PLAUSIBLE_GAINS)
-    assert found == pytest.approx(factor)
-    assert usual == 0.7
+    found = likely_factors(factor * gain * np.array([0.9, 1.1]), PLAUSIBLE_GAINS)
+    np.testing.assert_allclose(found, [factor, factor])
+    assert usual_gain(PLAUSIBLE_GAINS) == 0.7
 
 
 def test_other_factors_bring_a_usual_gain() -> None:
-    assert likely_factor(np.array([4.0]), (0.9, 1.0)) == (pytest.approx(4.4), 0.9)
+    assert likely_factors(np.array([4.0]), (0.9, 1.0)).tolist() == [pytest.approx(4.4)]
+    assert usual_gain((0.9, 1.0)) == 0.9
+
+
+def test_axes_far_apart_have_factors_of_their_own() -> None:
+    assert likely_factors(np.array([0.8, 1.6]), PLAUSIBLE_GAINS).tolist() == [1.0, 2.0]
+    found = likely_factors(np.array([700.0, 0.5]), PLAUSIBLE_GAINS)
+    np.testing.assert_allclose(found, [1000.0, 1.0])
+    assert likely_factors(np.array([1.4, 1.8]), PLAUSIBLE_GAINS).tolist() == [2.0, 2.0]

@@ -76,5 +76,9 @@ def test_axes_of_a_law_are_inverted() -> None:
 
 
 def test_words_for_a_scale() -> None:
-    assert wrong_scale(1000.0, np.array([0.0007])).startswith("they are 1000 times too large")
-    assert wrong_scale(0.5, np.array([1.6])).startswith("they are 2 times too small")
+    gain = np.array([0.0007])
+    assert wrong_scale(np.array([0.001]), gain).startswith("they are 1000 times too large")
+    assert wrong_scale(np.array([2.0]), gain).startswith("they are 2 times too small")
+    assert wrong_scale(np.array([1.0, 2.0]), np.array([0.8, 1.6])) == (
+        "those of axis 1 are 2 times too small (with them the sensor has a gain of 0.8, 1.6)"
+    )
