@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import NumericalError
+from lbt_synth.identification.commands.coarse_steps import is_stepped
 from lbt_synth.identification.commands.gain_interval import allowed_gains
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
@@ -24,7 +25,8 @@ def identify_with_gains(
     """Identify a record; return the model and the sensor gains that it allows, (axes, 2).
 
     None for an open loop, or a gain that is given. Where the coarse spectrum asks for other gains
-    than the fit, and a fit that is held at these is clearly less likely, the fit decides.
+    than the fit, and a fit that is held at these is clearly less likely, the fit decides: but not
+    where the commands are recorded in steps, which move the gain of the fit more.
     ``options`` are those of :func:`identify`.
     """
     model = identify(record, **options)
@@ -34,6 +36,7 @@ def identify_with_gains(
     if agrees(model, allowed):
         return model, allowed
     best, excluded = _compare(record, model, allowed, options)
+    excluded = excluded and not is_stepped(record)
     own = np.repeat(np.array(best.sensor_gains)[:, None], 2, axis=1)
     return best, own if excluded else allowed
 

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
+from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import BoolArray, FloatArray, read_only
 
 _FUZZ = 1e-6  # of the range of values, within which two are the same
-_MATTERS = 1e-3  # of the variance of increments, that the rounding must have
-_SEEN, _DROWNED = 1.05, 1.35  # factors of a gain that get a note, and that are too large
+_MATTERS = 1e-6  # of the variance of increments, that the rounding must have
+_SEEN, _DROWNED = 1.03, 1.15  # factors of a gain that get a note, and that are too large
 
 
 def command_steps(commands: FloatArray, usable: BoolArray) -> FloatArray:
@@ -30,6 +31,19 @@ def _step(values: FloatArray) -> float:
     return step if np.max(np.abs(away - np.round(away))) < 0.1 else 0.0
 
 
+def is_stepped(record: LoopRecord) -> bool:
+    """Return whether commands are recorded in steps that may change the sensor gain."""
+    return bool(np.any(_matters(record)))
+
+
+def _matters(record: LoopRecord) -> BoolArray:
+    """Return the axes whose rounding may matter, (axes,)."""
+    assert record.commands is not None
+    steps = command_steps(record.commands, record.usable)
+    changes = np.var(np.diff(record.commands, axis=0), axis=0)
+    return np.asarray(steps**2 / 12 > _MATTERS * changes)
+
+
 def gain_dilution(coarse: CoarseRecord) -> FloatArray:
     """Return by how much sensor gains are too small for the steps of commands, (axes,), about.
 
@@ -38,7 +52,7 @@ def gain_dilution(coarse: CoarseRecord) -> FloatArray:
     """
     record, steps = coarse.record, _steps(coarse)
     assert record.commands is not None
-    matters = steps**2 / 12 > _MATTERS * np.var(np.diff(record.commands, axis=0), axis=0)
+    matters = _matters(record)
     if not np.any(matters):
         return np.ones(record.axes)
     rounding = np.random.default_rng(0).uniform(-0.5, 0.5, record.commands.shape) * steps
@@ -53,9 +67,14 @@ def doubt_steps(coarse: CoarseRecord, dilution: FloatArray) -> str | None:
     worst = int(np.argmax(dilution))
     if dilution[worst] < _DROWNED:
         return None
-    step = _steps(coarse)[worst]
+    return drowns_in_steps(coarse, worst)
+
+
+def drowns_in_steps(coarse: CoarseRecord, axis: int) -> str:
+    """Return the words for a sensor gain that steps hide."""
+    step = _steps(coarse)[axis]
     return (
-        f"those of axis {worst} are recorded in steps of {step:.3g} nm, in which the sensor gain "
+        f"those of axis {axis} are recorded in steps of {step:.3g} nm, in which the sensor gain "
         "drowns. Record more digits, or give the sensor gain"
     )
 

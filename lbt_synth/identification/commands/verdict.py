@@ -96,7 +96,8 @@ class CommandVerdict:
         """What a design from a record rests on that was accepted nevertheless."""
         if self.accepted:
             return ()
-        return (f"the record is right although it looks as if of the commands {self.explanation}",)
+        what = self.explanation.partition(". ")[0]  # without advice
+        return (f"the record is right, although its commands look as if {what}",)
 
     def require_accepted(self) -> None:
         """Refuse a record that is explained better by something else.
@@ -208,6 +209,7 @@ def explain_commands(
         words.append(wrong_scale(scale, found.gain))
     if steps and not words:
         words.append(steps)
+    rounded = note_steps(coarse, dilution) if sensor_gain is None else ()
     repair = replace(repair, shift_frames=repair.shift_frames or early, scale=tuple(scale))
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
@@ -217,7 +219,7 @@ def explain_commands(
         nats=max(found.nats, 0.0),
         gain=frozen_copy(found.gain / scale),
         law=law,
-        notes=(*_notes(found, delay, lag), *note_steps(coarse, dilution)) if not words else (),
+        notes=() if words else (*_notes(found, delay, lag), *rounded),
     )
 
 
