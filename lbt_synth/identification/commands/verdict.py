@@ -187,13 +187,9 @@ def explain_commands(
     steps = doubt_steps(coarse, dilution) if sensor_gain is None else None
     if law is not None and (doubt := _doubt_commands(coarse, law, steps)):
         return refuse(explanation=doubt)
-    gains = PLAUSIBLE_GAINS
-    if sensor_gain is not None:
-        known = one_or_each(sensor_gain, "sensor_gain", above=0)
-        gains = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
     found = _find_best(coarse, law, max(lag, 0))
     one = np.ones(record.axes)
-    scale = one if found is None else found.scale(coarse, law, gains)
+    scale = one if found is None else found.scale(coarse, law, _plausible(sensor_gain))
     no_law = law is None or law.kind == "none"
     if found is None or (no_law and np.max(np.abs(np.log(scale))) > np.log(_ABSURD)):
         return refuse(
@@ -221,6 +217,14 @@ def explain_commands(
         law=law,
         notes=() if words else (*_notes(found, delay, lag), *rounded),
     )
+
+
+def _plausible(sensor_gain: float | Sequence[float] | None) -> tuple[float, float]:
+    """Return the least and the largest gain that a sensor may have."""
+    if sensor_gain is None:
+        return PLAUSIBLE_GAINS
+    known = one_or_each(sensor_gain, "sensor_gain", above=0)
+    return float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
 
 
 def _explain_moving(
