@@ -164,6 +164,7 @@ def explain_commands(
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
+    plausible = _plausible(sensor_gain)
     law, nothing = _find_law(record), np.full(record.axes, np.nan)
     moves = moving_axes(record)
     if moves.any() and not moves.all():
@@ -189,7 +190,7 @@ def explain_commands(
         return refuse(explanation=doubt)
     found = _find_best(coarse, law, max(lag, 0))
     one = np.ones(record.axes)
-    scale = one if found is None else found.scale(coarse, law, _plausible(sensor_gain))
+    scale = one if found is None else found.scale(coarse, law, plausible)
     no_law = law is None or law.kind == "none"
     if found is None or (no_law and np.max(np.abs(np.log(scale))) > np.log(_ABSURD)):
         return refuse(
