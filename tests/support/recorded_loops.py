@@ -6,6 +6,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -83,6 +84,29 @@ def hidden_resonance_record(seed: int = 63) -> lbt.identification.LoopRecord:
     return _directed_record(1000.0, 0.995, 0.2266, 2.82, resonances, air, seed)
 
 
+def drifting_record(seed: int = 337) -> lbt.identification.LoopRecord:
+    """Return a loop of sensor gain 0.586 under a drift and frozen flow, of which no model has both.
+
+    The spectrum in closed loop is simpler: coloured noise over a line, at no gain at all.
+    """
+    rate_hz = 723.0
+    path = lbt.LoopHardware(frame_rate_hz=rate_hz, modes=1)
+    air = lbt.Atmosphere(
+        seeing_arcsec=1.3785, outer_scale_m=15.56, wind_speed_m_s=12.702, diameter_m=8.22
+    )
+    drift = lbt.models.ARModel(
+        coefficients=[0.99988708], driving_rms_nm=3.8718, frame_rate_hz=rate_hz
+    )
+    line = lbt.Vibration(frequency_hz=78.643, damping=0.00516, rms_nm=16.754, direction=(1.0,))
+    total = lbt.models.SumSpectrum(parts=[air, drift])
+    truth = lbt.Truth(turbulence=total, vibrations=(line,), noise_nm=3.403, sensor_gain=0.5859)
+    law, frames = lbt.integrator(path, gain=0.4062).controller, int(15 * rate_hz)
+    run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000)
+    return lbt.identification.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=rate_hz, delay_frames=2, unit="nm"
+    )
+
+
 def _air(wind_speed_m_s: float) -> lbt.Atmosphere:
     """Return strong turbulence above a telescope of 8 m."""
     return lbt.Atmosphere(
@@ -119,6 +143,24 @@ def _directed_record(
     run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=500)
     return lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=rate_hz, delay_frames=2, unit="nm"
+    )
+
+
+def expected_periodogram(air: lbt.models.Spectrum, noise: float, gain: float) -> LoopPeriodogram:
+    """Return what the periodograms of a minute of an integrator's loop scatter about."""
+    f = np.arange(1, 30_000) / 60
+    delay = np.exp(-2j * np.pi * f / RATE)
+    loop = 0.4 * delay**2 / (1 - delay)  # from measurements to the corrections in them
+    measured = gain**2 * air.psd(f) + 2 / RATE * noise**2
+    measured = measured / np.abs(1 + gain * loop) ** 2
+    return LoopPeriodogram(
+        frequency_hz=f,
+        measured=measured,
+        crossed=loop.real * measured,
+        corrected=np.abs(loop) ** 2 * measured,
+        count=np.ones(f.size),
+        frame_rate_hz=RATE,
+        resolution_hz=1 / 60,
     )
 
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from lbt_synth.validation import FloatArray
 
-PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _USUAL_GAIN = 0.7
 _COARSE = 1.5  # factor by which a coarse gain may be wrong

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from lbt_synth.identification.commands.coarse_steps import drowns_in_steps, is_stepped
-from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS, likely_factors
+from lbt_synth.identification.commands.command_scale import likely_factors
 from lbt_synth.identification.commands.explanations import wrong_scale
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import AS_GIVEN, CommandVerdict
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import FloatArray, frozen_copy
 

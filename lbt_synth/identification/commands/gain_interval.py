@@ -18,7 +18,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import close_loop, stable_sensor_gains
 from lbt_synth.validation import BoolArray, FloatArray
 
-_LEAST, _MOST = 0.08, 2.5  # of a sensor
+POSSIBLE_GAINS = _LEAST, _MOST = 0.08, 2.5  # of a sensor
 _FAR_STEPS = 16
 _NEAR = np.geomspace(0.7, 1.43, 21)  # of the best gain, itself included
 _FAR = 6.0  # nats below the best gain that a record still allows

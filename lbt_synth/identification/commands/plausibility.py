@@ -11,11 +11,10 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.commands.axis_matrix import classify_matrix
-from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.guesses import CoarseRecord, Comparison, Guess
 from lbt_synth.identification.commands.law_controller import law_controller
-from lbt_synth.identification.fit.fitting import GAINS, Search, cost
+from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
 from lbt_synth.identification.fit.order_search import find_components, try_other_gains
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.whittle import FittedModel

@@ -10,7 +10,6 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, RecordError
 from lbt_synth.identification.commands.coarse_steps import doubt_steps, gain_dilution, note_steps
-from lbt_synth.identification.commands.command_scale import PLAUSIBLE_GAINS
 from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
 from lbt_synth.identification.commands.explanations import (
     invert_axes,
@@ -37,6 +36,7 @@ from lbt_synth.identification.commands.law_doubts import (
 from lbt_synth.identification.commands.plausibility import finer_saving, score_guesses
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.commands.scale_search import find_scale
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each, require_instance
 

@@ -12,7 +12,6 @@ import numpy as np
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import EXACT, SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import (
-    NO_CORNER,
     Component,
     Kind,
     SpectrumModel,
@@ -33,6 +32,7 @@ from lbt_synth.validation import IntArray, integer, number
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
+PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 COLOUR_PRICE = 9.0  # the same of noise that is not white
 _SPLIT = 9.0  # the same of the second of two lines that lie in each other's skirts
@@ -50,6 +50,7 @@ STARTING_CORNER_HZ, _CORNER_WIDTH = 50.0, 2.0
 _SLOWEST = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "turbulence": (np.log(0.45), 4.0),
+    "drift": (np.log(0.45), 4.0),
     "slow": (0.0, 1.0),
     "line": (np.log(0.01 / 0.99), 4.0),
 }
@@ -192,7 +193,7 @@ def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel
 def simplify(search: Search, model: FittedModel) -> FittedModel:
     """Return the model without roll-off or colour, where that adds too little."""
     if model.spectrum.rolls_off:
-        less = fit(search, replace(model.spectrum, log_corner=float(np.log(2 * NO_CORNER))))
+        less = fit(search, model.spectrum.without_roll_off())
         if less is not None and less.contrast - model.contrast < search.price / PARAMETERS:
             model = less
     if model.spectrum.colour:

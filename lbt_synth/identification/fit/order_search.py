@@ -20,12 +20,7 @@ from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.excesses import Candidate, find_candidates, measure_excess
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.scoring import SEARCHED
-from lbt_synth.identification.fit.spectrum_model import (
-    NO_CORNER,
-    Kind,
-    SpectrumModel,
-    damping_parameter,
-)
+from lbt_synth.identification.fit.spectrum_model import Kind, SpectrumModel, damping_parameter
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
 from lbt_synth.validation import FloatArray
 
@@ -40,6 +35,7 @@ _HALF = float(np.log(0.5))
 _SAME_GAIN = 0.15  # of a logarithm
 _MOST_TURBULENCES = 3
 _SIGNIFICANT = 1.92  # log-likelihood that one parameter too many adds in 5 % of the cases
+_BEYOND = 0.2  # of a logarithm: standard deviation of gains beyond the plausible ones
 _FAR_GAIN = 3.0  # standard errors by which a colour of the noise moves a gain that is doubted
 _OTHER_NOISE = 5.0  # log-likelihood by which white noise or a coloured one is excluded
 _COLOUR = 0.3  # of the noise, where a fit begins
@@ -81,7 +77,17 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
     spectrum = model.spectrum
     wide = sum(not c.is_narrow for c in spectrum.lines)
     coloured = fitting.COLOUR_PRICE * bool(spectrum.colour)
-    return fitting.cost(search, model) + search.price * wide + coloured
+    return _cost_with_gain(search, model) + search.price * wide + coloured
+
+
+def _cost_with_gain(search: Search, model: FittedModel) -> float:
+    """Return the cost of a model whose gain may be one that hardly any sensor has.
+
+    At a gain of almost nothing, what the loop left needs a simpler spectrum than the disturbance.
+    """
+    gain = model.spectrum.gain
+    beyond = float(np.log(gain / np.clip(gain, *fitting.PLAUSIBLE_GAINS)))
+    return fitting.cost(search, model) + 0.5 * (beyond / _BEYOND) ** 2 * search.finds_gain
 
 
 def try_other_gains(
@@ -106,7 +112,7 @@ def try_other_gains(
         if free is not None and abs(free.spectrum.colour) < _MOST_COLOUR:
             found.append(free)
     best = min(found, key=lambda each: _cost_of_noise(search, each))
-    near, costs = [], (fitting.cost, _cost_of_noise)
+    near, costs = [], (_cost_with_gain, _cost_of_noise)
     least = [cost(search, best) for cost in costs]
     for each in found:
         same = bool(each.spectrum.colour) == bool(best.spectrum.colour)
@@ -176,7 +182,8 @@ def _trials(
     search: Search, spectrum: SpectrumModel, moves: bool
 ) -> Iterator[tuple[SpectrumModel, float]]:
     """Yield models with new components or other places of lines, and what each must save."""
-    overdamped = spectrum.components[0].damping_ratio > _OVERDAMPED
+    first = spectrum.components[0]
+    overdamped = first.kind == "drift" or first.damping_ratio > _OVERDAMPED
     # where no line can be added, a second turbulence would take the place of one
     room = len(spectrum.lines) < search.most_lines
     if room and not overdamped:
@@ -264,19 +271,17 @@ def _add_first_order(search: Search, spectrum: SpectrumModel) -> list[SpectrumMo
     """Return models with a first-order drift in the place of the turbulence, which stays.
 
     Second-order processes cannot fall with the square of the frequency, and lines would have to.
+    The turbulence keeps its roll-off.
     """
     hz, ratio = _STARTING_TURBULENCE[-1]
-    first = search.component("turbulence", hz, ratio, 1.0)  # of a density hz / (pi ratio f^2)
+    first = search.component("drift", hz, ratio, 1.0)  # of a density hz / (pi ratio f^2)
     old = spectrum.components[0]
     damping = damping_parameter("slow", min(old.damping_ratio, _LARGEST_DAMPING))
     turbulence = replace(old, kind="slow", damping=damping)
     noise = 2 / search.data.frame_rate_hz * float(np.exp(spectrum.log_noise))
     noise = max(noise, float(np.finfo(float).tiny))
     trials = [
-        replace(
-            spectrum.exchange(0, replace(first, log_power=float(np.log(power)))).add(turbulence),
-            log_corner=float(np.log(2 * NO_CORNER)),
-        )
+        spectrum.exchange(0, replace(first, log_power=float(np.log(power)))).add(turbulence)
         for power in noise * np.array(_CROSSINGS_HZ) ** 2 * np.pi * ratio / hz
     ]
     return sorted(trials, key=lambda trial: contrast(search.data, trial))[:2]

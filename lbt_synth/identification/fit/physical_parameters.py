@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lbt_synth.identification.fit.finite_order import nearest_processes
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
@@ -16,14 +17,12 @@ from lbt_synth.identification.fit.identified_model import (
     Whiteness,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.scoring import Priors
 from lbt_synth.identification.fit.spectrum_model import GAIN, WIDE_DAMPING, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
     FittedModel,
     densities,
     derivatives,
     invert_information,
-    minimise,
 )
 from lbt_synth.models import ARModel
 from lbt_synth.models.resonance_spectrum import coefficients
@@ -33,7 +32,6 @@ UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 _DIFFERENCE = 1e-4  # of a logarithm
 _LAGS = 100
-_TURBULENCE = slice(3, 7)  # places of roll-off and turbulence in a packed vector
 _LOWEST = 3  # bins in which the ends of the taper show
 
 
@@ -95,25 +93,27 @@ def describe_axis(
     """
     data, spectrum, gain = search.data, model.spectrum, model.spectrum.gain
     rate = data.frame_rate_hz
-    covariance = parameter_covariance(model)
-    errors = standard_errors(spectrum, covariance)
-    density, _, _ = densities(data, spectrum)
-    fitted = density.sum(axis=0)
+    near = nearest_processes(search, model)
+    covariance = parameter_covariance(near)
+    errors = standard_errors(near.spectrum, covariance)
+    slow = spectrum if spectrum.rolling == "turbulence" else near.spectrum
+    density, _, _ = densities(data, near.spectrum)
+    fitted = densities(data, spectrum)[0].sum(axis=0)
     lines = [
-        _describe_line(search, model, i, errors, covariance, density)
+        _describe_line(search, near, i, errors, covariance, density)
         for i in range(1, len(spectrum.components))
     ]
     background = fitted.copy()
     for line, own in zip(lines, density[2:], strict=True):
         if line.kind == "line":
             background -= own
-    process = _turbulence_process(nearest_process(search, spectrum), rate)
+    process = _turbulence_process(near.spectrum, rate)
     innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
     noise = max(float(np.exp(spectrum.log_noise / 2)), _LEAST_NOISE * innovation)
     correlation = float(np.tanh(spectrum.colour))
     return IdentifiedAxis(
         turbulence=process,
-        turbulence_fit=_describe_turbulence(spectrum, errors, covariance, process),
+        turbulence_fit=_describe_turbulence(slow, errors, covariance, process),
         parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
@@ -177,23 +177,6 @@ def _describe_line(
         evidence=model.evidence[i],
         announced=line.announced is not None,
     )
-
-
-def nearest_process(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
-    """Return a model whose turbulence is a process of finite order, the nearest by its likelihood.
-
-    No process falls as tilt does.
-    """
-    if not spectrum.rolls_off:
-        return spectrum
-    data = search.merge(spectrum)
-    fitted, zero = densities(data, spectrum)[0].sum(axis=0), np.zeros_like(data.measured)
-    data = replace(data, measured=fitted, crossed=zero, corrected=zero)
-    start = replace(spectrum, roll_off_order=1.0)
-    width = np.zeros(start.pack().size)
-    width[_TURBULENCE] = np.inf
-    found = minimise(data, start, Priors(centre=start.pack(), width=width))
-    return start if found is None else found.spectrum
 
 
 def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:

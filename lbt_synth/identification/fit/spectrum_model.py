@@ -14,20 +14,22 @@ from lbt_synth.validation import FloatArray
 
 GAIN = 0  # place of the sensor gain in a packed vector
 WIDE_DAMPING = 0.1  # damping ratio of a resonance that is no line
-NO_CORNER = 50.0  # angle per frame; a corner above it is none
+_NO_CORNER = 50.0  # angle per frame; a corner above it is none
 _TILT_ORDER = 5 / 6  # of its roll-off: tilt falls with f^(-17/3), a second-order process with f^-4
 _LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
 _JUST_ABOVE = 1e-3
 _NOTHING = float(np.log(np.finfo(float).tiny))  # as a logarithm
 
-Kind = Literal["turbulence", "slow", "line"]  # "slow": another part of the turbulence
+# "slow" is another part of the turbulence; a first-order "drift" stands in the place of the first
+Kind = Literal["turbulence", "drift", "slow", "line"]
+_FIRST: tuple[Kind, ...] = ("turbulence", "drift")
 
 
 @dataclass(frozen=True, slots=True)
 class Component:
     """A resonance, by the numbers that a fit varies.
 
-    The damping ratio zeta of the turbulence is above 0.05, that of all others below 1: their
+    The damping ratio zeta of the first one is above 0.05, that of all others below 1: their
     ``damping`` is ``log(zeta - 0.05)`` and ``log(zeta / (1 - zeta))``.
     """
 
@@ -45,9 +47,14 @@ class Component:
     @property
     def damping_ratio(self) -> float:
         """Damping ratio."""
-        if self.kind == "turbulence":
+        if self.is_first:
             return _LEAST + math.exp(self.damping)
         return 1 / (1 + math.exp(-self.damping))
+
+    @property
+    def is_first(self) -> bool:
+        """Whether it stands in the first place, where processes may be overdamped."""
+        return self.kind in _FIRST
 
     @property
     def is_narrow(self) -> bool:
@@ -58,7 +65,7 @@ class Component:
     def damping_slope(self) -> float:
         """Derivative of the logarithm of the damping ratio by ``damping``."""
         ratio = self.damping_ratio
-        return 1 - _LEAST / ratio if self.kind == "turbulence" else 1 - ratio
+        return 1 - _LEAST / ratio if self.is_first else 1 - ratio
 
     def convert(self, kind: Kind) -> Component:
         """Return a component of another kind with the same spectrum, as far as it can have that."""
@@ -77,7 +84,7 @@ class Component:
 
 def damping_parameter(kind: Kind, ratio: float) -> float:
     """Return the ``damping`` of a component with a damping ratio."""
-    if kind == "turbulence":
+    if kind in _FIRST:
         return float(np.log(max(ratio - _LEAST, _JUST_ABOVE)))
     return float(np.log(ratio / (1 - ratio)))
 
@@ -85,6 +92,8 @@ def damping_parameter(kind: Kind, ratio: float) -> float:
 @dataclass(frozen=True, slots=True)
 class SpectrumModel:
     """White noise and resonances; the first component is the turbulence behind its roll-off.
+
+    Where that place is a drift's, the slow components roll off.
 
     A vector with a number for each parameter, such as standard errors, unpacks into the same
     fields.
@@ -123,7 +132,16 @@ class SpectrumModel:
     @property
     def rolls_off(self) -> bool:
         """Whether the turbulence rolls off behind a corner."""
-        return bool(self.log_corner < np.log(NO_CORNER))
+        return bool(self.log_corner < np.log(_NO_CORNER))
+
+    def without_roll_off(self) -> SpectrumModel:
+        """Return the model with turbulence that does not roll off."""
+        return replace(self, log_corner=float(np.log(2 * _NO_CORNER)))
+
+    @property
+    def rolling(self) -> Kind:
+        """The kind of the components that roll off."""
+        return "slow" if self.components and self.components[0].kind == "drift" else "turbulence"
 
     def keep(self, wanted: Callable[[Component], bool]) -> SpectrumModel:
         """Return the model with the turbulence and those of the other components."""

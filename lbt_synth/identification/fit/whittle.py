@@ -50,8 +50,8 @@ def densities(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the densities of noise and components, (1 + c, f), with log derivatives.
 
-    The derivatives by frequency and damping are (c, 2, f), those of the noise by its colour and of
-    the turbulence by its corner (2, f).
+    The derivatives by frequency and damping are (c, 2, f). Those of the density itself by the
+    colour of the noise and the corner of the turbulence are (2, f).
     """
     s, white = data.half_angle_square, 2 / data.frame_rate_hz
     components = spectrum.components
@@ -63,12 +63,12 @@ def densities(
     unit, slopes = unit_densities(frequency, ratio, s)
     np.multiply(unit, white * np.exp(power)[:, None], out=density[1:])
     fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
-    for c, own in zip(components, density[1:], strict=True):
-        if c.kind == "turbulence":
-            own *= np.exp(fall)
+    rolling = [i for i, c in enumerate(components, 1) if c.kind == spectrum.rolling]
+    density[rolling] *= np.exp(fall)
     _smear(data, components, density[1:], slopes)
     slopes[:, 1] *= slope[:, None]
-    return density, slopes, np.array([by_colour, by_corner])
+    by_shape = np.array([by_colour * density[0], by_corner * density[rolling].sum(axis=0)])
+    return density, slopes, by_shape
 
 
 def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -96,7 +96,7 @@ def _smear(
     narrow = []
     for i, c in enumerate(components):
         place = c.frequency * data.frame_rate_hz / (2 * np.pi) * data.duration_s
-        if c.kind != "turbulence" and c.damping_ratio * place <= WIDE:
+        if not c.is_first and c.damping_ratio * place <= WIDE:
             narrow.append((i, place, c.damping_ratio * place))
     if not narrow:
         return
@@ -128,12 +128,13 @@ def component_densities(data: LoopPeriodogram, components: Sequence[Component]) 
 
 @lru_cache(maxsize=64)
 def _component_density(
-    data: LoopPeriodogram, component: Component, corner: float, order: float
+    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None
 ) -> FloatArray:
-    """Return the density of a component, (f,)."""
+    """Return the density of a component behind a roll-off of a corner and an order, (f,)."""
     s, c = data.half_angle_square, component
     own = unit_density(c.frequency, c.damping_ratio, s)
-    if c.kind == "turbulence":
+    if roll_off is not None:
+        corner, order = roll_off
         own *= np.exp(log_roll_off(float(np.exp(corner)), order, s)[0])
     _smear(data, [c], own[None])
     return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * own)
@@ -144,9 +145,8 @@ def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
     shape, _ = _log_colour(spectrum.colour, data.half_angle_square)
     total = np.asarray(2 / data.frame_rate_hz * np.exp(spectrum.log_noise + shape))
     for c in spectrum.components:
-        rolls = c.kind == "turbulence"
-        corner = (spectrum.log_corner, spectrum.roll_off_order) if rolls else (0.0, 1.0)
-        total += _component_density(data, c, *corner)
+        roll_off = (spectrum.log_corner, spectrum.roll_off_order)
+        total += _component_density(data, c, roll_off if c.kind == spectrum.rolling else None)
     return total
 
 
@@ -173,7 +173,7 @@ def log_slopes(
     share = each / model
     rows = np.empty((4 + PARAMETERS * len(slopes), model.size))
     rows[0] = 0
-    np.multiply(by_shape, share[:2], out=rows[2:4])
+    np.divide(by_shape, model, out=rows[2:4])
     rows[1] = share[0]
     components = rows[4:].reshape(-1, PARAMETERS, model.size)
     np.multiply(slopes, share[1:, None], out=components[:, :2])

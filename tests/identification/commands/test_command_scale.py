@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lbt_synth.identification.commands.command_scale import (
-    PLAUSIBLE_GAINS,
     likely_factors,
     usual_gain,
 )
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 
 
 @pytest.mark.parametrize("gain", [0.2, 0.7, 1.25, 1.64])

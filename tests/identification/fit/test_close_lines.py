@@ -16,7 +16,7 @@ from lbt_synth.identification.fit.close_lines import (
 )
 from lbt_synth.identification.fit.fitting import Search, fit
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.spectrum_model import NO_CORNER, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import SpectrumModel
 from lbt_synth.identification.fit.whittle import contrast, density
 
 RATE, DURATION_S = 500.0, 60.0
@@ -41,7 +41,7 @@ def exact(separation: float, second_nm2: float = 500.0):
     )
     search = Search(data=data)
     slow = search.component("turbulence", 1.0, 0.5, 1e4)
-    ground = SpectrumModel(0.0, 0.0, 0.0, float(np.log(2 * NO_CORNER)), (slow,))
+    ground = SpectrumModel(0.0, 0.0, 0.0, 0.0, (slow,)).without_roll_off()
     places = ((40.0, 1000.0), (40.0 * (1 + separation * DAMPING), second_nm2))
     pair = ground.add(*(search.component("line", hz, DAMPING, power) for hz, power in places))
     data = replace(data, measured=density(data, pair))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.recorded_loops import integrator_loop
+from support.recorded_loops import expected_periodogram, integrator_loop
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.order_search import search_model
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
+from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     hold_gain,
@@ -47,24 +47,6 @@ def test_whiteness_of_white_noise_in_segments() -> None:
         # 120 trials: at most 6 below 1 %, and 16 below 5 %, with a probability of 0.999
         assert np.all(np.sum(np.array(p_values) < 0.01, axis=0) <= 6)
         assert np.all(np.sum(np.array(p_values) < 0.05, axis=0) <= 16)
-
-
-def expected_periodogram(air: lbt.Atmosphere, noise: float, gain: float) -> LoopPeriodogram:
-    """Return what the periodograms of a minute of an integrator's loop scatter about."""
-    f = np.arange(1, 30_000) / 60
-    delay = np.exp(-2j * np.pi * f / RATE)
-    loop = 0.4 * delay**2 / (1 - delay)  # from measurements to the corrections in them
-    measured = gain**2 * air.psd(f) + 2 / RATE * noise**2
-    measured = measured / np.abs(1 + gain * loop) ** 2
-    return LoopPeriodogram(
-        frequency_hz=f,
-        measured=measured,
-        crossed=loop.real * measured,
-        corrected=np.abs(loop) ** 2 * measured,
-        count=np.ones(f.size),
-        frame_rate_hz=RATE,
-        resolution_hz=1 / 60,
-    )
 
 
 @pytest.mark.parametrize("wind", [8.0, 20.0])

@@ -19,17 +19,23 @@ RATE = 1000.0
 FRAMES = 16_384
 
 
-def case() -> tuple[LoopPeriodogram, SpectrumModel]:
+def case(*, drift: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=4096)
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
     w = 2 * np.pi / RATE
     turbulence = Component("turbulence", np.log(1.1 * w), np.log(0.5), np.log(200.0**2))
     line = Component("line", np.log(39 * w), np.log(0.02 / 0.98), np.log(15.0**2))
-    return data, SpectrumModel(np.log(0.7), np.log(30), 0.3, np.log(20 * w), (turbulence, line))
+    components = (turbulence, line)
+    if drift:  # then all that is slow rolls off
+        first = Component("drift", np.log(0.3 * w), np.log(8.0), np.log(50.0**2))
+        slow = Component("slow", np.log(3 * w), 0.3, np.log(50.0**2))
+        components = (first, turbulence.convert("slow"), line, slow)
+    return data, SpectrumModel(np.log(0.7), np.log(30), 0.3, np.log(20 * w), components)
 
 
-def test_gradient_and_information_of_the_likelihood() -> None:
-    data, spectrum = case()
+@pytest.mark.parametrize("drift", [False, True])
+def test_gradient_and_information_of_the_likelihood(drift: bool) -> None:
+    data, spectrum = case(drift=drift)
     theta = spectrum.pack()
 
     def gradient(theta: np.ndarray, data: LoopPeriodogram = data) -> np.ndarray:
