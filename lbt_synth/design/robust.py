@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,8 +12,10 @@ from lbt_synth.design.shaping.objectives import Leaf, ResidualVariance, Total, V
 from lbt_synth.design.shaping.specification import Demand, Specification
 from lbt_synth.design.shaping.uncertainty import MovingSensorGain, SensorGainRange
 from lbt_synth.errors import ProblemError
-from lbt_synth.models import Spectrum, TipTiltPlant
+from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 from lbt_synth.validation import number, require_instance, sequence
+
+WIDE_DAMPING = 0.1  # damping of a resonance whose frequency says little
 
 
 def robust(
@@ -41,7 +43,8 @@ def robust(
     Parameters
     ----------
     plant : TipTiltPlant
-        Loop, noise and turbulence; its vibrations are not used, the bands take their place.
+        Loop, noise and turbulence. The bands take the place of its vibrations, but for resonances
+        with a damping above 0.1 that no band covers: these are disturbances like the turbulence.
     bands : sequence of VibrationBand, or one sequence per mode, optional
         Bands, each with the rms of its vibration. In one sequence, every mode may have all of
         them.
@@ -106,19 +109,45 @@ def robust(
     deviations = noise_per_mode(plant.hardware, plant.R)
     by_mode: dict[object, Specification] = {}
     specifications = []
-    for noise_nm, model, own in zip(deviations.tolist(), plant.turbulence, lines, strict=True):
-        spectrum = model if turbulence is None else turbulence
+    each = zip(deviations.tolist(), plant.turbulence, lines, strict=True)
+    for mode, (noise_nm, model, own) in enumerate(each):
+        spectrum, wide = model if turbulence is None else turbulence, _uncovered(plant, mode, own)
         # equal modes share one specification, and are solved once
-        key = f"{noise_nm:.9g}", id(spectrum), own
+        key = f"{noise_nm:.9g}", id(spectrum), own, wide
         if key not in by_mode:
             air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
-            terms: tuple[Leaf, ...] = (air, *own)
+            terms: tuple[Leaf, ...] = (air, *_resonance_terms(plant, wide), *own)
             terms = tuple(replace(term, sensor_gain=g) for g in gains for term in terms)
             by_mode[key] = Specification(objective=Total(terms=terms), demands=(*fixed, *further))
         specifications.append(by_mode[key])
     path = plant.hardware
     design = shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)
     return replace(design, method="robust")
+
+
+def _uncovered(
+    plant: TipTiltPlant, mode: int, bands: tuple[VibrationBand, ...]
+) -> tuple[Vibration, ...]:
+    """Return the wide resonances of a mode that no band covers, with their rms on it."""
+    return tuple(
+        replace(line, rms_nm=line.rms_nm * abs(line.direction[mode]), direction=(1.0,))
+        for line in plant.vibrations
+        if line.damping > WIDE_DAMPING
+        and line.direction[mode]
+        and not any(
+            band.low_hz <= line.frequency_hz <= band.high_hz and band.damping > line.damping / 2
+            for band in bands
+        )
+    )
+
+
+def _resonance_terms(
+    plant: TipTiltPlant, resonances: tuple[Vibration, ...]
+) -> Iterator[ResidualVariance]:
+    """Yield the residual of each resonance, whose spectrum is known as that of turbulence is."""
+    for line in resonances:
+        process = line.ar_model(plant.hardware.frame_rate_hz)
+        yield ResidualVariance(turbulence=process, noise_nm=0.0)
 
 
 def _bands_per_mode(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import CertificateError, SynthesisError
+from lbt_synth.errors import CertificateError, ProblemError, SynthesisError
 from lbt_synth.identification.commands.gain_interval import unstable_gains
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.loop import close_loop, residual_budget
@@ -148,7 +148,7 @@ def _robust(
         found = design_robustly(model, (float(np.min(factors)), float(np.max(factors))))
         if unstable_gains(found, intervals) is None:
             return found
-    except SynthesisError:
+    except (SynthesisError, ProblemError):  # a plant without lines has no such design
         pass  # the refusal says what the record lacks
     gain = ", ".join(f"{value:.3g}" for value in bad)
     advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"

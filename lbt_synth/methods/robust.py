@@ -199,10 +199,14 @@ def _plant_section(
 ) -> RobustSection:
     """Return bands around the strongest lines of a plant, those that overlap as one.
 
-    With sensor gains, these are what is uncertain, and the bands are narrow.
+    With sensor gains, these are what is uncertain, and the bands are narrow. Wide resonances need
+    no band, and would swallow those of the lines.
     """
     share = _BAND if sensor_gains is None else _GAIN_BAND
-    lines = sorted(plant.vibrations, key=lambda line: -line.rms_nm)
+    from lbt_synth.design.robust import WIDE_DAMPING
+
+    narrow = [line for line in plant.vibrations if line.damping <= WIDE_DAMPING]
+    lines = sorted(narrow or plant.vibrations, key=lambda line: -line.rms_nm)
     nyquist_hz = plant.hardware.frame_rate_hz / 2
     bands: list[BandSection] = []
     for line in sorted(lines[:_MOST_BANDS], key=lambda line: line.frequency_hz):

@@ -117,6 +117,15 @@ def test_all_gains_count_that_the_record_or_a_model_allows(half):
     assert interval == pytest.approx([gain - 3 * error, gain + 3 * error])
 
 
+def test_no_robust_design_without_a_line_is_a_refusal_of_the_record(fit_model, models) -> None:
+    def refuse(*_):
+        raise lbt.errors.ProblemError("a robust controller is for vibrations; the plant has none.")
+
+    wide = np.array([[0.02, 0.4]])
+    with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):
+        design_for_gains(fit_model, hinf, refuse, models, wide, command_scale_known=True)
+
+
 def test_gains_that_are_too_far_apart_take_robust_synthesis_or_no_design(fit_model, half, models):
     wide = np.array([[0.02, 0.4]])  # the fit is outside: both count
     with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):

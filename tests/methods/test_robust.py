@@ -119,6 +119,55 @@ def test_the_strongest_lines_of_a_plant_have_bands():
     assert [round(band.rms_nm) for band in section.bands] == [14, 15, 16, 17, 18, 19]
 
 
+def a_plant_with_a_wide_resonance() -> lbt.models.TipTiltPlant:
+    plant = a_plant_with_lines((20, 80.0), (50, 30.0))
+    wide = lbt.Vibration(frequency_hz=30, damping=0.9, rms_nm=25.0, direction=(1.0,))
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        turbulence=plant.turbulence[0],
+        vibrations=[*plant.vibrations, wide],
+        noise_nm=15.5,
+        modes=1,
+    )
+
+
+def test_a_wide_resonance_has_no_band_and_is_a_disturbance():
+    """Its band swallowed those of the lines: the design left 1.6 times the residual."""
+    plant = a_plant_with_a_wide_resonance()
+    inputs = PlantInputs(plant=plant, sensor_gains=(0.8, 1.2))
+    bands = inputs.method_section("robust").bands
+    assert [(band.rms_nm, band.damping) for band in bands] == [(80.0, 0.01), (30.0, 0.01)]
+    design = design_request("robust", {}).build(inputs)
+    (spec,) = design.specifications
+    _, wide, *lines = spec.objective.terms
+    assert wide.label == "disturbance at sensor gain 1"
+    assert wide.turbulence.rms_nm == pytest.approx(25.0)
+    assert len(lines) == 2
+    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
+    loops = [lbt.close_loop(plant.hardware, d.controller) for d in (design, lbt.kalman(plant))]
+    found, best = (lbt.residual_budget(loop, truth).rms_nm for loop in loops)
+    assert best < found < 1.1 * best
+
+
+def test_a_band_that_covers_a_wide_resonance_takes_its_place():
+    plant = a_plant_with_a_wide_resonance()
+    wide = {"low_hz": 25.0, "high_hz": 35.0, "rms_nm": 25.0}
+    for damping, terms in ((0.6, 2), (0.1, 3)):
+        band = lbt.design.shaping.VibrationBand(**wide, damping=damping)
+        design = lbt.robust(plant, bands=[band], functions=8, states=None, modulus_margin=0.2)
+        assert len(design.specifications[0].objective.terms) == terms
+
+
+def test_the_limit_of_a_design_counts_its_wide_resonances():
+    plant = a_plant_with_a_wide_resonance()
+    design = lbt.robust(plant, functions=60, states=None, modulus_margin=0.2)
+    wide = lbt.models.SumSpectrum(parts=[plant.turbulence[0], plant.vibrations[-1].ar_model(800)])
+    truth = lbt.Truth(turbulence=wide, noise_nm=15.5)
+    least = lbt.loop.least_residual(plant.hardware, truth).rms_nm
+    assert design.facts().limit_nm == pytest.approx(least, rel=1e-9)
+    assert 0 < design.facts().above_limit_percent < 5
+
+
 def test_a_plant_without_lines_has_no_robust_design():
     with pytest.raises(ProblemError, match="the plant has none"):
         design_request("robust", {}).build(PlantInputs(plant=a_plant_with_lines()))

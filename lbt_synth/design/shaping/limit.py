@@ -12,6 +12,7 @@ from lbt_synth.design.shaping.channel import mode_loop
 from lbt_synth.design.shaping.objectives import ResidualVariance, VibrationBand, leaves
 from lbt_synth.loop import BandLimit, ResidualLimit, least_residual, least_worst_residual
 from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models.spectra import SumSpectrum
 
 if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
@@ -29,14 +30,18 @@ def shaped_limit(design: ShapedDesign) -> tuple[float, float]:
         at_unit = [leaf for leaf in leaves(spec.objective) if leaf.sensor_gain == 1]
         variances = [leaf for leaf in at_unit if isinstance(leaf, ResidualVariance)]
         bands = [leaf for leaf in at_unit if isinstance(leaf, VibrationBand)]
-        if len(variances) != 1 or len(bands) > 1:
+        if not variances or len(bands) > 1:
             return np.nan, np.nan
         hardware = design.loop_hardware.single_mode()
-        truth = Truth(turbulence=variances[0].turbulence, noise_nm=variances[0].noise_nm)
+        spectra = [each.turbulence for each in variances if each.turbulence is not None]
+        truth = Truth(
+            turbulence=SumSpectrum(parts=tuple(spectra)) if spectra else None,
+            noise_nm=float(np.linalg.norm([each.noise_nm for each in variances])),
+        )
         found = limit_or_nan(partial(_mode_limit, hardware, truth, bands))
         loop = mode_loop(design.loop_hardware, parameter)
         limit_nm2 += found**2
-        residual_nm2 += variances[0].measured_nm2(loop)
+        residual_nm2 += sum(variance.measured_nm2(loop) for variance in variances)
         residual_nm2 += sum(band.measured_nm2(loop) for band in bands)
     limit_nm = float(np.sqrt(limit_nm2))
     return limit_nm, above_percent(float(np.sqrt(residual_nm2)), limit_nm)

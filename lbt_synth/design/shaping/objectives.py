@@ -61,7 +61,7 @@ class ResidualVariance(CheckedFields):
     1.0
     """
 
-    _label: ClassVar = "turbulence and noise at sensor gain {0.sensor_gain:g}"
+    _label: ClassVar = "{0._what} at sensor gain {0.sensor_gain:g}"
     turbulence: Spectrum | None
     noise_nm: NotNegative
     sensor_gain: Positive = 1.0
@@ -75,6 +75,10 @@ class ResidualVariance(CheckedFields):
         CheckedFields.__post_init__(self)
         if self.turbulence is None and self.noise_nm == 0:
             raise ProblemError("a variance needs turbulence or noise; got neither.")
+
+    @property
+    def _what(self) -> str:
+        return "turbulence and noise" if self.noise_nm else "disturbance"
 
     def function(self, channel: Channel, grid: Grid) -> Fractions:
         """Return the variance over a grid as a function of the coefficients [nm^2]."""
