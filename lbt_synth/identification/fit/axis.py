@@ -36,6 +36,7 @@ from lbt_synth.validation import FloatArray, number, real_array, require_instanc
 
 _GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
 _POOR_GAIN = 0.1  # relative error from which a note says so
+_ROUGH_GAIN = 0.05  # relative error from which other gains are tried
 _LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0
 
 
@@ -155,7 +156,7 @@ def find_axis(
         return describe_axis(search, model, None, "1: of an open loop it has no meaning")
     model, near = _compare_gains(search, model, rivals)
     own = model.spectrum
-    own_error = standard_errors(own, parameter_covariance(model)).log_gain
+    own_error = _gain_error(model)
     coloured = find_coloured_rival(search, model, own_error)
     near += [] if coloured is None else [coloured]
     away = max((abs(each.spectrum.log_gain - own.log_gain) for each in near), default=0.0)
@@ -176,6 +177,11 @@ def find_axis(
     )
     model = search_model(search, model.spectrum)
     return describe_axis(search, model, None, note, colour_error=unknown)
+
+
+def _gain_error(model: FittedModel) -> float:
+    """Return the standard error of the logarithm of the gain."""
+    return standard_errors(model.spectrum, parameter_covariance(model)).log_gain
 
 
 def refit_axis(
@@ -334,8 +340,12 @@ def estimate_averages(density: FloatArray) -> float | None:
 def _compare_gains(
     search: Search, model: FittedModel, rivals: Sequence[FittedModel]
 ) -> tuple[FittedModel, list[FittedModel]]:
-    """Return the likeliest model, and those of other gains that are nearly as likely."""
+    """Return the likeliest model, and those of other gains that are nearly as likely.
+
+    A gain that is well known, without anything that could explain another one, has none.
+    """
     spectrum = model.spectrum
-    if all(line.is_narrow for line in spectrum.lines) and not spectrum.colour:
+    plain = all(line.is_narrow for line in spectrum.lines) and not spectrum.colour
+    if plain and _gain_error(model) < _ROUGH_GAIN:
         return model, []
     return try_other_gains(search, model, rivals)

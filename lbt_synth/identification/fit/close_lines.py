@@ -81,14 +81,12 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
 def measure_separations(axis: IdentifiedAxis) -> IdentifiedAxis:
     """Return an axis each of whose lines knows how far apart two like it have to be."""
     search, spectrum = Search(data=axis.data), axis.fitted_model.spectrum
-    components = spectrum.components
-    order = sorted(range(1, len(components)), key=lambda i: components[i].log_frequency)
-    parts = [
-        replace(part, separable_hz=separable_hz(search, spectrum, i))
-        if part.kind == "line"
-        else part
-        for part, i in zip(axis.parts, order, strict=True)
-    ]
+    centres = np.array([search.place(c)[0] for c in spectrum.components[1:]])
+    parts = list(axis.parts)
+    for k, part in enumerate(parts):
+        if part.kind == "line":
+            i = 1 + int(np.argmin(np.abs(centres - part.frequency_hz)))
+            parts[k] = replace(part, separable_hz=separable_hz(search, spectrum, i))
     return replace(axis, parts=tuple(parts))
 
 

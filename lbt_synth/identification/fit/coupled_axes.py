@@ -23,7 +23,7 @@ from lbt_synth.identification.fit.physical_parameters import (
     gain_error_covariance,
 )
 from lbt_synth.identification.fit.shared_lines import find_shared
-from lbt_synth.identification.fit.spectrum_model import GAIN
+from lbt_synth.identification.fit.spectrum_model import GAIN, Component
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, invert_information
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches
@@ -54,7 +54,8 @@ def couple_axes(
     coupled = [_describe_axis(search, fit, i, axis) for i, axis in enumerate(axes)]
     parts, shared = [list(axis.parts) for axis in coupled], []
     for k, tie in enumerate(fit.joint.ties):
-        places = [_rank(fit, axis, place) for axis, place in enumerate(tie.parts)]
+        lines = [fit.joint.axes[i].components[place] for i, place in enumerate(tie.parts)]
+        places = [_find_part(axis, line) for axis, line in zip(coupled, lines, strict=True)]
         shares = [own[place] for own, place in zip(parts, places, strict=True)]
         line = _describe_line(fit, k, shares)
         for own, place, share in zip(parts, places, shares, strict=True):
@@ -133,15 +134,17 @@ def _describe_axis(
     )
     error = alone.sensor_gain_error
     relative = None if error is None else error / alone.sensor_gain
-    found = describe_axis(search.searches[i], model, relative, alone.sensor_gain_note)
+    shared = [tie.parts[i] for tie in fit.joint.ties]
+    note = alone.sensor_gain_note
+    found = describe_axis(search.searches[i], model, relative, note, shared=shared)
     return measure_separations(found)
 
 
-def _rank(fit: JointFit, axis: int, place: int) -> int:
-    """Return which of the parts of an axis, by frequency, a component is."""
-    components = fit.joint.axes[axis].components
-    order = sorted(range(1, len(components)), key=lambda i: components[i].log_frequency)
-    return order.index(place)
+def _find_part(axis: IdentifiedAxis, component: Component) -> int:
+    """Return which of the parts of an axis a component is."""
+    frequency_hz = component.frequency / axis.data.angle_s
+    apart = [abs(part.frequency_hz - frequency_hz) for part in axis.parts]
+    return int(np.argmin(apart))
 
 
 def _describe_line(fit: JointFit, k: int, shares: Sequence[IdentifiedLine]) -> IdentifiedLine:

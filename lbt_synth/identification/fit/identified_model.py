@@ -34,7 +34,8 @@ class IdentifiedLine:
     ----------
     kind : {"line", "broad", "turbulence"}
         A narrow line; a resonance that is wide (damping ratio at least 0.1) or below the rest of
-        the spectrum; a part of the turbulence, below the lowest frequency of lines.
+        the spectrum; a part of the turbulence, which began below the lowest frequency of lines or
+        stands for a drift.
     frequency_hz, frequency_error_hz : float
         Natural frequency and its standard error [Hz].
     separable_hz : float or None

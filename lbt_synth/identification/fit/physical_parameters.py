@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -85,15 +85,17 @@ def describe_axis(
     note: str,
     *,
     colour_error: float = 0.0,
+    shared: Collection[int] = (),
 ) -> IdentifiedAxis:
     """Return a fitted model in the units of the phase.
 
     ``gain_error`` is the standard error of the logarithm of the gain, None where it is unknown;
-    ``colour_error`` by how much the noise's correlation differs in models that are as likely.
+    ``colour_error`` by how much the noise's correlation differs in models that are as likely. The
+    components that are ``shared`` with another axis, by their places, keep their parameters.
     """
     data, spectrum, gain = search.data, model.spectrum, model.spectrum.gain
     rate = data.frame_rate_hz
-    near = nearest_processes(search, model)
+    near = nearest_processes(search, model, shared)
     covariance = parameter_covariance(near)
     errors = standard_errors(near.spectrum, covariance)
     slow = spectrum if spectrum.rolling == "turbulence" else near.spectrum
@@ -162,7 +164,7 @@ def _describe_line(
     own = float(np.interp(frequency, data.frequency_hz, density[1 + i]))
     rest = float(np.interp(frequency, data.frequency_hz, density.sum(axis=0))) - own
     narrow = damping < WIDE_DAMPING and own > rest
-    slow = frequency < search.lowest_line_hz
+    slow = line.kind == "slow" or frequency < search.lowest_line_hz
     kind: Kind = "turbulence" if slow else "line" if narrow else "broad"
     return IdentifiedLine(
         kind=kind,

@@ -112,3 +112,37 @@ def test_errors_hold_what_the_error_of_a_gain_moves():
     _, errors = couple(0.6, 0.06)
     moved, _ = couple(0.606, 0.0)
     assert np.sqrt(errors**2 - held**2) == pytest.approx(10 * np.abs(moved - values), rel=0.2)
+
+
+def test_a_drift_that_becomes_a_resonance_keeps_the_lines_in_their_places() -> None:
+    """Parts and components were matched by their order, which the drift changes."""
+    air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=20, diameter_m=8.22)
+    driving = 30 * float(np.sqrt(1 - 0.999**2))
+    drift = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=driving, frame_rate_hz=1000)
+    total = lbt.models.SumSpectrum(parts=[air, drift])
+    lines = tuple(
+        lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=rms, direction=direction)
+        for f, rms, direction in ((40.0, 50.0, (1, 1)), (4.5, 60.0, (1, -1)), (90.0, 20.0, (0, 1)))
+    )
+    path = lbt.LoopHardware(frame_rate_hz=1000)
+    truth = lbt.Truth(turbulence=total, vibrations=lines, noise_nm=5.0, sensor_gain=0.6)
+    law = lbt.integrator(path, gain=0.4).controller
+    run = lbt.simulate(law, truth, hardware=path, frames=30_000, seed=1, settle_frames=1000)
+    record = lbt.identification.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=1000, delay_frames=2, unit="nm"
+    )
+    model = lbt.identify(record)
+    for axis in model.axes:
+        kinds = [c.kind for c in axis.fitted_model.spectrum.components]
+        assert kinds[0] == "drift"
+        (slow,) = [part for part in axis.parts if part.kind == "turbulence"]
+        assert 4.5 < slow.frequency_hz < 40  # between two lines
+        assert slow.direction is None
+        for part in axis.parts:
+            if part.kind == "line":
+                assert part.separable_hz is not None
+                assert part.separable_hz < 2
+    assert [round(line.frequency_hz) for line in model.shared] == [5, 40]
+    for line, sign in zip(model.shared, (-1, 1), strict=True):
+        assert line.direction is not None
+        assert line.direction[0] * line.direction[1] == pytest.approx(0.5 * sign, abs=0.02)
