@@ -68,6 +68,16 @@ def test_errors_follow_the_processes_that_change_places() -> None:
     assert np.all(np.isfinite(density(search.data, near.spectrum)))
 
 
+def test_what_two_axes_share_stays() -> None:
+    search, model = fit(disturbance(20.0, 0.999, 30.0), GAIN)
+    drift, slow = model.spectrum.components
+    near = nearest_processes(search, model, [1]).spectrum
+    assert near.components[1] == slow
+    assert near.components[0].kind == "drift"
+    assert near.components[0] != drift
+    assert not near.rolls_off
+
+
 def test_turbulence_without_a_roll_off_is_left_alone() -> None:
     search, model = fit(disturbance(20.0, 0.999, 30.0), GAIN)
     plain = replace(model, spectrum=model.spectrum.without_roll_off())
