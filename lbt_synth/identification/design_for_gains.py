@@ -38,6 +38,7 @@ def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
 
     What a model leaves out moves its gain by more than its errors say. So all gains count that the
     record allows; where those of the fits are among them, only the ones not too far from these.
+    Gains of fits that are as likely count, too.
     """
     gains = np.array([each.sensor_gains for each in models])
     known = all(axis.sensor_gain_error is not None for each in models for axis in each.axes)
@@ -49,6 +50,8 @@ def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
     for own, each in zip(gains, models, strict=True):
         errors = [_APART * (axis.sensor_gain_error or 0.0) for axis in each.axes]
         found += [own - np.minimum(errors, own / 2), own + errors]
+        likely = [axis.likely_gains or 2 * (axis.sensor_gain,) for axis in each.axes]
+        found += list(np.transpose(likely))
     return np.column_stack([np.min(found, axis=0), np.max(found, axis=0)])
 
 

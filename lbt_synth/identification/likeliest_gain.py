@@ -95,7 +95,10 @@ def _compare(
     best = min(model, identify(record, **options | {"start": begun}), key=_criterion)
     if why := _distrust(best, allowed):
         taken = f"{_words(begun)} was taken, from the middle of what the record allows"
-        return replace(begun, notes=(*begun.notes, f"warning: {why}: {taken}")), False
+        each = zip(begun.axes, best.axes, strict=True)
+        axes = tuple(replace(axis, likely_gains=free.likely_gains) for axis, free in each)
+        notes = (*begun.notes, f"warning: {why}: {taken}")
+        return replace(begun, axes=axes, notes=notes), False
     excluded = _criterion(begun) > _criterion(best) + _price(best)
     return best, excluded and not agrees(best, allowed)
 

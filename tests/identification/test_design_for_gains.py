@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -115,6 +116,14 @@ def test_all_gains_count_that_the_record_or_a_model_allows(half):
     assert interval == pytest.approx([gain - 3 * error, 1.5 * gain])
     (interval,) = possible_gains(np.array([[gain - error, gain + error]]), half)
     assert interval == pytest.approx([gain - 3 * error, gain + 3 * error])
+
+
+def test_gains_of_models_that_are_as_likely_count(half) -> None:
+    """A record of 20 s allowed 1.0 to 1.6, and its fits 0.4 to 1.5; the truth was 0.41."""
+    rivals = replace(half, axes=tuple(replace(a, likely_gains=(0.1, 1.5)) for a in half.axes))
+    allowed = np.array([[0.5, 0.7]])
+    (interval,) = possible_gains(allowed, half, rivals)
+    assert interval == pytest.approx([0.1, 1.5])
 
 
 def test_no_robust_design_without_a_line_is_a_refusal_of_the_record(fit_model, models) -> None:

@@ -169,6 +169,7 @@ def find_axis(
             model = hold_gain(search, model, error)
         note = f"found in the closed loop's data{poor}"
         return describe_axis(search, model, error, note, colour_error=unknown)
+    likely = _likely_gains([model, *near], own_error) if near else None
     search = replace(search, gain=assumed)
     by = f" by {100 * error:.0f} %" if error < 1 else ""
     note = (
@@ -176,12 +177,20 @@ def find_axis(
         "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
     model = search_model(search, model.spectrum)
-    return describe_axis(search, model, None, note, colour_error=unknown)
+    found = describe_axis(search, model, None, note, colour_error=unknown)
+    return replace(found, likely_gains=likely)
 
 
 def _gain_error(model: FittedModel) -> float:
     """Return the standard error of the logarithm of the gain."""
     return standard_errors(model.spectrum, parameter_covariance(model)).log_gain
+
+
+def _likely_gains(models: Sequence[FittedModel], error: float) -> tuple[float, float]:
+    """Return the least and the largest gain of models, with a relative error of one."""
+    logs = [model.spectrum.log_gain for model in models]
+    margin = min(error, _GAIN_ERROR)
+    return float(np.exp(min(logs) - margin)), float(np.exp(max(logs) + margin))
 
 
 def refit_axis(

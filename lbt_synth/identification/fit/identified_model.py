@@ -204,6 +204,8 @@ class IdentifiedAxis(Summarised):
         Its standard error; None if it is unknown.
     sensor_gain_note : str
         Where it comes from, or why it could not be found.
+    likely_gains : tuple of float or None
+        The least and the largest gain of models that are as likely, where that is why.
     whiteness : Whiteness
         Tests of the innovations.
     frequency_hz, density_nm2_hz, fitted_nm2_hz, background_nm2_hz : (f,) ndarray
@@ -238,6 +240,7 @@ class IdentifiedAxis(Summarised):
     resolution_hz: float
     fitted_model: FittedModel
     data: LoopPeriodogram
+    likely_gains: tuple[float, float] | None = None
 
     def _brief(self) -> str:
         lines = count_text(len(self.lines), "line")

@@ -159,6 +159,8 @@ def test_a_rough_gain_has_rivals(gain: float, seed: int) -> None:
     found = lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=rate)
     if found.sensor_gain_error is None:
         assert "not found" in found.sensor_gain_note
+        low, high = found.likely_gains or (0.0, 0.0)
+        assert 0.2 < low < truth_gain < 1.1 * high < 2.0
     else:
         assert found.sensor_gain == pytest.approx(truth_gain, abs=3 * found.sensor_gain_error)
 
