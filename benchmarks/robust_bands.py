@@ -3,7 +3,7 @@
     python benchmarks/robust_bands.py
 
 A telescope of 8 m with a resonance on each axis, with and without their damping in the bands, and
-one of 39 m whose wind shake at 0.3 Hz the robust controller is not told of.
+one of 39 m whose wind shake at 0.3 Hz lies in no band.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ CASES = {
     "8 m, bands for sinusoids": settings(
         8.0, 12.0, VLT, bands=[{**each, "damping": 0.0} for each in VLT_BANDS]
     ),
-    "39 m, not told of the wind shake": settings(39.0, 10.0, ELT, bands=ELT_BANDS),
+    "39 m, wind shake in no band": settings(39.0, 10.0, ELT, bands=ELT_BANDS),
 }
 
 

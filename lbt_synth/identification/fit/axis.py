@@ -11,7 +11,13 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.close_lines import measure_separations
-from lbt_synth.identification.fit.fitting import GAINS, LOWEST_LINE_HZ, MOST_LINES, Search
+from lbt_synth.identification.fit.fitting import (
+    GAINS,
+    LOWEST_LINE_HZ,
+    MOST_LINES,
+    PLAUSIBLE_GAINS,
+    Search,
+)
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.order_search import (
     find_coloured_rival,
@@ -351,10 +357,11 @@ def _compare_gains(
 ) -> tuple[FittedModel, list[FittedModel]]:
     """Return the likeliest model, and those of other gains that are nearly as likely.
 
-    A gain that is well known, without anything that could explain another one, has none.
+    A plausible gain that is well known, without anything that could explain another one, has none.
     """
     spectrum = model.spectrum
     plain = all(line.is_narrow for line in spectrum.lines) and not spectrum.colour
-    if plain and _gain_error(model) < _ROUGH_GAIN:
+    low, high = PLAUSIBLE_GAINS
+    if plain and low <= spectrum.gain <= high and _gain_error(model) < _ROUGH_GAIN:
         return model, []
     return try_other_gains(search, model, rivals)

@@ -11,10 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 from support.plants import ROOT
-from support.recorded_loops import hidden_resonance_record, integrator_loop, slow
+from support.recorded_loops import (
+    expected_periodogram,
+    hidden_resonance_record,
+    integrator_loop,
+    slow,
+)
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.identification.fit import axis
+from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.order_search import try_other_gains
 
 RATE = 1000.0
 
@@ -163,6 +171,25 @@ def test_a_rough_gain_has_rivals(gain: float, seed: int) -> None:
         assert 0.2 < low < truth_gain < 1.1 * high < 2.0
     else:
         assert found.sensor_gain == pytest.approx(truth_gain, abs=3 * found.sensor_gain_error)
+
+
+@pytest.mark.parametrize(("gain", "doubted"), [(0.6, False), (1.5, True), (0.15, True)])
+def test_an_implausible_gain_is_doubted_however_well_it_is_known(
+    monkeypatch: pytest.MonkeyPatch, gain: float, doubted: bool
+) -> None:
+    """Two good records under a drift were refused for fits at 1.4, 20 errors from the truth."""
+    tried = []
+
+    def spy(search, model, rivals):
+        tried.append(model.spectrum.gain)
+        return try_other_gains(search, model, rivals)
+
+    monkeypatch.setattr(axis, "try_other_gains", spy)
+    air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=12, diameter_m=8.22)
+    search = Search(data=expected_periodogram(air, 5.0, gain))
+    found = axis.find_axis(search, assumed_gain=1.0, start=None)
+    assert bool(tried) == doubted
+    assert found.sensor_gain == pytest.approx(gain, rel=0.03)  # and stays where it is right
 
 
 @given(scale=st.sampled_from([1e-3, 0.02, 50.0]))
