@@ -10,6 +10,7 @@ import numpy as np
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, ProblemError, SynthesisError
 from lbt_synth.identification.commands.gain_interval import unstable_gains
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.loop import close_loop, residual_budget
 from lbt_synth.storage.display_unit import nm_text
@@ -37,13 +38,15 @@ def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
     """Return the interval of gains of each axis that the record or its models allow.
 
     What a model leaves out moves its gain by more than its errors say. So all gains count that the
-    record allows; where those of the fits are among them, only the ones not too far from these.
-    Gains of fits that are as likely count, too.
+    record allows; where those of the fits are among them, and plausible, only the ones not too far
+    from these. Gains of fits that are as likely count, too.
     """
     gains = np.array([each.sensor_gains for each in models])
     known = all(axis.sensor_gain_error is not None for each in models for axis in each.axes)
     low, high = allowed.T
-    if known and np.all((low <= gains) & (gains <= high)):
+    least, most = PLAUSIBLE_GAINS
+    inside = (np.maximum(low, least) <= gains) & (gains <= np.minimum(high, most))
+    if known and inside.all():
         low = np.maximum(low, gains.min(axis=0) / _FARTHEST)
         high = np.minimum(high, gains.max(axis=0) * _FARTHEST)
     found = [low, high]

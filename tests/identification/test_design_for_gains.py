@@ -116,6 +116,9 @@ def test_all_gains_count_that_the_record_or_a_model_allows(half):
     assert interval == pytest.approx([gain - 3 * error, 1.5 * gain])
     (interval,) = possible_gains(np.array([[gain - error, gain + error]]), half)
     assert interval == pytest.approx([gain - 3 * error, gain + 3 * error])
+    odd = replace(half, axes=tuple(replace(axis, sensor_gain=1.5) for axis in half.axes))
+    (interval,) = possible_gains(np.array([[0.6, 2.0]]), odd)  # an implausible one narrows nothing
+    assert interval == pytest.approx([0.6, 2.0])
 
 
 def test_gains_of_models_that_are_as_likely_count(half) -> None:
