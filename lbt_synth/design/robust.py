@@ -13,9 +13,8 @@ from lbt_synth.design.shaping.specification import Demand, Specification
 from lbt_synth.design.shaping.uncertainty import MovingSensorGain, SensorGainRange
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
+from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.validation import number, require_instance, sequence
-
-WIDE_DAMPING = 0.1  # damping of a resonance whose frequency says little
 
 
 def robust(

@@ -21,6 +21,7 @@ from lbt_synth.methods.robust_section import (
     BandSection,
     RobustSection,
 )
+from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import number
 
@@ -203,8 +204,6 @@ def _plant_section(
     no band, and would swallow those of the lines.
     """
     share = _BAND if sensor_gains is None else _GAIN_BAND
-    from lbt_synth.design.robust import WIDE_DAMPING
-
     narrow = [line for line in plant.vibrations if line.damping <= WIDE_DAMPING]
     lines = sorted(narrow or plant.vibrations, key=lambda line: -line.rms_nm)
     nyquist_hz = plant.hardware.frame_rate_hz / 2

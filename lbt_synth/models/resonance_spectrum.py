@@ -21,6 +21,7 @@ import numpy as np
 from lbt_synth.validation import FloatArray
 
 PARAMETERS = 3  # of a component: log frequency, log damping, log variance
+WIDE_DAMPING = 0.1  # damping ratio of a resonance that is no line
 Jacobian = tuple[tuple[float, float], tuple[float, float]]
 Number = TypeVar("Number", float, FloatArray)
 

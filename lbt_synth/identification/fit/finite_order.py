@@ -11,7 +11,7 @@ import numpy as np
 from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.spectrum_model import SpectrumModel, damping_parameter
+from lbt_synth.identification.fit.spectrum_model import SpectrumModel
 from lbt_synth.identification.fit.whittle import FittedModel, density, minimise
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray
@@ -68,9 +68,8 @@ def _exchange_drift(
     search: Search, slow: SpectrumModel, place: int, frequency_hz: float
 ) -> SpectrumModel:
     """Return a model with turbulence of finite order before a drift, which is a resonance."""
-    damping = damping_parameter("slow", _DRIFT_DAMPING)
-    drift = replace(slow.components[0], kind="slow", damping=damping)
-    drift = replace(drift, log_frequency=search.log_angle(frequency_hz))
+    drift = search.component("slow", frequency_hz, _DRIFT_DAMPING, 1.0)
+    drift = replace(drift, log_power=slow.components[0].log_power)
     return replace(slow.promote(place, drift), roll_off_order=1.0)
 
 

@@ -17,15 +17,16 @@ from lbt_synth.identification.fit.identified_model import (
     Whiteness,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.spectrum_model import GAIN, WIDE_DAMPING, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
     FittedModel,
     densities,
+    density,
     derivatives,
     invert_information,
 )
 from lbt_synth.models import ARModel
-from lbt_synth.models.resonance_spectrum import coefficients
+from lbt_synth.models.resonance_spectrum import WIDE_DAMPING, coefficients
 from lbt_synth.validation import FloatArray, frozen_copy
 
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
@@ -99,14 +100,14 @@ def describe_axis(
     covariance = parameter_covariance(near)
     errors = standard_errors(near.spectrum, covariance)
     slow = spectrum if spectrum.rolling == "turbulence" else near.spectrum
-    density, _, _ = densities(data, near.spectrum)
-    fitted = densities(data, spectrum)[0].sum(axis=0)
+    each, _, _ = densities(data, near.spectrum)
+    fitted = each.sum(axis=0) if near is model else density(data, spectrum)
     lines = [
-        _describe_line(search, near, i, errors, covariance, density)
+        _describe_line(search, near, i, errors, covariance, each)
         for i in range(1, len(spectrum.components))
     ]
     background = fitted.copy()
-    for line, own in zip(lines, density[2:], strict=True):
+    for line, own in zip(lines, each[2:], strict=True):
         if line.kind == "line":
             background -= own
     process = _turbulence_process(near.spectrum, rate)
@@ -146,9 +147,9 @@ def _describe_line(
     i: int,
     errors: SpectrumModel,
     covariance: FloatArray,
-    density: FloatArray,
+    each: FloatArray,
 ) -> IdentifiedLine:
-    """Return the resonance of component i, given the ``density`` (1 + parts, f) of each part."""
+    """Return the resonance of component i, given the density of ``each`` part (1 + parts, f)."""
     data, spectrum = search.data, model.spectrum
     line, error = spectrum.components[i], errors.components[i]
     frequency = line.frequency / data.angle_s
@@ -161,8 +162,8 @@ def _describe_line(
     rms = float(np.exp(line.log_power / 2 - spectrum.log_gain))
     by_gain = spectrum.unpack(covariance[GAIN])  # covariances with the gain
     variance = by_gain.log_gain - by_gain.components[i].log_power + error.log_power**2 / 4
-    own = float(np.interp(frequency, data.frequency_hz, density[1 + i]))
-    rest = float(np.interp(frequency, data.frequency_hz, density.sum(axis=0))) - own
+    own = float(np.interp(frequency, data.frequency_hz, each[1 + i]))
+    rest = float(np.interp(frequency, data.frequency_hz, each.sum(axis=0))) - own
     narrow = damping < WIDE_DAMPING and own > rest
     slow = line.kind == "slow" or frequency < search.lowest_line_hz
     kind: Kind = "turbulence" if slow else "line" if narrow else "broad"
