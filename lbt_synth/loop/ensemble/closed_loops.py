@@ -20,7 +20,7 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
 _SAME = 1e-11  # relative difference up to which two subloops are the same
-_SHARED, _OWN = 768, 256  # loops that share frequencies, and a controller or not
+_SHARED, _OWN = 4096, 256  # loops that share frequencies, and a controller or not
 _PER_LOOP = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
 
 
@@ -187,7 +187,7 @@ def _close_subloop(
         ends = [loop_matrices(*subloop.controllers(rows), mirror=m, **parts) for m in mirrors]
         share, gain = fraction[:, None, None], sensor_gains[rows][:, None, None]
         A0, A1, B, C0, C1, D = (
-            one if one is two or not fraction.any() else one + share * (two - one)
+            one if not fraction.any() or np.array_equal(one, two) else one + share * (two - one)
             for one, two in zip(*ends, strict=True)
         )
         n, A = subloop.modes.size, A0 + gain * A1

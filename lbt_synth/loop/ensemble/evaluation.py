@@ -6,9 +6,8 @@ sinusoids through the loops' responses.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -230,20 +229,23 @@ def turbulence_and_noise_nm2(
         if isinstance(spectrum, Process):
             require_loop_rate(spectrum.frame_rate_hz, hardware)
     n, rate = hardware.modes, hardware.frame_rate_hz
-    turbulence_nm2, noise_nm2 = np.full((2, stable.size, n, n), np.nan)
-    turbulence_nm2[stable], noise_nm2[stable] = 0.0, 0.0
+    both = np.full((2, stable.size, n, n), np.nan)
+    both[:, stable] = 0.0
+    turbulence_nm2, noise_nm2 = both
     spectra = [pair for pair in turbulence if not isinstance(pair[0], Process)]
-    for group in chain.from_iterable(loops.subloops):
-        for batch in group.batches(stable):
-            own = batch.subloop.modes
-            smooth = []
-            for spectrum, modes in spectra:
-                places = np.flatnonzero(np.isin(own, modes)).tolist()
-                if places:
-                    smooth.append((turbulence_rows(spectrum, batch.rows), places))
-            at = (batch.rows[:, None, None], *np.ix_(own, own))
-            noise = noise_nm[batch.rows][:, batch.subloop.measurements]
-            turbulence_nm2[at], noise_nm2[at] = spectral_covariances(batch, smooth, noise, rate)
+    for same_delay in zip(*loops.subloops, strict=True):
+        done: list[_SpectralPart] = []
+        for group in same_delay:
+            part = _SpectralPart.of(group, spectra, noise_nm)
+            rows, twin = group.rows[:, None, None], next(filter(part.equals, done), None)
+            if twin is None:
+                for batch, turbulence_left, noise_left in part.covariances(stable, rate):
+                    at = (batch.rows[:, None, None], *np.ix_(part.modes, part.modes))
+                    turbulence_nm2[at], noise_nm2[at] = turbulence_left, noise_left
+                done.append(part)
+            else:
+                own, other = np.ix_(part.modes, part.modes), np.ix_(twin.modes, twin.modes)
+                both[:, rows, *own] = both[:, rows, *other]
     for spectrum, modes in turbulence:
         if not isinstance(spectrum, Process):
             continue
@@ -257,6 +259,50 @@ def turbulence_and_noise_nm2(
                     axis = np.eye(n)[mode]
                     _add_process(turbulence_nm2, chosen[0].rows, chosen, process, axis, {})
     return turbulence_nm2, noise_nm2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SpectralPart:
+    """The loops of a subloop with the same whole delay, and the spectra and noise they meet."""
+
+    group: LoopGroup
+    spectra: list[tuple[Turbulence, list[int]]]  # with their places among the modes
+    noise_nm: FloatArray  # (p, q)
+
+    @classmethod
+    def of(
+        cls,
+        group: LoopGroup,
+        spectra: list[tuple[Turbulence, tuple[int, ...]]],
+        noise_nm: FloatArray,
+    ) -> _SpectralPart:
+        """Choose what reaches a subloop of all spectra, with their modes, and all noise."""
+        own = group.subloop.modes
+        places = [(s, np.flatnonzero(np.isin(own, modes)).tolist()) for s, modes in spectra]
+        reached = [(spectrum, place) for spectrum, place in places if place]
+        return cls(group, reached, noise_nm[:, group.subloop.measurements])
+
+    @property
+    def modes(self) -> IntArray:
+        """Modes of the subloop."""
+        return self.group.subloop.modes
+
+    def equals(self, other: _SpectralPart) -> bool:
+        """Whether another part is left the same: equal subloops are closed only once."""
+        return (
+            self.group.poles is other.group.poles
+            and self.spectra == other.spectra
+            and np.array_equal(self.noise_nm, other.noise_nm)
+        )
+
+    def covariances(
+        self, stable: BoolArray, frame_rate_hz: float
+    ) -> Iterator[tuple[LoopGroup, FloatArray, FloatArray]]:
+        """Yield batches of the stable loops, and the covariances (k, n, n) that both leave."""
+        for batch in self.group.batches(stable):
+            own = [(turbulence_rows(s, batch.rows), places) for s, places in self.spectra]
+            noise = self.noise_nm[batch.rows]
+            yield batch, *spectral_covariances(batch, own, noise, frame_rate_hz)
 
 
 def vibration_residuals(
@@ -284,6 +330,8 @@ def vibration_residuals(
                 turn = 2 * np.pi * line.frequency_hz[rows] / rate
                 for group in chosen:
                     modes = group.subloop.modes
+                    if not np.any(peak[:, modes]):
+                        continue
                     left = group.rejections(turn) @ peak[:, modes, None]
                     amplitudes_nm[rows[:, None], i, modes] = left[..., 0]
             alike: dict[tuple[bool, ...], list[EnsembleVibration]] = {}  # by the subloops reached

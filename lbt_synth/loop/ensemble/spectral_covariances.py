@@ -7,7 +7,6 @@ are known, so that a rule of fixed order is enough.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from lbt_synth.loop.ensemble.loop_ensemble import Turbulence
 from lbt_synth.models import ARModel, Atmosphere, FrozenFlows, SumSpectrum, TabulatedSpectrum
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.turbulence.atmosphere import LOWEST, TAIL
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 ORDER = 10  # nodes per panel
 # The tilt filter ripples with the inverse of the time that the wind takes over the pupil. Panels
@@ -36,8 +35,45 @@ _PANEL = 2.0  # length of a panel over its distance from a pole, or over the pol
 _PROBES = 5  # frequencies at which partial fractions are checked by solving linear systems
 _AGREEMENT = 1e-9
 _IN_CACHE = 16  # loops whose spectra are integrated at once: more do not fit the processor's cache
+_PRODUCTS = 128  # the same where the integrals are products of matrices
+_FEW_SHAPES = 16  # spectra that are integrated for all loops, where each needs one of them
+_CANCELS = 1e-5  # |1 + g L|^2 below which its expansion has less than nine digits
 
-_Array = TypeVar("_Array", FloatArray, ComplexArray)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Density:
+    """Weighted spectra of the turbulence of k loops, at the f frequencies of a quadrature."""
+
+    shapes: FloatArray  # (u, f)
+    which: IntArray  # shape of each loop, (k,)
+    factor: FloatArray  # of each loop, (k,)
+    modes: list[int]  # of the subloop
+
+    @classmethod
+    def of(
+        cls, spectrum: Turbulence, modes: list[int], loops: int, nodes: tuple[FloatArray, ...]
+    ) -> _Density:
+        """Evaluate a spectrum at nodes, frequencies and weights (f,), for some loops."""
+        frequency, weight = nodes
+        if isinstance(spectrum, FrozenFlows):
+            shapes, which, factor = spectrum.factored_psd(frequency)
+        else:
+            shapes, which, factor = spectrum.psd(frequency)[None], np.zeros(1, int), np.ones(1)
+        whole = np.broadcast_to(which, loops), np.broadcast_to(factor, loops)
+        return cls(shapes * weight, *whole, modes)
+
+    def row(self, k: int) -> FloatArray:
+        """Return the spectrum of a loop, (f,)."""
+        return np.asarray(self.factor[k] * self.shapes[self.which[k]])
+
+    def integrate(self, rejection: FloatArray, rows: slice) -> FloatArray:
+        """Return the sums over the frequencies of what some loops leave of their spectra."""
+        which = self.which[rows]
+        if len(self.shapes) > _FEW_SHAPES:
+            sums = np.einsum("kf,kf->k", rejection, self.shapes[which])
+        else:
+            sums = (rejection @ self.shapes.T)[np.arange(which.size), which]
+        return np.asarray(self.factor[rows] * sums)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +85,7 @@ class _Samples:
     second: ComplexArray
     controller: ComplexArray  # (f, m, q), or (k, f, m, q) with one per loop
     white: FloatArray  # weighted spectrum of unit noise per frame, (f,)
-    densities: list[tuple[FloatArray, list[int]]]  # weighted, (f,) or (k, f), with their modes
+    densities: list[_Density]
 
 
 def spectral_covariances(
@@ -82,11 +118,8 @@ def _sample(
     A, B, C, D = subloop.controllers(group.rows)
     one = subloop.is_shared
     controller = _response(A[0], B[0], C[0], D[0], z) if one else batched_response(A, B, C, D, z)
-    densities = []
-    for spectrum, modes in turbulence:
-        density = spectrum.psd(frequency)
-        density = np.asarray(density[0] if len(density) == 1 else density) * weight
-        densities.append((density, modes))
+    loops, nodes = len(group.rows), (frequency, weight)
+    densities = [_Density.of(spectrum, modes, loops, nodes) for spectrum, modes in turbulence]
     first, second = mirrors[0][:, 0, 0], mirrors[-1][:, 0, 0]
     return _Samples(1 / z, first, second, controller, 2 / frame_rate_hz * weight, densities)
 
@@ -95,11 +128,15 @@ def graded_edges(poles: ComplexArray) -> FloatArray:
     """Panels of (0, 1), as fractions of Nyquist, that are short where a pole is near.
 
     A panel is halved while it is longer than twice its distance from a pole, or than twice
-    the width of a pole that it holds.
+    the width of a pole that it holds. Poles that differ by less than a quarter of their width count
+    once.
     """
     upper = poles[poles.imag >= 0]
     centre = np.abs(np.angle(upper)) / np.pi
     width = np.maximum(1 - np.abs(upper), np.pi * _NARROWEST) / np.pi
+    size = np.exp2(np.floor(np.log2(width)))
+    distinct = np.unique(size + 1j * np.floor(4 * centre / size), return_index=True)[1]
+    centre, width = centre[distinct], width[distinct]
     grid = np.concatenate([[0.0], np.geomspace(1e-6, 1, 24)])
     low, high = grid[:-1], grid[1:]
     done = [np.ones(1)]
@@ -180,36 +217,79 @@ def _panel_integrals(spectrum: Turbulence, low: FloatArray, high: FloatArray) ->
 def _scalar_covariances(
     group: LoopGroup, samples: _Samples, noise_nm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """One mode, in real numbers: ``|S|^2 = 1 / |1 + g L|^2`` with the loop L at unit gain."""
-    subloop, gains, share = group.subloop, group.sensor_gains[:, None], group.fraction[:, None]
+    """One mode, in real numbers."""
+    subloop = group.subloop
     size = subloop.influence[0, 0] * subloop.sensor[0, 0]
     unit = size * samples.controller[..., 0, 0] * samples.delay
-    first, second = unit * samples.first, unit * (samples.second - samples.first)
-    turbulence, noise = np.zeros((2, len(gains)))
-    for start in range(0, len(gains), _IN_CACHE):
-        rows = slice(start, start + _IN_CACHE)
-        g, s, one, other = gains[rows], share[rows], _rows(first, rows), _rows(second, rows)
-        real, imaginary = one.real + s * other.real, one.imag + s * other.imag
-        square = real**2 + imaginary**2
-        # not 1 + 2 g Re L + g^2 |L|^2, which cancels next to instability
-        rejection = 1 / ((1 + g * real) ** 2 + (g * imaginary) ** 2)
-        for density, _ in samples.densities:  # each is of the one mode
-            turbulence[rows] += _integrate(rejection, _rows(density, rows))
-        noise[rows] = _integrate(rejection * square, samples.white)
+    ends = unit * samples.first, unit * (samples.second - samples.first)
+    shared = _SharedLoop.of(*ends, samples.white) if subloop.is_shared else None
+    turbulence, noise = np.zeros((2, len(group.rows)))
+    step = _IN_CACHE if shared is None else _PRODUCTS
+    for start in range(0, len(group.rows), step):
+        rows = slice(start, start + step)
+        gain, fraction = group.sensor_gains[rows], group.fraction[rows]
+        if shared is None:
+            first, second = (end[rows] for end in ends)
+            rejection, noise[rows] = _rejections(gain, fraction, first, second, samples.white)
+        else:
+            rejection, noise[rows] = shared.rejections(gain, fraction)
+        for density in samples.densities:  # each is of the one mode
+            turbulence[rows] += density.integrate(rejection, rows)
     noise *= (noise_nm[:, 0] / subloop.sensor[0, 0]) ** 2
     return turbulence[:, None, None], noise[:, None, None]
 
 
-def _rows(values: _Array, rows: slice) -> _Array:
-    """Return some rows of values per loop (k, f), or values of all loops (f,) as they are."""
-    return values if values.ndim == 1 else values[rows]
+def _rejections(
+    gain: FloatArray,
+    fraction: FloatArray,
+    first: ComplexArray,
+    second: ComplexArray,
+    white: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``|S|^2 = 1 / |1 + g L|^2`` of k loops, (k, f), and the sums of ``white |S L|^2``.
+
+    The loop at unit gain is ``first + fraction second``; both are (f,), or (k, f).
+    """
+    g, s = gain[:, None], fraction[:, None]
+    real, imaginary = first.real + s * second.real, first.imag + s * second.imag
+    rejection = 1 / ((1 + g * real) ** 2 + (g * imaginary) ** 2)
+    return rejection, (rejection * (real**2 + imaginary**2)) @ white
 
 
-def _integrate(values: FloatArray, density: FloatArray) -> FloatArray:
-    """Sum over the frequencies (k, f), with one density (f,) or one per loop (k, f)."""
-    if density.ndim == 1:
-        return np.asarray(values @ density)
-    return np.asarray(np.einsum("kf,kf->k", values, density))
+@dataclass(frozen=True, slots=True, eq=False)
+class _SharedLoop:
+    """One loop at unit gain for many gains and fractions: ``|1 + g L|^2`` is a polynomial."""
+
+    first: ComplexArray  # (f,)
+    second: ComplexArray  # (f,)
+    white: FloatArray  # (f,)
+    terms: FloatArray  # of ``|1 + g L|^2``, (6, f)
+    noise: FloatArray  # ``white |L|^2`` by powers of the fraction, (3, f)
+
+    @classmethod
+    def of(cls, first: ComplexArray, second: ComplexArray, white: FloatArray) -> _SharedLoop:
+        """Expand a loop whose two ends are given."""
+        cross = 2 * (first * second.conj()).real
+        squares = np.array([abs(first) ** 2, cross, abs(second) ** 2])
+        terms = np.array([np.ones_like(white), 2 * first.real, 2 * second.real, *squares])
+        return cls(first, second, white, terms, white * squares)
+
+    def rejections(self, gain: FloatArray, fraction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what :func:`_rejections` does, as products of two matrices.
+
+        The polynomial cancels next to instability, where it is not used.
+        """
+        powers = fraction[:, None] ** [0, 1, 2]
+        mixed = [gain[:, None] * powers[:, :2], gain[:, None] ** 2 * powers]
+        size = np.hstack([powers[:, :1], *mixed]) @ self.terms
+        near = np.min(size, axis=1) < _CANCELS
+        rejection = np.reciprocal(size, out=size)
+        noise = np.sum((rejection @ self.noise.T) * powers, axis=1)
+        if near.any():
+            rejection[near], noise[near] = _rejections(
+                gain[near], fraction[near], self.first, self.second, self.white
+            )
+        return rejection, noise
 
 
 def _matrix_covariances(
@@ -227,8 +307,8 @@ def _matrix_covariances(
         S = _inverses(np.eye(n) + loop)
         N = S @ (path * noise_nm[k])
         noise[k] = _gram(N, samples.white)
-        for density, modes in samples.densities:
-            turbulence[k] += _gram(S[..., modes], density if density.ndim == 1 else density[k])
+        for density in samples.densities:
+            turbulence[k] += _gram(S[..., density.modes], density.row(k))
     return turbulence, noise
 
 

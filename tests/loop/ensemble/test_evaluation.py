@@ -299,6 +299,23 @@ def test_noise_through_an_integrator():
     assert found.noise_nm**2 == pytest.approx(9 * (0.5 / g) ** 2 * g / (2 - g), rel=1e-9)
 
 
+@pytest.mark.parametrize("noise", [(4.0, 4.0), (4.0, 9.0)])
+@pytest.mark.parametrize("turbulence", [(AIR, AIR), (AIR, None)])
+def test_equal_loops_of_axes_that_meet_something_else(kalman, noise, turbulence):
+    """Tip and tilt are the same loop: only what reaches both alike is evaluated once."""
+    gains = np.array([0.5, 0.8, 1.1])
+    ensemble = lbt.loop.LoopEnsemble(
+        sensor_gain=gains, noise_nm=np.tile(noise, (3, 1)), turbulence=turbulence
+    )
+    found = lbt.loop.ensemble_residuals(kalman.controller, kalman.hardware, ensemble)
+    for i, gain in enumerate(gains):
+        truth = lbt.Truth(turbulence=turbulence, noise_nm=noise, sensor_gain=gain)
+        loop = lbt.close_loop(kalman.hardware, kalman.controller, sensor_gain=gain)
+        budget = lbt.residual_budget(loop, truth)
+        assert found.turbulence_nm2[i] == pytest.approx(budget.turbulence_nm2, rel=5e-7, abs=1e-9)
+        assert found.noise_nm2[i] == pytest.approx(budget.noise_nm2, rel=5e-7, abs=1e-9)
+
+
 def test_nothing_to_meet(kalman):
     found = lbt.loop.ensemble_residuals(
         kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(loops=3)
