@@ -29,15 +29,23 @@ def __getattr__(name):
     try:
         return import_lazily(name)
     except AttributeError:
-        from pathlib import Path
+        room = None if name.startswith("_") else _find_room(name)
+        if room is None:
+            raise
+        where = f"lbt_synth.{room}.{name}"
+        raise AttributeError(f"no name {name!r} in lbt_synth; try {where}.") from None
 
-        package = Path(__file__).parent
-        for file in (package / "errors.py", *sorted(package.glob("*/**/__init__.pyi"))):
-            text = file.read_text(encoding="utf-8")
-            if f" as {name}\n" in text or f"class {name}(" in text:
-                folders = file.with_suffix("").relative_to(package).parts
-                room = ".".join(part for part in folders if part != "__init__")
-                raise AttributeError(
-                    f"no name {name!r} in lbt_synth; try lbt_synth.{room}.{name}."
-                ) from None
-        raise
+
+def _find_room(name):
+    """Return the room that has a public name; None if none has."""
+    from pathlib import Path
+
+    package, known = Path(__file__).parent, globals()
+    if "_stubs" not in known:
+        files = (package / "errors.py", *sorted(package.glob("*/**/__init__.pyi")))
+        known["_stubs"] = {file: file.read_text(encoding="utf-8") for file in files}
+    for file, text in known["_stubs"].items():
+        if f" as {name}\n" in text or f"class {name}(" in text:
+            folders = file.with_suffix("").relative_to(package).parts
+            return ".".join(part for part in folders if part != "__init__")
+    return None

@@ -74,36 +74,40 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
 def unit_density(frequency: float, damping: float, s: FloatArray) -> FloatArray:
     """Spectrum of unit variance of a resonance, (f,) as s is."""
     b, p, _ = recursion(frequency, damping)
-    size = (b - (2 - p) / 2 * s) ** 2
-    size += p**2 * (s - s**2 / 4)
+    size = s * ((p - 2) / 2)
+    size += b
+    size *= size
+    size += p**2 * s * (1 - s / 4)
     return np.asarray(_drive(b, p) / size)
 
 
-def unit_densities(
-    frequency: FloatArray, damping: FloatArray, s: FloatArray
+def resonance_densities(
+    frequency: FloatArray, damping: FloatArray, variance: FloatArray, s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Spectra of unit variance of c resonances, (c, f), with their logarithmic slopes (c, 2, f).
+    """Spectra of c resonances, (c, f), with their logarithmic slopes (c, 2, f).
 
     The slopes are those of the logarithm by the logarithms of frequency and damping ratio; s is
     (f,).
     """
     each = [recursion(*pair) for pair in zip(frequency.tolist(), damping.tolist(), strict=True)]
     b, p = np.array([row[:2] for row in each]).T[..., None]
-    jacobian = np.array([row[2] for row in each])
-    near = b - (2 - p) / 2 * s
-    wide = s * (1 - s / 4)
-    over = 1 / (near**2 + p**2 * wide)
+    by_b, by_p = np.array([row[2] for row in each]).transpose(1, 0, 2)  # by the logarithms
+    half, wide = (2 - p) / 2, s * (1 - s / 4)
+    near = s * -half
+    near += b
+    over = near * near
+    over += p**2 * wide
+    np.reciprocal(over, out=over)
+    # s near = (b near - near^2) / half, and near^2 over = 1 - p^2 wide over
+    shapes = np.ones((b.size, 3, s.size))
+    np.multiply(near, over, out=shapes[:, 1])
+    np.multiply(wide, over, out=shapes[:, 2])
     rest = 2 * (2 - p) - b
-    # of the logarithm of the numerator by b, and by p = 1 - q with b held
-    top = np.hstack([1 / b - 1 / rest, 1 / p - 2 / rest + 1 / (2 - p)])
-    # and of that of the denominator
-    bottom = np.ones((b.size, 3, s.size))
-    np.multiply(near, over, out=bottom[:, 1])
-    np.multiply(s * near + 2 * p * wide, over, out=bottom[:, 2])
-    falls = jacobian.transpose(0, 2, 1) * [-2.0, -1.0]
-    constant = np.sum(top[:, :, None] * jacobian, axis=1)
-    slopes = np.concatenate([constant[:, :, None], falls], axis=2) @ bottom
-    return _drive(b, p) * over, slopes
+    top = (1 / b - 1 / rest) * by_b + (1 / p - 2 / rest + 1 / (2 - p)) * by_p  # of the numerator
+    falls = [top + by_p / half, -2 * by_b - b / half * by_p, -2 * p / half * by_p]
+    slopes = np.stack(falls, axis=2) @ shapes
+    over *= _drive(b, p) * variance[:, None]
+    return over, slopes
 
 
 def _drive(b: Number, p: Number) -> Number:
@@ -115,7 +119,7 @@ def log_density(
     frequency: float, damping: float, s: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Logarithm of the spectrum of unit variance, and its derivatives; all are (f,) as s is."""
-    value, slopes = unit_densities(np.array([frequency]), np.array([damping]), s)
+    value, slopes = resonance_densities(np.array([frequency]), np.array([damping]), np.ones(1), s)
     return np.log(value[0]), slopes[0, 0], slopes[0, 1]
 
 

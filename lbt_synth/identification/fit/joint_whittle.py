@@ -20,12 +20,11 @@ import numpy as np
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import Priors, scoring_minimum
-from lbt_synth.identification.fit.spectrum_model import Component, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import COMPONENTS, Component, SpectrumModel
 from lbt_synth.identification.fit.whittle import densities, invert_information, log_slopes
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
-_FIRST = 4  # place of the first component in a packed spectrum
 _DIFFERENCE = 1e-4  # of a logarithm
 
 Parts = tuple[Component | None, Component | None]
@@ -51,7 +50,7 @@ class JointSpectrum:
     @property
     def sizes(self) -> tuple[int, int]:
         """Number of parameters of each axis."""
-        first, second = (_FIRST + PARAMETERS * len(axis.components) for axis in self.axes)
+        first, second = (COMPONENTS + PARAMETERS * len(axis.components) for axis in self.axes)
         return first, second
 
     @property
@@ -61,7 +60,7 @@ class JointSpectrum:
 
     def place(self, axis: int, part: int) -> int:
         """Return where the parameters of a component begin in the vector."""
-        return self.starts[axis] + _FIRST + PARAMETERS * part
+        return self.starts[axis] + COMPONENTS + PARAMETERS * part
 
     def pack(self) -> FloatArray:
         """Return the parameters of both axes, and the phases, as a vector (p,)."""

@@ -137,6 +137,12 @@ class LoopPeriodogram:
         return half_angle_square(self.frequency_hz, self.frame_rate_hz)
 
     @cached_property
+    def periods(self) -> FloatArray:
+        """Periods of each frequency within a tapered segment, (f,)."""
+        assert self.duration_s is not None
+        return self.frequency_hz * self.duration_s
+
+    @cached_property
     def step_hz(self) -> float:
         """Distance of neighbouring frequencies."""
         return float(np.median(np.diff(self.frequency_hz)))

@@ -13,7 +13,7 @@ import numpy as np
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.validation import FloatArray
 
-GAIN = 0  # place of the sensor gain in a packed vector
+GAIN, NOISE, COLOUR, CORNER, COMPONENTS = range(5)  # where they begin in a packed vector
 _NO_CORNER = 50.0  # angle per frame; a corner above it is none
 _TILT_ORDER = 5 / 6  # of its roll-off: tilt falls with f^(-17/3), a second-order process with f^-4
 _LEAST = 0.05  # damping ratio of turbulence; narrower components are lines

@@ -15,7 +15,7 @@ Everything is in units of the measurement: a component's variance is g^2 times t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -23,11 +23,19 @@ import numpy as np
 
 from lbt_synth.identification.fit.periodogram import FAR, WIDE, LoopPeriodogram, log_smearing
 from lbt_synth.identification.fit.scoring import EXACT, Priors, scoring_minimum
-from lbt_synth.identification.fit.spectrum_model import GAIN, Component, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import (
+    COLOUR,
+    COMPONENTS,
+    CORNER,
+    GAIN,
+    NOISE,
+    Component,
+    SpectrumModel,
+)
 from lbt_synth.models.resonance_spectrum import (
     PARAMETERS,
     log_roll_off,
-    unit_densities,
+    resonance_densities,
     unit_density,
 )
 from lbt_synth.validation import FloatArray
@@ -60,8 +68,7 @@ def densities(
     density = np.empty((1 + len(components), s.size))
     shape, by_colour = _log_colour(spectrum.colour, s)
     density[0] = white * np.exp(spectrum.log_noise + shape)
-    unit, slopes = unit_densities(frequency, ratio, s)
-    np.multiply(unit, white * np.exp(power)[:, None], out=density[1:])
+    density[1:], slopes = resonance_densities(frequency, ratio, white * np.exp(power), s)
     fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
     rolling = [i for i, c in enumerate(components, 1) if c.kind == spectrum.rolling]
     density[rolling] *= np.exp(fall)
@@ -101,7 +108,7 @@ def _smear(
     if not narrow:
         return
     centres, half_widths = np.array(narrow).T[1:]
-    at = data.frequency_hz * data.duration_s
+    at = data.periods
     starts, stops = np.searchsorted(at, [centres - FAR, centres + FAR])
     inside = np.concatenate([at[a:b] for a, b in zip(starts, stops, strict=True)])
     centre, half_width = np.repeat([centres, half_widths], stops - starts, axis=1)
@@ -120,8 +127,8 @@ def component_densities(data: LoopPeriodogram, components: Sequence[Component]) 
     """Return the densities of components but for the roll-off of turbulence, (c, f)."""
     shape = [(c.frequency, c.damping_ratio, c.log_power) for c in components]
     frequency, ratio, power = np.array(shape).reshape(-1, 3).T
-    own, _ = unit_densities(frequency, ratio, data.half_angle_square)
-    own *= 2 / data.frame_rate_hz * np.exp(power)[:, None]
+    variance = 2 / data.frame_rate_hz * np.exp(power)
+    own, _ = resonance_densities(frequency, ratio, variance, data.half_angle_square)
     _smear(data, components, own)
     return own
 
@@ -239,23 +246,68 @@ def minimise(
 
 
 def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Priors) -> FittedModel:
-    """Return a minimum with the exact second derivatives of L, by differences of its gradient.
+    """Return a minimum with the exact second derivatives of L in place of the expected ones.
 
     Where they are not positive definite, the expected ones stay.
     """
-    free, theta = priors.free, model.spectrum.pack()
-
-    def gradient(change: FloatArray) -> FloatArray:
-        return derivatives(data, model.spectrum.unpack(theta + change))[1][free]
-
-    steps = _DIFFERENCE * np.eye(theta.size)[free]
-    exact = np.array([gradient(step) - gradient(-step) for step in steps]) / (2 * _DIFFERENCE)
-    exact = (exact + exact.T) / 2 + np.diag(1 / priors.width[free] ** 2)
+    free = np.ix_(priors.free, priors.free)
+    exact = second_derivatives(data, model.spectrum)[free]
+    exact = exact + np.diag(1 / priors.width[priors.free] ** 2)
     if np.min(np.linalg.eigvalsh(exact)) <= 0:
         return model
     information = np.zeros_like(model.information)
-    information[np.ix_(free, free)] = exact
+    information[free] = exact
     return replace(model, information=information)
+
+
+def second_derivatives(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
+    """Return the second derivatives of L by all parameters, (p, p), without the priors.
+
+    Those of the spectrum are differences of its slopes. Components add, so that one difference
+    serves a parameter of all of them.
+    """
+    theta, ones = spectrum.pack(), np.ones_like(data.frequency_hz)
+    model = density(data, spectrum)
+    ratio = data.power(spectrum.gain) / model
+    weight = data.count * (1 - ratio) / model
+
+    def slopes(change: FloatArray | float) -> FloatArray:
+        return log_slopes(*densities(data, spectrum.unpack(theta + change)), ones)
+
+    rows = slopes(0.0)
+    out = (rows * (data.count * (2 * ratio - 1) / model**2)) @ rows.T
+    power, cross = 2 * spectrum.gain * data.crossed, 2 * spectrum.gain**2 * data.corrected
+    out[GAIN] = out[:, GAIN] = -(rows @ (data.count * (power + cross) / model**2))
+    out[GAIN, GAIN] = np.sum(data.count * (power + 2 * cross) / model)
+    bends = _spectrum_bends(spectrum, rows @ weight, lambda change: slopes(change) @ weight)
+    return np.asarray(out + (bends + bends.T) / 2)
+
+
+def _spectrum_bends(
+    spectrum: SpectrumModel, first: FloatArray, weighted: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Return weighted sums of the second derivatives of a spectrum, (p, p).
+
+    Its slopes are given as weighted sums (p,), and so are those after a change of parameters.
+    """
+    parts = np.repeat(np.arange(len(spectrum.components)), PARAMETERS)
+    owner = np.concatenate([[-1, -2, -2, -3], parts])  # gain, noise and colour, corner, components
+    rolling = [i for i, c in enumerate(spectrum.components) if c.kind == spectrum.rolling]
+    places = np.arange(owner.size)
+
+    def difference(moved: Iterable[int]) -> FloatArray:
+        step = np.where(np.isin(places, list(moved)), _DIFFERENCE, 0.0)
+        return (weighted(step) - weighted(-step)) / (2 * _DIFFERENCE)
+
+    frequencies, dampings, powers = (places[COMPONENTS + i :: PARAMETERS] for i in range(3))
+    out = np.zeros((owner.size, owner.size))
+    out[:, [NOISE, *powers]] = first[:, None]  # it is linear in what these are logarithms of
+    for moved in ([COLOUR], frequencies, dampings):
+        out[:, moved] = difference(moved)[:, None]
+    out *= owner[:, None] == owner
+    by_corner = difference([CORNER]) * np.isin(owner, [owner[CORNER], *rolling])
+    out[CORNER], out[:, CORNER] = by_corner, by_corner
+    return out
 
 
 def invert_information(information: FloatArray) -> FloatArray:

@@ -11,7 +11,12 @@ from support.recorded_loops import integrator_loop
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import GAIN, Component, SpectrumModel
-from lbt_synth.identification.fit.whittle import contrast, density, derivatives
+from lbt_synth.identification.fit.whittle import (
+    contrast,
+    density,
+    derivatives,
+    second_derivatives,
+)
 
 RATE = 1000.0
 
@@ -67,3 +72,24 @@ def test_gradient_and_information_of_the_likelihood(drift: bool) -> None:
         ]
     )
     assert expected[1:, 1:] == pytest.approx(rows[:, 1:], rel=1e-3, abs=1e-3 * np.max(rows))
+
+
+@pytest.mark.parametrize("taper", [False, True])
+@pytest.mark.parametrize("drift", [False, True])
+def test_second_derivatives_of_the_likelihood(drift: bool, taper: bool) -> None:
+    """The slope of the table that smears lines has corners: differences see them."""
+    data, spectrum = case(drift=drift)
+    if not taper:
+        data = dataclasses.replace(data, duration_s=None)
+    theta, step = spectrum.pack(), 1e-4
+
+    def gradient(change: np.ndarray) -> np.ndarray:
+        return derivatives(data, spectrum.unpack(theta + change))[1]
+
+    rows = [(gradient(h) - gradient(-h)) / (2 * step) for h in step * np.eye(theta.size)]
+    found = second_derivatives(data, spectrum)
+    scale = np.sqrt(np.abs(np.diag(found)))
+    assert found / np.outer(scale, scale) == pytest.approx(
+        np.array(rows) / np.outer(scale, scale), abs=1e-2 if taper else 1e-4
+    )
+    assert found == pytest.approx(found.T, rel=1e-12)
