@@ -7,6 +7,8 @@ OUT    ?= out
 # small matrices: more threads than processes only get in each other's way
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
+# what Python compiles once serves all processes of the tests
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-all lowest e2e browser study bench docs lint clean
 

@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lbt_synth.linear import StateSpace
 from lbt_synth.linear.connected_parts import connected_parts
+from lbt_synth.linear.state_space import schur_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response, mirror_system, tapped_mirror
@@ -42,6 +44,16 @@ class Subloop:
     def is_shared(self) -> bool:
         """Whether one controller serves all loops."""
         return len(self.matrices[0]) == 1
+
+    @property
+    def is_scalar(self) -> bool:
+        """Whether it has one mode, one measurement and one command."""
+        return self.sensor.shape == self.influence.shape == (1, 1)
+
+    @property
+    def scalar_gain(self) -> float:
+        """Gain of sensor and mirror where they are scalar."""
+        return float(self.influence[0, 0] * self.sensor[0, 0])
 
     def controllers(self, rows: IntArray) -> tuple[FloatArray, ...]:
         """Return the controllers ``A, B, C, D`` of some loops, or the one that serves all."""
@@ -105,8 +117,8 @@ def _nonzero_entries(entries: FloatArray) -> BoolArray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopGroup:
-    """k loops of one subloop, from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``.
+class LoopPoints:
+    """Where k loops of one subloop differ.
 
     Their mirrors are ``(1 - fraction) first + fraction second``.
     """
@@ -117,30 +129,69 @@ class LoopGroup:
     rows: IntArray  # which loops, (k,)
     fraction: FloatArray  # (k,)
     sensor_gains: FloatArray  # (k,)
+    poles: ComplexArray  # (k, s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopGroup(LoopPoints):
+    """k loops of one subloop, from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``."""
+
     A: FloatArray  # (k, s, s)
     B: FloatArray
     C: FloatArray
     D: FloatArray
-    poles: ComplexArray  # (k, s)
 
     def take(self, which: IntArray) -> LoopGroup:
         """Return some of the loops."""
         return replace(self, **{name: getattr(self, name)[which] for name in _PER_LOOP})
 
-    def batches(self, stable: BoolArray) -> Iterator[LoopGroup]:
+    def batches(self, stable: BoolArray) -> Iterator[LoopPoints]:
         """Yield batches of the stable loops, sorted by their distance from instability."""
         found = np.flatnonzero(stable[self.rows])
         order = found[np.argsort(_radius(self.poles[found]), kind="stable")]
         most = _SHARED if self.subloop.is_shared else _OWN
         for start in range(0, order.size, most):
-            yield self.take(order[start : start + most])
+            which = order[start : start + most]
+            yield LoopPoints(
+                subloop=self.subloop,
+                first=self.first,
+                second=self.second,
+                rows=self.rows[which],
+                fraction=self.fraction[which],
+                sensor_gains=self.sensor_gains[which],
+                poles=self.poles[which],
+            )
 
     def rejections(self, turn: FloatArray) -> ComplexArray:
         """Rejection (k, n, n) of each loop at its own frequency [radians per frame]."""
+        z, subloop = np.exp(1j * turn), self.subloop
+        if subloop.is_shared and subloop.is_scalar:
+            A, B, C, D = (part[0] for part in subloop.matrices)
+            controller = system_response(A, B, C, D, z)[:, 0, 0]
+            first, second = (mirror_response(end, z) for end in (self.first, self.second))
+            mirror = first + self.fraction * (second - first)
+            loop = self.sensor_gains * subloop.scalar_gain * controller * mirror / z
+            # at a pole of the controller, nothing is left
+            return np.where(np.isfinite(loop), 1 / (1 + loop), 0)[:, None, None]
         n = self.C.shape[1]
-        pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
+        pencil = z[:, None, None] * np.eye(self.A.shape[1]) - self.A
         states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
         return np.asarray(self.C @ states + self.D[..., :n])
+
+
+def system_response(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, z: ComplexArray
+) -> ComplexArray:
+    """Transfer matrices (f, m, q) of one system, which may have no state."""
+    if len(A) == 0:
+        return np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
+    return schur_response(StateSpace(A=A, B=B, C=C, D=D).balanced(), z)
+
+
+def mirror_response(mirror: Response, z: ComplexArray) -> ComplexArray:
+    """Response of a mirror, (f,)."""
+    direct = np.array([[mirror.D]])
+    return system_response(mirror.A, mirror.B[:, None], mirror.C[None], direct, z)[:, 0, 0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,8 +12,8 @@ import numpy as np
 
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import gauss_panels, panel_rule
-from lbt_synth.linear.state_space import pointwise_response, schur_response
-from lbt_synth.loop.ensemble.closed_loops import LoopGroup
+from lbt_synth.linear.state_space import pointwise_response
+from lbt_synth.loop.ensemble.closed_loops import LoopPoints, mirror_response, system_response
 from lbt_synth.loop.ensemble.loop_ensemble import Turbulence
 from lbt_synth.models import ARModel, Atmosphere, FrozenFlows, SumSpectrum, TabulatedSpectrum
 from lbt_synth.models.spectra import breakpoints_below
@@ -89,7 +89,7 @@ class _Samples:
 
 
 def spectral_covariances(
-    group: LoopGroup,
+    group: LoopPoints,
     turbulence: list[tuple[Turbulence, list[int]]],
     noise_nm: FloatArray,
     frame_rate_hz: float,
@@ -99,13 +99,12 @@ def spectral_covariances(
     ``turbulence`` pairs each spectrum with its modes of the subloop.
     """
     samples = _sample(group, turbulence, frame_rate_hz)
-    is_scalar = group.subloop.sensor.shape == group.subloop.influence.shape == (1, 1)
-    evaluate = _scalar_covariances if is_scalar else _matrix_covariances
+    evaluate = _scalar_covariances if group.subloop.is_scalar else _matrix_covariances
     return evaluate(group, samples, noise_nm)
 
 
 def _sample(
-    group: LoopGroup, turbulence: list[tuple[Turbulence, list[int]]], frame_rate_hz: float
+    group: LoopPoints, turbulence: list[tuple[Turbulence, list[int]]], frame_rate_hz: float
 ) -> _Samples:
     """Choose frequencies for the poles of a batch of loops, and evaluate its subloop there."""
     nyquist, subloop = frame_rate_hz / 2, group.subloop
@@ -114,14 +113,17 @@ def _sample(
     frequency, weight = gauss_panels(np.unique(np.concatenate(edges)), ORDER)
     z = np.exp(1j * np.pi * frequency / nyquist)
     ends = (group.first,) if group.first is group.second else (group.first, group.second)
-    mirrors = [_response(m.A, m.B[:, None], m.C[None], np.array([[m.D]]), z) for m in ends]
+    mirrors = [mirror_response(mirror, z) for mirror in ends]
     A, B, C, D = subloop.controllers(group.rows)
     one = subloop.is_shared
-    controller = _response(A[0], B[0], C[0], D[0], z) if one else batched_response(A, B, C, D, z)
+    controller = (
+        system_response(A[0], B[0], C[0], D[0], z) if one else batched_response(A, B, C, D, z)
+    )
     loops, nodes = len(group.rows), (frequency, weight)
     densities = [_Density.of(spectrum, modes, loops, nodes) for spectrum, modes in turbulence]
-    first, second = mirrors[0][:, 0, 0], mirrors[-1][:, 0, 0]
-    return _Samples(1 / z, first, second, controller, 2 / frame_rate_hz * weight, densities)
+    return _Samples(
+        1 / z, mirrors[0], mirrors[-1], controller, 2 / frame_rate_hz * weight, densities
+    )
 
 
 def graded_edges(poles: ComplexArray) -> FloatArray:
@@ -148,15 +150,6 @@ def graded_edges(poles: ComplexArray) -> FloatArray:
         middle = (low[long] + high[long]) / 2
         low, high = np.concatenate([low[long], middle]), np.concatenate([middle, high[long]])
     return np.sort(np.concatenate(done))
-
-
-def _response(
-    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, z: ComplexArray
-) -> ComplexArray:
-    """Transfer matrices (f, m, q) of one system, which may have no state."""
-    if len(A) == 0:
-        return np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
-    return schur_response(StateSpace(A=A, B=B, C=C, D=D).balanced(), z)
 
 
 def _breakpoints(spectrum: Turbulence, nyquist_hz: float) -> FloatArray:
@@ -215,12 +208,11 @@ def _panel_integrals(spectrum: Turbulence, low: FloatArray, high: FloatArray) ->
 
 
 def _scalar_covariances(
-    group: LoopGroup, samples: _Samples, noise_nm: FloatArray
+    group: LoopPoints, samples: _Samples, noise_nm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """One mode, in real numbers."""
     subloop = group.subloop
-    size = subloop.influence[0, 0] * subloop.sensor[0, 0]
-    unit = size * samples.controller[..., 0, 0] * samples.delay
+    unit = subloop.scalar_gain * samples.controller[..., 0, 0] * samples.delay
     ends = unit * samples.first, unit * (samples.second - samples.first)
     shared = _SharedLoop.of(*ends, samples.white) if subloop.is_shared else None
     turbulence, noise = np.zeros((2, len(group.rows)))
@@ -293,7 +285,7 @@ class _SharedLoop:
 
 
 def _matrix_covariances(
-    group: LoopGroup, samples: _Samples, noise_nm: FloatArray
+    group: LoopPoints, samples: _Samples, noise_nm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Several modes, one loop at a time."""
     subloop, n = group.subloop, group.subloop.modes.size

@@ -237,7 +237,7 @@ def step_controller(
         u = controller.step(y, applied)
     else:
         u = np.asarray(controller.step(y), dtype=np.float64)
-    finite = bool(np.all(np.isfinite(u)))
+    finite = bool(np.isfinite(u).all())
     if u.shape != (size,) or not finite:
         kind = "" if finite else " with values that are not finite"
         raise ProblemError(
@@ -268,15 +268,16 @@ def step_loop(
     taps, gains = hardware.mirror_taps, np.broadcast_to(sensor_gain, frames)
     sensor, influence = hardware.sensor, hardware.influence
     out = np.zeros((cases, frames, n + m + q))
-    for case in range(cases):
+    for phase, white, left in zip(total, noise, out, strict=True):
         controller.reset()
         residual = np.zeros(n)
         commands = np.zeros((len(taps), m))  # u(k), u(k-1), ...
+        residuals, applied, measured = np.split(left, [n, n + m], axis=1)
         for k in range(frames):
-            y = gains[k] * sensor @ residual + noise[case, k]
+            y = gains[k] * sensor @ residual + white[k]
             u = step_controller(controller, y, m, frame=k, applied=commands[0])
             commands[1:] = commands[:-1]
             commands[0] = u if stroke == np.inf else np.clip(u, -stroke, stroke)
-            residual = total[case, k] - influence @ (taps @ commands)
-            out[case, k] = np.concatenate([residual, commands[0], y])
+            residual = phase[k] - influence @ (taps @ commands)
+            residuals[k], applied[k], measured[k] = residual, commands[0], y
     return out
