@@ -35,7 +35,7 @@ from lbt_synth.validation import (
 _DIRECTIONS = 64
 _FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])  # directions to try
 _STRIPS = np.linspace(0.2, 4, 20)
-_SMOOTH, _SMOOTH_NODES = -1, 20  # fineness of jitters up to a turn, and radii that are enough
+_FEW_RADII = {-1: (1.0, 20), -2: (0.3, 8)}  # by fineness: turns of phase, and radii for them
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
 _SERIES_CHUNK = 20_000  # frames at once
@@ -250,15 +250,16 @@ def _choose_rules(
 ) -> IntArray:
     """Fineness and number of directions of the nodes that each jitter needs, (p, 2).
 
-    Up to a turn of phase over the pupil the integrand is nearly a polynomial, and few nodes are
-    enough; beyond some 5 turns the nodes are made denser. Where the jitter is
-    the same in all directions, or small, fewer directions are enough: the equidistant sum over N
-    directions of half a turn misses only harmonics from 2 N on, which decay faster than
-    ``exp(-2 N t)`` times the largest value of the integrand on a strip of width t.
+    Up to a turn of phase over the pupil the integrand is nearly a polynomial, and few radii are
+    enough; beyond some 5 turns the nodes are made denser. Where the jitter is the same in all
+    directions, or small, fewer directions are enough: the equidistant sum over N directions of half
+    a turn misses only harmonics from 2 N on, which decay faster than ``exp(-2 N t)`` times the
+    largest value of the integrand on a strip of width t.
     """
     turns = np.maximum(spread * cycles_per_nm, 1e-9)
     fineness = np.maximum(0, np.ceil(np.log2(turns / 5))).astype(np.int64)
-    fineness[turns <= 1] = _SMOOTH
+    for few, (most, _) in _FEW_RADII.items():
+        fineness[turns <= most] = few
     variance, last = covariance[:, 0, 0], covariance[:, -1, -1]
     two = covariance.shape[1] == 2
     unequal = np.hypot(variance - last, 2 * covariance[:, 0, 1]) if two else variance
@@ -267,7 +268,9 @@ def _choose_rules(
     growth = np.outer(gaussian, np.cosh(2 * _STRIPS) - 1) + np.outer(sinusoids, np.sinh(_STRIPS))
     error = np.min(growth[:, None] - 2 * np.outer(_FEWER, _STRIPS), axis=2)
     halvings = np.sum(error < np.log(1e-15), axis=1)
-    directions = np.where(fineness <= 0, _DIRECTIONS >> halvings, _DIRECTIONS << np.abs(fineness))
+    directions = np.where(
+        fineness <= 0, _DIRECTIONS >> halvings, _DIRECTIONS << np.maximum(fineness, 0)
+    )
     return np.stack([fineness, directions], axis=1)
 
 
@@ -334,8 +337,8 @@ def _weighted_otf(
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    if fineness == _SMOOTH:
-        square, weight = compress_rule(radius**2, weight, _SMOOTH_NODES)
+    if fineness in _FEW_RADII:
+        square, weight = compress_rule(radius**2, weight, _FEW_RADII[fineness][1])
         radius = np.sqrt(square)
     angle = np.pi * (np.arange(directions // 2 if quadrant else directions) + 0.5) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
