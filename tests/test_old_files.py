@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 from dataclasses import asdict
+from functools import cache
 
 import numpy as np
 import pytest
@@ -20,6 +21,12 @@ TRUTHS = {"lqg.npz": "lbt_slow_mirror.yaml", "robust.npz": "lbt_robust.yaml"}
 GAIN_FILES = sorted(name for name, entry in EXPECTED.items() if "spectral_radius" in entry)
 
 
+@cache
+def old_design(name):
+    """The design of an old gain file, read once."""
+    return lbt.load_gain(OLD / name)
+
+
 def test_there_is_a_gain_file_of_each_method_and_format():
     assert len(GAIN_FILES) == 7
     assert {name.rpartition(".")[2] for name in GAIN_FILES} == {"fits", "json", "npz"}
@@ -28,7 +35,7 @@ def test_there_is_a_gain_file_of_each_method_and_format():
 @pytest.mark.parametrize("name", GAIN_FILES)
 def test_gain_files_load_and_close_the_same_loop(name):
     expected = EXPECTED[name]
-    design = lbt.load_gain(OLD / name)
+    design = old_design(name)
     config = lbt.load_config(OLD / TRUTHS.get(name, "lbt.yaml"))
     loop = lbt.close_loop(config.hardware, design.controller)
     budget = lbt.residual_budget(loop, config.truth)
@@ -52,7 +59,7 @@ def test_gain_files_pass_their_certificate_again(name, capsys):
 @pytest.mark.parametrize("name", GAIN_FILES)
 @pytest.mark.parametrize("ending", ["fits", "npz", "json"])
 def test_gain_files_are_written_again_without_a_loss(name, ending, tmp_path):
-    design = lbt.load_gain(OLD / name)
+    design = old_design(name)
     lbt.save_gain(tmp_path / f"again.{ending}", design)
     again = lbt.load_gain(tmp_path / f"again.{ending}")
     for matrix in "ABCD":

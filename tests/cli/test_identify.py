@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,28 @@ from support.plants import LBT_YAML
 from support.recorded_loops import RATE, open_record
 
 import lbt_synth as lbt
+
+FACTS = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
+
+
+@pytest.fixture(scope="module")
+def tip_night(recorded_loop, tmp_path_factory):
+    """The axis of the recorded night that vibrates, alone."""
+    file = tmp_path_factory.mktemp("tip") / "tip.npz"
+    run_, _, _ = recorded_loop
+    y, u = (series[0, :, :1] for series in (run_.measurements, run_.commands))
+    np.savez(file, measurements=y, commands=u)
+    return file
+
+
+@pytest.fixture(scope="module")
+def brief_night(recorded_loop, tmp_path_factory):
+    """The telemetry of the first five seconds."""
+    run_, path, ran = recorded_loop
+    seen = lbt.files.telemetry_from_simulation(run_, path, sensor_gain=GAIN, design=ran)
+    names = ("commands", "measurements", "residual_nm", "total_nm")
+    brief = replace(seen, **{name: getattr(seen, name)[:5000] for name in names})
+    return lbt.files.save_telemetry(tmp_path_factory.mktemp("brief") / "brief.fits", brief)
 
 
 def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, recorded_night):
@@ -38,9 +61,9 @@ def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, recorded
 @pytest.mark.parametrize("ending", ["npy", "npz", "csv", "fits"])
 def test_series_of_any_format(tmp_path, capsys, recorded_loop, ending):
     run_, _, _ = recorded_loop
-    y, u = run_.measurements[0], run_.commands[0]
+    y, u = run_.measurements[0, :6000], run_.commands[0, :6000]
     file = tmp_path / f"night.{ending}"
-    options: tuple[object, ...] = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
+    options: tuple[object, ...] = FACTS
     if ending == "npy":
         np.save(file, np.hstack([y, u]))
         options += ("--columns", "measurements=0,1", "commands=2,3")
@@ -140,7 +163,7 @@ def test_accelerometers_and_lists_announce_lines(tmp_path, capsys, recorded_loop
 
 
 def test_accelerometers_are_compared_with_the_lines_of_the_model(
-    tmp_path, capsys, recorded_loop, recorded_night
+    tmp_path, capsys, recorded_loop, tip_night
 ):
     """Two readings a frame in mm/s^2: a channel that follows the line twofold, and a dead one."""
     run_, _, _ = recorded_loop
@@ -150,7 +173,7 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     )
     table = np.column_stack([readings, np.zeros(shake.size)]).repeat(2, axis=0)
     np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="m1,m2", comments="")
-    base = ("identify", recorded_night, "-o", tmp_path / "m.yaml", "--no-figure")
+    base = ("identify", tip_night, *FACTS, "-o", tmp_path / "m.yaml", "--no-figure")
     own = ("--accelerometers", tmp_path / "a.csv", "--acceleration-unit", "mm/s2")
     status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 2000, "--json")
     assert (status, error) == (0, "")
@@ -175,13 +198,13 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
 
 
 def test_exchanged_channels_are_named_against_an_earlier_model(
-    tmp_path, capsys, recorded_loop, recorded_night
+    tmp_path, capsys, recorded_loop, tip_night
 ):
     run_, _, _ = recorded_loop
     shake = np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0])  # mm/s^2 at 1 kHz
     noise = 0.05 * np.std(shake) * np.random.default_rng(4).standard_normal((shake.size, 2))
     table = shake[:, None] * [2.0, -0.5] + noise
-    base = ("identify", recorded_night, "--no-figure", "--acceleration-unit", "mm/s2", "--json")
+    base = ("identify", tip_night, *FACTS, "--no-figure", "--acceleration-unit", "mm/s2", "--json")
     names = (("m1", "m2"), ("m2", "m1"))
     for before, after in [(None, 0), (0, 0), (0, 1)]:
         file, model = tmp_path / f"{after}.csv", tmp_path / f"{before}-{after}.yaml"
@@ -201,7 +224,7 @@ def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
     y[5000:5400] = np.nan
     y[8000] = np.nan
     np.savez(tmp_path / "n.npz", measurements=y, commands=u)
-    options = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm", "--no-figure")
+    options = (*FACTS, "--no-figure")
     status, text, _ = run(
         capsys, "identify", tmp_path / "n.npz", "-o", tmp_path / "m.yaml", *options
     )
@@ -240,9 +263,9 @@ def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
         (("-o", "m.yaml", "--kind", "spectrum"), "kind"),
     ],
 )
-def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, recorded_night, options, words):
+def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, brief_night, options, words):
     monkeypatch.chdir(tmp_path)
-    status, text, error = run(capsys, "identify", recorded_night, *options)
+    status, text, error = run(capsys, "identify", brief_night, *options)
     assert (status, text) == (2, "")
     assert words in error
     assert "Traceback" not in error

@@ -7,7 +7,7 @@ import json
 import pytest
 from support.commands import run
 from support.plants import LBT_YAML
-from support.several_sensors import write_config
+from support.several_sensors import CONFIG, write_config
 
 from lbt_synth.cli.sensor_failures import parse_drop
 
@@ -92,9 +92,10 @@ def test_show_prints_what_failures_do(capsys, fused_file):
     assert "of the loop's own sensor in the truth" in text
 
 
-def test_verify_and_limits_take_it(capsys, config_file, fused_file):
+def test_verify_and_limits_take_it(tmp_path, capsys, fused_file):
     assert "verified" in run(capsys, "verify", fused_file)[1]
-    status, text, _ = run(capsys, "limits", config_file, fused_file)
+    few = write_config(tmp_path, CONFIG + "robustness: {errors_hz: [0]}\n")
+    status, text, _ = run(capsys, "limits", few, fused_file)
     assert status == 0
     assert "fused" in text
 

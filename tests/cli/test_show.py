@@ -7,7 +7,7 @@ import re
 
 import pytest
 from support.commands import run
-from support.exports import lbt_designs
+from support.exports import lbt_config, turn_states
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
@@ -34,8 +34,11 @@ def test_show_and_verify(capsys, gains, name):
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
 def test_show_prints_the_cost(tmp_path, capsys, monkeypatch, name):
-    design = lbt_designs()[name]
-    gain = lbt.save_gain(tmp_path / "kalman.fits", lbt_designs()["kalman"])
+    design = kalman = lbt.kalman(lbt_config().plant)
+    if name == "turned":
+        spread = lbt.models.spread_plant(lbt_config().plant, half_width_hz=3.5, lines=3)
+        design = turn_states(lbt.kalman(spread))
+    gain = lbt.save_gain(tmp_path / "kalman.fits", kalman)
     monkeypatch.setattr("lbt_synth.cli.show.load_with_digest", lambda path: (design, "0"))
     cost = lbt.interop.frame_cost(design)
     status, text, _ = run(capsys, "show", gain)

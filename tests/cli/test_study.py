@@ -132,8 +132,18 @@ def test_dask_without_its_package(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The results of a study that nothing disturbs."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    study = lbt.studies.load_study(study_file(folder, samples="600", parameters=PARAMETERS))
+    done = lbt.studies.run_study(study, folder)
+    assert (done.computed, done.failures) == (600, 0)
+    return read_table(done.results)
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_killed_it_goes_on_where_it_was(tmp_path, capsys, jobs):
+def test_killed_it_goes_on_where_it_was(tmp_path, capsys, undisturbed, jobs):
     path = study_file(tmp_path, samples="600", parameters=PARAMETERS)
     folder = tmp_path / "out"
     first = started(path, "-o", folder, "--jobs", jobs)
@@ -148,9 +158,7 @@ def test_killed_it_goes_on_where_it_was(tmp_path, capsys, jobs):
     assert status == 0, error
     missing = 600 - sum(stop - start for start, stop in kept)
     assert f"{missing} of 600 samples computed" in out
-    status, _, _ = run(capsys, "study", path, "-o", tmp_path / "undisturbed")
-    assert status == 0
-    found, undisturbed = (read_table(f / "results.csv") for f in (folder, tmp_path / "undisturbed"))
+    found = read_table(folder / "results.csv")
     assert found["row"].tolist() == list(range(600))
     for name, column in undisturbed.items():
         np.testing.assert_allclose(found[name], column, rtol=1e-6, err_msg=name)

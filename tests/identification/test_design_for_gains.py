@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -20,8 +20,9 @@ from lbt_synth.methods.request import PlantInputs, design_request
 
 @pytest.fixture(scope="module")
 def fit_model():
+    """Return what fits a model to one record, each start and gain once."""
     record = spliced_record((0,), lines=LINE, frames=20_000, sensor_gain=0.9)
-    return partial(lbt.identification.identify, record)
+    return cache(partial(lbt.identification.identify, record))
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,7 @@ def kalman(model):
     return lbt.kalman(model.plant())
 
 
+@cache
 def hinf(model):
     return lbt.hinf(
         model.plant(), gamma_ratio=1.02, route="riccati"
@@ -70,7 +72,7 @@ def test_gains_that_the_fit_shows_keep_the_design(fit_model, half, models):
 def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
     line = ((60.0, 0.004, 100.0),)
     record = spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9)
-    fit_model = partial(lbt.identification.identify, record)
+    fit_model = cache(partial(lbt.identification.identify, record))
     first = fit_model()
     models, allowed = (fit_model(start=first), first), np.array([[0.8, 1.0]])
     made = partial(design_for_gains, fit_model, hinf, models=models, allowed=allowed)

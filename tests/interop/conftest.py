@@ -6,6 +6,8 @@ import pytest
 from support.exports import lbt_config, lbt_designs
 
 import lbt_synth as lbt
+from lbt_synth.interop import export_checks
+from lbt_synth.interop.c import fused_terms
 
 
 @pytest.fixture
@@ -16,6 +18,16 @@ def loaded():
 @pytest.fixture
 def designs():
     return lbt_designs()
+
+
+@pytest.fixture
+def short_rehearsal(monkeypatch):
+    """Rehearse few frames, in tests that do not look at what is found there."""
+    for module in (export_checks, fused_terms):
+        monkeypatch.setattr(module, "FRAMES", 100)
+    export_checks._own_commands.cache_clear()
+    yield
+    export_checks._own_commands.cache_clear()
 
 
 @pytest.fixture(scope="session")

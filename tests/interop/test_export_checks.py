@@ -10,6 +10,7 @@ import pytest
 
 import lbt_synth as lbt
 
+pytestmark = pytest.mark.usefixtures("short_rehearsal")
 EXPORTS = {
     "k.c": lbt.interop.export_c,
     "k.mat": lbt.interop.export_mat,

@@ -14,6 +14,7 @@ import lbt_synth as lbt
 from lbt_synth.design.modal import MixedController, modal_filters
 from lbt_synth.loop.simulation.run import step_loop
 
+pytestmark = pytest.mark.usefixtures("short_rehearsal")
 AIR = lbt.models.ARModel(coefficients=[0.98], driving_rms_nm=20.0, frame_rate_hz=800)
 
 

@@ -14,6 +14,7 @@ from lbt_synth.interop.cacao.truncation import predictive_filter
 from lbt_synth.interop.target import target_named, target_names
 from lbt_synth.loop.simulation.run import filter_series, step_loop
 
+pytestmark = pytest.mark.usefixtures("short_rehearsal")
 PATH = lbt.LoopHardware(frame_rate_hz=800)
 PHASE = 100 * np.cumsum(np.random.default_rng(0).standard_normal((1500, 2)), axis=0) / 30
 

@@ -36,6 +36,7 @@ def test_each_folder_with_an_export_is_a_target_and_has_an_oracle():
     assert not set(ORACLES) & WITHOUT_ORACLE
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
     """Files of an integrator, judged in the loop of one that is too slow for it."""
     quick = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.9)

@@ -13,12 +13,26 @@ from lbt_synth.studies.paper import tables as compute
 
 
 @pytest.fixture(scope="module")
-def table_iii():
-    return list(compute.table_iii())
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("paper")
 
 
-def test_written_files(tmp_path, table_iii):
-    result = write_paper(tmp_path, table_iii)
+@pytest.fixture(scope="module")
+def written(folder):
+    """The files of the paper, and the figures of robustness that were drawn for them."""
+    drawn = []
+
+    def draw(*arguments):
+        drawn.append(lbt.report.figures.robustness_figure(*arguments))
+        return drawn[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "robustness_figure", draw)
+        return write_paper(folder, list(compute.table_iii())), drawn
+
+
+def test_written_files(folder, written):
+    result, _ = written
     assert {p.name for p in result.files} == {
         "table_ii.csv",
         "table_iii.csv",
@@ -30,22 +44,15 @@ def test_written_files(tmp_path, table_iii):
         "paper_kalman.fits",
         "paper_hinf.fits",
     }
-    with (tmp_path / "table_iii.csv").open() as stream:
+    with (folder / "table_iii.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 30
     assert float(rows[0]["paper_strehl_percent"]) == 22.4
-    assert lbt.load_gain(tmp_path / "paper_hinf.fits").recertify().passed
+    assert lbt.load_gain(folder / "paper_hinf.fits").recertify().passed
 
 
-def test_the_papers_points_lie_on_our_curves(tmp_path, table_iii, monkeypatch):
-    drawn = []
-
-    def draw(*arguments):
-        drawn.append(lbt.report.figures.robustness_figure(*arguments))
-        return drawn[-1]
-
-    monkeypatch.setattr(paper, "robustness_figure", draw)
-    write_paper(tmp_path, table_iii)
+def test_the_papers_points_lie_on_our_curves(written):
+    _, drawn = written
     lines = {line.get_label(): line.get_xydata() for line in drawn[0].axes[0].get_lines()}
     assert len(lines) == 4
     for name in ("Kalman", "H∞"):

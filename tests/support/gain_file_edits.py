@@ -315,7 +315,7 @@ def judge(edit, folder, commands=COMMANDS):
         saved(edit.design, edit.ending).changed(edit).write(path)
     except Exception:  # the format cannot hold it: no such file
         return "cannot be written"
-    taken = []
+    taken, found = [], {}
     for name in (*commands, *(c for c in COMMANDS if c not in commands)):
         if name not in commands and not taken:
             break  # refused by those that were asked: the others read it the same way
@@ -326,11 +326,11 @@ def judge(edit, folder, commands=COMMANDS):
         if status and len(error.strip().splitlines()) > 1:
             return f"more than a line in {name}: {error}"
         taken += [name] if status == 0 else []
+        if name == "show" and status == 0:
+            found = facts(shown)
     if not taken:
         return "refused"
     own = facts_of_original(edit.design)
-    status, shown, _ = run_quietly(command("show", path))
-    found = facts(shown) if status == 0 else {}
     changed = {k[0] for k in own.keys() | found.keys() if differ(own.get(k), found.get(k))}
     if not changed:
         return "no other design"

@@ -301,13 +301,23 @@ def test_truncated_files_are_refused(tmp_path, ending):
         assert "\n" not in str(caught.value)
 
 
+@pytest.fixture(scope="module")
+def contents(tmp_path_factory):
+    """The gain file of the Kalman filter, by its format."""
+    target = tmp_path_factory.mktemp("kalman") / "g"
+    return {
+        ending: lbt.save_gain(target.with_suffix(f".{ending}"), DESIGNS["kalman"]).read_bytes()
+        for ending in ENDINGS
+    }
+
+
 @settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     ending=st.sampled_from(ENDINGS), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7)
 )
-def test_a_flipped_bit_is_found_or_harmless(tmp_path, ending, place, bit):
-    path = lbt.save_gain(tmp_path / f"g.{ending}", DESIGNS["kalman"])
-    content = bytearray(path.read_bytes())
+def test_a_flipped_bit_is_found_or_harmless(tmp_path, contents, ending, place, bit):
+    path = tmp_path / f"g.{ending}"
+    content = bytearray(contents[ending])
     content[int(place * len(content))] ^= 1 << bit
     path.write_bytes(bytes(content))
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop
@@ -20,6 +22,12 @@ def of_another_night(y, u):
     return y, np.column_stack([u[:, 0], ordinary_loop(5)[1][:, 1]])
 
 
+@cache
+def explain_spoilt(spoil):
+    """Return the verdict on the series of an ordinary loop, spoilt."""
+    return explain_commands(record(*spoil(*ordinary_loop())))
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -27,19 +35,19 @@ def of_another_night(y, u):
         (lambda y, u: (y, u[:, [0, 0]]), "one axis was recorded twice"),
         (lambda y, u: (y, u[:, [1, 1]]), "one axis was recorded twice"),
         (of_another_night, "those of axis 1 have nothing to do with its measurements"),
-        (lambda y, u: (np.diff(y, axis=0), u[1:]), "unstable at any sensor gain"),
+        (lambda y, u: (np.diff(y[:5000], axis=0), u[1:5000]), "unstable at any sensor gain"),
         (slipped, "they follow their measurements 1 frame later than before"),
     ],
 )
 def test_what_cannot_be_is_named(spoil, words: str) -> None:
-    verdict = explain_commands(record(*spoil(*ordinary_loop())))
+    verdict = explain_spoilt(spoil)
     assert words in verdict.explanation
     assert not verdict.accepted
     assert verdict.options == ""
 
 
 def test_a_slip_is_found_where_it_is() -> None:
-    words = explain_commands(record(*slipped(*ordinary_loop()))).explanation
+    words = explain_spoilt(slipped).explanation
     first, last = [int(word) for word in words.split() if word.isdigit()][:2]
     assert first < 6000 < last
 

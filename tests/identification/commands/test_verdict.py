@@ -56,7 +56,7 @@ def test_a_rotated_mirror_is_found_without_the_law() -> None:
         frame_rate_hz=RATE, influence_matrix=np.array([[0.866, -0.5], [0.5, 0.866]])
     )
     law = lbt.integrator(PATH, gain=0.4).controller
-    run = lbt.simulate(law, TRUTH, hardware=turned, frames=20_000)
+    run = lbt.simulate(law, TRUTH, hardware=turned, frames=10_000)
     verdict = explain_commands(record(run.measurements[0], run.commands[0]))
     assert verdict.repair.rotation_deg == pytest.approx(30, abs=8)
 
@@ -105,8 +105,8 @@ def test_a_wrong_delay(delay) -> None:
 
 def test_commands_that_are_shaken_need_no_law() -> None:
     rng = np.random.default_rng(7)
-    u = 40 * np.repeat(rng.standard_normal((500, 2)), 20, axis=0)
-    y = np.zeros((10_000, 2))
+    u = 40 * np.repeat(rng.standard_normal((200, 2)), 20, axis=0)
+    y = np.zeros((4000, 2))
     y[2:] = -0.5 * u[:-2]
     y += 5 * rng.standard_normal(y.shape)
     verdict = explain_commands(record(y, u))

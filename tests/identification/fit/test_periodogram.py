@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,23 +20,27 @@ from lbt_synth.identification.fit.periodogram import (
 )
 
 
-def correlation(t: float) -> float:
-    """Autocorrelation of the taper at a lag, by its definition."""
+def taper(x: float) -> float:
+    """Return the taper at a part of its length, by its definition."""
+    edge = min(x, 1 - x)
+    if edge < 0:
+        return 0.0
+    return 1.0 if edge >= TAPER / 2 else 0.5 * (1 - math.cos(2 * math.pi * edge / TAPER))
 
-    def h(x: float) -> float:
-        edge = min(x, 1 - x)
-        if edge < 0:
-            return 0.0
-        return 1.0 if edge >= TAPER / 2 else 0.5 * (1 - np.cos(2 * np.pi * edge / TAPER))
 
-    value = quad(lambda x: h(x) * h(x + t), 0, 1 - t, limit=400)[0]
-    return float(value / quad(lambda x: h(x) ** 2, 0, 1, limit=200)[0])
+@cache
+def correlations() -> tuple[np.ndarray, np.ndarray]:
+    """Return lags and the autocorrelation of the taper at them."""
+    t = np.linspace(0, 1, 1201)
+    products = [
+        quad(lambda x, lag=lag: taper(x) * taper(x + lag), 0, 1 - lag, limit=400)[0] for lag in t
+    ]
+    return t, np.array(products) / products[0]
 
 
 @pytest.mark.parametrize(("width", "distance"), [(0.02, 0.4), (0.3, 1.3), (2.0, 0.0), (8.0, 5.0)])
 def test_smearing_is_the_integral_that_defines_it(width: float, distance: float) -> None:
-    t = np.linspace(0, 1, 1201)
-    r = np.array([correlation(float(x)) for x in t])
+    t, r = correlations()
     kernel = r * np.exp(-2 * np.pi * width * t) * np.cos(2 * np.pi * distance * t)
     smeared = 2 * trapezoid(kernel, t)
     line = width / np.pi / (width**2 + distance**2)

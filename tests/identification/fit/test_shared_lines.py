@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from support.recorded_loops import integrator_loop, open_record
@@ -17,9 +19,18 @@ def shaking(degrees: float, *, hz: float = 31.0, rms: float = 60.0) -> lbt.Vibra
     return lbt.Vibration(frequency_hz=hz, damping=0.006, rms_nm=rms, direction=direction)
 
 
+@cache
+def diagonal(
+    degrees: float,
+) -> tuple[lbt.identification.LoopRecord, lbt.identification.IdentifiedModel]:
+    """Return an open loop of one line along a direction, and its model."""
+    record = open_record(((shaking(degrees), 0),))
+    return record, lbt.identify(record)
+
+
 @pytest.mark.parametrize("degrees", [36.0, -70.0])
 def test_a_line_along_a_diagonal_is_one_line(degrees: float) -> None:
-    model = lbt.identify(open_record(((shaking(degrees), 0),)))
+    _, model = diagonal(degrees)
     (line,) = model.shared
     assert line.kind == "line"
     assert line.direction_deg == pytest.approx(degrees, abs=4 * line.direction_error_deg)
@@ -106,8 +117,8 @@ def test_axes_that_share_nothing_are_those_that_were_found_alone() -> None:
 
 
 def test_a_line_that_begins_on_the_wrong_side_of_an_axis_is_taken_across() -> None:
-    record = open_record(((shaking(36), 0),))
-    axes = lbt.identify(record).axes
+    record, model = diagonal(36.0)
+    axes = model.axes
     search = _joint_search(record, axes, record.stretches(), 3.0)
     joint = JointSpectrum(axes=tuple(axis.fitted_model.spectrum for axis in axes))
     for degrees in (36, -36):

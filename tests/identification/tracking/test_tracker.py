@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,6 +17,12 @@ from lbt_synth.models.plant.tip_tilt import with_vibrations
 def unguarded(*given, **options):
     """A tracker whose filters run without a proof that they are better."""
     return lbt.identification.TrackingController(*given, guarded=False, **options)
+
+
+@cache
+def fixed_commands(frames):
+    """Commands of the filter that never changes, in the loop of ``simulated``."""
+    return simulated(SwitchedController(lbt.kalman(axis(18))), frames=frames).commands
 
 
 def test_a_trend_is_ahead_of_the_windows():
@@ -63,8 +70,7 @@ def test_the_tracker_follows_a_drift_and_a_fixed_filter_does_not():
 def test_without_a_change_the_commands_are_those_of_the_fixed_filter():
     plant = axis(18)
     same = unguarded(plant, lambda _y, _c: plant, window_s=0.5, update_s=0.25)
-    fixed = simulated(lbt.identification.SwitchedController(lbt.kalman(plant)), frames=1600)
-    assert np.array_equal(simulated(same, frames=1600).commands, fixed.commands)
+    assert np.array_equal(simulated(same, frames=800).commands, fixed_commands(800))
     assert same.kept == 0
     assert all(update.switched and update.reason == "" for update in same.history)
 
@@ -83,10 +89,7 @@ def test_a_fit_that_fails_keeps_the_filter_and_is_noted(identifier, words):
     plant = axis(18)
     tracker = unguarded(plant, identifier, window_s=0.5, update_s=0.25)
     out = simulated(tracker, frames=800)
-    assert np.array_equal(
-        out.commands,
-        simulated(lbt.identification.SwitchedController(lbt.kalman(plant)), frames=800).commands,
-    )
+    assert np.array_equal(out.commands, fixed_commands(800))
     assert tracker.kept == len(tracker.history) == 11
     for update in tracker.history:
         assert not update.switched
@@ -139,28 +142,27 @@ def test_a_window_with_holes_is_not_identified():
     assert tracker.history[-1].frequencies_hz[0] == pytest.approx(19, abs=0.1)
 
 
+@cache
+def without_a_glitch(whole):
+    """A tracker by the whole model or by the line, its run without a glitch, and the history."""
+    plant = axis(18)
+    identifier = lbt.identification.LoopIdentifier if whole else lbt.identification.LineFollower
+    tracker = unguarded(plant, identifier(plant), window_s=2, update_s=0.5, extrapolate=False)
+    series = disturbed(plant, frames=4000, hz=19)
+    run(tracker, plant, series)
+    return tracker, series, tracker.history
+
+
 @pytest.mark.parametrize("size_nm", [1e4, 1e6])
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_glitch_is_no_noise(size_nm, whole):
     """One measurement that is off by far, in the first windows."""
-    plant = axis(18)
-    tracker = unguarded(
-        plant,
-        lbt.identification.LoopIdentifier(plant)
-        if whole
-        else lbt.identification.LineFollower(plant),
-        window_s=2,
-        update_s=0.5,
-        extrapolate=False,
-    )
-    total, noise = disturbed(plant, frames=4000, hz=19)
-    run(tracker, plant, (total, noise))
-    clean = tracker.history
+    tracker, (total, noise), clean = without_a_glitch(whole)
     # the disturbance begins with a jump from zero
     assert [u.left_out for u in clean] == [2] + [0] * (len(clean) - 1)
     hit = noise.copy()
     hit[0, 1700] += size_nm
-    run(tracker, plant, (total, hit))
+    run(tracker, axis(18), (total, hit))
     kept = [u for u in tracker.history if not u.switched]
     # a gain that was found a little off shows the glitch's way through the loop: windows wait
     assert all(whole and size_nm == 1e6 and "do not stand alone" in u.reason for u in kept)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
 from support.compiled import Compiled
-from support.exports import bare_design
+from support.exports import bare_design, lbt_designs
 
 import lbt_synth as lbt
 from lbt_synth.interop.c.reading import read_source
@@ -34,11 +35,23 @@ def export(folder, design, **options):
     return lbt.interop.export_c(folder / "ctl.c", design, form="estimator", **options)
 
 
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Function that exports a design in a precision, each of them once."""
+
+    @cache
+    def write(name, precision="double"):
+        folder = tmp_path_factory.mktemp("exported")
+        return export(folder, lbt_designs()[name], precision=precision)
+
+    return write
+
+
 @pytest.mark.parametrize("precision", KINDS)
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "turned"])
-def test_the_source_is_what_was_proved(tmp_path, designs, name, precision):
+def test_the_source_is_what_was_proved(exported, designs, name, precision):
     design = designs[name]
-    written = export(tmp_path, design, precision=precision)
+    written = exported(name, precision)
     theirs = Compiled(written.files[0], single=precision == "single")
     assert rehearsal_error(design, Applied(theirs)) == written.error
     names = [check.name for check in written.checks]
@@ -56,8 +69,8 @@ def test_the_source_is_what_was_proved(tmp_path, designs, name, precision):
 
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_it_takes_the_applied_commands(tmp_path, designs, name):
-    theirs = Compiled(export(tmp_path, designs[name]).files[0])
+def test_it_takes_the_applied_commands(exported, designs, name):
+    theirs = Compiled(exported(name).files[0])
     ours = estimator_form(designs[name]).start()
     rng = np.random.default_rng(2)
     for y, applied in rng.standard_normal((300, 2, 2)):
@@ -70,8 +83,8 @@ def test_it_takes_the_applied_commands(tmp_path, designs, name):
 
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_what_is_not_finite_holds_command_and_state(tmp_path, designs, name):
-    theirs = Compiled(export(tmp_path, designs[name]).files[0])
+def test_what_is_not_finite_holds_command_and_state(exported, name):
+    theirs = Compiled(exported(name).files[0])
     last = theirs.step([1.0, -2.0], [0.3, 0.1])
     state = theirs.state.copy()
     for bad in (np.nan, np.inf, -np.inf):

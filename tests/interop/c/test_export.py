@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.compiled import STRICT, Compiled, compiler
-from support.exports import bare_design, relative
+from support.exports import bare_design, lbt_config, lbt_designs, relative
 
 import lbt_synth as lbt
 from lbt_synth.interop.c.arithmetic import SourceTerms
@@ -22,21 +23,41 @@ FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
 
 
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Function that writes ``ctl.c`` of a design and a precision, each of them once."""
+
+    @cache
+    def write(name, precision="double"):
+        target = tmp_path_factory.mktemp("exported") / "ctl.c"
+        return lbt.interop.export_c(target, lbt_designs()[name], precision=precision)
+
+    return write
+
+
+@cache
+def own_commands(name):
+    """Commands of a design in the loop of the configuration, which no export changes."""
+    return loop_commands(lbt_designs()[name].controller.start())
+
+
+def loop_commands(stepped):
+    """Commands of a controller in the loop of the configuration."""
+    run = lbt.simulate(
+        stepped, lbt_config().truth, hardware=lbt_config().hardware, frames=FRAMES, settle_frames=0
+    )
+    return run.commands
+
+
 @pytest.mark.parametrize("precision", LIMITS)
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "prior", "turned"])
-def test_the_compiled_controller_closes_the_loop(tmp_path, loaded, designs, name, precision):
+def test_the_compiled_controller_closes_the_loop(exported, name, precision):
     """Same disturbance and noise for thousands of frames, in a loop: some are unstable alone."""
     single = precision == "single"
-    written = lbt.interop.export_c(tmp_path / "ctl.c", designs[name], precision=precision)
-    theirs = Compiled(written.files[0], single=single)
-    commands = [
-        lbt.simulate(
-            stepped, loaded.truth, hardware=loaded.hardware, frames=FRAMES, settle_frames=0
-        ).commands
-        for stepped in (theirs, designs[name].controller.start())
-    ]
-    assert np.max(np.abs(commands[1])) > 100  # nm
-    error = relative(*commands)
+    written = exported(name, precision)
+    expected = own_commands(name)
+    assert np.max(np.abs(expected)) > 100  # nm
+    error = relative(loop_commands(Compiled(written.files[0], single=single)), expected)
     assert error < LIMITS[precision]
     if single:  # what the file says of itself, met in another loop
         assert written.error / 10 < error < 10 * written.error
@@ -44,10 +65,10 @@ def test_the_compiled_controller_closes_the_loop(tmp_path, loaded, designs, name
 
 @pytest.mark.parametrize("precision", LIMITS)
 @pytest.mark.parametrize("name", ["kalman", "hinf", "prior", "turned"])
-def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, precision):
+def test_the_rehearsal_is_the_arithmetic_of_the_source(exported, designs, name, precision):
     """Bit for bit in the loop, and the reported error is that of the compiled source."""
     design, single = designs[name], precision == "single"
-    written = lbt.interop.export_c(tmp_path / "ctl.c", design, precision=precision)
+    written = exported(name, precision)
     theirs = Compiled(written.files[0], single=single)
     assert rehearsal_error(design, theirs) == written.error
     assert 0 < written.error < LIMITS[precision]
@@ -62,8 +83,8 @@ def test_the_rehearsal_is_the_arithmetic_of_the_source(tmp_path, designs, name, 
 
 
 @pytest.mark.parametrize("precision", LIMITS)
-def test_the_compiled_integrator_on_given_measurements(tmp_path, designs, precision):
-    written = lbt.interop.export_c(tmp_path / "slow.c", designs["integrator"], precision=precision)
+def test_the_compiled_integrator_on_given_measurements(exported, designs, precision):
+    written = exported("integrator", precision)
     theirs = Compiled(written.files[0], single=precision == "single")
     ours = designs["integrator"].controller.start()
     series = np.random.default_rng(1).standard_normal((FRAMES, 2))
@@ -91,6 +112,7 @@ def controllers(draw):
     return lbt.Controller(A=A, B=matrix(n, q), C=matrix(m, n), D=D, dt_s=0.002)
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(controller=controllers(), precision=st.sampled_from(list(LIMITS)))
 def test_any_stable_controller(tmp_path, controller, precision):
@@ -106,9 +128,10 @@ def test_any_stable_controller(tmp_path, controller, precision):
 
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_two_loops_at_once_do_not_meet(tmp_path, designs, name):
-    one = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs[name]).files[0])
-    two = Compiled(tmp_path / "ctl.c", library=one.library)
+def test_two_loops_at_once_do_not_meet(exported, designs, name):
+    source = exported(name).files[0]
+    one = Compiled(source)
+    two = Compiled(source, library=one.library)
     alone = [designs[name].controller.start() for _ in range(2)]
     series = np.random.default_rng(3).standard_normal((60, 2, 2))
     for pair in series:
@@ -118,10 +141,8 @@ def test_two_loops_at_once_do_not_meet(tmp_path, designs, name):
 
 @pytest.mark.parametrize("precision", ["double", "single"])
 @pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_a_measurement_that_is_not_finite_holds_command_and_state(
-    tmp_path, designs, name, precision
-):
-    source = lbt.interop.export_c(tmp_path / "ctl.c", designs[name], precision=precision).files[0]
+def test_a_measurement_that_is_not_finite_holds_command_and_state(exported, name, precision):
+    source = exported(name, precision).files[0]
     theirs, undisturbed = (Compiled(source, single=precision == "single") for _ in range(2))
     before = np.zeros(2)
     for k, y in enumerate(np.random.default_rng(4).standard_normal((20, 2))):
@@ -136,8 +157,8 @@ def test_a_measurement_that_is_not_finite_holds_command_and_state(
         assert theirs.held == undisturbed.held == 0
 
 
-def test_a_command_is_held_where_it_shares_its_array_with_the_measurements(tmp_path, designs):
-    theirs = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs["kalman"]).files[0])
+def test_a_command_is_held_where_it_shares_its_array_with_the_measurements(exported):
+    theirs = Compiled(exported("kalman").files[0])
     last = theirs.step([1.0, -2.0])
     both = np.array([3.0, np.nan])
     assert theirs._call("step", theirs.state, both, both) == 1
@@ -145,8 +166,8 @@ def test_a_command_is_held_where_it_shares_its_array_with_the_measurements(tmp_p
 
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_reset_forgets(tmp_path, designs, name):
-    theirs = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs[name]).files[0])
+def test_reset_forgets(exported, name):
+    theirs = Compiled(exported(name).files[0])
     series = np.random.default_rng(4).standard_normal((20, 2))
     first = [theirs.step(y) for y in series]
     theirs.reset()
@@ -154,17 +175,17 @@ def test_reset_forgets(tmp_path, designs, name):
     assert np.array_equal([theirs.step(y) for y in series], first)
 
 
-def test_flags_that_hide_such_measurements_are_refused(tmp_path, designs):
-    source = lbt.interop.export_c(tmp_path / "ctl.c", designs["integrator"]).files[0]
+def test_flags_that_hide_such_measurements_are_refused(tmp_path, exported):
+    source = exported("integrator").files[0]
     command = [compiler(), "-std=c99", "-ffast-math", "-c", source, "-o", tmp_path / "ctl.o"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode != 0
     assert "compile without -ffast-math" in done.stderr
 
 
-def test_measurements_and_commands_in_one_array(tmp_path, designs):
+def test_measurements_and_commands_in_one_array(exported, designs):
     for name in ("kalman", "turned"):
-        theirs = Compiled(lbt.interop.export_c(tmp_path / "ctl.c", designs[name]).files[0])
+        theirs = Compiled(exported(name).files[0])
         ours = designs[name].controller.start()
         for y in np.random.default_rng(5).standard_normal((5, 2)):
             both = y.copy()
@@ -172,18 +193,16 @@ def test_measurements_and_commands_in_one_array(tmp_path, designs):
             assert np.allclose(both, ours.step(y), rtol=1e-12, atol=1e-12)
 
 
-def test_the_header_is_fit_for_cpp(tmp_path, designs):
-    written = lbt.interop.export_c(tmp_path / "ctl.c", designs["kalman"], precision="single")
+def test_the_header_is_fit_for_cpp(tmp_path, exported):
+    source = exported("kalman", "single").files[0]
     user = tmp_path / "user.cpp"
     user.write_text(
         '#include "ctl.h"\n#include "ctl.h"\n'
         "int main() { ctl_state s; float y[CTL_MEASUREMENTS] = {0}, u[CTL_COMMANDS];\n"
         "ctl_reset(&s); ctl_step(&s, y, u); return u[0] == 0.0f ? 0 : 1; }\n"
     )
-    flags = ["-pedantic", "-Wall", "-Wextra", "-Werror"]
-    subprocess.run(
-        [compiler(), *STRICT, "-c", written.files[0], "-o", tmp_path / "ctl.o"], check=True
-    )
+    flags = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-I", source.parent]
+    subprocess.run([compiler(), *STRICT, "-c", source, "-o", tmp_path / "ctl.o"], check=True)
     program = tmp_path / "user"
     subprocess.run(
         [compiler("c++"), "-std=c++98", *flags, user, tmp_path / "ctl.o", "-o", program], check=True
@@ -191,9 +210,9 @@ def test_the_header_is_fit_for_cpp(tmp_path, designs):
     subprocess.run([program], check=True)
 
 
-def test_coefficients_are_exact_and_explained(tmp_path, designs):
+def test_coefficients_are_exact_and_explained(exported, designs):
     controller = designs["kalman"].controller
-    text = lbt.interop.export_c(tmp_path / "k.c", designs["kalman"]).files[0].read_text()
+    text = exported("kalman").files[0].read_text()
     found = re.findall(r"(-?0x\S+p[+-]\d+), /\* ([ABCD])\[(\d+)\]\[(\d+)\] = (\S+) \*/", text)
     assert len(found) == lbt.interop.frame_cost(controller).coefficients
     for code, name, i, j, decimal in found:
@@ -212,6 +231,7 @@ def test_the_comment_says_where_it_comes_from(tmp_path, designs):
     assert f'#define K_GAIN_SHA256 "{sha}"' in written.files[1].read_text()
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 @pytest.mark.parametrize(
     "evil", ["*/ int main(void) {} /*", "x\\\n*/", "??/", "*\n/ #error", "\u202e*/", 'a"b', "\x00"]
 )
@@ -234,14 +254,12 @@ def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
 
 
 @pytest.mark.parametrize("precision", LIMITS)
-def test_the_same_design_is_the_same_source(tmp_path, designs, precision):
-    texts = []
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        files = lbt.interop.export_c(
-            tmp_path / folder / "k.c", designs["hinf"], precision=precision
-        ).files
-        texts.append([file.read_bytes() for file in files])
+def test_the_same_design_is_the_same_source(tmp_path, exported, designs, precision):
+    again = lbt.interop.export_c(tmp_path / "ctl.c", designs["hinf"], precision=precision)
+    texts = [
+        [file.read_bytes() for file in files]
+        for files in (exported("hinf", precision).files, again.files)
+    ]
     assert texts[0] == texts[1]
 
 
@@ -300,6 +318,7 @@ def test_precision_is_one_of_two(tmp_path, designs):
         lbt.interop.export_c(tmp_path / "k.c", designs["integrator"], precision="half")
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 def test_source_and_header_are_both_written_or_none(tmp_path, designs, monkeypatch):
     before = {
         file: file.read_bytes()

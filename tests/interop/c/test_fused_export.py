@@ -44,10 +44,10 @@ def theirs(written):
     return CompiledFilter(written["double"].files[0])
 
 
-def run(fused, config, filters=None):
+def run(fused, config, filters):
     """A run in which sensors fail, alone and together; its readings and commands."""
     return simulate_fused(
-        filters or fused.controllers,
+        filters,
         fused.problem.suite,
         config.truth,
         hardware=config.hardware,
@@ -57,27 +57,34 @@ def run(fused, config, filters=None):
     )
 
 
+@pytest.fixture(scope="module")
+def simulated(fused, fused_config):
+    """That run with the filters of the design."""
+    return run(fused, fused_config, fused.controllers)
+
+
 def fresh_in(k, missing=None):
     """What is new in a frame: the slow sensor is read in every second one."""
     away = {d.unit for d in DROPS if d.covers(k * 1e-3 + 1e-9)} if missing is None else missing
     return [unit not in away and not (unit == "slow" and k % 2) for unit in UNITS]
 
 
-def test_the_commands_are_those_of_the_simulation(fused, fused_config, theirs):
+def test_the_commands_are_those_of_the_simulation(simulated, theirs):
     """On the same readings and applied commands, with sensors missing."""
-    expected = run(fused, fused_config)
     last, found = np.zeros(2), []
-    for k, (y, u) in enumerate(zip(expected.measurements[0], expected.commands[0], strict=True)):
+    for k, (y, u) in enumerate(zip(simulated.measurements[0], simulated.commands[0], strict=True)):
         fresh = fresh_in(k)
         stale = np.where(np.repeat(fresh, [2, 2, 1, 1]), y, np.nan)  # nobody looks at the others
         found.append(theirs.step(stale, fresh, last))
         assert theirs.status == MISSING * any(d.covers(k * 1e-3 + 1e-9) for d in DROPS)
         last = u
-    assert relative(found, expected.commands[0]) < 1e-9
+    assert relative(found, simulated.commands[0]) < 1e-9
 
 
 @pytest.mark.parametrize(("precision", "limit"), [("double", 1e-9), ("single", 1e-3)])
-def test_the_compiled_filter_closes_the_loop(fused, fused_config, written, precision, limit):
+def test_the_compiled_filter_closes_the_loop(
+    fused, fused_config, simulated, written, precision, limit
+):
     """The simulation with the compiled source as its filters, for each set that is missing."""
     theirs = CompiledFilter(written[precision].files[0], single=precision == "single")
     frame = iter(range(FRAMES))
@@ -99,9 +106,9 @@ def test_the_compiled_filter_closes_the_loop(fused, fused_config, written, preci
             self.C = [Stepped(missing)] * 2
 
     filters = {some: Filter(some) for some in fused.controllers}
-    found, expected = run(fused, fused_config, filters), run(fused, fused_config)
-    assert relative(found.commands, expected.commands) < limit
-    assert relative(found.residual_nm, expected.residual_nm) < limit
+    found = run(fused, fused_config, filters)
+    assert relative(found.commands, simulated.commands) < limit
+    assert relative(found.residual_nm, simulated.residual_nm) < limit
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
@@ -185,6 +192,7 @@ def renamed(fused, names):
     return lbt.design.fused_kalman(lbt.models.fused_plant(fused.problem.own, suite, motions))
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 @pytest.mark.parametrize(
     ("names", "found"),
     [
@@ -229,6 +237,7 @@ def test_what_is_not_certified_is_refused(tmp_path, fused):
         lbt.interop.export_c(tmp_path / "k.c", wrong)
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 def test_a_table_that_is_too_long_is_refused(tmp_path, fused, monkeypatch):
     terms = fused_terms(fused)
     count = sum(np.count_nonzero(gains.any(axis=1)) for gains in terms.gains.values())

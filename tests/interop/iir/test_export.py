@@ -51,6 +51,7 @@ def test_states_of_the_other_axis_and_delays_in_both_are_left_out(tmp_path, desi
     assert all(np.min(np.abs(own - pole)) < 1e-9 for pole in poles)
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), orders=st.lists(st.integers(1, 5), min_size=1, max_size=3))
 def test_axes_of_any_order(tmp_path, seed, orders):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,6 +14,12 @@ from lbt_synth.linear.lmi.output_feedback import least_level_lmi
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 
 slycot = pytest.importorskip("slycot")
+
+
+@cache
+def random_design(seed):
+    """The design of a random plant, which several tests look at."""
+    return lbt.hinf_controller(random_plant(seed))
 
 
 def slicot_norm(plant, gamma):
@@ -30,8 +37,7 @@ def slicot_norm(plant, gamma):
 # grows without bound next to the level
 @pytest.mark.parametrize("seed", [*range(1, 13), 15, 863, 637])
 def test_slicot_reaches_no_less(seed):
-    plant = random_plant(seed)
-    least = lbt.hinf_controller(plant).gamma_least
+    plant, least = random_plant(seed), random_design(seed).gamma_least
     assert slicot_norm(plant, least * (1 - 1e-6)) > least * (1 - 1e-6)
     assert slicot_norm(plant, least * 1.01) < least * 1.01
 
@@ -41,7 +47,7 @@ def test_slicot_reaches_no_less(seed):
     ("seed", "open_by"), [*((seed, 1e-6) for seed in range(1, 9)), (73, 1e-4), (257, 1e-4)]
 )
 def test_witness_closes_the_bracket(seed, open_by):
-    design = lbt.hinf_controller(random_plant(seed))
+    design = random_design(seed)
     assert design.gamma_least * (1 - open_by) < design.gamma_infeasible <= design.gamma_least
 
 

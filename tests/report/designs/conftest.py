@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from support.design_reports import SMALL, three_designs
 
@@ -18,6 +20,14 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="session")
 def config(folder):
     return lbt.load_config(folder / "small.yaml")
+
+
+@pytest.fixture(scope="session")
+def few(folder):
+    """The same with few errors and gains, for what does not depend on them."""
+    text = re.sub(r"errors_hz: .*", "errors_hz: [-2, 2]", SMALL)
+    (folder / "few.yaml").write_text(re.sub(r"sensor_gains: .*", "sensor_gains: [0.5, 1.0]", text))
+    return lbt.load_config(folder / "few.yaml")
 
 
 @pytest.fixture(scope="session")

@@ -114,9 +114,9 @@ def test_a_truth_without_vibrations(config, designs):
     assert "slow leaves" in verdict(report)
 
 
-def test_many_designs_fill_several_sheets(config):
-    many = {f"design {i}": lbt.integrator(config.hardware, gain=0.2 + 0.02 * i) for i in range(8)}
-    report = lbt.report.design_report(config, many)
+def test_many_designs_fill_several_sheets(few):
+    many = {f"design {i}": lbt.integrator(few.hardware, gain=0.2 + 0.02 * i) for i in range(8)}
+    report = lbt.report.design_report(few, many)
     keys = [chart.key for chart in design_page(report).charts]
     assert {"map", "map-2", "poles-2", "spectra-2", "series-2"} <= set(keys)
     (section,) = [s for s in design_page(report).sections if s.key == "summary"]
@@ -139,14 +139,14 @@ def test_nothing_stable_is_needed(config, designs):
     assert "Of 0" not in text
 
 
-def test_a_certificate_that_cannot_be_computed(config, monkeypatch):
-    slow = lbt.integrator(config.hardware, gain=0.4)
+def test_a_certificate_that_cannot_be_computed(few, monkeypatch):
+    slow = lbt.integrator(few.hardware, gain=0.4)
 
     def broken(self):
         raise lbt.errors.NumericalError("the norm did not settle.")
 
     monkeypatch.setattr(type(slow), "recertify", broken)
-    report = lbt.report.design_report(config, {"slow": slow})
+    report = lbt.report.design_report(few, {"slow": slow})
     assert not report.assessments[0].certified
     text = words_of(report)
     assert "The certificate of slow fails: the norm did not settle." in text

@@ -36,12 +36,12 @@ def test_the_verdict_is_made_of_the_numbers(report):
     assert "the certificate of wild does NOT hold." in words
 
 
-def test_equal_designs_share_the_lead(config, designs):
+def test_equal_designs_share_the_lead(few, designs):
     kalman = designs["kalman"]
     pair = {"one": kalman, "two": kalman}
-    words = verdict(lbt.report.design_report(config, pair)).replace("\u00a0", " ")
+    words = verdict(lbt.report.design_report(few, pair)).replace("\u00a0", " ")
     assert "Of 2 stable designs, one and two leave the least, " in words
     assert ", all do equally well: the Strehl ratio is still " in words
-    three = verdict(lbt.report.design_report(config, {"slow": designs["slow"], **pair}))
+    three = verdict(lbt.report.design_report(few, {"slow": designs["slow"], **pair}))
     assert "Of 3 stable designs, one and two leave the least, " in three
     assert ", one and two do best: " in three or ", slow does best: " in three

@@ -55,10 +55,16 @@ class Page:
         self.session._close(None)
 
 
-@pytest.fixture
-def own(tmp_path):
+@pytest.fixture(scope="module")
+def opened():
+    """What is explored, and its first view."""
     exploration = explore(lbt.load_config(LBT_YAML), {})
-    first = whole_view(exploration, quick_view(exploration, first_wish()))
+    return exploration, whole_view(exploration, quick_view(exploration, first_wish()))
+
+
+@pytest.fixture
+def own(opened, tmp_path):
+    exploration, first = opened
     page = Page(Site(exploration=exploration, first=first, folder=tmp_path))
     yield page
     page.close()
