@@ -170,9 +170,9 @@ class LoopGroup(LoopPoints):
             controller = system_response(A, B, C, D, z)[:, 0, 0]
             first, second = (mirror_response(end, z) for end in (self.first, self.second))
             mirror = first + self.fraction * (second - first)
-            loop = self.sensor_gains * subloop.scalar_gain * controller * mirror / z
-            # at a pole of the controller, nothing is left
-            return np.where(np.isfinite(loop), 1 / (1 + loop), 0)[:, None, None]
+            with np.errstate(all="ignore"):  # at a pole of the controller, nothing is left
+                loop = self.sensor_gains * subloop.scalar_gain * controller * mirror / z
+                return np.where(np.isfinite(loop), 1 / (1 + loop), 0)[:, None, None]
         n = self.C.shape[1]
         pencil = z[:, None, None] * np.eye(self.A.shape[1]) - self.A
         states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))

@@ -316,6 +316,34 @@ def test_equal_loops_of_axes_that_meet_something_else(kalman, noise, turbulence)
         assert found.noise_nm2[i] == pytest.approx(budget.noise_nm2, rel=5e-7, abs=1e-9)
 
 
+def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
+    """A resonator without damping, and an exposure that ends within a frame."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2.3, modes=1)
+    turn = [[0.0, -1.0], [1.0, 0.0]]
+    entries = ([[0.05], [0.0]], [[0.0], [0.05]], [[-0.05], [0.0]], [[0.0], [-0.05]])
+    resonators = [
+        lbt.Controller(A=turn, B=B, C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE) for B in entries
+    ]
+    controller = next(one for one in resonators if lbt.close_loop(path, one).is_stable)
+    line = lbt.loop.EnsembleVibration(
+        frequency_hz=[RATE / 4, RATE / 4 + 1], rms_nm=100.0, direction=(1.0,)
+    )
+    ensemble = lbt.loop.LoopEnsemble(sensor_gain=[0.9, 0.9], vibrations=[line])
+    left = np.abs(lbt.loop.ensemble_residuals(controller, path, ensemble).line_amplitudes_nm)
+    assert left[0, 0, 0] < 1e-9
+    truth = lbt.Truth(
+        turbulence=None,
+        sensor_gain=0.9,
+        vibrations=(
+            lbt.models.SinusoidalVibration(
+                frequency_hz=RATE / 4 + 1, rms_nm=100.0, direction=(1.0,)
+            ),
+        ),
+    )
+    budget = lbt.residual_budget(lbt.close_loop(path, controller, sensor_gain=0.9), truth)
+    assert left[1, 0, 0] == pytest.approx(np.abs(budget.line_amplitudes_nm)[0, 0], rel=1e-9)
+
+
 def test_nothing_to_meet(kalman):
     found = lbt.loop.ensemble_residuals(
         kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(loops=3)
