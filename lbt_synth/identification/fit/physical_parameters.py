@@ -31,6 +31,7 @@ from lbt_synth.validation import FloatArray, frozen_copy
 
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
+_LEAST_PART = 1e-3  # of the noise: a part of the turbulence with less is none
 _DIFFERENCE = 1e-4  # of a logarithm
 _LAGS = 100
 _LOWEST = 3  # bins in which the ends of the taper show
@@ -114,10 +115,12 @@ def describe_axis(
     innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
     noise = max(float(np.exp(spectrum.log_noise / 2)), _LEAST_NOISE * innovation)
     correlation = float(np.tanh(spectrum.colour))
+    # a drift that a fit has emptied keeps its place, as nothing else lets several parts roll off
+    parts = [p for p in lines if p.kind != "turbulence" or p.rms_nm > _LEAST_PART * noise]
     return IdentifiedAxis(
         turbulence=process,
         turbulence_fit=_describe_turbulence(slow, errors, covariance, process),
-        parts=tuple(sorted(lines, key=lambda line: line.frequency_hz)),
+        parts=tuple(sorted(parts, key=lambda part: part.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
         noise_correlation=correlation,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.recorded_loops import expected_periodogram, integrator_loop
@@ -64,6 +66,26 @@ def test_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
     assert np.max(np.abs(log_ratio[axis.frequency_hz > 0.3])) < 0.25
     assert axis.turbulence.order == 3
     assert axis.turbulence.rms_nm == pytest.approx(air.tilt_rms_nm, rel=0.05)
+
+
+def test_a_part_of_the_turbulence_without_power_is_none() -> None:
+    """A configuration refuses it, and a design has a state for it."""
+    y, c = integrator_loop(lines=((40, 0.01, 30),), frames=8192)
+    data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
+    search = Search(data=data, gain=0.6)
+    model = search_model(search)
+    for power, count in ((1e-12, 0), (100.0, 1)):
+        slow = search.component("slow", 1.0, 0.5, power)
+        more = replace(
+            model,
+            spectrum=model.spectrum.add(slow),
+            information=np.pad(model.information, (0, 3)),
+            evidence=(*model.evidence, 0.0),
+        )
+        axis = describe_axis(search, more, None, "")
+        found = [part.frequency_hz for part in axis.parts]
+        assert sum(f == pytest.approx(1.0) for f in found) == count
+        assert len(found) == len(describe_axis(search, model, None, "").parts) + count
 
 
 def test_errors_at_a_held_gain_are_those_of_a_free_one() -> None:
