@@ -156,6 +156,11 @@ class LoopPeriodogram:
         """Return the density of ``y + gain c`` [nm^2/Hz], (f,)."""
         return np.asarray(self.measured + gain * (2 * self.crossed + gain * self.corrected))
 
+    def power_slopes(self, gain: float) -> tuple[FloatArray, FloatArray]:
+        """Return the first two derivatives of that density by the logarithm of the gain, (f,)."""
+        cross, square = 2 * gain * self.crossed, 2 * gain**2 * self.corrected
+        return cross + square, cross + 2 * square
+
     def merge(self, starts: IntArray) -> LoopPeriodogram:
         """Return the means over groups of neighbours that begin at these indices."""
         size = np.diff(np.append(starts, len(self.frequency_hz)))

@@ -204,11 +204,11 @@ def derivatives(
     gradient = rows @ (root * (1 - ratio))
     information = rows @ rows.T
     # the gain changes the data, not the model
-    cross, square = 2 * gain * data.crossed, 2 * gain**2 * data.corrected
-    by_gain = (cross + square) / model
+    slope, bend = data.power_slopes(gain)
+    by_gain = slope / model
     gradient[GAIN] = np.sum(count * by_gain)
     information[GAIN] = information[:, GAIN] = -(rows @ (root * by_gain))
-    information[GAIN, GAIN] = np.sum(count * (cross + 2 * square) / model)
+    information[GAIN, GAIN] = np.sum(count * bend / model)
     return float(np.sum(count * (np.log(model) + ratio))), gradient, information
 
 
@@ -276,9 +276,9 @@ def second_derivatives(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatA
 
     rows = slopes(0.0)
     out = (rows * (data.count * (2 * ratio - 1) / model**2)) @ rows.T
-    power, cross = 2 * spectrum.gain * data.crossed, 2 * spectrum.gain**2 * data.corrected
-    out[GAIN] = out[:, GAIN] = -(rows @ (data.count * (power + cross) / model**2))
-    out[GAIN, GAIN] = np.sum(data.count * (power + 2 * cross) / model)
+    slope, bend = data.power_slopes(spectrum.gain)
+    out[GAIN] = out[:, GAIN] = -(rows @ (data.count * slope / model**2))
+    out[GAIN, GAIN] = np.sum(data.count * bend / model)
     bends = _spectrum_bends(spectrum, rows @ weight, lambda change: slopes(change) @ weight)
     return np.asarray(out + (bends + bends.T) / 2)
 

@@ -22,7 +22,7 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
 _SAME = 1e-11  # relative difference up to which two subloops are the same
-_SHARED, _OWN = 4096, 256  # loops that share frequencies, and a controller or not
+_SHARED, _OWN = 1024, 256  # loops that share frequencies, and a controller or not
 _PER_LOOP = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
 
 
@@ -50,10 +50,19 @@ class Subloop:
         """Whether it has one mode, one measurement and one command."""
         return self.sensor.shape == self.influence.shape == (1, 1)
 
-    @property
-    def scalar_gain(self) -> float:
-        """Gain of sensor and mirror where they are scalar."""
-        return float(self.influence[0, 0] * self.sensor[0, 0])
+    def unit_loop(
+        self,
+        controller: ComplexArray,
+        first: ComplexArray,
+        second: ComplexArray,
+        delay: ComplexArray,
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return the scalar loop at unit gain, as one part and what the fraction multiplies.
+
+        Controller, mirrors and delay are responses at the same frequencies.
+        """
+        unit = self.influence[0, 0] * self.sensor[0, 0] * controller * delay
+        return unit * first, unit * (second - first)
 
     def controllers(self, rows: IntArray) -> tuple[FloatArray, ...]:
         """Return the controllers ``A, B, C, D`` of some loops, or the one that serves all."""
@@ -168,10 +177,10 @@ class LoopGroup(LoopPoints):
         if subloop.is_shared and subloop.is_scalar:
             A, B, C, D = (part[0] for part in subloop.matrices)
             controller = system_response(A, B, C, D, z)[:, 0, 0]
-            first, second = (mirror_response(end, z) for end in (self.first, self.second))
-            mirror = first + self.fraction * (second - first)
+            one, other = (mirror_response(end, z) for end in (self.first, self.second))
             with np.errstate(all="ignore"):  # at a pole of the controller, nothing is left
-                loop = self.sensor_gains * subloop.scalar_gain * controller * mirror / z
+                first, second = subloop.unit_loop(controller, one, other, 1 / z)
+                loop = self.sensor_gains * (first + self.fraction * second)
                 return np.where(np.isfinite(loop), 1 / (1 + loop), 0)[:, None, None]
         n = self.C.shape[1]
         pencil = z[:, None, None] * np.eye(self.A.shape[1]) - self.A

@@ -212,8 +212,8 @@ def _scalar_covariances(
 ) -> tuple[FloatArray, FloatArray]:
     """One mode, in real numbers."""
     subloop = group.subloop
-    unit = subloop.scalar_gain * samples.controller[..., 0, 0] * samples.delay
-    ends = unit * samples.first, unit * (samples.second - samples.first)
+    controller = samples.controller[..., 0, 0]
+    ends = subloop.unit_loop(controller, samples.first, samples.second, samples.delay)
     shared = _SharedLoop.of(*ends, samples.white) if subloop.is_shared else None
     turbulence, noise = np.zeros((2, len(group.rows)))
     step = _IN_CACHE if shared is None else _PRODUCTS
