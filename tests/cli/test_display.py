@@ -6,6 +6,7 @@ import json
 import re
 
 import pytest
+from support.configs import with_errors
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
@@ -21,7 +22,7 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("units")
     text = LBT_YAML.read_text().replace("cases: 4", "cases: 1")
     small = folder / "c.yaml"
-    small.write_text(re.sub(r"errors_hz: .*", "errors_hz: [-1, 1]", text))
+    small.write_text(with_errors(text, -1, 1))
     gain = str(lbt.save_gain(folder / "k.fits", lbt.load_config(small).design("kalman")))
     assert main(["simulate", str(small), gain, "--telemetry", str(folder / "n.fits")]) == 0
     return folder

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 
 import pytest
+from support.configs import with_errors
 from support.limits import RATE, ar
 from support.plants import LBT_YAML
 
@@ -43,7 +43,7 @@ def test_limits_command(tmp_path, capsys, config):
 
 
 def test_limits_command_without_vibrations_and_with_coupled_modes(tmp_path, capsys):
-    text = re.sub(r"errors_hz: .*", "errors_hz: [0]", LBT_YAML.read_text())
+    text = with_errors(LBT_YAML.read_text(), 0)
     line = "    - {kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}\n"
     still = tmp_path / "still.yaml"
     still.write_text(text.replace("  vibrations:\n" + line, ""))

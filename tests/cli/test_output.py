@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 
 import numpy as np
 import pytest
 from support.commands import run
+from support.configs import with_errors
 from support.plants import LBT_YAML, ROOT
 
 from lbt_synth.cli.output import Report, json_value
@@ -46,7 +46,7 @@ STUDIES = {
 def test_the_same_rows_are_printed_three_times(tmp_path, capsys, command):
     example, options, key, headings, shown = STUDIES[command]
     config, table = tmp_path / "few.yaml", tmp_path / "t.csv"
-    config.write_text(re.sub(r"errors_hz: .*", "errors_hz: [-1, 0, 2.5]", example.read_text()))
+    config.write_text(with_errors(example.read_text(), -1, 0, 2.5))
     status, text, error = run(capsys, command, config, *options, "-o", table)
     assert (status, error) == (0, "")
     assert shown in text

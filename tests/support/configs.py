@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 
 from ruamel.yaml import YAML
 from support.plants import LBT_YAML
@@ -18,6 +19,11 @@ def write_config(tmp_path, content):
         with path.open("w") as stream:
             YAML(typ="safe", pure=True).dump(content, stream)
     return path
+
+
+def with_errors(text, *errors_hz):
+    """The text of a configuration with other errors of the frequency."""
+    return re.sub(r"errors_hz: .*", f"errors_hz: {list(errors_hz)}", text)
 
 
 def change_key(path, value):

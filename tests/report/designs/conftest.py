@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
+from support.configs import with_errors
 from support.design_reports import SMALL, three_designs
 
 import lbt_synth as lbt
@@ -25,7 +26,7 @@ def config(folder):
 @pytest.fixture(scope="session")
 def few(folder):
     """The same with few errors and gains, for what does not depend on them."""
-    text = re.sub(r"errors_hz: .*", "errors_hz: [-2, 2]", SMALL)
+    text = with_errors(SMALL, -2, 2)
     (folder / "few.yaml").write_text(re.sub(r"sensor_gains: .*", "sensor_gains: [0.5, 1.0]", text))
     return lbt.load_config(folder / "few.yaml")
 
