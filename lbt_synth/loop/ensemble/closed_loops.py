@@ -16,6 +16,7 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.state_space import schur_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
+from lbt_synth.loop.ensemble.loop_poles import loop_poles
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response, mirror_system, tapped_mirror
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
@@ -199,6 +200,8 @@ def system_response(
 
 def mirror_response(mirror: Response, z: ComplexArray) -> ComplexArray:
     """Response of a mirror, (f,)."""
+    if mirror.is_tapped:
+        return np.asarray(np.polyval([*mirror.C[::-1], mirror.D], 1 / z))
     direct = np.array([[mirror.D]])
     return system_response(mirror.A, mirror.B[:, None], mirror.C[None], direct, z)[:, 0, 0]
 
@@ -263,8 +266,17 @@ def _close_subloop(
             B=B,
             C=(C0 + gain * C1)[:, :n],
             D=D,
-            poles=np.linalg.eigvals(A).astype(np.complex128),
+            poles=_poles(subloop, A, sensor_gains[rows], fraction),
         )
+
+
+def _poles(
+    subloop: Subloop, A: FloatArray, sensor_gains: FloatArray, fraction: FloatArray
+) -> ComplexArray:
+    """Return the poles (k, s) of loops of a subloop, of state matrices (k, s, s)."""
+    if subloop.is_shared and subloop.is_scalar:
+        return loop_poles(A, sensor_gains, fraction)
+    return np.linalg.eigvals(A).astype(np.complex128)
 
 
 def _mirrors_by_delay(

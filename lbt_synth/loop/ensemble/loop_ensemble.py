@@ -232,6 +232,8 @@ class LoopEnsemble:
         varying = [column for column in columns if np.ptp(column) > 0]
         if not varying:
             return rows[:1], np.zeros(self.loops, dtype=np.int64)
+        if any(np.unique(column).size == self.loops for column in varying):
+            return rows, rows
         table = np.stack(varying, axis=1)
         _, first, which = np.unique(table, axis=0, return_index=True, return_inverse=True)
         return (rows, rows) if first.size == self.loops else (first, which.reshape(-1))

@@ -1,0 +1,86 @@
+"""Poles of many loops from those of a few, beside eigenvalues of each."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import lbt_synth as lbt
+from lbt_synth.loop.closed_loop import loop_matrices
+from lbt_synth.loop.ensemble import loop_poles as module
+from lbt_synth.loop.ensemble.loop_poles import loop_poles
+from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
+
+LOOPS = 2000
+
+
+def closed(gain, fraction, seed):
+    """Return the state matrices of loops of a filter for turbulence and a random line."""
+    rng = np.random.default_rng(seed)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=50.0, frame_rate_hz=1000)
+    hz = rng.uniform(10, 200)
+    line = lbt.Vibration(frequency_hz=hz, damping=0.01, rms_nm=100.0, direction=(1.0,))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=1000, turbulence=slow, vibrations=[line], noise_nm=15.0, modes=1
+    )
+    system = lbt.kalman(plant).controller.to_statespace()
+    matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
+    one = np.ones((1, 1))
+    ends = [
+        loop_matrices(*matrices, mirror=tapped_mirror(np.array(taps)), sensor=one, influence=one)
+        for taps in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+    ]
+    share, g = fraction[:, None, None], gain[:, None, None]
+    A0, A1 = (a + share * (b - a) for a, b in zip(ends[0][:2], ends[1][:2], strict=True))
+    return A0 + g * A1
+
+
+def distances(one, other):
+    """Return how far each of one set of numbers is from the nearest of the other, both ways."""
+    apart = np.abs(one[:, :, None] - other[:, None])
+    return np.maximum(apart.min(axis=2).max(axis=1), apart.min(axis=1).max(axis=1))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_poles_are_those_of_eigenvalues(seed, monkeypatch):
+    rng = np.random.default_rng(seed)
+    gain, fraction = rng.uniform(0.05, 3.0, LOOPS), rng.uniform(0, 1, LOOPS)
+    A = closed(gain, fraction, seed)
+    expected = np.linalg.eigvals(A)
+    counts, plain = [], module._eigenvalues
+    monkeypatch.setattr(
+        module, "_eigenvalues", lambda A: counts.append(len(A)) or plain(A), raising=True
+    )
+    found = loop_poles(A, gain, fraction)
+    assert sum(counts) < LOOPS / 2  # most were continued
+    assert np.max(distances(found, expected)) < 1e-7  # twice the poles of the delay
+    inside = np.max(np.abs(expected), axis=1) < 1
+    assert np.any(inside)
+    assert not np.all(inside)
+    assert np.array_equal(np.max(np.abs(found), axis=1) < 1, inside)
+    real = np.sum(np.abs(expected.imag) < 1e-9, axis=1)
+    assert np.ptp(real) > 0  # pairs meet on the real axis
+
+
+def test_loops_next_to_instability_have_eigenvalues():
+    def radius(gain):
+        A = closed(np.full(1, gain), np.full(1, 0.5), 3)
+        return np.max(np.abs(np.linalg.eigvals(A))) - 1
+
+    limit = brentq(radius, 1.0, 3.0, xtol=1e-14)
+    gain = limit * (1 + np.linspace(-1e-7, 1e-7, LOOPS))
+    fraction = np.full(LOOPS, 0.5)
+    A = closed(gain, fraction, 3)
+    assert np.array_equal(loop_poles(A, gain, fraction), np.linalg.eigvals(A))
+
+
+def test_loops_that_are_no_family_have_eigenvalues():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(LOOPS, 5, 5)) / 3
+    found = loop_poles(A, rng.uniform(0.5, 1, LOOPS), np.zeros(LOOPS))
+    assert np.array_equal(found, np.linalg.eigvals(A))
+
+
+def test_equal_loops_have_equal_poles():
+    gain, fraction = np.full(LOOPS, 0.8), np.zeros(LOOPS)
+    A = closed(gain, fraction, 1)
+    assert np.max(distances(loop_poles(A, gain, fraction), np.linalg.eigvals(A))) < 1e-7
