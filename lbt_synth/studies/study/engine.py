@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent import futures
-from contextlib import nullcontext
+from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
 
@@ -98,25 +98,63 @@ class _InlineExecutor(futures.Executor):
         return future
 
 
-class _Workers:
-    """What evaluates batches: the caller's executor, this process, or a pool of its own."""
+class Workers:
+    """What evaluates batches: the caller's executor, this process, or a pool of its own.
+
+    ``workers`` says how many batches run at once, where an executor is given.
+    """
 
     def __init__(
-        self, study: Study, evaluate: Evaluate, jobs: int, executor: futures.Executor | None
+        self,
+        study: Study,
+        *,
+        evaluate: Evaluate,
+        jobs: int = 1,
+        executor: futures.Executor | None = None,
+        workers: int | None = None,
     ) -> None:
         self._study, self._jobs = study, jobs
         self._call = partial(evaluate_timed, evaluate, study)
-        self._executor = executor or (WorkerPool(jobs) if jobs > 1 else _InlineExecutor())
+        self._executor = executor or _InlineExecutor()
         self._is_own = executor is None and jobs > 1
         self._broken: futures.BrokenExecutor | None = None
         self._deaths = 0  # in a row
+        self._environment = ExitStack()
+        self.at_once = workers or jobs
+        self.in_flight = 1 if executor is None and jobs == 1 else _IN_FLIGHT * self.at_once
 
-    def __enter__(self) -> _Workers:
+    def __enter__(self) -> Workers:
+        if self._is_own:
+            self._environment.enter_context(limit_threads())
+            self._executor = WorkerPool(self._jobs)
+            for _ in range(self._jobs):  # all processes start now, and load what they need
+                self._executor.submit(_load, self._call)
         return self
 
     def __exit__(self, *error: Any) -> None:
-        if self._is_own:
-            self._executor.__exit__(*error)
+        with self._environment:
+            if self._is_own:
+                self._executor.__exit__(*error)
+
+    def begin(self, call: Callable[..., Any], *args: Any) -> Callable[[], Any]:
+        """Begin a call in a process of its own pool, and return what waits for its result.
+
+        Without a pool it runs at once, and where its process dies it runs again in this one.
+        """
+        if not self._is_own:
+            found = call(*args)
+            return lambda: found
+
+        def wait() -> Any:
+            with suppress(futures.BrokenExecutor):
+                return future.result()
+            return call(*args)
+
+        try:
+            future = self._executor.submit(call, *args)
+        except futures.BrokenExecutor:
+            return partial(call, *args)
+        return wait
 
     def submit(self, rows: RowRange) -> futures.Future[TimedBatch]:
         """Begin to evaluate some rows."""
@@ -181,40 +219,31 @@ def evaluate_timed(evaluate: Evaluate, study: Study, values: FloatArray, start: 
     return batch, time.perf_counter() - before
 
 
-def run_batches(
-    study: Study,
-    ranges: Sequence[RowRange],
-    *,
-    evaluate: Evaluate,
-    jobs: int = 1,
-    executor: futures.Executor | None = None,
-    workers: int | None = None,
-) -> Generator[TimedBatch, None, None]:
+def _load(call: Callable[..., Any]) -> None:
+    """Do nothing with a call; the process that got it has loaded what it needs."""
+
+
+def run_batches(engine: Workers, ranges: Sequence[RowRange]) -> Generator[TimedBatch, None, None]:
     """Yield the results of all rows of some ranges, in the order in which they arrive.
 
     When a process dies, all batches in flight run again, each alone. One that kills its process
     again is halved, down to single rows, which fail.
     """
-    queue = BatchQueue(ranges, workers or jobs)
-    most = 1 if executor is None and jobs == 1 else _IN_FLIGHT * (workers or jobs)
-    with (
-        limit_threads() if executor is None and jobs > 1 else nullcontext(),
-        _Workers(study, evaluate, jobs, executor) as engine,
-    ):
-        while queue.left:
-            for rows in (yield from _run_until_death(engine, queue, most)):
-                yield from _run_alone(engine, rows)
+    queue = BatchQueue(ranges, engine.at_once)
+    while queue.left:
+        for rows in (yield from _run_until_death(engine, queue)):
+            yield from _run_alone(engine, rows)
 
 
 def _run_until_death(
-    engine: _Workers, queue: BatchQueue, most: int
+    engine: Workers, queue: BatchQueue
 ) -> Generator[TimedBatch, None, list[RowRange]]:
     """Yield the batches of a queue until a process dies, and return those that were lost."""
     running: dict[futures.Future[TimedBatch], RowRange] = {}
     dead: list[RowRange] = []
     try:
         while running or (queue.left and not dead):
-            while queue.left and not dead and len(running) < most:
+            while queue.left and not dead and len(running) < engine.in_flight:
                 rows = queue.take()
                 running[engine.submit(rows)] = rows
             for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
@@ -233,7 +262,7 @@ def _run_until_death(
     return sorted(dead)
 
 
-def _run_alone(engine: _Workers, rows: RowRange) -> Iterator[TimedBatch]:
+def _run_alone(engine: Workers, rows: RowRange) -> Iterator[TimedBatch]:
     """Yield the results of rows of which one may have killed a process, in halves if it does."""
     batch = engine.receive(engine.submit(rows), rows)
     if batch is not None:

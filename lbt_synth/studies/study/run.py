@@ -6,18 +6,24 @@ import contextlib
 import errno
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.file_locks import exclusive_lock
 from lbt_synth.studies.study import store
 from lbt_synth.studies.study.batch_evaluation import evaluate_samples
-from lbt_synth.studies.study.engine import FIRST_ROWS, GROWTH, MOST_ROWS, Evaluate, run_batches
+from lbt_synth.studies.study.engine import (
+    FIRST_ROWS,
+    GROWTH,
+    MOST_ROWS,
+    Evaluate,
+    Workers,
+    run_batches,
+)
 from lbt_synth.studies.study.parquet import require_parquet
 from lbt_synth.studies.study.store import (
     read_results,
@@ -25,7 +31,7 @@ from lbt_synth.studies.study.store import (
     write_failures,
     write_results,
 )
-from lbt_synth.studies.study.study import Study
+from lbt_synth.studies.study.study import Failure, Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
 _MOST_JOBS = 64
@@ -193,17 +199,12 @@ def run_study(
                 found, spent = read_results(folder, study), manifest.computing_seconds
                 whole(FinishedStudy(columns=found, computing_s=spent, new=False))
         else:
-            computed = _compute_missing(
-                study,
-                folder,
-                count,
-                executor=executor,
-                jobs=jobs,
-                workers=workers,
-                evaluate=evaluate,
-            )
-            computing_s = time.perf_counter() - began
-            manifest = _write_tables(folder, study, manifest, computed, began, whole)
+            with Workers(
+                study, evaluate=evaluate, jobs=jobs, executor=executor, workers=workers
+            ) as engine:
+                log = _compute_missing(study, folder, count, engine)
+                computed, computing_s = log.computed, time.perf_counter() - began
+                manifest = _write_tables(folder, study, manifest, log, began, whole, engine)
     return StudyRun(
         directory=folder,
         results=results_path(folder, study),
@@ -250,15 +251,33 @@ def _begin(folder: Path, study: Study) -> store.Manifest:
     return manifest
 
 
+@dataclass(slots=True)
+class _Log:
+    """What a run computed, and what all parts say of their results."""
+
+    computed: int = 0  # rows of this run
+    failures: list[Failure] = field(default_factory=list)
+    seconds: float = 0.0  # of their batches
+
+    def add(self, failures: Sequence[Failure], seconds: float) -> None:
+        """Add what one part says."""
+        self.failures.extend(failures)
+        self.seconds += seconds
+
+
 def _compute_missing(
-    study: Study, folder: Path, progress: Callable[[int], None], **options: Any
-) -> int:
-    """Compute the rows that no part has, and those to try again; return their number."""
+    study: Study, folder: Path, progress: Callable[[int], None], engine: Workers
+) -> _Log:
+    """Compute the rows that no part has, and those to try again."""
+    log = _Log()
     for part in store.list_parts(folder):
-        if any(failure.retry for failure in store.read_part(part, study)[1]):
+        _, failures, seconds = store.read_part(part, study)
+        if any(failure.retry for failure in failures):
             part.path.unlink()  # a part of one row, see the engine
+        else:
+            log.add(failures, seconds)
     missing = store.missing_rows(store.list_parts(folder), study.samples)
-    count = sum(stop - start for start, stop in missing)
+    log.computed = sum(stop - start for start, stop in missing)
     try:
         (folder / store.PARTS).mkdir(exist_ok=True)
         if (folder / store.PARTS).is_symlink():
@@ -266,43 +285,44 @@ def _compute_missing(
     except OSError as error:
         why = f"cannot make the directory {folder / store.PARTS}: {error.strerror}."
         raise OutputError(why, path=folder) from error
-    if count < study.samples:
-        progress(study.samples - count)
-    with contextlib.closing(run_batches(study, missing, **options)) as batches:
+    if log.computed < study.samples:
+        progress(study.samples - log.computed)
+    with contextlib.closing(run_batches(engine, missing)) as batches:
         for batch, seconds in batches:
             part = store.write_part(folder, study, batch, seconds)
+            log.add(batch.failures, seconds)
             progress(part.stop - part.start)
-    return count
+    return log
 
 
 def _write_tables(
     folder: Path,
     study: Study,
     manifest: store.Manifest,
-    computed: int,
+    log: _Log,
     began: float,
     whole: Callable[[FinishedStudy], None] | None,
+    engine: Workers,
 ) -> store.Manifest:
     """Write the results of all parts, then the manifest, then remove the parts."""
     parts = store.list_parts(folder)
-    logs = [store.read_part(part, study)[1:] for part in parts]
-    failures = [failure for failed, _ in logs for failure in failed]
-    spent = sum(seconds for _, seconds in logs)
-    tables = (write_results(folder, study, parts), write_failures(folder, failures))
+    wait_for_results = engine.begin(write_results, folder, study, parts)
+    failed = write_failures(folder, log.failures)
     if whole is not None:
         found = read_results(folder, study, parts)
-        whole(FinishedStudy(columns=found, computing_s=spent, new=True))
-    retry = sum(failure.retry for failure in failures)
+        whole(FinishedStudy(columns=found, computing_s=log.seconds, new=True))
+    tables = wait_for_results(), failed
+    retry = sum(failure.retry for failure in log.failures)
     manifest = manifest.write(
         folder,
         finished=True,
         tables={path.name: store.file_digest(path) for path in tables},
         settings=study.settings.model_dump(by_alias=True, exclude_none=True),
-        failures=len(failures),
+        failures=len(log.failures),
         retry=retry,
-        computed_last=computed,
+        computed_last=log.computed,
         seconds=manifest.seconds + time.perf_counter() - began,
-        computing_seconds=spent,
+        computing_seconds=log.seconds,
     )
     if not retry:  # else the parts are needed to try again
         store.remove_parts(folder)

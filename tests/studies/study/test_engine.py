@@ -20,7 +20,7 @@ from support.studies import (
 
 import lbt_synth as lbt
 from lbt_synth.errors import NumericalError
-from lbt_synth.studies.study.engine import DIED, BatchQueue
+from lbt_synth.studies.study.engine import DIED, BatchQueue, Workers
 from lbt_synth.studies.study.store import list_parts
 
 
@@ -189,3 +189,24 @@ def test_processes_that_die_without_end(tmp_path, monkeypatch):
     study = load_small_study(tmp_path, samples="400")
     with pytest.raises(NumericalError, match="1 times in a row a process died"):
         lbt.studies.run_study(study, make_folder(tmp_path), jobs=2, evaluate=always_dies)
+
+
+def only_in(process):
+    """Return the number of this process, and end any but one of them."""
+    if process not in (None, os.getpid()):
+        os._exit(1)
+    return os.getpid()
+
+
+def test_a_call_begins_in_another_process_if_there_are_some(tmp_path):
+    study = load_small_study(tmp_path)
+    with Workers(study, evaluate=evaluate_quickly, jobs=2) as engine:
+        assert engine.begin(only_in, None)() != os.getpid()
+        assert engine.begin(only_in, os.getpid())() == os.getpid()  # its process died
+        assert engine.begin(only_in, os.getpid())() == os.getpid()  # there is none any more
+        with pytest.raises(ZeroDivisionError):
+            engine.begin(divmod, 1, 0)()
+    with Workers(study, evaluate=evaluate_quickly) as engine:
+        assert engine.begin(only_in, None)() == os.getpid()
+        with pytest.raises(ZeroDivisionError):
+            engine.begin(divmod, 1, 0)
