@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from support.plants import LBT_YAML
 from support.recorded_loops import RATE, open_record
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit import whittle
 
 FACTS = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
 
@@ -294,10 +294,14 @@ def test_a_short_record_is_refused_with_the_length_it_needs(tmp_path, capsys):
         assert "needs 4096 usable frames" in error
 
 
-def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys) -> None:
+def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys, monkeypatch) -> None:
+    evaluations = []
+    plain = whittle.derivatives
+    monkeypatch.setattr(
+        whittle, "derivatives", lambda *given: evaluations.append(0) or plain(*given)
+    )
     series = 100 * np.sin(2 * np.pi * 0.05 * np.arange(8192))
     np.save(tmp_path / "s.npy", series)
-    begin = time.process_time()
     status, _, error = run(
         capsys,
         "identify",
@@ -314,4 +318,4 @@ def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys) -> None:
     )
     assert status in (0, 2)
     assert "Traceback" not in error
-    assert time.process_time() - begin < 60
+    assert 0 < len(evaluations) < 10_000  # the search ends
