@@ -216,8 +216,10 @@ class _Fit:
         self.axis, self.guess, self.free = axis, guess, free
         self.fixed, self.lines = len(axis.shapes), axis.lines.size
         self.amplitudes = self.fixed + self.lines
-        shapes = axis.shapes
-        self.pairs = (shapes[:, None] * shapes).reshape(self.fixed**2, -1).T
+        upper = np.triu_indices(self.fixed)
+        self.pairs = (axis.shapes[upper[0]] * axis.shapes[upper[1]]).T
+        self.pair = np.zeros((self.fixed, self.fixed), dtype=np.intp)  # the place of each there
+        self.pair[upper] = self.pair.T[upper] = np.arange(upper[0].size)
 
     def minimise(self, gain: FloatArray) -> CoarseFit:
         """Return the least contrast of each row, by damped scoring."""
@@ -328,7 +330,7 @@ class _Fit:
         information[:, 0, 0] += axis.peak_count * np.sum(at_peaks**2, axis=1)
         information[:, 0, 1:k] = -a * ((axis.count * by_gain / model) @ axis.shapes.T)
         information[:, 0, k:] = -(weighted @ by_gain[:, :, None])[:, :, 0]
-        pairs = ((axis.count / model**2) @ self.pairs).reshape(-1, self.fixed, self.fixed)
+        pairs = ((axis.count / model**2) @ self.pairs)[:, self.pair]
         information[:, 1:k, 1:k] = a[:, :, None] * pairs * a[:, None]
         information[:, k:, 1:k] = ((weighted / model[:, None]) @ axis.shapes.T) * a[:, None]
         information[:, 1:k, k:] = information[:, k:, 1:k].transpose(0, 2, 1)

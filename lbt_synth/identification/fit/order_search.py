@@ -147,7 +147,10 @@ def find_components(
     rounds: int = _MOST_ROUNDS,
     moves: bool = True,
 ) -> FittedModel:
-    """Find the model: add components, prune them, and move lines (with ``moves``)."""
+    """Find the model: add components, prune them, and move lines (with ``moves``).
+
+    Without rounds it stays as it begins, but for what it does not need.
+    """
     model = None if start is None else fitting.refit(search, start)
     if model is None:
         model = _begin(search)
@@ -156,6 +159,8 @@ def find_components(
             "the likelihood of the spectrum is not finite. Check the units of the series."
         )
     model = _add_announced(search, fitting.prune(search, model))
+    if not rounds:
+        return model
     for _ in range(rounds):
         better = _improve(search, model, moves)
         if better is None:
