@@ -41,7 +41,7 @@ def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
         place = (
             f"warning: the line of axis {name} at {search.place(spectrum.components[i])[0]:.4g} Hz"
         )
-        if split_gain(search, spectrum, i) > _LIKELY:
+        if split_gain(search, spectrum, i, worth=_LIKELY) > _LIKELY:
             yield (
                 f"{place} may be two, closer than the record separates: its errors hold for the "
                 "mean of their frequencies and for their power together"
@@ -50,10 +50,11 @@ def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
             yield f"{place} lies in the skirts of another: the errors of both may be too small"
 
 
-def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
+def split_gain(search: Search, spectrum: SpectrumModel, i: int, *, worth: float = 0.0) -> float:
     """Return what two lines of like damping in the place of line i add to the log-likelihood.
 
-    Nothing beside zero frequency, where there is no place for two.
+    Nothing beside zero frequency, where there is no place for two. Fits that will hardly add what
+    is worth it are given up.
     """
     line = spectrum.components[i]
     centre, half = search.place(line)
@@ -71,7 +72,7 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int) -> float:
         width = np.zeros(start.pack().size)
         width[-2 * _TRIPLE :] = 2 * (np.inf, _LIKE, np.inf)
         priors = Priors(centre=start.pack(), width=width)
-        found = minimise(data, start, priors, held=rest, bound=best, accuracy=SEARCHED)
+        found = minimise(data, start, priors, held=rest, bound=best - worth, accuracy=SEARCHED)
         if found is not None:
             away = (found.spectrum.pack() - priors.centre)[[1 - 2 * _TRIPLE, 1 - _TRIPLE]]
             best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)
