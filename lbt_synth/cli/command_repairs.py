@@ -6,12 +6,15 @@ from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from lbt_synth.errors import RecordError
-from lbt_synth.identification.auto import RecordedDesign
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.records.record import LoopRecord
+
+if TYPE_CHECKING:  # it loads the methods of synthesis, which identify does not need
+    from lbt_synth.identification.auto import RecordedDesign
 
 
 def given_repair(arguments: Namespace) -> CommandRepair:

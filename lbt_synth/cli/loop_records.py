@@ -8,7 +8,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.loop_inputs import given_options
@@ -35,7 +35,6 @@ from lbt_synth.identification.accelerometers.readings import (
     load_readings,
 )
 from lbt_synth.identification.accelerometers.swapped import EarlierLine
-from lbt_synth.identification.auto import RecordedDesign
 from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.fit.model_tables import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS
@@ -44,6 +43,9 @@ from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
+
+if TYPE_CHECKING:  # as in command_repairs
+    from lbt_synth.identification.auto import RecordedDesign
 
 _FACTS = (  # that a file may not hold
     *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
