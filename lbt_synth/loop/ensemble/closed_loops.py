@@ -254,6 +254,11 @@ def _close_subloop(
             for one, two in zip(*ends, strict=True)
         )
         n, A = subloop.modes.size, A0 + gain * A1
+        if subloop.is_shared and subloop.is_scalar:
+            extremes = [(end[0][0], end[1][0]) for end in ends]
+            poles = loop_poles(A, sensor_gains[rows], fraction, extremes)
+        else:
+            poles = np.linalg.eigvals(A).astype(np.complex128)
         B, D = (np.broadcast_to(m, (rows.size, *m.shape[1:])) for m in (B, D[:, :n]))
         yield LoopGroup(
             subloop=subloop,
@@ -266,17 +271,8 @@ def _close_subloop(
             B=B,
             C=(C0 + gain * C1)[:, :n],
             D=D,
-            poles=_poles(subloop, A, sensor_gains[rows], fraction),
+            poles=poles,
         )
-
-
-def _poles(
-    subloop: Subloop, A: FloatArray, sensor_gains: FloatArray, fraction: FloatArray
-) -> ComplexArray:
-    """Return the poles (k, s) of loops of a subloop, of state matrices (k, s, s)."""
-    if subloop.is_shared and subloop.is_scalar:
-        return loop_poles(A, sensor_gains, fraction)
-    return np.linalg.eigvals(A).astype(np.complex128)
 
 
 def _mirrors_by_delay(

@@ -1,51 +1,69 @@
 """Poles of many loops of one mode that differ by sensor gain and delay, from those of a few.
 
-Their characteristic polynomial is affine in the gain g and in ``g s``, where s is the fraction of
-the later mirror: eigenvalues of a few loops give its coefficients. Newton's method then leads from
-the poles of a loop to those of its neighbours. The zeros of a polynomial p of degree n lie within
-discs about any distinct numbers z_i, of radius ``n |p(z_i)| / prod |z_i - z_j|`` (B. T. Smith,
-J. ACM 17, 661 (1970), doi:10.1145/321607.321615), to which the errors of its coefficients add.
-Loops whose discs are not small, or that are next to instability, get eigenvalues of their own.
+With a gain g and a fraction s of the later mirror, the characteristic polynomial of a loop is::
+
+    p(z) = d(z) + g ((1 - s) n0(z) + s n1(z))
+
+A product of factors evaluates each of the three accurately, even where poles crowd. Weierstrass'
+iteration ``z_i - w_i``, with ``w_i = p(z_i) / prod (z_i - z_j)``, leads from the poles of a loop to
+those of its neighbours. All zeros of p lie in discs of radius ``n |w_i|`` about any distinct
+numbers z_i (B. T. Smith, J. ACM 17, 661 (1970), doi:10.1145/321607.321615). What the polynomials
+miss at eigenvalues of some loops adds to these radii. Loops whose discs are not small, or that are
+next to instability, get eigenvalues of their own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
 import numpy as np
+from scipy.linalg import eigvals
 
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
+Parts: TypeAlias = tuple[FloatArray, FloatArray]
+
 _SIDE = 12  # cells of neighbours in the gain, and in the fraction
 _FEWEST = 8 * _SIDE**2  # loops that are worth it
-_ORIGIN = 1e-3  # poles within are delays; their places matter to nobody
-_STEPS = 5  # of Newton's method
-_AT_ONCE = 1024  # loops, that they stay in the processor's cache
+_ORIGIN = 1e-3  # poles and zeros within are delays; their places matter to nobody
+_INFINITE = 1e8  # zeros beyond are none
+_STEPS = 5  # of the iteration
+_AT_ONCE = 8192  # poles, that they stay in the processor's cache
 _DISC = 1e-8  # largest radius of a disc
 _NEAR = 1e-5  # distance from the unit circle within which eigenvalues decide
+_PROBE = 1.5 * np.exp(1j)  # where zeros get their factor
 
 
-def loop_poles(A: FloatArray, gain: FloatArray, fraction: FloatArray) -> ComplexArray:
-    """Return the poles (k, s) of loops of one mode and one controller, of matrices (k, s, s)."""
+def loop_poles(
+    A: FloatArray, gain: FloatArray, fraction: FloatArray, ends: Sequence[Parts]
+) -> ComplexArray:
+    """Return the poles (k, s) of loops of one mode and one controller, of matrices (k, s, s).
+
+    The loops at fractions of 0 and 1 have matrices ``A0 + g A1``, the ends, (s, s) each.
+    """
     if len(A) < _FEWEST:
         return _eigenvalues(A)
     order, cell, middle = _cells(gain, fraction)
-    known = _eigenvalues(A[middle])
-    delays = np.sum(np.abs(known) < _ORIGIN, axis=1)
-    degree = A.shape[-1] - int(delays[0])
-    if np.any(delays != delays[0]) or not degree:
+    known, family = _eigenvalues(A[middle]), _Family.of(ends)
+    if family is None:
         return _eigenvalues(A)
-    largest = np.argsort(-np.abs(known), axis=1)[:, :degree]
-    known = np.take_along_axis(known, largest, axis=1) - 1  # where the slow ones crowd
-    basis = np.stack([np.ones_like(gain), gain, gain * fraction], axis=1)
-    coefficients = np.array([np.poly(each) for each in known]).real
-    affine = np.linalg.lstsq(basis[middle], coefficients)[0]
-    errors = np.max(np.abs(basis[middle] @ affine - coefficients), axis=0)
-    poles = np.zeros(A.shape[:2], dtype=np.complex128)
-    for start in range(0, len(A), _AT_ONCE):
-        rows, near = order[start : start + _AT_ONCE], cell[start : start + _AT_ONCE]
-        found, radius = _continue_zeros(basis[rows] @ affine, errors, known[near])
-        apart = np.abs(np.max(np.abs(1 + found), axis=1) - 1) > _NEAR
-        sure = apart & (radius < _DISC)
-        poles[rows[sure], :degree] = 1 + found[sure]
+    degree = A.shape[-1] - family.delays
+    known = np.where(np.abs(known) < _ORIGIN, 0, known)
+    near = np.take_along_axis(known, np.argsort(-np.abs(known), axis=1)[:, :degree], axis=1)
+    value, size, _ = family.evaluate(near, gain[middle], fraction[middle])
+    missed = float(np.max(np.abs(value) / np.maximum(size, np.finfo(float).tiny), initial=0.0))
+    _, radius = family.find_zeros(near, gain[middle], fraction[middle], missed)
+    if not np.median(radius) < _DISC:
+        return _eigenvalues(A)
+    poles, step = np.zeros(A.shape[:2], dtype=np.complex128), max(1, _AT_ONCE // degree)
+    for start in range(0, len(A), step):
+        rows, begin = order[start : start + step], near[cell[start : start + step]]
+        found, radius = family.find_zeros(begin, gain[rows], fraction[rows], missed)
+        far = np.abs(np.max(np.abs(found), axis=1) - 1) > _NEAR
+        sure = far & (radius < _DISC)
+        poles[rows[sure], :degree] = found[sure]
         poles[rows[~sure]] = _eigenvalues(A[rows[~sure]])
     return poles
 
@@ -65,32 +83,79 @@ def _cells(gain: FloatArray, fraction: FloatArray) -> tuple[IntArray, IntArray, 
     return order, cell, order[(edges[:-1] + edges[1:]) // 2]
 
 
-def _continue_zeros(
-    coefficients: FloatArray, errors: FloatArray, start: ComplexArray
-) -> tuple[ComplexArray, FloatArray]:
-    """Return zeros (k, n) of monic polynomials (k, n + 1), and the largest radius of their discs.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Family:
+    """The characteristic polynomials of loops, but for the poles of delays, by their zeros."""
 
-    Newton's method begins at given numbers (k, n). The coefficients have errors (n + 1,).
-    """
-    z, n = start, start.shape[1]
-    with np.errstate(all="ignore"):  # what does not settle has no finite radius
-        for _ in range(_STEPS):
-            slope = _evaluate(coefficients[:, :-1] * np.arange(n, 0, -1), z)
-            z = z - _evaluate(coefficients, z) / slope
-        others = z[:, :, None] - z[:, None]
-        others[:, range(n), range(n)] = 1
-        size = (
-            np.abs(_evaluate(coefficients, z))
-            + _evaluate(errors[None], np.abs(z).astype(z.dtype)).real
-        )
-        radius = n * size / np.abs(np.prod(others, axis=2))
-    return z, np.max(radius, axis=1)
+    delays: int  # zeros at the origin that all have
+    d: ComplexArray  # (n,)
+    n: tuple[ComplexArray, ComplexArray]  # (m,) each
+    factors: tuple[complex, complex]
+
+    @classmethod
+    def of(cls, ends: Sequence[Parts]) -> _Family | None:
+        """Return the family of loops between two ends; None if a controller does nothing."""
+        poles, zeros, factors = _eigenvalues(ends[0][0]), [], []
+        for A0, A1 in ends:
+            left, sizes, right = np.linalg.svd(A1)  # of rank one
+            if sizes[0] == 0:
+                return None
+            entry, leaving = left[:, :1] * sizes[0], right[:1]
+            found = _zeros(A0, entry, leaving)
+            pencil = _PROBE * np.eye(len(A0)) - A0
+            response = -(leaving @ np.linalg.solve(pencil, entry.astype(complex)))[0, 0]
+            zeros.append(found)
+            factors.append(response * np.prod(_PROBE - poles) / np.prod(_PROBE - found))
+        snapped = [np.where(np.abs(each) < _ORIGIN, 0, each) for each in (poles, *zeros)]
+        delays = min(int(np.sum(each == 0)) for each in snapped)
+        d, *n = (each[np.argsort(np.abs(each))[delays:]] for each in snapped)
+        return cls(delays, d, (n[0], n[1]), (factors[0], factors[1]))
+
+    def evaluate(
+        self, z: ComplexArray, gain: FloatArray, fraction: FloatArray
+    ) -> tuple[ComplexArray, FloatArray, ComplexArray]:
+        """Return values at numbers (k, n), the sizes of their terms, and ``prod |z_i - z_j|``."""
+        g, s = gain[:, None], fraction[:, None]
+        terms = [_product(z, self.d)]
+        for zeros, factor, share in zip(self.n, self.factors, (1 - s, s), strict=True):
+            terms.append(g * share * factor * _product(z, zeros))
+        value, size = sum(terms, np.zeros_like(z)), np.sum(np.abs(terms), axis=0)
+        apart = np.ones_like(z)
+        for j in range(z.shape[1]):
+            other = z - z[:, j, None]
+            other[:, j] = 1
+            apart *= other
+        return value, np.asarray(size), apart
+
+    def find_zeros(
+        self, start: ComplexArray, gain: FloatArray, fraction: FloatArray, missed: float
+    ) -> tuple[ComplexArray, FloatArray]:
+        """Return zeros (k, n) from given numbers, and the largest radius of their discs (k,).
+
+        The values miss a part of the sizes of their terms.
+        """
+        z = start
+        with np.errstate(all="ignore"):  # what does not settle has no finite radius
+            for _ in range(_STEPS):
+                value, _, apart = self.evaluate(z, gain, fraction)
+                z = z - value / apart
+            value, size, apart = self.evaluate(z, gain, fraction)
+            radius = z.shape[1] * (np.abs(value) + missed * size) / np.abs(apart)
+        return z, np.max(radius, axis=1)
 
 
-def _evaluate(coefficients: FloatArray, z: ComplexArray) -> ComplexArray:
-    """Return the values (k, n) of polynomials (k or 1, n), by Horner's scheme."""
-    value = np.zeros_like(z) + coefficients[:, :1]
-    for column in coefficients.T[1:, :, None]:
-        value *= z
-        value += column
-    return value
+def _zeros(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> ComplexArray:
+    """Return the finite zeros of ``leaving (z - A)^-1 entry``."""
+    n = len(A)
+    pencil = np.block([[A, entry], [leaving, np.zeros((1, 1))]])
+    with np.errstate(all="ignore"):
+        found = eigvals(pencil, np.diag([1.0] * n + [0.0]))
+    return np.asarray(found[np.abs(found) < _INFINITE], dtype=np.complex128)
+
+
+def _product(z: ComplexArray, zeros: ComplexArray) -> ComplexArray:
+    """Return the product of all ``z - zero``, as z."""
+    out = np.ones_like(z)
+    for zero in zeros.tolist():
+        out *= z - zero
+    return out

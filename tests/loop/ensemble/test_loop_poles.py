@@ -7,20 +7,23 @@ from scipy.optimize import brentq
 import lbt_synth as lbt
 from lbt_synth.loop.closed_loop import loop_matrices
 from lbt_synth.loop.ensemble import loop_poles as module
+from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
 from lbt_synth.loop.ensemble.loop_poles import loop_poles
 from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
 
 LOOPS = 2000
 
 
-def closed(gain, fraction, seed):
-    """Return the state matrices of loops of a filter for turbulence and a random line."""
+def closed(gain, fraction, seed, lines=1):
+    """Return matrices and ends of loops of a filter for turbulence and random lines."""
     rng = np.random.default_rng(seed)
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=50.0, frame_rate_hz=1000)
-    hz = rng.uniform(10, 200)
-    line = lbt.Vibration(frequency_hz=hz, damping=0.01, rms_nm=100.0, direction=(1.0,))
+    vibrations = [
+        lbt.Vibration(frequency_hz=hz, damping=0.01, rms_nm=100.0, direction=(1.0,))
+        for hz in rng.uniform(10, 200, lines)
+    ]
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=1000, turbulence=slow, vibrations=[line], noise_nm=15.0, modes=1
+        frame_rate_hz=1000, turbulence=slow, vibrations=vibrations, noise_nm=15.0, modes=1
     )
     system = lbt.kalman(plant).controller.to_statespace()
     matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
@@ -31,7 +34,7 @@ def closed(gain, fraction, seed):
     ]
     share, g = fraction[:, None, None], gain[:, None, None]
     A0, A1 = (a + share * (b - a) for a, b in zip(ends[0][:2], ends[1][:2], strict=True))
-    return A0 + g * A1
+    return A0 + g * A1, [(end[0][0], end[1][0]) for end in ends]
 
 
 def distances(one, other):
@@ -40,17 +43,18 @@ def distances(one, other):
     return np.maximum(apart.min(axis=2).max(axis=1), apart.min(axis=1).max(axis=1))
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_poles_are_those_of_eigenvalues(seed, monkeypatch):
+@pytest.mark.parametrize(("seed", "lines"), [(seed, 1) for seed in range(8)] + [(8, 6), (9, 15)])
+def test_poles_are_those_of_eigenvalues(seed, lines, monkeypatch):
     rng = np.random.default_rng(seed)
     gain, fraction = rng.uniform(0.05, 3.0, LOOPS), rng.uniform(0, 1, LOOPS)
-    A = closed(gain, fraction, seed)
+    fraction[:5] = 0.0  # there is a delay more
+    A, ends = closed(gain, fraction, seed, lines)
     expected = np.linalg.eigvals(A)
     counts, plain = [], module._eigenvalues
     monkeypatch.setattr(
         module, "_eigenvalues", lambda A: counts.append(len(A)) or plain(A), raising=True
     )
-    found = loop_poles(A, gain, fraction)
+    found = loop_poles(A, gain, fraction, ends)
     assert sum(counts) < LOOPS / 2  # most were continued
     assert np.max(distances(found, expected)) < 1e-7  # twice the poles of the delay
     inside = np.max(np.abs(expected), axis=1) < 1
@@ -63,24 +67,40 @@ def test_poles_are_those_of_eigenvalues(seed, monkeypatch):
 
 def test_loops_next_to_instability_have_eigenvalues():
     def radius(gain):
-        A = closed(np.full(1, gain), np.full(1, 0.5), 3)
+        A, _ = closed(np.full(1, gain), np.full(1, 0.5), 3)
         return np.max(np.abs(np.linalg.eigvals(A))) - 1
 
     limit = brentq(radius, 1.0, 3.0, xtol=1e-14)
     gain = limit * (1 + np.linspace(-1e-7, 1e-7, LOOPS))
     fraction = np.full(LOOPS, 0.5)
-    A = closed(gain, fraction, 3)
-    assert np.array_equal(loop_poles(A, gain, fraction), np.linalg.eigvals(A))
+    A, ends = closed(gain, fraction, 3)
+    assert np.array_equal(loop_poles(A, gain, fraction, ends), np.linalg.eigvals(A))
 
 
 def test_loops_that_are_no_family_have_eigenvalues():
     rng = np.random.default_rng(0)
-    A = rng.normal(size=(LOOPS, 5, 5)) / 3
-    found = loop_poles(A, rng.uniform(0.5, 1, LOOPS), np.zeros(LOOPS))
-    assert np.array_equal(found, np.linalg.eigvals(A))
+    A, (one, other) = rng.normal(size=(LOOPS, 5, 5)) / 3, rng.normal(size=(2, 5, 5))
+    gain, fraction = rng.uniform(0.5, 1, LOOPS), rng.uniform(0, 1, LOOPS)
+    column = np.outer(one[0], other[0])
+    for ends in ([(one, column), (one, column)], [(one, 0 * column), (one, 0 * column)]):
+        found = loop_poles(A, gain, fraction, ends)
+        assert np.array_equal(found, np.linalg.eigvals(A))
+
+
+def test_poles_that_never_move_may_be_double():
+    """A controller with two equal states of which the loop sees none: no disc is small."""
+    system = lbt.linear.StateSpace(
+        A=np.diag([0.95, 0.95, 0.3]), B=[[1.0], [1.0], [0.2]], C=[[0.2, -0.2, 0.4]], D=[[0.0]]
+    )
+    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+    matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
+    gain = np.linspace(0.1, 5.0, LOOPS)
+    loops = ClosedLoops.of(matrices, path, gain, np.full(LOOPS, 2.3))
+    [[group]] = loops.subloops
+    assert np.array_equal(group.poles, np.linalg.eigvals(group.A))
 
 
 def test_equal_loops_have_equal_poles():
     gain, fraction = np.full(LOOPS, 0.8), np.zeros(LOOPS)
-    A = closed(gain, fraction, 1)
-    assert np.max(distances(loop_poles(A, gain, fraction), np.linalg.eigvals(A))) < 1e-7
+    A, ends = closed(gain, fraction, 1)
+    assert np.max(distances(loop_poles(A, gain, fraction, ends), np.linalg.eigvals(A))) < 1e-7
