@@ -46,15 +46,16 @@ def loop_poles(
     if len(A) < _FEWEST:
         return _eigenvalues(A)
     order, cell, middle = _cells(gain, fraction)
-    known, family = _eigenvalues(A[middle]), _Family.of(ends)
+    extremes = [place(x) for x in (gain, fraction) for place in (np.argmin, np.argmax)]
+    seen = np.append(middle, extremes)  # where the polynomials are checked
+    known, family = _eigenvalues(A[seen]), _Family.of(ends)
     if family is None:
         return _eigenvalues(A)
     degree = A.shape[-1] - family.delays
     known = np.where(np.abs(known) < _ORIGIN, 0, known)
     near = np.take_along_axis(known, np.argsort(-np.abs(known), axis=1)[:, :degree], axis=1)
-    value, size, _ = family.evaluate(near, gain[middle], fraction[middle])
-    missed = float(np.max(np.abs(value) / np.maximum(size, np.finfo(float).tiny), initial=0.0))
-    _, radius = family.find_zeros(near, gain[middle], fraction[middle], missed)
+    missed = family.miss(near, gain[seen], fraction[seen])
+    _, radius = family.find_zeros(near, gain[seen], fraction[seen], missed)
     if not np.median(radius) < _DISC:
         return _eigenvalues(A)
     poles, step = np.zeros(A.shape[:2], dtype=np.complex128), max(1, _AT_ONCE // degree)
@@ -126,6 +127,13 @@ class _Family:
             other[:, j] = 1
             apart *= other
         return value, np.asarray(size), apart
+
+    def miss(self, zeros: ComplexArray, gain: FloatArray, fraction: FloatArray) -> float:
+        """Return what the values at known zeros (k, n) are of the sizes of their terms, at most."""
+        with np.errstate(all="ignore"):  # infinite where a term overflows
+            value, size, _ = self.evaluate(zeros, gain, fraction)
+            part = np.abs(value) / np.maximum(size, np.finfo(float).tiny)
+        return float(np.max(np.nan_to_num(part, nan=np.inf)))
 
     def find_zeros(
         self, start: ComplexArray, gain: FloatArray, fraction: FloatArray, missed: float

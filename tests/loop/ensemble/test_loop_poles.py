@@ -77,6 +77,35 @@ def test_loops_next_to_instability_have_eigenvalues():
     assert np.array_equal(loop_poles(A, gain, fraction, ends), np.linalg.eigvals(A))
 
 
+@pytest.mark.parametrize("controller", ["integrator", "kalman"])
+def test_loops_far_from_all_others_are_no_guesses(controller):
+    """Most gains are equal; the others say alone what the gain does."""
+    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=50.0, frame_rate_hz=1000)
+    plant = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=15.0, modes=1)
+    design = lbt.integrator(path, gain=0.5) if controller == "integrator" else lbt.kalman(plant)
+    system = design.controller.to_statespace()
+    matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
+    gain = np.ones(LOOPS)
+    gain[-4:] = 0.2, 3.0, 4.0, 50.0
+    delay = np.random.default_rng(0).uniform(2.0, 2.99, LOOPS)
+    loops = ClosedLoops.of(matrices, path, gain, delay)
+    [[group]] = loops.subloops
+    expected = np.linalg.eigvals(group.A)
+    assert np.max(distances(group.poles, expected)) < 1e-7
+    assert np.array_equal(loops.stable, np.max(np.abs(expected), axis=1) < 1 - 1e-9)
+    assert not loops.stable[-2:].any()
+
+
+def test_absurd_gains_are_left_to_eigenvalues():
+    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+    system = lbt.integrator(path, gain=0.5).controller.to_statespace()
+    matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
+    gain = np.linspace(0.1, 1.0, LOOPS) * 1e300
+    loops = ClosedLoops.of(matrices, path, gain, np.linspace(2.0, 2.9, LOOPS))
+    assert not loops.stable.any()
+
+
 def test_loops_that_are_no_family_have_eigenvalues():
     rng = np.random.default_rng(0)
     A, (one, other) = rng.normal(size=(LOOPS, 5, 5)) / 3, rng.normal(size=(2, 5, 5))
