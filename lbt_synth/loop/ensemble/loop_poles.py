@@ -129,11 +129,14 @@ class _Family:
         return value, np.asarray(size), apart
 
     def miss(self, zeros: ComplexArray, gain: FloatArray, fraction: FloatArray) -> float:
-        """Return what the values at known zeros (k, n) are of the sizes of their terms, at most."""
+        """Return what the values at known zeros (k, n) are of the sizes of their terms, at most.
+
+        Those at the origin are not known: they count as such from near it on.
+        """
         with np.errstate(all="ignore"):  # infinite where a term overflows
             value, size, _ = self.evaluate(zeros, gain, fraction)
             part = np.abs(value) / np.maximum(size, np.finfo(float).tiny)
-        return float(np.max(np.nan_to_num(part, nan=np.inf)))
+        return float(np.max(np.nan_to_num(part, nan=np.inf), where=zeros != 0, initial=0.0))
 
     def find_zeros(
         self, start: ComplexArray, gain: FloatArray, fraction: FloatArray, missed: float
