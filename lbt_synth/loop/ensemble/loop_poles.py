@@ -64,6 +64,7 @@ def loop_poles(
         found, radius = family.find_zeros(begin, gain[rows], fraction[rows], missed)
         far = np.abs(np.max(np.abs(found), axis=1) - 1) > _NEAR
         sure = far & (radius < _DISC)
+        found.imag[np.abs(found.imag) < _DISC] = 0  # its conjugate is in the same disc
         poles[rows[sure], :degree] = found[sure]
         poles[rows[~sure]] = _eigenvalues(A[rows[~sure]])
     return poles

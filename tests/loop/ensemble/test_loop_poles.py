@@ -61,8 +61,11 @@ def test_poles_are_those_of_eigenvalues(seed, lines, monkeypatch):
     assert np.any(inside)
     assert not np.all(inside)
     assert np.array_equal(np.max(np.abs(found), axis=1) < 1, inside)
-    real = np.sum(np.abs(expected.imag) < 1e-9, axis=1)
+    real, of_found = (
+        np.sum((poles.imag == 0) & (np.abs(poles) > 1e-2), axis=1) for poles in (expected, found)
+    )
     assert np.ptp(real) > 0  # pairs meet on the real axis
+    assert np.array_equal(of_found, real)
 
 
 def test_loops_next_to_instability_have_eigenvalues():
@@ -75,6 +78,31 @@ def test_loops_next_to_instability_have_eigenvalues():
     fraction = np.full(LOOPS, 0.5)
     A, ends = closed(gain, fraction, 3)
     assert np.array_equal(loop_poles(A, gain, fraction, ends), np.linalg.eigvals(A))
+
+
+@pytest.mark.parametrize("controller", ["integrator", "kalman"])
+def test_residuals_next_to_instability_are_those_with_eigenvalues(controller, monkeypatch):
+    """A pole near -1 or 1 that is not seen leaves the panels too long."""
+    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=50.0, frame_rate_hz=1000)
+    plant = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=15.0, modes=1)
+    design = lbt.integrator(path, gain=0.5) if controller == "integrator" else lbt.kalman(plant)
+    rng = np.random.default_rng(1)
+    ensemble = lbt.loop.LoopEnsemble(
+        sensor_gain=rng.uniform(0.5, 4.0, LOOPS),
+        delay_frames=rng.uniform(2.0, 2.9, LOOPS),
+        noise_nm=15.0,
+        turbulence=lbt.Atmosphere(
+            seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+        ),
+    )
+    found = lbt.loop.ensemble_residuals(design, path, ensemble)
+    monkeypatch.setattr(module, "_FEWEST", 10**9)
+    expected = lbt.loop.ensemble_residuals(design, path, ensemble)
+    assert np.array_equal(found.stable, expected.stable)
+    assert np.nanmax(expected.noise_nm) > 10 * np.nanmin(expected.noise_nm)
+    assert found.noise_nm == pytest.approx(expected.noise_nm, rel=1e-6, nan_ok=True)
+    assert found.turbulence_nm == pytest.approx(expected.turbulence_nm, rel=1e-6, nan_ok=True)
 
 
 @pytest.mark.parametrize("controller", ["integrator", "kalman"])
