@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
@@ -199,12 +200,14 @@ def run_study(
                 found, spent = read_results(folder, study), manifest.computing_seconds
                 whole(FinishedStudy(columns=found, computing_s=spent, new=False))
         else:
-            with Workers(
-                study, evaluate=evaluate, jobs=jobs, executor=executor, workers=workers
-            ) as engine:
-                log = _compute_missing(study, folder, count, engine)
-                computed, computing_s = log.computed, time.perf_counter() - began
-                manifest = _write_tables(folder, study, manifest, log, began, whole, engine)
+            options: dict[str, Any] = {"jobs": jobs, "executor": executor, "workers": workers}
+            try:
+                with Workers(study, evaluate=evaluate, **options) as engine:
+                    log = _compute_missing(study, folder, count, engine)
+                    computed, computing_s = log.computed, time.perf_counter() - began
+                    manifest = _write_tables(folder, study, manifest, log, began, whole, engine)
+            finally:  # a process may have been ended while it wrote
+                store.remove_unfinished(folder)
     return StudyRun(
         directory=folder,
         results=results_path(folder, study),

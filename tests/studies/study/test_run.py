@@ -56,6 +56,19 @@ def test_a_finished_study_is_not_run_again(tmp_path):
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
+def test_a_call_that_fails_leaves_no_unfinished_table(tmp_path):
+    """Another process may be writing it."""
+    study, folder = load_small_study(tmp_path, samples="60000"), make_folder(tmp_path)
+
+    def fail(results):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        lbt.studies.run_study(study, folder, jobs=2, evaluate=evaluate_quickly, whole=fail)
+    assert not [path for path in folder.rglob("*") if path.suffix == ".tmp"]
+    assert lbt.studies.run_study(study, folder, evaluate=None).computed == 0
+
+
 def test_failures_are_listed_and_their_rows_are_there(tmp_path):
     study = load_small_study(
         tmp_path,
