@@ -21,6 +21,8 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import eigvals
 
+from lbt_synth.linear import StateSpace
+from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 Parts: TypeAlias = tuple[FloatArray, FloatArray]
@@ -104,10 +106,10 @@ class _Family:
                 return None
             entry, leaving = left[:, :1] * sizes[0], right[:1]
             found = _zeros(A0, entry, leaving)
-            pencil = _PROBE * np.eye(len(A0)) - A0
-            response = -(leaving @ np.linalg.solve(pencil, entry.astype(complex)))[0, 0]
+            system = StateSpace(A=A0, B=entry, C=leaving, D=np.zeros((1, 1)))
+            response = pointwise_response(system, np.array([_PROBE]))[0, 0, 0]
             zeros.append(found)
-            factors.append(response * np.prod(_PROBE - poles) / np.prod(_PROBE - found))
+            factors.append(-response * np.prod(_PROBE - poles) / np.prod(_PROBE - found))
         snapped = [np.where(np.abs(each) < _ORIGIN, 0, each) for each in (poles, *zeros)]
         delays = min(int(np.sum(each == 0)) for each in snapped)
         d, *n = (each[np.argsort(np.abs(each))[delays:]] for each in snapped)

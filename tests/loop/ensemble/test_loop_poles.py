@@ -8,26 +8,43 @@ import lbt_synth as lbt
 from lbt_synth.loop.closed_loop import loop_matrices
 from lbt_synth.loop.ensemble import loop_poles as module
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
+from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.loop.ensemble.loop_poles import loop_poles
 from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
 
 LOOPS = 2000
 
 
-def closed(gain, fraction, seed, lines=1):
-    """Return matrices and ends of loops of a filter for turbulence and random lines."""
-    rng = np.random.default_rng(seed)
+PATH = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+
+
+def kalman(lines_hz=()):
+    """Return a filter of one axis for turbulence and lines."""
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=50.0, frame_rate_hz=1000)
     vibrations = [
         lbt.Vibration(frequency_hz=hz, damping=0.01, rms_nm=100.0, direction=(1.0,))
-        for hz in rng.uniform(10, 200, lines)
+        for hz in lines_hz
     ]
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=1000, turbulence=slow, vibrations=vibrations, noise_nm=15.0, modes=1
+        frame_rate_hz=1000, turbulence=slow, vibrations=vibrations or None, noise_nm=15.0, modes=1
     )
-    system = lbt.kalman(plant).controller.to_statespace()
-    matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
-    one = np.ones((1, 1))
+    return lbt.kalman(plant)
+
+
+DESIGNS = {"integrator": lbt.integrator(PATH, gain=0.5), "kalman": kalman()}
+
+
+def close(design, gain, delay):
+    """Close the loops of a design, and return them and their only group."""
+    loops = ClosedLoops.of(textbook_matrices([design.controller]), PATH, gain, delay)
+    [[group]] = loops.subloops
+    return loops, group
+
+
+def closed(gain, fraction, seed, lines=1):
+    """Return matrices and ends of loops of a filter for turbulence and random lines."""
+    design = kalman(np.random.default_rng(seed).uniform(10, 200, lines))
+    matrices, one = textbook_matrices([design.controller]), np.ones((1, 1))
     ends = [
         loop_matrices(*matrices, mirror=tapped_mirror(np.array(taps)), sensor=one, influence=one)
         for taps in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
@@ -80,13 +97,9 @@ def test_loops_next_to_instability_have_eigenvalues():
     assert np.array_equal(loop_poles(A, gain, fraction, ends), np.linalg.eigvals(A))
 
 
-@pytest.mark.parametrize("controller", ["integrator", "kalman"])
-def test_residuals_next_to_instability_are_those_with_eigenvalues(controller, monkeypatch):
+@pytest.mark.parametrize("name", DESIGNS)
+def test_residuals_next_to_instability_are_those_with_eigenvalues(name, monkeypatch):
     """A pole near -1 or 1 that is not seen leaves the panels too long."""
-    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=50.0, frame_rate_hz=1000)
-    plant = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=15.0, modes=1)
-    design = lbt.integrator(path, gain=0.5) if controller == "integrator" else lbt.kalman(plant)
     rng = np.random.default_rng(1)
     ensemble = lbt.loop.LoopEnsemble(
         sensor_gain=rng.uniform(0.5, 4.0, LOOPS),
@@ -96,29 +109,22 @@ def test_residuals_next_to_instability_are_those_with_eigenvalues(controller, mo
             seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
         ),
     )
-    found = lbt.loop.ensemble_residuals(design, path, ensemble)
+    found = lbt.loop.ensemble_residuals(DESIGNS[name], PATH, ensemble)
     monkeypatch.setattr(module, "_FEWEST", 10**9)
-    expected = lbt.loop.ensemble_residuals(design, path, ensemble)
+    expected = lbt.loop.ensemble_residuals(DESIGNS[name], PATH, ensemble)
     assert np.array_equal(found.stable, expected.stable)
     assert np.nanmax(expected.noise_nm) > 10 * np.nanmin(expected.noise_nm)
     assert found.noise_nm == pytest.approx(expected.noise_nm, rel=1e-6, nan_ok=True)
     assert found.turbulence_nm == pytest.approx(expected.turbulence_nm, rel=1e-6, nan_ok=True)
 
 
-@pytest.mark.parametrize("controller", ["integrator", "kalman"])
-def test_loops_far_from_all_others_are_no_guesses(controller):
+@pytest.mark.parametrize("name", DESIGNS)
+def test_loops_far_from_all_others_are_no_guesses(name):
     """Most gains are equal; the others say alone what the gain does."""
-    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=50.0, frame_rate_hz=1000)
-    plant = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=15.0, modes=1)
-    design = lbt.integrator(path, gain=0.5) if controller == "integrator" else lbt.kalman(plant)
-    system = design.controller.to_statespace()
-    matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
     gain = np.ones(LOOPS)
     gain[-4:] = 0.2, 3.0, 4.0, 50.0
     delay = np.random.default_rng(0).uniform(2.0, 2.99, LOOPS)
-    loops = ClosedLoops.of(matrices, path, gain, delay)
-    [[group]] = loops.subloops
+    loops, group = close(DESIGNS[name], gain, delay)
     expected = np.linalg.eigvals(group.A)
     assert np.max(distances(group.poles, expected)) < 1e-7
     assert np.array_equal(loops.stable, np.max(np.abs(expected), axis=1) < 1 - 1e-9)
@@ -126,11 +132,8 @@ def test_loops_far_from_all_others_are_no_guesses(controller):
 
 
 def test_absurd_gains_are_left_to_eigenvalues():
-    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
-    system = lbt.integrator(path, gain=0.5).controller.to_statespace()
-    matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
     gain = np.linspace(0.1, 1.0, LOOPS) * 1e300
-    loops = ClosedLoops.of(matrices, path, gain, np.linspace(2.0, 2.9, LOOPS))
+    loops, _ = close(DESIGNS["integrator"], gain, np.linspace(2.0, 2.9, LOOPS))
     assert not loops.stable.any()
 
 
@@ -149,10 +152,9 @@ def test_poles_that_never_move_may_be_double():
     system = lbt.linear.StateSpace(
         A=np.diag([0.95, 0.95, 0.3]), B=[[1.0], [1.0], [0.2]], C=[[0.2, -0.2, 0.4]], D=[[0.0]]
     )
-    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
     matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
     gain = np.linspace(0.1, 5.0, LOOPS)
-    loops = ClosedLoops.of(matrices, path, gain, np.full(LOOPS, 2.3))
+    loops = ClosedLoops.of(matrices, PATH, gain, np.full(LOOPS, 2.3))
     [[group]] = loops.subloops
     assert np.array_equal(group.poles, np.linalg.eigvals(group.A))
 
