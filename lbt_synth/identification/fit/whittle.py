@@ -21,8 +21,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from lbt_synth.identification.fit.periodogram import FAR, WIDE, LoopPeriodogram, log_smearing
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import EXACT, Priors, scoring_minimum
+from lbt_synth.identification.fit.smearing import WIDE, log_smearing, smearing_reach
 from lbt_synth.identification.fit.spectrum_model import (
     COLOUR,
     COMPONENTS,
@@ -109,7 +110,8 @@ def _smear(
         return
     centres, half_widths = np.array(narrow).T[1:]
     at = data.periods
-    starts, stops = np.searchsorted(at, [centres - FAR, centres + FAR])
+    reach = smearing_reach(half_widths)
+    starts, stops = np.searchsorted(at, [centres - reach, centres + reach])
     inside = np.concatenate([at[a:b] for a, b in zip(starts, stops, strict=True)])
     centre, half_width = np.repeat([centres, half_widths], stops - starts, axis=1)
     more, by_width, by_distance = log_smearing(half_width, inside - centre)
