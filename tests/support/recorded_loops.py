@@ -84,7 +84,7 @@ def hidden_resonance_record(seed: int = 63) -> lbt.identification.LoopRecord:
     return _directed_record(1000.0, 0.995, 0.2266, 2.82, resonances, air, seed)
 
 
-def drifting_record(seed: int = 337) -> lbt.identification.LoopRecord:
+def drifting_record(seed: int = 337, *, gain: float = 0.4062) -> lbt.identification.LoopRecord:
     """Return a loop of sensor gain 0.586 under a drift and frozen flow, of which no model has both.
 
     The spectrum in closed loop is simpler: coloured noise over a line, at no gain at all.
@@ -100,7 +100,7 @@ def drifting_record(seed: int = 337) -> lbt.identification.LoopRecord:
     line = lbt.Vibration(frequency_hz=78.643, damping=0.00516, rms_nm=16.754, direction=(1.0,))
     total = lbt.models.SumSpectrum(parts=[air, drift])
     truth = lbt.Truth(turbulence=total, vibrations=(line,), noise_nm=3.403, sensor_gain=0.5859)
-    law, frames = lbt.integrator(path, gain=0.4062).controller, int(15 * rate_hz)
+    law, frames = lbt.integrator(path, gain=gain).controller, int(15 * rate_hz)
     run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000)
     return lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=rate_hz, delay_frames=2, unit="nm"

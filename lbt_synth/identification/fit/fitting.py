@@ -31,6 +31,7 @@ from lbt_synth.validation import IntArray, integer, number
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
+OVERDAMPED = 2.0  # damping ratio from which turbulence is a drift
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
@@ -160,8 +161,9 @@ def fit(
 ) -> FittedModel | None:
     """Fit all parameters; None if no fit settles.
 
-    Components that leave the band, from the first bin to the Nyquist frequency, are dropped. A fit
-    is given up where its log-likelihood does not reach that of ``better_than`` less a margin.
+    Components that leave the band, from the first bin to the Nyquist frequency, are dropped, and so
+    is a drift that oscillates. A fit is given up where its log-likelihood does not reach that of
+    ``better_than`` less a margin.
     """
     data, bound = search.merge(start), float("inf")
     if better_than is not None:
@@ -170,6 +172,9 @@ def fit(
     if found is None or found.contrast > bound:
         return None
     inside = found.spectrum.keep(search.has_in_band)
+    first = inside.components[0]
+    if first.kind == "drift" and first.damping_ratio < OVERDAMPED:
+        inside = inside.drop(0) or inside
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(found, contrast=contrast(search.data, found.spectrum))
@@ -203,23 +208,27 @@ def simplify(search: Search, model: FittedModel) -> FittedModel:
     return model
 
 
-def prune(search: Search, model: FittedModel) -> FittedModel:
-    """Drop the components that add less than they must, the least first."""
-    trials = []
-    data = search.merge(model.spectrum)
-    whole = contrast(data, model.spectrum)
-    for i in range(len(model.spectrum.components)):
-        less = _drop(data, model.spectrum, i)
+def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> FittedModel:
+    """Drop the components that add less than they must, the least first.
+
+    What a wide or a close one explains, others may take over, on a long way: ``thorough`` goes it.
+    """
+    trials, spectrum = [], model.spectrum
+    data = search.merge(spectrum)
+    whole = contrast(data, spectrum)
+    for i, component in enumerate(spectrum.components):
+        close = close_line(search, spectrum, i)
+        less = _drop(data, spectrum, i) if close is None else _unite(search, spectrum, i, close)
         if less is not None:
-            required = required_gain(search, model.spectrum, i)
+            required = required_gain(search, spectrum, i)
             spare = contrast(data, less) - whole - 4 * required
-            trials.append((spare, required, less))
-    for spare, required, less in sorted(trials, key=lambda trial: trial[0]):
-        if spare > 0:
-            break
-        made = fit(search, less, better_than=model, margin=required)
-        if made is not None and made.contrast - model.contrast < required:
-            return prune(search, made)
+            patient = thorough and (close is not None or not component.is_narrow)
+            if patient or spare <= 0:
+                trials.append((spare, required, less, None if patient else model))
+    for _, required, less, bound in sorted(trials, key=lambda trial: trial[0]):
+        made = fit(search, less, better_than=bound, margin=required)
+        if made is not None and cost(search, made) < cost(search, model):
+            return prune(search, made, thorough=thorough)
     return model
 
 
@@ -234,6 +243,17 @@ def _drop(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> SpectrumMod
     lost = density(data, spectrum) - density(data, less)
     white = float(np.min(lost)) * data.frame_rate_hz / 2
     return replace(less, log_noise=float(np.log(noise + white))) if white > noise else less
+
+
+def _unite(search: Search, spectrum: SpectrumModel, i: int, close: int) -> SpectrumModel:
+    """Return the model with one line for two, of their power and the means of their places."""
+    pair = [spectrum.components[k] for k in (close, i)]
+    power = np.exp([line.log_power for line in pair])
+    centre, half = np.average([search.place(line) for line in pair], axis=0, weights=power)
+    ratio = min(float(half / centre), 0.5)
+    line = search.component("line", float(centre), ratio, float(np.sum(power)))
+    line = replace(line, announced=pair[0].announced or pair[1].announced)
+    return spectrum.exchange(close, line).exchange(i)
 
 
 def required_gain(
@@ -256,13 +276,23 @@ def lies_in_skirts(
 
     All lines lie in the skirts of a wide resonance, which does not say where to look for them.
     """
-    component = spectrum.components[i]
-    if component.kind != "line":
-        return False
-    centre, half = search.place(component)
-    others = spectrum.components[:i] if earlier else spectrum.exchange(i).components
-    places = [search.place(other) for other in others if other.kind == "line"]
-    return any(abs(centre - at) < _SKIRTS * min(half, its_half) for at, its_half in places)
+    return close_line(search, spectrum, i, earlier=earlier) is not None
+
+
+def close_line(
+    search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
+) -> int | None:
+    """Return the nearest line (with ``earlier``, of those before it) that is close to one."""
+    if spectrum.components[i].kind != "line":
+        return None
+    centre, half = search.place(spectrum.components[i])
+    near = {}
+    for k, other in enumerate(spectrum.components[: i if earlier else None]):
+        if k != i and other.kind == "line":
+            at, its_half = search.place(other)
+            if abs(centre - at) < _SKIRTS * min(half, its_half):
+                near[k] = abs(centre - at)
+    return min(near, key=near.__getitem__, default=None)
 
 
 def cost(search: Search, model: FittedModel) -> float:

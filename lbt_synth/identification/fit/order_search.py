@@ -11,23 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
+from lbt_synth.identification.fit.background import fit_background
 from lbt_synth.identification.fit.excesses import Candidate, find_candidates, measure_excess
 from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.scoring import SEARCHED
-from lbt_synth.identification.fit.spectrum_model import Kind, SpectrumModel, damping_parameter
-from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
-from lbt_synth.validation import FloatArray
+from lbt_synth.identification.fit.spectrum_model import Component, Kind, SpectrumModel
+from lbt_synth.identification.fit.whittle import FittedModel, density
 
-_STARTING_TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz], damping ratio
-_OVERDAMPED = 2.0  # damping ratio of a turbulence that is a drift already
-_LARGEST_DAMPING = 0.9  # of the turbulence beside a drift, when a fit begins
-_CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a first-order drift may meet the noise
 _FEW_ROUNDS = 3
 _LITTLE, _CLEARLY = 0.1, 1.0  # log-likelihood that a component or a move must save at least
 _MOST_ROUNDS = 12
@@ -37,7 +32,8 @@ _MOST_TURBULENCES = 3
 _SIGNIFICANT = 1.92  # log-likelihood that one parameter too many adds in 5 % of the cases
 _BEYOND = 0.2  # of a logarithm: standard deviation of gains beyond the plausible ones
 _FAR_GAIN = 3.0  # standard errors by which a colour of the noise moves a gain that is doubted
-_OTHER_NOISE = 5.0  # log-likelihood by which white noise or a coloured one is excluded
+_SAME_NOISE = 0.1  # of the correlation of neighbouring frames
+_OTHER_NOISE = 5.0  # log-likelihood by which noise of another correlation is excluded
 _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, and a design must not take it white
 
@@ -115,11 +111,14 @@ def try_other_gains(
     near, costs = [], (_cost_with_gain, _cost_of_noise)
     least = [cost(search, best) for cost in costs]
     for each in found:
-        same = bool(each.spectrum.colour) == bool(best.spectrum.colour)
+        colour, own = each.spectrum.colour, best.spectrum.colour
+        same = bool(colour) == bool(own) and abs(np.tanh(colour) - np.tanh(own)) < _SAME_NOISE
         above = min(cost(search, each) - low for cost, low in zip(costs, least, strict=True))
         if above < (search.price if same else _OTHER_NOISE):
             near.append(each)
-    return (model if best is model else fitting.add_evidence(search, best)), near
+    if best is not model:
+        best = fitting.add_evidence(search, fitting.prune(search, best, thorough=True))
+    return best, near
 
 
 def find_coloured_rival(
@@ -169,51 +168,65 @@ def find_components(
     if abs(model.spectrum.colour) > _MOST_COLOUR:
         white = None if start is None else replace(start, colour=0.0)
         return find_components(replace(search, colour=0.0), white, rounds=rounds, moves=moves)
-    return _restore_turbulence(search, fitting.prune(search, fitting.simplify(search, model)))
+    model = fitting.prune(search, fitting.simplify(search, model), thorough=moves)
+    return _restore_turbulence(search, model)
 
 
 def _improve(search: Search, model: FittedModel, moves: bool) -> FittedModel | None:
-    """Return the first model that is clearly better; None if none is."""
-    for trial, least in _trials(search, model.spectrum, moves):
-        made = fitting.fit(search, trial, better_than=model)
-        if made is not None:
-            made = fitting.prune(search, made)
-            if fitting.cost(search, made) < fitting.cost(search, model) - least:
-                return made
+    """Return the best of the first trials of which one is clearly better; None if none is."""
+    for trials, least in _trials(search, model.spectrum, moves):
+        fits = (fitting.fit(search, trial, better_than=model) for trial in trials)
+        pruned = [fitting.prune(search, made) for made in fits if made is not None]
+        best = fitting.likeliest(search, pruned)
+        if best is not None and fitting.cost(search, best) < fitting.cost(search, model) - least:
+            return best
     return None
 
 
 def _trials(
     search: Search, spectrum: SpectrumModel, moves: bool
-) -> Iterator[tuple[SpectrumModel, float]]:
-    """Yield models with new components or other places of lines, and what each must save."""
-    first = spectrum.components[0]
-    overdamped = first.kind == "drift" or first.damping_ratio > _OVERDAMPED
+) -> Iterator[tuple[list[SpectrumModel], float]]:
+    """Yield models with other turbulence, new lines or other places, and what they must save."""
+    first, *others = spectrum.components
+    lines = [c for c in others if c.kind == "line"]
+    has_parts = len(lines) < len(others)
+    overdamped = first.kind == "drift" or first.damping_ratio > fitting.OVERDAMPED
     # where no line can be added, a second turbulence would take the place of one
-    room = len(spectrum.lines) < search.most_lines
-    if room and not overdamped:
-        yield from ((trial, _LITTLE) for trial in _add_first_order(search, spectrum))
+    room = len(lines) < search.most_lines
     found = _find_excesses(search, spectrum)
     found = [c for c in found if c.gain > 0.25 * found[0].gain]
-    while found:
-        yield _add_candidates(search, spectrum, found), _LITTLE
-        found = found[: len(found) // 2]
+    either = [_add_candidates(search, spectrum, found)] if found else []
+    if room and not overdamped:
+        either += _other_backgrounds(search, spectrum, lines, drifts=True)
+    yield either, _LITTLE
+    while found := found[: len(found) // 2]:
+        yield [_add_candidates(search, spectrum, found)], _LITTLE
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
-            yield from ((trial, _CLEARLY) for trial in _line_moves(search, spectrum, i))
-    if room and overdamped and not any(c.kind == "slow" for c in spectrum.components):
-        yield from ((trial, _LITTLE) for trial in _add_first_order(search, spectrum))
+            yield from (([trial], _CLEARLY) for trial in _line_moves(search, spectrum, i))
+    if room and overdamped and not (has_parts and first.kind == "drift"):
+        yield _other_backgrounds(search, spectrum, lines, drifts=True), _LITTLE
+    if has_parts:
+        yield _other_backgrounds(search, spectrum, lines, drifts=False), _LITTLE
+
+
+def _other_backgrounds(
+    search: Search, spectrum: SpectrumModel, lines: Sequence[Component], *, drifts: bool
+) -> list[SpectrumModel]:
+    """Return the model with turbulence fitted afresh beside its lines."""
+    known = replace(search, colour=spectrum.colour)
+    ground = fit_background(known, spectrum.gain, lines, drifts=drifts)
+    return [] if ground is None else [ground.spectrum.add(*lines)]
 
 
 def _begin(search: Search) -> FittedModel | None:
-    """Fit the background and the clear lines from several sensor gains; return the likeliest.
+    """Fit the background and the clear lines.
 
-    The first gain is held until the lines are there: a gain that is free while lines are missing
-    runs away to what explains these. The others begin with those lines.
+    The gain is held until the lines are there: one that is free while lines are missing runs away
+    to what explains these.
     """
-    gains = search.starting_gains if search.finds_gain else (search.gain or 1.0,)
-    known = replace(search, gain=gains[0])
-    model = _fit_background(search, gains[0])
+    known = search if not search.finds_gain else replace(search, gain=search.starting_gains[0])
+    model = fit_background(known, known.gain or 1.0)
     for _ in range(_FEW_ROUNDS):
         found = [] if model is None else _find_excesses(known, model.spectrum)
         clear = [c for c in found if c.gain > max(2 * search.price, 0.02 * found[0].gain)]
@@ -222,39 +235,7 @@ def _begin(search: Search) -> FittedModel | None:
         model = fitting.fit(known, _add_candidates(known, model.spectrum, clear))
     if model is None or not search.finds_gain:
         return model
-    _, *lines = model.spectrum.components
-    best = fitting.fit(search, model.spectrum)
-    for gain in gains[1:]:
-        ground = _fit_background(search, gain)
-        if ground is not None:
-            more = 2 * float(np.log(gain / gains[0]))
-            moved = [line.shift(0.0, 0.0, more) for line in lines]
-            made = fitting.fit(search, ground.spectrum.add(*moved))
-            best = fitting.likeliest(search, [best, made])
-    return best
-
-
-def _fit_background(search: Search, gain: float) -> FittedModel | None:
-    """Fit turbulence and noise to medians over bands, which lines hardly touch."""
-    data = search.data
-    f, d, weight = _smooth_background(data.power(gain), data.frequency_hz, data.count)
-    zero = np.zeros_like(f)
-    smooth = replace(data, frequency_hz=f, measured=d, crossed=zero, corrected=zero, count=weight)
-    white = float(np.median(d[f >= 0.6 * f[-1]])) * data.frame_rate_hz / 2
-    slow = max(float(np.trapezoid(d, f)) - white, 0.1 * white)
-    known = replace(search, gain=gain)
-    corner = known.log_angle(fitting.STARTING_CORNER_HZ)
-    ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), search.colour, corner, ())
-    starts = [
-        ground.add(known.component("turbulence", hz, ratio, slow))
-        for hz, ratio in _STARTING_TURBULENCE
-    ]
-    best: FittedModel | None = None
-    for start in starts:
-        bound = float("inf") if best is None else best.contrast
-        made = minimise(smooth, start, known.priors(start), bound=bound, accuracy=SEARCHED)
-        best = fitting.likeliest(known, [best, made])
-    return best
+    return fitting.fit(search, model.spectrum)
 
 
 def _add_candidates(
@@ -270,26 +251,6 @@ def _add_candidates(
     for i in range(len(spectrum.components), len(whole.components)):
         whole = fitting.centre_line(search, whole, i)
     return whole
-
-
-def _add_first_order(search: Search, spectrum: SpectrumModel) -> list[SpectrumModel]:
-    """Return models with a first-order drift in the place of the turbulence, which stays.
-
-    Second-order processes cannot fall with the square of the frequency, and lines would have to.
-    The turbulence keeps its roll-off.
-    """
-    hz, ratio = _STARTING_TURBULENCE[-1]
-    first = search.component("drift", hz, ratio, 1.0)  # of a density hz / (pi ratio f^2)
-    old = spectrum.components[0]
-    damping = damping_parameter("slow", min(old.damping_ratio, _LARGEST_DAMPING))
-    turbulence = replace(old, kind="slow", damping=damping)
-    noise = 2 / search.data.frame_rate_hz * float(np.exp(spectrum.log_noise))
-    noise = max(noise, float(np.finfo(float).tiny))
-    trials = [
-        spectrum.exchange(0, replace(first, log_power=float(np.log(power)))).add(turbulence)
-        for power in noise * np.array(_CROSSINGS_HZ) ** 2 * np.pi * ratio / hz
-    ]
-    return sorted(trials, key=lambda trial: contrast(search.data, trial))[:2]
 
 
 def _add_announced(search: Search, model: FittedModel) -> FittedModel:
@@ -337,7 +298,8 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     if abs(moved_by) * centre > 0.4 * step:
         yield centred
     reach = max(10 * half, 20 * step)
-    start, stop = np.searchsorted(data.frequency_hz, [centre - reach, centre + reach])
+    lowest = min(max(centre - reach, search.lowest_line_hz), centre)
+    start, stop = np.searchsorted(data.frequency_hz, [lowest, centre + reach])
     rest = density(data, spectrum.exchange(i))
     seen = measure_excess(data, data.power(spectrum.gain), rest, int(start), int(stop))
     if abs(seen.frequency_hz - centre) > 0.5 * half + step:
@@ -362,23 +324,3 @@ def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
     if made is not None and fitting.cost(search, made) < fitting.cost(search, model) + search.price:
         return made
     return model
-
-
-def _smooth_background(
-    power: FloatArray, frequency_hz: FloatArray, count: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a background without its lines: frequencies, medians over bands, weights, (b,)."""
-    from scipy.special import gammaincinv
-
-    low, high = frequency_hz[0], frequency_hz[-1]
-    edges = np.searchsorted(frequency_hz, np.geomspace(low, high * (1 + 1e-12), 80))
-    edges = np.unique(np.append(edges, frequency_hz.size))
-    shape = max(float(np.median(count)), 0.5)
-    to_mean = shape / float(gammaincinv(shape, 0.5))
-    bands = [(slice(a, b), to_mean if b - a > 2 else 1.0) for a, b in pairwise(edges)]
-    rows = [
-        (np.mean(frequency_hz[band]), np.median(power[band]) * factor, np.sum(count[band]))
-        for band, factor in bands
-    ]
-    f, d, w = np.array(rows).T
-    return f, d, w

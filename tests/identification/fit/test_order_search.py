@@ -1,9 +1,9 @@
-"""The gain at which a fit begins."""
+"""The gain at which a fit begins, and searches that rounding does not move."""
 
 from __future__ import annotations
 
 import pytest
-from support.recorded_loops import integrator_loop
+from support.recorded_loops import hidden_resonance_record, integrator_loop
 
 import lbt_synth as lbt
 
@@ -22,3 +22,18 @@ def test_lines_that_are_still_missing_do_not_carry_the_gain_away() -> None:
         sorted(f for f, _, _ in lines), abs=0.3
     )
     assert found.whiteness.white
+
+
+def test_rounding_does_not_move_the_search() -> None:
+    """It moved this one by 15 in the log-likelihood, and its gain from 0.76 to 0.93."""
+    record = hidden_resonance_record(3)
+    y, c = record.measurements[:, 0], record.corrections()[:, 0]
+    one, other = (
+        lbt.identification.identify_axis(
+            y * scale, c * scale, frame_rate_hz=RATE, stretches=record.stretches()
+        )
+        for scale in (1.0, 1.0 + 2e-12)
+    )
+    assert len(one.parts) == len(other.parts)
+    assert one.fitted_model.contrast == pytest.approx(other.fitted_model.contrast, abs=0.5)
+    assert one.sensor_gain == pytest.approx(other.sensor_gain, rel=0.01)
