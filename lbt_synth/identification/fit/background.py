@@ -12,7 +12,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.fitting import GAINS, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import Component, SpectrumModel
@@ -24,6 +24,7 @@ _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _MOST_DRIFTS = 2  # fits of both
 _BANDS = 80
+_GAINS = (2 * GAINS["above"], GAINS["below"] / 2)
 
 
 def fit_background(
@@ -31,9 +32,11 @@ def fit_background(
 ) -> FittedModel | None:
     """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles.
 
+    A gain that a free fit ran away to counts as the nearest that a sensor may have.
     Second-order processes cannot fall with the square of the frequency, and lines would have to:
     where it ``drifts``, a first-order process comes first, and the turbulence is a part beside it.
     """
+    gain = float(np.clip(gain, *_GAINS))
     smooth = _smooth_background(search.data, gain)
     f, d, rate = smooth.frequency_hz, smooth.measured, smooth.frame_rate_hz
     white = max(float(np.median(d[f >= 0.6 * f[-1]])) * rate / 2, float(np.finfo(float).tiny))

@@ -85,3 +85,14 @@ def test_a_drift_is_a_process_beside_the_turbulence(seed: int) -> None:
     middle = (data.frequency_hz > 0.2) & (data.frequency_hz < 100)
     ratio = density(data, both.spectrum)[middle] / density(data, truth)[middle]
     assert np.median(ratio) == pytest.approx(1, rel=0.15)
+
+
+@pytest.mark.parametrize("gain", [1e-9, 1e9])
+@pytest.mark.parametrize("drifts", [False, True])
+def test_a_gain_that_ran_away_is_no_error(gain: float, drifts: bool) -> None:
+    data = empty()
+    search = Search(data=data, gain=1.0)
+    truth = ground(search).add(search.component("turbulence", 1.4, 0.45, 6000.0))
+    found = fit_background(Search(data=draw(data, truth, 0)), gain, drifts=drifts)
+    assert found is not None
+    assert 1e-4 < found.spectrum.gain < 1e4
