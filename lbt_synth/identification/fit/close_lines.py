@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lbt_synth.identification.fit.fitting import Search, lies_in_skirts
+from lbt_synth.identification.fit.fitting import Search, close_line
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.scoring import SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import SpectrumModel
@@ -46,7 +46,7 @@ def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
                 f"{place} may be two, closer than the record separates: its errors hold for the "
                 "mean of their frequencies and for their power together"
             )
-        elif model.evidence[i] < _WEAK and lies_in_skirts(search, spectrum, i):
+        elif model.evidence[i] < _WEAK and close_line(search, spectrum, i) is not None:
             yield f"{place} lies in the skirts of another: the errors of both may be too small"
 
 

@@ -266,23 +266,17 @@ def required_gain(
     """
     if spectrum.components[i].announced is not None:
         return _ANNOUNCED
-    return _SPLIT if lies_in_skirts(search, spectrum, i, earlier=earlier) else search.price
-
-
-def lies_in_skirts(
-    search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
-) -> bool:
-    """Whether a line and another (with ``earlier``, one before it) lie in each other's skirts.
-
-    All lines lie in the skirts of a wide resonance, which does not say where to look for them.
-    """
-    return close_line(search, spectrum, i, earlier=earlier) is not None
+    is_alone = close_line(search, spectrum, i, earlier=earlier) is None
+    return search.price if is_alone else _SPLIT
 
 
 def close_line(
     search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
 ) -> int | None:
-    """Return the nearest line (with ``earlier``, of those before it) that is close to one."""
+    """Return the nearest of the lines (``earlier``: before it) that share skirts with line i.
+
+    All lines lie in the skirts of a wide resonance, which does not say where to look for them.
+    """
     if spectrum.components[i].kind != "line":
         return None
     centre, half = search.place(spectrum.components[i])

@@ -2,65 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from support.drawn_spectra import NOISE, drawn_search, empty_search, white_noise
 
 from lbt_synth.identification.fit.background import fit_background
-from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.spectrum_model import SpectrumModel
 from lbt_synth.identification.fit.whittle import density
-
-RATE, NOISE = 1000.0, 30.0
-
-
-def empty() -> LoopPeriodogram:
-    """Return a periodogram of a minute without anything in it."""
-    f = np.arange(1, 30_000) / 60.0
-    zero = np.zeros_like(f)
-    return LoopPeriodogram(
-        frequency_hz=f,
-        measured=zero + 1.0,
-        crossed=zero,
-        corrected=zero,
-        count=zero + 1.0,
-        frame_rate_hz=RATE,
-        resolution_hz=1 / 60,
-    )
-
-
-def draw(data: LoopPeriodogram, spectrum: SpectrumModel, seed: int) -> LoopPeriodogram:
-    """Return a random periodogram of a spectrum."""
-    chance = np.random.default_rng(seed).exponential(size=data.frequency_hz.size)
-    return LoopPeriodogram(
-        **{name: getattr(data, name) for name in ("frequency_hz", "crossed", "corrected", "count")},
-        measured=density(data, spectrum) * chance,
-        frame_rate_hz=RATE,
-        resolution_hz=data.resolution_hz,
-    )
-
-
-def ground(search: Search) -> SpectrumModel:
-    """Return noise alone, without a roll-off."""
-    return SpectrumModel(0.0, float(np.log(NOISE)), 0.0, 0.0, ()).without_roll_off()
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_narrow_lines_are_hardly_touched_and_wide_ones_are_held(seed: int) -> None:
-    data = empty()
-    search = Search(data=data, gain=1.0)
+    search = empty_search()
+    data = search.data
     slow = search.component("turbulence", 1.4, 0.45, 6000.0)
     wide = search.component("line", 30.0, 0.25, 4000.0)
     narrow = search.component("line", 77.0, 0.002, 3000.0)
-    truth = ground(search).add(slow, wide, narrow)
-    drawn = Search(data=draw(data, truth, seed), gain=1.0)
+    truth = white_noise().add(slow, wide, narrow)
+    drawn = drawn_search(truth, seed)
     found = fit_background(drawn, 1.0, [wide, narrow])
     assert found is not None
     (turbulence,) = found.spectrum.components
     assert np.exp(turbulence.log_power) == pytest.approx(6000, rel=0.4)
     assert np.exp(found.spectrum.log_noise) == pytest.approx(NOISE, rel=0.1)
     own = density(data, found.spectrum)[data.frequency_hz < 300]
-    expected = density(data, ground(search).add(slow))[data.frequency_hz < 300]
+    expected = density(data, white_noise().add(slow))[data.frequency_hz < 300]
     assert np.median(own / expected) == pytest.approx(1, rel=0.15)
     blind = fit_background(drawn, 1.0)  # as if nothing were there
     assert blind is not None
@@ -70,12 +37,12 @@ def test_narrow_lines_are_hardly_touched_and_wide_ones_are_held(seed: int) -> No
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_drift_is_a_process_beside_the_turbulence(seed: int) -> None:
-    data = empty()
-    search = Search(data=data, gain=1.0)
+    search = empty_search()
+    data = search.data
     drift = search.component("drift", 2.0, 30.0, 20_000.0)  # a corner at 1/30 Hz
     slow = search.component("slow", 2.0, 0.4, 3000.0)
-    truth = ground(search).add(drift, slow)
-    drawn = Search(data=draw(data, truth, seed), gain=1.0)
+    truth = white_noise().add(drift, slow)
+    drawn = drawn_search(truth, seed)
     alone, both = (fit_background(drawn, 1.0, drifts=drifts) for drifts in (False, True))
     assert alone is not None
     assert both is not None
@@ -90,9 +57,9 @@ def test_a_drift_is_a_process_beside_the_turbulence(seed: int) -> None:
 @pytest.mark.parametrize("gain", [1e-9, 1e9])
 @pytest.mark.parametrize("drifts", [False, True])
 def test_a_gain_that_ran_away_is_no_error(gain: float, drifts: bool) -> None:
-    data = empty()
-    search = Search(data=data, gain=1.0)
-    truth = ground(search).add(search.component("turbulence", 1.4, 0.45, 6000.0))
-    found = fit_background(Search(data=draw(data, truth, 0)), gain, drifts=drifts)
+    search = empty_search()
+    truth = white_noise().add(search.component("turbulence", 1.4, 0.45, 6000.0))
+    drawn = replace(drawn_search(truth, 0), gain=None)
+    found = fit_background(drawn, gain, drifts=drifts)
     assert found is not None
     assert 1e-4 < found.spectrum.gain < 1e4

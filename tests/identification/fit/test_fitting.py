@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.drawn_spectra import drawn_search, empty_search, white_noise
 
 from lbt_synth.identification.fit.fitting import Search, cost, fit, prune, required_gain
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
+from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import SpectrumModel
-from lbt_synth.identification.fit.whittle import contrast, density
+from lbt_synth.identification.fit.whittle import contrast
 
 RATE = 1000.0
 
@@ -68,41 +69,23 @@ def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:
 
 
 def resonances(
-    search: Search, *places: tuple[float, float, float], drift_ratio: float | None = None
+    *places: tuple[float, float, float], drift_ratio: float | None = None
 ) -> SpectrumModel:
     """Return turbulence, and a drift before it if it has a ratio, under resonances."""
-    slow = search.component("turbulence", 0.9, 0.31, 3000.0)
-    first = (slow,)
-    if drift_ratio is not None:
-        drift = search.component("drift", 2.0, drift_ratio, 3000.0)
-        first = (drift, search.component("slow", 0.9, 0.31, 3000.0))
-    noise = SpectrumModel(0.0, float(np.log(30.0)), 0.0, 0.0, first).without_roll_off()
-    return noise.add(*(search.component("line", *place) for place in places))
-
-
-def drawn_search(start: SpectrumModel, seed: int) -> Search:
-    """Return the search in a random periodogram of a spectrum, of a minute."""
-    f = np.arange(1, 30_000) / 60.0
-    zero = np.zeros_like(f)
-    data = LoopPeriodogram(
-        frequency_hz=f,
-        measured=zero,
-        crossed=zero,
-        corrected=zero,
-        count=zero + 1.0,
-        frame_rate_hz=RATE,
-        resolution_hz=1 / 60,
-    )
-    chance = np.random.default_rng(seed).exponential(size=f.size)
-    return Search(data=replace(data, measured=density(data, start) * chance), gain=1.0)
+    component = empty_search().component
+    if drift_ratio is None:
+        slow = white_noise().add(component("turbulence", 0.9, 0.31, 3000.0))
+    else:
+        drift = component("drift", 2.0, drift_ratio, 3000.0)
+        slow = white_noise().add(drift, component("slow", 0.9, 0.31, 3000.0))
+    return slow.add(*(component("line", *place) for place in places))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_two_close_resonances_become_one_of_their_power(seed: int) -> None:
     """Without one of them, the model of the other looks hopeless beside that of both."""
-    units = drawn_search(SpectrumModel(0.0, 0.0, 0.0, 0.0, ()), seed)
-    search = drawn_search(resonances(units, (102.0, 0.146, 1800.0)), seed)
-    both = fit(search, resonances(units, (98.5, 0.17, 900.0), (107.0, 0.11, 900.0)))
+    search = drawn_search(resonances((102.0, 0.146, 1800.0)), seed)
+    both = fit(search, resonances((98.5, 0.17, 900.0), (107.0, 0.11, 900.0)))
     assert both is not None
     one = prune(search, both)
     assert [len(model.spectrum.components) for model in (both, one)] == [3, 2]
@@ -115,10 +98,9 @@ def test_two_close_resonances_become_one_of_their_power(seed: int) -> None:
 )
 def test_what_a_part_of_the_turbulence_explains_the_rest_takes_over(seed: int, parts: list) -> None:
     """On a way that a trial of the search gives up."""
-    units = drawn_search(SpectrumModel(0.0, 0.0, 0.0, 0.0, ()), seed)
-    truth = resonances(units)
+    truth = resonances()
     search = drawn_search(truth, seed)
-    several = fit(search, truth.add(*(units.component("slow", *part) for part in parts)))
+    several = fit(search, truth.add(*(search.component("slow", *part) for part in parts)))
     assert several is not None
     kept, dropped = (prune(search, several, thorough=thorough) for thorough in (False, True))
     assert [len(model.spectrum.components) for model in (kept, dropped)] == [2, 1]
@@ -126,9 +108,8 @@ def test_what_a_part_of_the_turbulence_explains_the_rest_takes_over(seed: int, p
 
 
 def test_a_drift_that_oscillates_is_none() -> None:
-    units = drawn_search(SpectrumModel(0.0, 0.0, 0.0, 0.0, ()), 0)
-    search = drawn_search(resonances(units, (30.0, 0.5, 3000.0)), 0)
-    start = resonances(units, drift_ratio=2.5)
+    search = drawn_search(resonances((30.0, 0.5, 3000.0)), 0)
+    start = resonances(drift_ratio=2.5)
     found = fit(search, start)
     assert found is not None
     assert [c.kind for c in found.spectrum.components] == ["turbulence"]
