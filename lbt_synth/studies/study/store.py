@@ -312,10 +312,11 @@ def read_failures(folder: Path) -> list[tuple[int, str, str]]:
 
 
 def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict[str, FloatArray]:
-    """Return all columns (n,), from the parts if there are any, else from the table of results."""
+    """Return all columns (n,), from all parts if there are any, else from the table of results."""
     if parts:
-        stacked = np.vstack([_part_rows(study, part) for part in parts])
-        return dict(zip(study.columns, stacked.T, strict=True))
+        results = np.concatenate([read_part(part, study)[0] for part in parts])
+        columns = [np.arange(float(study.samples)), *study.values().T, *results.T]
+        return dict(zip(study.columns, map(np.ascontiguousarray, columns), strict=True))
     path = results_path(folder, study)
     found = (read_parquet if study.settings.results == "parquet" else _read_csv)(path)
     size = len(next(iter(found.values()), ()))

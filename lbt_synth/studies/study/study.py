@@ -20,6 +20,7 @@ from lbt_synth.validation import FloatArray, integer
 DELAY_ERROR = "error.delay_frames"
 NOISE_FACTOR = "error.noise_factor"
 ERRORS = (DELAY_ERROR, NOISE_FACTOR)
+_BLOCK = 1 << 14  # points of a Sobol sequence that are drawn together
 _PARTS = ("turbulence_nm", "vibration_nm", "noise_nm")
 RESIDUALS = {"residual_nm": "rms_nm"} | {n: n for n in _PARTS}  # columns, attributes of budgets
 EXACT_COLUMNS = ("strehl", *RESIDUALS, "stable")
@@ -214,14 +215,22 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
         return np.zeros((stop - start, dimensions))
     if settings.sampling == "latin_hypercube":
         return _hypercube(settings.samples, dimensions, settings.seed)[start:stop]
+    first, last = start // _BLOCK, (stop - 1) // _BLOCK
+    blocks = [_sobol_block(dimensions, settings.seed, block) for block in range(first, last + 1)]
+    return np.concatenate(blocks)[start - first * _BLOCK : stop - first * _BLOCK]
+
+
+@lru_cache(maxsize=2)
+def _sobol_block(dimensions: int, seed: int, block: int) -> FloatArray:
+    """Return points of a sequence from ``block * _BLOCK``, as scrambling it anew takes longer."""
     from scipy.stats import qmc
 
-    engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(settings.seed))
-    if start > 0:
-        engine.fast_forward(start)
-        return np.asarray(engine.random(stop - start))
-    first = engine.random(1)  # taken apart, as SciPy warns of a number that is no power of two
-    return np.vstack([first, engine.random(stop - 1)]) if stop > 1 else np.asarray(first)
+    engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
+    if block > 0:
+        engine.fast_forward(block * _BLOCK)
+    points = np.asarray(engine.random(_BLOCK))
+    points.setflags(write=False)
+    return points
 
 
 @lru_cache(maxsize=1)

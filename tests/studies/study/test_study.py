@@ -6,10 +6,12 @@ import pickle
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 from support.studies import load_small_study
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
+from lbt_synth.studies.study.study import unit_points
 
 ONE = "truth.vibrations[0].rms_nm"
 
@@ -70,3 +72,12 @@ def test_rows_for_ever(tmp_path, sampling, expected):
 def test_more_samples_begin_with_the_same(tmp_path):
     few, many = (load_small_study(tmp_path, samples=n).values(0, 16) for n in ("16", "64"))
     np.testing.assert_array_equal(few, many)
+
+
+@pytest.mark.parametrize("first", [0, 16_380, 40_000])
+def test_points_are_those_of_one_long_sequence(tmp_path, first):
+    settings = load_small_study(tmp_path, samples=str(1 << 17)).settings
+    engine = qmc.Sobol(3, scramble=True, seed=np.random.default_rng(settings.seed))
+    expected = engine.random(1 << 16)[first : first + 20_000]
+    points = unit_points(settings, 3, first, first + 20_000)
+    np.testing.assert_array_equal(points, expected)
