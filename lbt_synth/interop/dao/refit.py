@@ -22,7 +22,6 @@ _ROOM = 2e-3  # of each limit
 _ENOUGH = 1.006  # times what the design leaves
 _EDGE = 3e-3  # weight of the loops at the ends of the sensor gains
 _FAR = -1.7  # a section with a larger first coefficient is far from z = 1
-_MODULUS = 0.92  # squared, of the roots of such sections
 # Weight of the rounding, weight of what exceeds a limit, largest squared modulus of the roots of
 # sections far from z = 1: one search each.
 _STEPS = (
