@@ -222,7 +222,7 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
 
 @lru_cache(maxsize=2)
 def _sobol_block(dimensions: int, seed: int, block: int) -> FloatArray:
-    """Return points of a sequence from ``block * _BLOCK``, as scrambling it anew takes longer."""
+    """Return points of a sequence from ``block * _BLOCK``, as scrambling it again takes longer."""
     from scipy.stats import qmc
 
     engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
