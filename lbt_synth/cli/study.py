@@ -42,8 +42,8 @@ def run(arguments: Namespace) -> Report:
 
 def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
-    found, statistics, new = _compute(loaded, folder, pages, arguments)
-    files = [found.results, found.failed, *pages]
+    found, statistics, new, drawn = _compute(loaded, folder, pages, arguments)
+    files = {found.results: new, found.failed: new} | dict.fromkeys(pages, drawn)
     varying = [p.name for p in loaded.parameters if p.distribution.varies]
     worst = [worst_table(each, varying) for each in statistics.controllers]
     done = f"{folder} is finished: {found.samples} samples in {found.results.name}; none computed."
@@ -54,7 +54,7 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
         )
     failed = f"note: {found.failures} results failed, see {found.failed}."
     if found.retry:
-        failed += " Those that ended their process are tried again if it is started again."
+        failed += " Those that ended their process are tried again when the study is started again."
     return Report(
         data={name: getattr(found, name) for name in _COUNTS}
         | {
@@ -70,23 +70,24 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
             done,
             *_sampling_notes(loaded),
             *([failed] if found.failures else []),
-            *(f"{'written' if new else 'there'}: {path}" for path in files),
+            *(f"{'written' if now else 'unchanged'}: {path}" for path, now in files.items()),
         ],
     )
 
 
 def _compute(
     loaded: studies.Study, folder: Path, files: Sequence[Path], arguments: Namespace
-) -> tuple[studies.StudyRun, studies.StudyStatistics, bool]:
-    """Run a study and write its page; return also whether anything was left to compute."""
-    found: list[tuple[studies.StudyStatistics, bool]] = []
+) -> tuple[studies.StudyRun, studies.StudyStatistics, bool, bool]:
+    """Run a study and draw its page where it must; return also if there was anything to do."""
+    found: list[tuple[studies.StudyStatistics, bool, bool]] = []
     page, *pdf = files
     names = [controller.name for controller in loaded.controllers]
 
     def summarise(results: FinishedStudy) -> None:
         statistics = studies.study_statistics(results.columns, loaded.parameter_names, names)
-        found.append((statistics, results.new))
-        if results.new or not all(path.exists() for path in files):
+        draws = results.new or not all(path.exists() for path in files)
+        found.append((statistics, results.new, draws))
+        if draws:
             failures = [
                 studies.Failure(row=row, controller=name, error=error)
                 for row, name, error in read_failures(folder)
@@ -120,8 +121,8 @@ def _compute(
                 note = f"what is finished is kept in {folder}; start it again to continue"
                 print_error(note)
                 raise
-    [(statistics, new)] = found
-    return study_run, statistics, new
+    [(statistics, new, drawn)] = found
+    return study_run, statistics, new, drawn
 
 
 def _duration(seconds: float) -> str:

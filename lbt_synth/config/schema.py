@@ -280,7 +280,7 @@ class RobustnessSection(Section):
 
     errors_hz: Annotated[list[q.Shift], Field(min_length=1)] | None = Field(
         default=None,
-        description="true frequency less the assumed one, of the vibration that moves most [Hz] "
+        description="true frequency minus the assumed one, of the vibration that moves most [Hz] "
         "(default: 15 steps over the stated errors, or over 17.5 % and at most 3.5 Hz)",
     )
     hold: Literal["driving", "rms"] = Field(
@@ -293,7 +293,7 @@ class RobustnessSection(Section):
         description="real sensor gains of maps",
     )
     delay_errors_frames: list[q.Shift] = Field(
-        default=[0.0], min_length=1, description="real delay less the design's [frames]"
+        default=[0.0], min_length=1, description="real delay minus the design's [frames]"
     )
 
 

@@ -310,7 +310,10 @@ def _judge_commands(
     verdict = explain_commands(record, sensor_gain=sensor_gain)
     if not accept:
         verdict.require_accepted()
-    given = [] if sensor_gain is None else [f"the sensor gain is {sensor_gain}, as it was given"]
+    given = []
+    if sensor_gain is not None:
+        gains = " and ".join(f"{gain:g}" for gain in np.ravel(sensor_gain))
+        given = [f"the sensor gain is {gains}, as it was given"]
     return list(verdict.notes), [*verdict.overruled, *given]
 
 

@@ -12,10 +12,9 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.identification.commands.coarse_steps import is_stepped
 from lbt_synth.identification.commands.gain_interval import POSSIBLE_GAINS, allowed_gains
 from lbt_synth.identification.fit.both_axes import identify
-from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, Search
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray
 
 _OUTSIDE = 1.3  # factor beyond an interval of gains
@@ -133,8 +132,7 @@ def _words(model: IdentifiedModel) -> str:
 
 def _price(model: IdentifiedModel) -> float:
     """Return what a component must add to the logarithm of the likelihood."""
-    values = max(float(np.sum(axis.data.count)) for axis in model.axes)
-    return 0.5 * PARAMETERS * float(np.log(values))
+    return max(Search(data=axis.data).price for axis in model.axes)
 
 
 def _criterion(model: IdentifiedModel) -> float:

@@ -64,7 +64,7 @@ def test_the_command(tmp_path, capsys):
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out")
     assert status == 0
     assert "is finished: 200 samples in results.csv; none computed" in out
-    for text in ("50th percentile", "Worst samples of b", "sensor_gain", "there: "):
+    for text in ("50th percentile", "Worst samples of b", "sensor_gain", "unchanged: "):
         assert text in out
     page = tmp_path / "out" / "summary.html"
     page.write_text("changed")
@@ -74,6 +74,8 @@ def test_the_command(tmp_path, capsys):
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--pdf")
     assert status == 0
     assert "200 samples" in out
+    assert f"written: {page}" in out
+    assert f"unchanged: {tmp_path / 'out' / 'results.csv'}" in out
     assert b"computing time, of all processes together" in page.read_bytes()
     assert (tmp_path / "out" / "summary.pdf").read_bytes().startswith(b"%PDF")
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "7")

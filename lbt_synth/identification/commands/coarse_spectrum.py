@@ -283,12 +283,11 @@ class _Fit:
         The amplitudes are those of the shapes that all rows share, (rows, k); parts and slopes are
         (rows, l, b).
         """
-        k = 1 + self.fixed
         a = np.exp(theta[:, 1 : 1 + self.amplitudes])
         skirt, slope = self._skirts(theta[:, 1 + self.amplitudes :])
         skirt *= a[:, self.fixed :, None]
         model = a[:, : self.fixed] @ self.axis.shapes + np.sum(skirt, axis=1)
-        return theta[:, 0], model, a[:, : k - 1], skirt, slope
+        return theta[:, 0], model, a[:, : self.fixed], skirt, slope
 
     def _away(self, theta: FloatArray) -> FloatArray:
         """Return how far lines are from their peaks, over their widths, (rows, l)."""
@@ -365,7 +364,7 @@ def coherence_credit(
     independent: float,
     frame_rate_hz: float,
 ) -> float:
-    """Return the contrast that the coherence of two axes saves, given (segments, f) of each.
+    """Return what the coherence of two axes adds to the contrast, at most 0.
 
     A line along a diagonal is in both axes; a guess that removes it from one of them must not
     count as an explanation. What shakes along a direction has no phase between the axes; the

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from functools import partial
+from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import ComplexArray, FloatArray
 
 GuessKind: TypeAlias = Literal["as given", "matrix", "shift", "increments", "clipped"]
+_Series = TypeVar("_Series", FloatArray, ComplexArray)
 SHIFTS = tuple(float(shift) for shift in np.arange(-3, 3.1, 0.5) if shift)
 _ROTATIONS_DEG = (-150.0, -120.0, -90.0, -60.0, -30.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
 _MIRRORS_DEG = (-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0)
@@ -62,7 +64,7 @@ class Guess:
         """Whether the matrix, if there is one, is a rotation, with a mirror or without."""
         return self.matrix is None or is_orthogonal(self.matrix)
 
-    def corrections(self, record: LoopRecord, shift: int = 0) -> FloatArray:
+    def unturned_corrections(self, record: LoopRecord, shift: int = 0) -> FloatArray:
         """Return the corrections in the measurements, but for the matrix, (frames, axes) [nm].
 
         A shift that is not whole mixes those of two whole ones, ``shift`` is one of them.
@@ -148,6 +150,13 @@ def _matrices(axes: int) -> Iterator[FloatArray]:
     yield from (rotation(angle) @ MIRROR for angle in _MIRRORS_DEG)
 
 
+def _mix_shifts(shift_frames: float, at: Callable[[int], _Series]) -> _Series:
+    """Return what a shift gives, mixed from what two whole ones do."""
+    whole = int(np.floor(shift_frames))
+    part = shift_frames - whole
+    return (1 - part) * at(whole) + part * at(whole + 1) if part else at(whole)
+
+
 class CoarseRecord:
     """The transforms of one record, on which guesses are compared; none without ``stretches``.
 
@@ -177,25 +186,17 @@ class CoarseRecord:
         limit = None if guess.limit_nm is None else tuple(guess.limit_nm.tolist())
         key = (guess.kind == "increments", limit, shift)
         if key not in self._known:
-            self._known[key] = self._transform(guess.corrections(self.record, shift))[1]
+            self._known[key] = self._transform(guess.unturned_corrections(self.record, shift))[1]
         return self._known[key]
 
     def transform(self, guess: Guess) -> ComplexArray:
         """Return the transforms of the corrections of a guess, (axes, segments, f)."""
-        whole = int(np.floor(guess.shift_frames))
-        part = guess.shift_frames - whole
-        out = self._shifted(guess, whole)
-        if part:
-            out = (1 - part) * out + part * self._shifted(guess, whole + 1)
+        out = _mix_shifts(guess.shift_frames, partial(self._shifted, guess))
         return out if guess.matrix is None else np.tensordot(guess.matrix, out, 1)
 
     def corrections(self, guess: Guess) -> FloatArray:
         """Return the corrections of a guess as series, (frames, axes) [nm]."""
-        whole = int(np.floor(guess.shift_frames))
-        part = guess.shift_frames - whole
-        out = guess.corrections(self.record, whole)
-        if part:
-            out = (1 - part) * out + part * guess.corrections(self.record, whole + 1)
+        out = _mix_shifts(guess.shift_frames, partial(guess.unturned_corrections, self.record))
         return out if guess.matrix is None else out @ guess.matrix.T
 
     def compare(self, guesses: Sequence[Guess]) -> Comparison:
@@ -238,7 +239,7 @@ class CoarseRecord:
         )
 
     def _fit_axis(self, i: int, corrections: ComplexArray) -> CoarseFit:
-        """Fit all guesses of one axis, each scaled to a natural gain of 1."""
+        """Fit all guesses of one axis, from multiples of the gain that is natural for each."""
         high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
         level = np.mean(abs(self.measured[i][:, high]) ** 2)
         steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
@@ -247,7 +248,7 @@ class CoarseRecord:
         return fit_guesses(self._axis(i, corrections), natural[:, None] * _NATURAL_GAINS)
 
     def _credit(self, corrections: ComplexArray, gain: FloatArray) -> float:
-        """Return what the coherence of two axes saves."""
+        """Return what the coherence of the axes adds to the contrast, at most 0."""
         if self.record.axes == 1:
             return 0.0
         one, other = self.measured + gain[:, None, None] * corrections

@@ -38,7 +38,7 @@ from lbt_synth.identification.commands.repair import CommandRepair, repair_comma
 from lbt_synth.identification.commands.scale_search import find_scale
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, one_or_each, require_instance
+from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_instance
 
 AS_GIVEN = "as given"
 _CLEAR = 20.0  # nats that decide
@@ -93,7 +93,7 @@ class CommandVerdict:
 
     @property
     def overruled(self) -> tuple[str, ...]:
-        """What a design from a record rests on that was accepted nevertheless."""
+        """What a design assumes that is made although the record is refused."""
         if self.accepted:
             return ()
         what = self.explanation.partition(". ")[0]  # without advice
@@ -164,11 +164,14 @@ def explain_commands(
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
-    plausible = _plausible(sensor_gain)
+    known = None if sensor_gain is None else record.known_gains(sensor_gain)
+    plausible = PLAUSIBLE_GAINS
+    if known is not None:
+        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
     law, nothing = _find_law(record), np.full(record.axes, np.nan)
     moves = moving_axes(record)
     if moves.any() and not moves.all():
-        return _explain_moving(record, moves, law, sensor_gain)
+        return _explain_moving(record, moves, law, known)
     refuse = partial(CommandVerdict, accepted=False, gain=nothing, law=law)
     if doubt := _doubt_series(record, law):
         return refuse(explanation=doubt)
@@ -220,29 +223,15 @@ def explain_commands(
     )
 
 
-def _plausible(sensor_gain: float | Sequence[float] | None) -> tuple[float, float]:
-    """Return the least and the largest gain that a sensor may have."""
-    if sensor_gain is None:
-        return PLAUSIBLE_GAINS
-    known = one_or_each(sensor_gain, "sensor_gain", above=0)
-    return float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
-
-
 def _explain_moving(
-    record: LoopRecord,
-    moves: BoolArray,
-    law: ControlLaw | None,
-    sensor_gain: float | Sequence[float] | None,
+    record: LoopRecord, moves: BoolArray, law: ControlLaw | None, known: FloatArray | None
 ) -> CommandVerdict:
     """Explain the commands of the axis that moves; the loop of the other one was open."""
     assert record.commands is not None
     one = replace(
         record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
     )
-    known = sensor_gain
-    if sensor_gain is not None and np.ndim(sensor_gain):
-        known = np.asarray(sensor_gain)[moves].tolist()
-    found = explain_commands(one, sensor_gain=known)
+    found = explain_commands(one, sensor_gain=None if known is None else known[moves].tolist())
     gain = np.full(record.axes, np.nan)
     gain[moves] = found.gain
     note = f"the commands of axis {int(np.argmin(moves))} stand still: its loop was open"
@@ -308,16 +297,18 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
         compared = compared.join(coarse.compare(guesses[-1:]))
     score, surprising = score_guesses(compared, record, law, lag)
     best = int(np.argmin(score))
-    asked = np.flatnonzero(~surprising)  # what the law asks for, which the coarse spectrum may miss
-    if surprising[[0, best]].all() and asked.size:
-        other = int(asked[np.argmin(score[asked])])
+    expected = np.flatnonzero(
+        ~surprising
+    )  # what the law asks for, which the coarse spectrum may miss
+    if surprising[[0, best]].all() and expected.size:
+        other = int(expected[np.argmin(score[expected])])
         saving = finer_saving(coarse, guesses[other], clear=_CLEAR_FINER, decides=True)
         if saving >= _CLEAR_FINER:
             best, score[0] = other, np.inf
     clear = _CLEAR * compared.dispersion(best)
     no_law = law is None or law.kind == "none"
     saved = coarse.unrelated() - np.min(compared.contrast) if no_law else np.inf
-    if saved < _RELATED * clear / _CLEAR:
+    if saved < _RELATED * compared.dispersion(best):
         return None
     given = _Best(
         guess=guesses[0],
@@ -328,7 +319,7 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     )
     if best == 0:
         return given
-    nats = float(min(score[0], compared.contrast[0]) - compared.contrast[best])
+    nats = float(compared.contrast[0] - compared.contrast[best])
     part_of_a_frame = abs(guesses[best].shift_frames) == _PART
     guess = refine_guess(coarse, guesses[best], law)
     shown = nats >= clear / 2 or np.isinf(score[0])

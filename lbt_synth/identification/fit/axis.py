@@ -193,7 +193,7 @@ def _gain_error(model: FittedModel) -> float:
 
 
 def _likely_gains(models: Sequence[FittedModel], error: float) -> tuple[float, float]:
-    """Return the least and the largest gain of models, with a relative error of one."""
+    """Return the least and the largest gain of models, widened by the relative error of one."""
     logs = [model.spectrum.log_gain for model in models]
     margin = min(error, _GAIN_ERROR)
     return float(np.exp(min(logs) - margin)), float(np.exp(max(logs) + margin))
@@ -202,7 +202,7 @@ def _likely_gains(models: Sequence[FittedModel], error: float) -> tuple[float, f
 def refit_axis(
     axis: IdentifiedAxis, search: Search, error: float, note: str, *, moves: bool
 ) -> IdentifiedAxis:
-    """Fit an axis again at the gain of a search, of a relative error; lines may get ``moves``."""
+    """Fit an axis again at the gain of a search, with its error; with ``moves``, lines may move."""
     model = search_model(search, axis.fitted_model.spectrum, moves=moves)
     return describe_axis(search, hold_gain(search, model, error), error, note)
 

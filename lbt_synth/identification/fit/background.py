@@ -33,8 +33,8 @@ def fit_background(
     """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles.
 
     A gain that a free fit ran away to counts as the nearest that a sensor may have.
-    Second-order processes cannot fall with the square of the frequency, and lines would have to:
-    where it ``drifts``, a first-order process comes first, and the turbulence is a part beside it.
+    Second-order processes cannot fall with the square of the frequency, and lines would fill the
+    gap. With ``drifts``, a first-order process comes first, and the turbulence is a part beside it.
     """
     gain = float(np.clip(gain, *_GAINS))
     smooth = _smooth_background(search.data, gain)

@@ -35,7 +35,7 @@ from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
-from lbt_synth.validation import real_array, require_instance
+from lbt_synth.validation import require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
@@ -77,7 +77,7 @@ def identify(
     delay_frames : float, optional
         Total delay of that loop [frames], if the record does not have it; 2 by default.
     sensor_gain : float or one per axis, optional
-        Known sensor gain.
+        Known sensor gain; like ``assumed_gain``, ``stretches`` and ``start`` for series alone.
     assumed_gain, lowest_line_hz, most_lines
         As for :func:`identify_axis`.
     announced : sequence of LinePrior, optional
@@ -129,12 +129,21 @@ def identify(
         "most_lines": most_lines,
     }
     if isinstance(record, SpectrumRecord):
+        for name, value in (
+            ("sensor_gain", sensor_gain),
+            ("stretches", stretches),
+            ("start", start),
+        ):
+            if value is not None:
+                raise ProblemError(f"{name} is for series of a loop; a spectrum is of the phase.")
         return _identify_spectra(record, frame_rate_hz, delay_frames, options)
     require_instance(record, LoopRecord)
     _check_record(record, frame_rate_hz, delay_frames, start)
-    gains = _gain_per_axis(sensor_gain, record.axes)
+    gains: list[float | None] = [None] * record.axes
+    if sensor_gain is not None:
+        gains = record.known_gains(sensor_gain).tolist()
     pieces = record.stretches() if stretches is None else _usable_stretches(stretches, record)
-    fits, total = count(1), 2 * record.axes
+    fits, total = count(1), 3 * record.axes  # at first, after a jump, with the mean gain
 
     def step() -> None:
         if progress is not None:
@@ -235,16 +244,6 @@ def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches
     return out
 
 
-def _gain_per_axis(given: Any, count: int) -> list[float | None]:
-    """Return the given gain of each axis, None for one to be found."""
-    if given is None:
-        return [None] * count
-    values = np.atleast_1d(real_array(given, "sensor_gain"))
-    if values.shape not in ((1,), (count,)):
-        raise ProblemError(f"sensor_gain must be one number, or {count}; got {given!r}.")
-    return [float(v) for v in np.broadcast_to(values, (count,))]
-
-
 def _pool_gains(
     axes: list[IdentifiedAxis],
     found_gain: list[int],
@@ -254,7 +253,7 @@ def _pool_gains(
     """Fit the axes again with the mean of the gains that were found, if they agree.
 
     An axis whose gain was found has its lines where they are. ``options`` are those of a search.
-    Where these scatter by more than their errors, so does the mean: its error is scaled by
+    Where the gains scatter by more than their errors, the error of the mean is scaled by
     ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
     """
     gains = np.array([axes[i].sensor_gain for i in found_gain])
@@ -281,7 +280,7 @@ def _pool_gains(
 
 
 def _doubt_scale(axes: Sequence[IdentifiedAxis]) -> Iterator[str]:
-    """Yield that gains above 1 may be those of commands recorded at a part of their size."""
+    """Yield that gains above 1 may be those of commands recorded at a fraction of their size."""
     above = {
         f"{axis.sensor_gain:.3f} +- {axis.sensor_gain_error:.3f}"
         for axis in axes
@@ -291,8 +290,8 @@ def _doubt_scale(axes: Sequence[IdentifiedAxis]) -> Iterator[str]:
     if above:
         yield (
             f"warning: a calibrated sensor has a gain of at most 1; here it is "
-            f"{' and '.join(sorted(above))}. Commands recorded at a part of what was applied look "
-            "like that (--command-scale 2 if at half)"
+            f"{' and '.join(sorted(above))}. Commands recorded at a fraction of what was applied "
+            "look like that (--command-scale 2 if at half)"
         )
 
 

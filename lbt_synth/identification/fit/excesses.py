@@ -19,7 +19,7 @@ class Candidate:
     frequency_hz: float  # where it is highest
     half_width_hz: float  # at half height
     variance_nm2: float  # of a resonance of that height and width
-    gain: float  # log-likelihood that a model with the mean of the band would add
+    evidence: float  # log-likelihood that a model with the mean of the band would add
 
 
 def find_candidates(
@@ -62,7 +62,7 @@ def measure_excess(
     model: FloatArray,
     start: int,
     stop: int,
-    gain: float = 0.0,
+    evidence: float = 0.0,
 ) -> Candidate:
     """Measure place, half width and variance of the highest excess between two bins."""
     excess = power[start:stop] - model[start:stop]
@@ -80,7 +80,7 @@ def measure_excess(
         frequency_hz=float(data.frequency_hz[start + peak]),
         half_width_hz=half,
         variance_nm2=np.pi * half * height,
-        gain=gain,
+        evidence=evidence,
     )
 
 

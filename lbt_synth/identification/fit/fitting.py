@@ -31,7 +31,7 @@ from lbt_synth.validation import IntArray, integer, number
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
-OVERDAMPED = 2.0  # damping ratio from which turbulence is a drift
+DRIFT_DAMPING = 2.0  # damping ratio from which turbulence is a drift
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
@@ -48,7 +48,7 @@ _FIXED, _NONE = (0.0, 0.0), (0.0, np.inf)
 _GAIN_PRIOR = (np.log(0.7), 1.0)
 _COLOUR_PRIOR = (0.0, 1.0)
 STARTING_CORNER_HZ, _CORNER_WIDTH = 50.0, 2.0
-_SLOWEST = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
+_TURBULENCE_WIDTH = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "turbulence": (np.log(0.45), 4.0),
     "drift": (np.log(0.45), 4.0),
@@ -112,7 +112,7 @@ class Search:
         colour = _COLOUR_PRIOR if spectrum.colour else _FIXED
         rows = [gain, _NONE, colour, corner if spectrum.rolls_off else _FIXED]
         for c in spectrum.components:
-            frequency, damping = (self.log_angle(1.0), _SLOWEST), _DAMPING_PRIORS[c.kind]
+            frequency, damping = (self.log_angle(1.0), _TURBULENCE_WIDTH), _DAMPING_PRIORS[c.kind]
             if c.kind == "line":
                 frequency = _NONE
                 if self.data.duration_s is None:
@@ -126,7 +126,7 @@ class Search:
         centre = component.frequency / self.data.angle_s
         return centre, max(centre * component.damping_ratio, self.data.step_hz)
 
-    def has_in_band(self, component: Component) -> bool:
+    def covers(self, component: Component) -> bool:
         """Whether a component lies between the first bin and the Nyquist frequency."""
         lowest = self.log_angle(_LOWEST * self.data.step_hz)
         return bool(lowest < component.log_frequency < _HIGHEST)
@@ -142,7 +142,7 @@ class Search:
         for line in spectrum.lines:
             centre, half_width = self.place(line)
             fine = _SIDELOBES if half_width < _SMEARED * step else _BINS
-            reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, the widest group is larger
+            reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
             near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)
             wide = _SHARE * np.maximum(half_width, 2 * away)
@@ -162,8 +162,8 @@ def fit(
     """Fit all parameters; None if no fit settles.
 
     Components that leave the band, from the first bin to the Nyquist frequency, are dropped, and so
-    is a drift that oscillates. A fit is given up where its log-likelihood does not reach that of
-    ``better_than`` less a margin.
+    is a drift whose damping ratio falls below 2, if another part can take its place. A fit is given
+    up where its log-likelihood does not reach that of ``better_than`` minus a margin.
     """
     data, bound = search.merge(start), float("inf")
     if better_than is not None:
@@ -171,9 +171,9 @@ def fit(
     found = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
     if found is None or found.contrast > bound:
         return None
-    inside = found.spectrum.keep(search.has_in_band)
+    inside = found.spectrum.keep(search.covers)
     first = inside.components[0]
-    if first.kind == "drift" and first.damping_ratio < OVERDAMPED:
+    if first.kind == "drift" and first.damping_ratio < DRIFT_DAMPING:
         inside = inside.drop(0) or inside
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
@@ -211,7 +211,8 @@ def simplify(search: Search, model: FittedModel) -> FittedModel:
 def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> FittedModel:
     """Drop the components that add less than they must, the least first.
 
-    What a wide or a close one explains, others may take over, on a long way: ``thorough`` goes it.
+    Others may take over what a wide one, or one of a close pair, explains, but only after a long
+    fit: ``thorough`` makes it.
     """
     trials, spectrum = [], model.spectrum
     data = search.merge(spectrum)
@@ -220,7 +221,7 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
         close = close_line(search, spectrum, i)
         less = _drop(data, spectrum, i) if close is None else _unite(search, spectrum, i, close)
         if less is not None:
-            required = required_gain(search, spectrum, i)
+            required = required_evidence(search, spectrum, i)
             spare = contrast(data, less) - whole - 4 * required
             patient = thorough and (close is not None or not component.is_narrow)
             if patient or spare <= 0:
@@ -256,7 +257,7 @@ def _unite(search: Search, spectrum: SpectrumModel, i: int, close: int) -> Spect
     return spectrum.exchange(close, line).exchange(i)
 
 
-def required_gain(
+def required_evidence(
     search: Search, spectrum: SpectrumModel, i: int, *, earlier: bool = False
 ) -> float:
     """Return what a component must add to the logarithm of the likelihood.
@@ -296,7 +297,9 @@ def cost(search: Search, model: FittedModel) -> float:
     # the same for any order of the search
     rest = sorted(rest, key=lambda component: component.log_frequency)
     spectrum, others = replace(spectrum, components=(first, *rest)), range(1, 1 + len(rest))
-    return model.contrast + sum(required_gain(search, spectrum, i, earlier=True) for i in others)
+    return model.contrast + sum(
+        required_evidence(search, spectrum, i, earlier=True) for i in others
+    )
 
 
 def add_evidence(search: Search, model: FittedModel) -> FittedModel:

@@ -311,7 +311,7 @@ class JointSearch:
             joint.place(axis, part)
             for axis, (search, model) in each
             for part, component in enumerate(model.components)
-            if not search.has_in_band(component)
+            if not search.covers(component)
         )
 
     def _priors(self, start: JointSpectrum, first: IntArray) -> Priors:

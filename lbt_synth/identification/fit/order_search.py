@@ -35,7 +35,7 @@ _FAR_GAIN = 3.0  # standard errors by which a colour of the noise moves a gain t
 _SAME_NOISE = 0.1  # of the correlation of neighbouring frames
 _OTHER_NOISE = 5.0  # log-likelihood by which noise of another correlation is excluded
 _COLOUR = 0.3  # of the noise, where a fit begins
-_MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, and a design must not take it white
+_MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 
 
 def search_model(
@@ -89,7 +89,7 @@ def _cost_with_gain(search: Search, model: FittedModel) -> float:
 def try_other_gains(
     search: Search, model: FittedModel, rivals: Sequence[FittedModel] = ()
 ) -> tuple[FittedModel, list[FittedModel]]:
-    """Return the likeliest model from several gains, and the others of nearly its cost.
+    """Return the likeliest model from several gains, and all models of nearly its cost, itself too.
 
     Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
     lines cannot.
@@ -190,13 +190,13 @@ def _trials(
     first, *others = spectrum.components
     lines = [c for c in others if c.kind == "line"]
     has_parts = len(lines) < len(others)
-    overdamped = first.kind == "drift" or first.damping_ratio > fitting.OVERDAMPED
+    nearly_first_order = first.kind == "drift" or first.damping_ratio > fitting.DRIFT_DAMPING
     # where no line can be added, a second turbulence would take the place of one
     room = len(lines) < search.most_lines
     found = _find_excesses(search, spectrum)
-    found = [c for c in found if c.gain > 0.25 * found[0].gain]
+    found = [c for c in found if c.evidence > 0.25 * found[0].evidence]
     either = [_add_candidates(search, spectrum, found)] if found else []
-    if room and not overdamped:
+    if room and not nearly_first_order:
         either += _other_backgrounds(search, spectrum, lines, drifts=True)
     yield either, _LITTLE
     while found := found[: len(found) // 2]:
@@ -204,7 +204,7 @@ def _trials(
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
             yield from (([trial], _CLEARLY) for trial in _line_moves(search, spectrum, i))
-    if room and overdamped and not (has_parts and first.kind == "drift"):
+    if room and nearly_first_order and not (has_parts and first.kind == "drift"):
         yield _other_backgrounds(search, spectrum, lines, drifts=True), _LITTLE
     if has_parts:
         yield _other_backgrounds(search, spectrum, lines, drifts=False), _LITTLE
@@ -229,7 +229,7 @@ def _begin(search: Search) -> FittedModel | None:
     model = fit_background(known, known.gain or 1.0)
     for _ in range(_FEW_ROUNDS):
         found = [] if model is None else _find_excesses(known, model.spectrum)
-        clear = [c for c in found if c.gain > max(2 * search.price, 0.02 * found[0].gain)]
+        clear = [c for c in found if c.evidence > max(2 * search.price, 0.02 * found[0].evidence)]
         if model is None or not clear:
             break
         model = fitting.fit(known, _add_candidates(known, model.spectrum, clear))

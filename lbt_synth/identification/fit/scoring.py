@@ -95,9 +95,9 @@ def scoring_minimum(
 def _best_step(
     curvature: FloatArray, gradient: FloatArray, radius: float
 ) -> tuple[FloatArray, float, float]:
-    """Return the step (p,) to the least of a quadratic form within a radius, and two gains.
+    """Return the step (p,) that minimises a quadratic form within a radius, and two gains.
 
-    They are what the step to the least of all gains, and what this step gains. The curvature
+    The first is that of the minimum without a radius, the second that of this step. The curvature
     (p, p) counts by its absolute value.
     """
     whole, info = dposv(curvature, -gradient)[1:]
@@ -112,14 +112,14 @@ def _best_step(
 
 
 def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
-    """Return what a matrix needs, symmetric and of rank one, to add ``missing`` along a step."""
+    """Return the symmetric rank-one matrix that maps a step to ``missing``; 0 if nearly normal."""
     along = float(missing @ step)
     least = _ALONG * float(np.linalg.norm(missing) * np.linalg.norm(step))
     return np.outer(missing, missing) / along if abs(along) > least else np.zeros((step.size,) * 2)
 
 
 def _trust_step(slope: FloatArray, curvature: FloatArray, radius: float) -> FloatArray:
-    """Return the step (p,) to the least of a quadratic form within a radius, in its own axes."""
+    """Return the step (p,) to the minimum of a quadratic form within a radius, in its axes."""
     more = 0.0
     for _ in range(_MOST_DAMPINGS):
         step = -slope / (curvature + more)

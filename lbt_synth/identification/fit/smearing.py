@@ -21,7 +21,7 @@ from lbt_synth.validation import FloatArray
 
 WIDE = 30.0  # half width above which a line is not smeared
 _FAR = 400.0  # distance beyond which no line is smeared
-_NOTHING = 0.003  # change of a line beyond whose distance it is not smeared
+_NOTHING = 0.003  # change of the logarithm of a line that is neglected
 _NARROWEST = 1e-9
 _WIDTHS = 72
 _LOBES = 64.0  # distance up to which single lobes are resolved
@@ -36,7 +36,8 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return knots of log g (w,), a grid of distances (d,), and log K between both.
 
     The last has the coefficients of polynomials in two variables, cubic in the part of a step of
-    the grid and in log g beyond its knot, the highest power of the latter first: (4, 4, w, d).
+    the grid and in log g beyond its knot, the highest power of the latter first:
+    (4, 4, w - 1, d - 1).
     """
     h = tukey(_SAMPLES)
     transform = np.fft.rfft(h, 2 * _SAMPLES)
@@ -44,16 +45,16 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     correlation /= correlation[0]
     t = np.arange(_SAMPLES) / _SAMPLES
     widths = np.geomspace(_NARROWEST, 1.2 * WIDE, _WIDTHS)
-    near = np.arange(0, _LOBES, _STEP)
-    far = [near[-1] + _STEP]
-    while far[-1] < 1.05 * _FAR:
-        far.append(far[-1] + (far[-1] - (far[-2] if len(far) > 1 else near[-1])) * _GROWTH)
-    grid = np.concatenate([near, far])
+    places = np.arange(0, _LOBES + _STEP / 2, _STEP).tolist()
+    while places[-1] < 1.05 * _FAR:
+        places.append(places[-1] + _GROWTH * (places[-1] - places[-2]))
+    grid = np.array(places)
     decaying = 2 / _SAMPLES * correlation * np.exp(-2 * np.pi * np.outer(widths, t))
     decaying[:, 0] /= 2
     waves = np.cos(2 * np.pi * np.outer(t, grid))
     at, mean = decaying @ waves, (decaying * np.sinc(t)) @ waves  # the mean over a lobe
-    at, mean = (each * np.sinc(grid / _SAMPLES) ** 2 for each in (at, mean))  # not sampled
+    # of the taper itself, not of its samples
+    at, mean = (each * np.sinc(grid / _SAMPLES) ** 2 for each in (at, mean))
     at = np.maximum(at, _VALLEY * mean)  # no fit crosses the zeros between lobes
     blend = np.clip((grid - _LOBES / 2) / (_LOBES / 2), 0, 1)
     k = np.maximum(at * (1 - blend) + mean * blend, 1e-14)
@@ -85,7 +86,7 @@ def smearing_reach(half_width: FloatArray) -> FloatArray:
 def log_smearing(
     half_width: FloatArray | float, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the logarithm of smeared lines over the lines themselves, (f,).
+    """Return the logarithm of the ratio of smeared lines to the lines themselves, (f,).
 
     The half width is one for all, or (f,) as the distance. The derivatives by the logarithm of the
     width and by the distance follow.

@@ -23,6 +23,7 @@ from lbt_synth.validation import (
     number,
     one_or_each,
     read_only,
+    real_array,
     set_fields,
 )
 
@@ -208,6 +209,11 @@ class LoopRecord:
 
     def _gains(self, sensor_gain: ArrayLike) -> FloatArray:
         return one_or_each(sensor_gain, "sensor_gain", self.axes, above=0)
+
+    def known_gains(self, sensor_gain: ArrayLike) -> FloatArray:
+        """Return the gain of each axis, (axes,), from one for all, alone or in a list, or each."""
+        given = np.atleast_1d(real_array(sensor_gain, "sensor_gain"))
+        return np.broadcast_to(self._gains(given[0] if given.size == 1 else given), (self.axes,))
 
     def stretches(self) -> tuple[tuple[int, int], ...]:
         """Return (start, stop) of each stretch of contiguous usable frames."""

@@ -120,7 +120,7 @@ class Workers:
         self._broken: futures.BrokenExecutor | None = None
         self._deaths = 0  # in a row
         self._environment = ExitStack()
-        self.at_once = workers or jobs
+        self.at_once = jobs if executor is None else workers or jobs
         self.in_flight = 1 if executor is None and jobs == 1 else _IN_FLIGHT * self.at_once
 
     def __enter__(self) -> Workers:
@@ -137,7 +137,7 @@ class Workers:
                 self._executor.__exit__(*error)
 
     def begin(self, call: Callable[..., Any], *args: Any) -> Callable[[], Any]:
-        """Begin a call in a process of its own pool, and return what waits for its result.
+        """Begin a call in a process of its own pool; return a function that waits for its result.
 
         Without a pool it runs at once, and where its process dies it runs again in this one.
         """

@@ -245,7 +245,7 @@ def _begin(folder: Path, study: Study) -> store.Manifest:
             store.refuse(folder, f"{why} delete {folder / store.PARTS}.")
         for path in output_paths(folder, study):
             if path.exists():
-                why = "is of no study that was begun there, and would be replaced. Name another"
+                why = "is not of a study in this directory, and would be replaced. Name another"
                 store.refuse(path, f"{why} directory, or delete it.")
         manifest = store.new_manifest(study).write(folder)
     if set(manifest.designs) != {c.name for c in study.controllers if c.is_designed}:

@@ -202,7 +202,7 @@ class ConditionalCurve:
     discrete: bool  # whether the groups are the values of a list
 
     def swing(self) -> tuple[float, float]:
-        """Return greatest less least mean over the middle 90 % of samples, and its error."""
+        """Return the range of the mean over the middle 90 % of samples, and its error."""
         end = np.cumsum(self.samples)
         centre = (end - self.samples / 2) / end[-1]
         inside = self.discrete | ((centre >= _MIDDLE[0]) & (centre <= _MIDDLE[1]))
@@ -255,7 +255,7 @@ class ControllerSensitivity:
 
     @property
     def interactions(self) -> float:
-        """1 less the sum: the part that only several independent parameters explain together."""
+        """1 minus the sum: the part that only several independent parameters explain together."""
         return 1 - self.sum
 
 

@@ -38,7 +38,7 @@ class Comparison:
     second: str
     better: Share  # samples with a higher Strehl ratio of the first
     equal: Share  # samples with the same, mostly as both are unstable
-    mean: float  # Strehl ratio of the first less the second
+    mean: float  # Strehl ratio of the first minus the second
     mean_error: float  # standard error of that mean
     difference: tuple[Percentile, ...]  # of the same difference
 
@@ -48,7 +48,7 @@ class Loss:
     """What a controller loses against the best one of each sample."""
 
     best: Share  # samples on which no controller has a higher Strehl ratio
-    loss: tuple[Percentile, ...]  # highest Strehl ratio less this one: 50th, 95th and 99th
+    loss: tuple[Percentile, ...]  # highest Strehl ratio minus this one: 50th, 95th and 99th
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -284,7 +284,7 @@ def _compare(first: ControllerSamples, second: ControllerSamples) -> Comparison:
 
 
 def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray, ...]:
-    """Return for each controller the best Strehl ratio less its own, on every sample (m,)."""
+    """Return for each controller the best Strehl ratio minus its own, on every sample (m,)."""
     whole = np.logical_and.reduce([each.evaluated for each in controllers])
     best = np.max([each.strehl[whole] for each in controllers], axis=0)
     return tuple(best - each.strehl[whole] for each in controllers)

@@ -81,7 +81,7 @@ class Manifest(BaseModel):
     failures: int
     retry: int  # failures that are tried again
     computed_last: int = 0  # rows that the last run computed
-    seconds: Seconds  # of all runs
+    seconds: Seconds  # of all runs that reached their end
     computing_seconds: Seconds  # of all batches, summed over processes
 
     def write(self, folder: Path, **changes: Any) -> Manifest:
@@ -323,9 +323,9 @@ def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict
     if tuple(found) != study.columns or size != study.samples:
         refuse(
             path,
-            f"is not the table of this study: it has {size} rows and {len(found)} columns, "
-            f"expected are {study.samples} and {len(study.columns)}. Delete the directory, and "
-            "start again.",
+            f"is not the table of this study: it has {size} rows and {len(found)} columns; "
+            f"expected {study.samples} and {len(study.columns)}. Delete the directory, and start "
+            "again.",
         )
     return found
 

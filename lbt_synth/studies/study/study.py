@@ -216,21 +216,24 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
     if settings.sampling == "latin_hypercube":
         return _hypercube(settings.samples, dimensions, settings.seed)[start:stop]
     first, last = start // _BLOCK, (stop - 1) // _BLOCK
-    blocks = [_sobol_block(dimensions, settings.seed, block) for block in range(first, last + 1)]
-    return np.concatenate(blocks)[start - first * _BLOCK : stop - first * _BLOCK]
+    draw = _known_sobol_points if first == last else _sobol_points  # a part of one block, or more
+    points = draw(dimensions, settings.seed, first, last)
+    return points[start - first * _BLOCK : stop - first * _BLOCK]
 
 
-@lru_cache(maxsize=2)
-def _sobol_block(dimensions: int, seed: int, block: int) -> FloatArray:
-    """Return points of a sequence from ``block * _BLOCK``, as scrambling it again takes longer."""
+def _sobol_points(dimensions: int, seed: int, first: int, last: int) -> FloatArray:
+    """Return the points of some blocks of a sequence, (n, dimensions)."""
     from scipy.stats import qmc
 
     engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
-    if block > 0:
-        engine.fast_forward(block * _BLOCK)
-    points = np.asarray(engine.random(_BLOCK))
+    if first > 0:
+        engine.fast_forward(first * _BLOCK)
+    points = np.concatenate([engine.random(_BLOCK) for _ in range(first, last + 1)])
     points.setflags(write=False)
     return points
+
+
+_known_sobol_points = lru_cache(maxsize=1)(_sobol_points)  # scrambling takes longer than a batch
 
 
 @lru_cache(maxsize=1)

@@ -58,6 +58,8 @@ def test_an_axis_whose_commands_stand_still_is_an_open_loop() -> None:
     verdict = explain_commands(record(y, still))
     assert verdict.accepted
     assert verdict.notes[-1] == "the commands of axis 1 stand still: its loop was open"
+    for gain in (0.6, [0.6], [0.6, 0.7]):
+        assert explain_commands(record(y, still), sensor_gain=gain).notes == verdict.notes
     assert np.isnan(verdict.gain[1])
     assert verdict.gain[0] == pytest.approx(0.7, rel=0.3)
     assert explain_commands(record(y, -still)).options == "--command-sign -1"

@@ -181,7 +181,9 @@ def test_a_known_gain_decides_on_the_scale() -> None:
     y, u = ordinary_loop()
     assert explain_commands(record(y, u / 2), sensor_gain=1.4).accepted
     assert explain_commands(record(y, u), sensor_gain=[0.6, 0.8]).accepted
-    assert explain_commands(record(y, u), sensor_gain=0.1).options.startswith("--command-scale")
+    assert explain_commands(record(y, u), sensor_gain=[0.1]).options.startswith("--command-scale")
+    with pytest.raises(lbt.errors.ProblemError, match="sensor_gain must be one number"):
+        explain_commands(record(y, u), sensor_gain=[0.6, 0.8, 0.7])
 
 
 def test_a_record_without_long_stretches_is_not_tested() -> None:

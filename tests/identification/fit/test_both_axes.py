@@ -62,7 +62,7 @@ def test_identify_needs_what_it_needs() -> None:
     without = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
     with pytest.raises(ProblemError, match="give delay_frames"):
         lbt.identify(without)
-    with pytest.raises(ProblemError, match="one number, or 1"):
+    with pytest.raises(ProblemError, match="one number, or one per measurement \\(1\\)"):
         lbt.identify(
             lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm"), sensor_gain=[1.0, 2.0]
         )
@@ -211,6 +211,16 @@ def test_spectrum_without_scatter_is_taken_for_one_periodogram(example):
         peaks = np.array(example.peaks(plain.frequency_hz, column))[:, 0]
         assert all(np.min(np.abs(peaks - line.frequency_hz)) < 0.06 for line in axis.lines)
         assert all(line.rms_nm < 30 for line in axis.lines)  # 332 where it counts as a million
+
+
+@pytest.mark.parametrize(
+    "option", [{"sensor_gain": 0.5}, {"stretches": [(0, 600)]}, {"start": "model"}]
+)
+def test_a_spectrum_takes_no_options_of_series(option, model):
+    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    given = {"start": model} if "start" in option else option
+    with pytest.raises(lbt.errors.ProblemError, match="is for series of a loop"):
+        lbt.identify(plain, frame_rate_hz=1000, **given)
 
 
 def test_known_lines_are_found(model):

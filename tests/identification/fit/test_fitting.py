@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.drawn_spectra import drawn_search, empty_search, white_noise
 
-from lbt_synth.identification.fit.fitting import Search, cost, fit, prune, required_gain
+from lbt_synth.identification.fit.fitting import Search, cost, fit, prune, required_evidence
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import SpectrumModel
 from lbt_synth.identification.fit.whittle import contrast
@@ -44,10 +44,10 @@ def test_a_line_in_the_skirts_of_a_wide_resonance_costs_as_much_as_any_other(
     line = search.component("line", 100.0, 0.01, 0.1)
     wide = search.component("line", 90.0, damping, 1.0)
     start = SpectrumModel(0.0, 0.0, 0.0, search.log_angle(50.0), (slow, line))
-    assert required_gain(search, start.add(wide), 1) == search.price
-    assert required_gain(search, start.add(wide), 2) == search.price
+    assert required_evidence(search, start.add(wide), 1) == search.price
+    assert required_evidence(search, start.add(wide), 2) == search.price
     close = search.component("line", 102.0, 0.01, 0.1)
-    assert required_gain(search, start.add(close), 1) < search.price
+    assert required_evidence(search, start.add(close), 1) < search.price
 
 
 def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:

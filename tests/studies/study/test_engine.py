@@ -210,3 +210,11 @@ def test_a_call_begins_in_another_process_if_there_are_some(tmp_path):
         assert engine.begin(only_in, None)() == os.getpid()
         with pytest.raises(ZeroDivisionError):
             engine.begin(divmod, 1, 0)
+
+
+@pytest.mark.parametrize("workers", [-1, 100])
+def test_workers_are_those_of_an_executor(tmp_path, workers):
+    """A study without one never ended with -1."""
+    study = load_small_study(tmp_path, samples="8")
+    with Workers(study, evaluate=evaluate_quickly, jobs=2, workers=workers) as engine:
+        assert (engine.at_once, engine.in_flight) == (2, 4)

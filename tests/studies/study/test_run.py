@@ -215,7 +215,7 @@ def test_files_of_others_are_not_replaced(tmp_path):
     study, folder = load_small_study(tmp_path), make_folder(tmp_path)
     for name in ("slow.fits", "results.csv", "summary.html", "summary.pdf"):
         (folder / name).write_text("mine")
-        with pytest.raises(OutputError, match=f"{name} is of no study that was begun there"):
+        with pytest.raises(OutputError, match=f"{name} is not of a study in this directory"):
             lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
         assert [path.name for path in folder.iterdir() if path.name != ".lock"] == [name]
         (folder / name).unlink()
