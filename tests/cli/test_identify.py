@@ -242,7 +242,10 @@ def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
         (("-o", "nowhere/m.yaml"), "no directory"),
         (("-o", "m.yaml", "--frame-rate-hz", "900"), "must be that of the telemetry"),
         (("-o", "m.yaml", "--columns", "a"), "takes ROLE=NAME"),
-        (("-o", "m.yaml", "--sensor-gain", "1", "2", "3"), "one number, or 2"),
+        (
+            ("-o", "m.yaml", "--sensor-gain", "1", "2", "3"),
+            "one number, or one per measurement (2)",
+        ),
         (("-o", "m.yaml", "--sensor-gain", "0"), "--sensor-gain must be"),
         (("-o", "m.yaml", "--lines-hz", "800"), "announced frequency"),
         (("-o", "m.yaml", "--lines-hz", "20", "--lines-error-hz", "-1"), "must be at least 0"),

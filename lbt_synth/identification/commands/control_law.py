@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.commands.axis_matrix import AxisMatrix, classify_matrix
 from lbt_synth.identification.commands.law_search import (
-    CAUSAL_LAGS,
     LAGS,
     LawCoefficients,
     LawShape,
@@ -43,6 +42,7 @@ _LEAKY = 0.5  # least pole of a leaky one
 _PURE = 1e-6
 _ROUNDING = 1e-12
 _AS_GOOD = 0.9
+_NEARLY = 2.0  # times the residual of a law that knows the future, which one that does not may have
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
 _COUNTS = 0.05  # of the largest weight of an axis
 FOLLOWED = 0.5  # coherence of an axis whose law counts
@@ -262,13 +262,23 @@ def _search(series: LoopSeries) -> ControlLaw:
         if found is None or regression.residual(found) > regression.most_residual():
             found = simplest_law(regression)
     law = _describe(regression, found)
-    if law.lag_frames < 0 and law.residual > _ROUGH:
-        # the sensor's response to commands that are shaken explains more than their law may: it
-        # comes later, and has the other sign; or it is only that of an axis without a law
-        causal = _describe(regression, simplest_law(regression, CAUSAL_LAGS))
-        as_good = np.max(causal.axis_coherence) > _AS_GOOD * np.max(law.axis_coherence)
-        if as_good or np.sum(causal.taps[:, 0] * law.taps[:, 0]) < 0:
-            return causal
+    return _least_anticipating(regression, law) if law.lag_frames < 0 and not law.exact else law
+
+
+def _least_anticipating(regression: Regression, law: ControlLaw) -> ControlLaw:
+    """Return the law that knows least of the future among those nearly as good as one that does.
+
+    The sensor's response to commands explains more than their law may: it comes later, and has the
+    other sign; or it is only that of an axis without a law.
+    """
+    for first in range(0, law.lag_frames, -1):
+        later = _describe(regression, simplest_law(regression, range(first, LAGS.stop)))
+        if later.kind != "none" and later.residual < _NEARLY * law.residual:
+            return later
+        if first == 0 and law.residual > _ROUGH:
+            as_good = np.max(later.axis_coherence) > _AS_GOOD * np.max(law.axis_coherence)
+            if as_good or np.sum(later.taps[:, 0] * law.taps[:, 0]) < 0:
+                return later
     return law
 
 

@@ -18,7 +18,6 @@ from lbt_synth.identification.commands.loop_series import LoopSeries
 from lbt_synth.validation import FloatArray
 
 LAGS = range(-4, 5)  # frames by which the first measurement may be late
-CAUSAL_LAGS = range(5)
 _CUTOFF = 1e-11  # of the largest singular value
 _BLOCK = 2048  # rows of a triangular factor
 _ALIKE = 3.0  # over the residual of the richest law, within which a simple one explains as much

@@ -29,6 +29,7 @@ _HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _STABLE = 1 - 1e-9  # spectral radius below which a loop has run
 _SHORT = 3  # order of a law that does not couple axes
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
+_CONTRADICTED = 60.0  # nats by which a guess is likelier than all that a law allows
 _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
@@ -87,6 +88,11 @@ def score_guesses(
     A loop that would have been unstable has not run.
     """
     surprising = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
+    best = int(np.argmin(compared.contrast))
+    if law is not None and not law.exact and surprising[best] and not surprising.all():
+        saved = np.min(compared.contrast[~surprising]) - compared.contrast[best]
+        if saved > _CONTRADICTED * compared.dispersion(best):
+            return score_guesses(compared, record, None, 0)  # it is not what computed the commands
     assert record.delay_frames is not None
     simple = np.array(
         [

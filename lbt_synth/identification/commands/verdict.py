@@ -46,6 +46,7 @@ _CLEAR_FINER = 8.0  # the same by the criterion of the fit, where a shift is of 
 _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
+_NO_UNIT = 1e12  # scale that no two units of a length or an angle have
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 
 
@@ -195,7 +196,8 @@ def explain_commands(
     one = np.ones(record.axes)
     scale = one if found is None else found.scale(coarse, law, plausible)
     no_law = law is None or law.kind == "none"
-    if found is None or (no_law and np.max(np.abs(np.log(scale))) > np.log(_ABSURD)):
+    absurd = _ABSURD if no_law else _NO_UNIT
+    if found is None or np.max(np.abs(np.log(scale))) > np.log(absurd):
         return refuse(
             explanation="they have nothing to do with the measurements, as if of another night",
             gain=np.zeros(record.axes),

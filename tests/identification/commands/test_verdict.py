@@ -29,6 +29,30 @@ def test_crowded_resonances_do_not_look_like_another_delay() -> None:
     assert verdict.accepted, verdict.explanation
 
 
+@pytest.mark.parametrize("method", ["kalman", "hinf"])
+def test_a_filter_is_known_although_its_measurements_were_rounded(method) -> None:
+    """The short law that fits anticipates, or turns an axis: it led to an unstable design."""
+    config = lbt.load_config("examples/lbt.yaml")
+    law = config.design(method, **({"gamma_ratio": 1.2} if method == "hinf" else {})).controller
+    run = lbt.simulate(law, config.truth, hardware=config.hardware, frames=16_000, seed=7)
+    y, u = run.measurements[0], run.commands[0]
+
+    def options(spacing_nm: float, shift: int = 0, sign: float = 1.0) -> str:
+        seen = np.rint(y / spacing_nm) * spacing_nm
+        moved = np.roll(u, shift, axis=0) * [1.0, sign]
+        rate = config.hardware.frame_rate_hz
+        return explain_commands(
+            lbt.identification.loop_record(
+                seen[5:-5], moved[5:-5], frame_rate_hz=rate, delay_frames=2, unit="nm"
+            )
+        ).options
+
+    assert [options(2.0), options(4.0)] == ["", ""]
+    assert options(4.0, shift=-2) == "--command-shift-frames 2"
+    assert options(4.0, shift=1) == "--command-shift-frames -1"
+    assert options(4.0, sign=-1.0) == "--command-sign 1 -1"
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_and_repaired(fault) -> None:
     wrong = wrong_record(fault)
