@@ -24,7 +24,6 @@ from .study.run import Estimate as Estimate
 from .study.run import StudyRun as StudyRun
 from .study.run import estimate_study as estimate_study
 from .study.run import run_study as run_study
-from .study.sensitivity import first_order_index as first_order_index
 from .study.statistics import ControllerStatistics as ControllerStatistics
 from .study.statistics import StudyStatistics as StudyStatistics
 from .study.statistics import study_statistics as study_statistics
@@ -32,6 +31,7 @@ from .study.study import BatchResult as BatchResult
 from .study.study import Failure as Failure
 from .study.study import Study as Study
 from .study.summary import summary_tables as summary_tables
+from .study.variance_index import first_order_index as first_order_index
 from .tradeoff import TradeoffPoint as TradeoffPoint
 from .tradeoff import tradeoff as tradeoff
 from .truth_comparison import TruthComparison as TruthComparison

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.studies.study.sensitivity import is_list
+from lbt_synth.studies.study.variance_index import is_list
 from lbt_synth.validation import FloatArray, frozen_copy
 
 _POINTS = 200  # of a cumulative distribution

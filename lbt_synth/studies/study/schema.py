@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, model_validator
 from scipy.special import ndtr, ndtri
 
 from lbt_synth.methods.method import Section
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, IntArray
 
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
 ControllerName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=100)]
@@ -140,10 +140,14 @@ class ParameterSection(Section):
         if self.uniform is not None:
             low, high = self.uniform
             return np.clip(low + level * (high - low), low, high)
-        weights = np.array(self.weights or [1.0] * len(self.values))
+        return self._pick(np.arange(len(self.values)), level)
+
+    def _pick(self, order: IntArray, level: FloatArray) -> FloatArray:
+        """Return the values of a list, in an order, below which each share of the weights lies."""
+        weights = np.array(self.weights or [1.0] * len(self.values))[order]
         shares = weights / np.max(weights)  # so that their sum cannot overflow
         bounds = np.cumsum(shares) / np.sum(shares)
-        return np.array(self.values)[np.searchsorted(bounds[:-1], level, side="right")]
+        return np.array(self.values)[order][np.searchsorted(bounds[:-1], level, side="right")]
 
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the ends, or values beyond which half a sample is expected."""
@@ -157,7 +161,10 @@ class ParameterSection(Section):
 
     def median(self) -> float:
         """Return the median."""
-        return float(self.quantile(np.array([0.5]))[0])
+        half = np.array([0.5])
+        if self.values:
+            return float(self._pick(np.argsort(self.values), half)[0])
+        return float(self.quantile(half)[0])
 
 
 class ControllerSection(Section):

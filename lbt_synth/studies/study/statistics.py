@@ -28,6 +28,7 @@ from lbt_synth.validation import FloatArray, IntArray, integer, number
 PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
 LEVELS = (0.3, 0.5, 0.7, 0.8)
 DIFFERENCES = (5.0, 25.0, 50.0, 75.0, 95.0)
+_EQUAL = 1e-6  # difference of Strehl ratios that is rounding: the accuracy of the evaluation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,7 +211,7 @@ def study_statistics(
             for each, loss in zip(found, _losses(found), strict=True)
         ),
         comparisons=tuple(_compare(first, second) for first, second in combinations(found, 2)),
-        sensitivities=sensitivities(found, values),
+        sensitivities=sensitivities(found, values, rows),
     )
 
 
@@ -275,8 +276,8 @@ def _compare(first: ControllerSamples, second: ControllerSamples) -> Comparison:
     return Comparison(
         first=first.controller,
         second=second.controller,
-        better=share(difference > 0),
-        equal=share(difference == 0),
+        better=share(difference > _EQUAL),
+        equal=share(np.abs(difference) <= _EQUAL),
         mean=mean,
         mean_error=error,
         difference=percentiles(difference, DIFFERENCES),
@@ -293,6 +294,6 @@ def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray,
 def _losses(controllers: Sequence[ControllerSamples]) -> tuple[Loss, ...]:
     """Return the loss of each controller against the best one of each sample."""
     return tuple(
-        Loss(best=share(loss == 0), loss=percentiles(loss, (50.0, 95.0, 99.0)))
+        Loss(best=share(loss <= _EQUAL), loss=percentiles(loss, (50.0, 95.0, 99.0)))
         for loss in sample_losses(controllers)
     )

@@ -41,3 +41,9 @@ def test_distributions(tmp_path):
     assert edge.round(6).tolist() == [20.0]
     huge = ParameterSection.model_validate({"list": [1.0, 2.0, 3.0], "weights": weights})
     assert huge.quantile(np.array([0.1, 0.5, 0.9])).tolist() == [1, 2, 3]
+
+
+def test_the_median_of_a_list_does_not_depend_on_its_order() -> None:
+    read = ParameterSection.model_validate
+    assert read({"list": [30.0, 10.0, 20.0]}).median() == 20
+    assert read({"list": [30.0, 10.0, 20.0], "weights": [5.0, 1.0, 1.0]}).median() == 30

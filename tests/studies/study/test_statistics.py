@@ -137,3 +137,15 @@ def test_columns_that_cannot_be_are_refused(small, change, error, says):
 def test_arguments_that_cannot_be_are_refused(small, arguments, options, says):
     with pytest.raises(lbt.errors.ProblemError, match=says):
         lbt.studies.study_statistics(small, *arguments, **options)
+
+
+def test_rounding_is_neither_better_nor_worse() -> None:
+    """The table of results has 9 digits, and the same filter by two routes differs below them."""
+    strehl = np.random.default_rng(0).random(200)
+    columns = make_columns({}, {"a": strehl, "b": strehl + 1e-8, "c": strehl + 1e-4})
+    found = lbt.studies.study_statistics(columns, [], ["a", "b", "c"])
+    first = found.comparisons[0]
+    assert (first.better.count, first.equal.count) == (0, 200)
+    assert [each.loss.best.count for each in found.controllers] == [0, 0, 200]
+    both = lbt.studies.study_statistics(columns, [], ["a", "b"])
+    assert [each.loss.best.count for each in both.controllers] == [200, 200]
