@@ -101,7 +101,7 @@ def imaging_wavelength_um(arguments: Namespace, record: LoopRecord | SpectrumRec
     known = record.imaging_wavelength_um if isinstance(record, LoopRecord) else None
     for value in (arguments.wavelength_um, known):
         if value is not None:
-            return float(value)
+            return Imaging(wavelength_um=value).wavelength_um
     return Imaging().wavelength_um
 
 

@@ -247,7 +247,8 @@ def read_mapping(source: Path) -> dict[str, Any]:
     except FileError as error:
         raise ConfigError(str(error)) from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{source} is not a text file: {error.reason}.") from error
+        where = f"{error.reason} at byte {error.start}"
+        raise ConfigError(f"{source} is no text in UTF-8: {where}.") from error
     try:
         raw = _load_yaml(text)
     except Exception as error:  # the parsers of YAML raise whatever they like

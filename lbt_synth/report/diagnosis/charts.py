@@ -34,7 +34,9 @@ def residual_charts(found: Diagnosis) -> list[Chart]:
             Bars(name="model", values=np.array([row.model_nm for row in rows]), look=1),
         )
         names = [row.name for row in rows]
-        said = [f"{row.name} {nm_text(row.replayed_nm, '.1f')}" for row in rows]
+        shown = np.where(np.isfinite(values), values, [row.model_nm for row in rows])
+        pairs = zip(names, shown.tolist(), strict=True)  # the limit has no data
+        said = [f"{name} {nm_text(value_nm, '.1f')}" for name, value_nm in pairs]
         charts.append(chart("residuals", [_bar_panel(bars, names)], values=listing_text(said)))
     if costs := found.costs:
         columns = {"loop that ran": "running_nm", "best design": "best_nm"}

@@ -32,6 +32,7 @@ def test_sections_and_charts(page):
     assert [chart.key for chart in page.charts] == ["residuals", "costs", "identification"]
     residuals, costs, spectra = page.charts
     (bars, promised) = residuals.panels[0].select(Bars)
+    assert all("nan nm" not in chart.alt for chart in page.charts)
     rows = line_diagnosis().residuals
     np.testing.assert_allclose(bars.values, [row.replayed_nm for row in rows])
     np.testing.assert_allclose(promised.values, [row.model_nm for row in rows])
