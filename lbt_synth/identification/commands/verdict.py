@@ -47,6 +47,7 @@ _PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _NO_UNIT = 1e12  # scale that no two units of a length or an angle have
+_NOT_SHOWN = 3.0  # factor beyond plausible gains
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 
 
@@ -68,7 +69,8 @@ class CommandVerdict:
         Logarithm of the likelihood of the explanation over that of the record as given; 0 where
         the control law alone decides.
     gain : (axes,) ndarray
-        Coarse sensor gain of the explanation.
+        Coarse sensor gain of the explanation; nan where it is far from any plausible one, because
+        the coarse spectrum does not show it.
     law : ControlLaw or None
         The control law of the record; None where too few frames show it.
     notes : tuple of str
@@ -213,13 +215,15 @@ def explain_commands(
         words.append(steps)
     rounded = note_steps(coarse, dilution) if sensor_gain is None else ()
     repair = replace(repair, shift_frames=repair.shift_frames or early, scale=tuple(scale))
+    gain, (low, high) = found.gain / scale, plausible
+    gain = np.where((gain > low / _NOT_SHOWN) & (gain < high * _NOT_SHOWN), gain, np.nan)
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
         accepted=not words,
         repair=repair if repair.options else None,
         delay_frames=other_delay,
         nats=max(found.nats, 0.0),
-        gain=frozen_copy(found.gain / scale),
+        gain=frozen_copy(gain),
         law=law,
         notes=() if words else (*_notes(found, delay, lag), *rounded),
     )
