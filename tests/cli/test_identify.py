@@ -262,7 +262,7 @@ def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
             "must say how accelerometers move",
         ),
         (("-o", "m.yaml", "--most-lines", "-1"), "--most-lines must be"),
-        (("-o", "m.yaml", "--wavelength-um", "0"), "wavelength_um"),
+        (("-o", "m.yaml", "--wavelength-um", "0"), "--wavelength-um must be above 0"),
         (("-o", "m.yaml", "--kind", "spectrum"), "kind"),
     ],
 )
