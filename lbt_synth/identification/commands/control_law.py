@@ -268,8 +268,7 @@ def _search(series: LoopSeries) -> ControlLaw:
 def _least_anticipating(regression: Regression, law: ControlLaw) -> ControlLaw:
     """Return the law that knows least of the future among those nearly as good as one that does.
 
-    The sensor's response to commands explains more than their law may: it comes later, and has the
-    other sign; or it is only that of an axis without a law.
+    The sensor's answer to commands may explain more: it comes later, with the other sign.
     """
     for first in range(0, law.lag_frames, -1):
         later = _describe(regression, simplest_law(regression, range(first, LAGS.stop)))

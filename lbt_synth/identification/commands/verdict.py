@@ -168,9 +168,7 @@ def explain_commands(
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     known = None if sensor_gain is None else record.known_gains(sensor_gain)
-    plausible = PLAUSIBLE_GAINS
-    if known is not None:
-        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
+    plausible = _plausible(known)
     law, nothing = _find_law(record), np.full(record.axes, np.nan)
     moves = moving_axes(record)
     if moves.any() and not moves.all():
@@ -215,18 +213,29 @@ def explain_commands(
         words.append(steps)
     rounded = note_steps(coarse, dilution) if sensor_gain is None else ()
     repair = replace(repair, shift_frames=repair.shift_frames or early, scale=tuple(scale))
-    gain, (low, high) = found.gain / scale, plausible
-    gain = np.where((gain > low / _NOT_SHOWN) & (gain < high * _NOT_SHOWN), gain, np.nan)
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
         accepted=not words,
         repair=repair if repair.options else None,
         delay_frames=other_delay,
         nats=max(found.nats, 0.0),
-        gain=frozen_copy(gain),
+        gain=_shown_gain(found.gain / scale, plausible),
         law=law,
         notes=() if words else (*_notes(found, delay, lag), *rounded),
     )
+
+
+def _plausible(known: FloatArray | None) -> tuple[float, float]:
+    """Return the least and the largest gain that a sensor may have."""
+    if known is None:
+        return PLAUSIBLE_GAINS
+    return float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
+
+
+def _shown_gain(gain: FloatArray, plausible: tuple[float, float]) -> FloatArray:
+    """Return gains, nan where the coarse spectrum shows none."""
+    low, high = plausible[0] / _NOT_SHOWN, plausible[1] * _NOT_SHOWN
+    return frozen_copy(np.where((gain > low) & (gain < high), gain, np.nan))
 
 
 def _explain_moving(

@@ -129,13 +129,7 @@ def identify(
         "most_lines": most_lines,
     }
     if isinstance(record, SpectrumRecord):
-        for name, value in (
-            ("sensor_gain", sensor_gain),
-            ("stretches", stretches),
-            ("start", start),
-        ):
-            if value is not None:
-                raise ProblemError(f"{name} is for series of a loop; a spectrum is of the phase.")
+        _refuse_of_series(sensor_gain=sensor_gain, stretches=stretches, start=start)
         return _identify_spectra(record, frame_rate_hz, delay_frames, options)
     require_instance(record, LoopRecord)
     _check_record(record, frame_rate_hz, delay_frames, start)
@@ -181,6 +175,13 @@ def identify(
         notes=tuple(notes),
     )
     return describe_drifts(model, record.pseudo_open_loop(model.sensor_gains), cut)
+
+
+def _refuse_of_series(**options: object) -> None:
+    """Refuse options with a spectrum that only series have."""
+    for name, value in options.items():
+        if value is not None:
+            raise ProblemError(f"{name} is for series of a loop; a spectrum is of the phase.")
 
 
 def _fit_axes(
