@@ -42,8 +42,9 @@ def run(arguments: Namespace) -> Report:
 
 def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
-    found, statistics, new, drawn = _compute(loaded, folder, pages, arguments)
-    files = {found.results: new, found.failed: new} | dict.fromkeys(pages, drawn)
+    draws = not all(path.exists() for path in pages)
+    found, statistics, new = _compute(loaded, folder, pages, arguments, draws=draws)
+    files = {found.results: new, found.failed: new} | dict.fromkeys(pages, new or draws)
     varying = [p.name for p in loaded.parameters if p.distribution.varies]
     worst = [worst_table(each, varying) for each in statistics.controllers]
     done = f"{folder} is finished: {found.samples} samples in {found.results.name}; none computed."
@@ -76,18 +77,25 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
 
 
 def _compute(
-    loaded: studies.Study, folder: Path, files: Sequence[Path], arguments: Namespace
-) -> tuple[studies.StudyRun, studies.StudyStatistics, bool, bool]:
-    """Run a study and draw its page where it must; return also if there was anything to do."""
-    found: list[tuple[studies.StudyStatistics, bool, bool]] = []
+    loaded: studies.Study,
+    folder: Path,
+    files: Sequence[Path],
+    arguments: Namespace,
+    *,
+    draws: bool,
+) -> tuple[studies.StudyRun, studies.StudyStatistics, bool]:
+    """Run a study; return also whether anything was left to compute.
+
+    Its page is written where something was, or where it ``draws`` in any case.
+    """
+    found: list[tuple[studies.StudyStatistics, bool]] = []
     page, *pdf = files
     names = [controller.name for controller in loaded.controllers]
 
     def summarise(results: FinishedStudy) -> None:
         statistics = studies.study_statistics(results.columns, loaded.parameter_names, names)
-        draws = results.new or not all(path.exists() for path in files)
-        found.append((statistics, results.new, draws))
-        if draws:
+        found.append((statistics, results.new))
+        if results.new or draws:
             failures = [
                 studies.Failure(row=row, controller=name, error=error)
                 for row, name, error in read_failures(folder)
@@ -121,8 +129,8 @@ def _compute(
                 note = f"what is finished is kept in {folder}; start it again to continue"
                 print_error(note)
                 raise
-    [(statistics, new, drawn)] = found
-    return study_run, statistics, new, drawn
+    [(statistics, new)] = found
+    return study_run, statistics, new
 
 
 def _duration(seconds: float) -> str:

@@ -366,6 +366,7 @@ def coherence_credit(
 ) -> float:
     """Return what the coherence of two axes adds to the contrast, at most 0.
 
+    Their transforms are (segments, f) each.
     A line along a diagonal is in both axes; a guess that removes it from one of them must not
     count as an explanation. What shakes along a direction has no phase between the axes; the
     coupling that a wrong guess leaves has one, and no credit.

@@ -312,9 +312,8 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
         compared = compared.join(coarse.compare(guesses[-1:]))
     score, surprising = score_guesses(compared, record, law, lag)
     best = int(np.argmin(score))
-    expected = np.flatnonzero(
-        ~surprising
-    )  # what the law asks for, which the coarse spectrum may miss
+    # what the law asks for, which the coarse spectrum may miss
+    expected = np.flatnonzero(~surprising)
     if surprising[[0, best]].all() and expected.size:
         other = int(expected[np.argmin(score[expected])])
         saving = finer_saving(coarse, guesses[other], clear=_CLEAR_FINER, decides=True)

@@ -202,9 +202,8 @@ def derivatives(
     model = held + each.sum(axis=0)
     ratio = data.power(gain) / model
     root = np.sqrt(count)
-    rows = log_slopes(
-        each, slopes, by_shape, model / root
-    )  # weighted by how often each value counts
+    # weighted by how often each value counts
+    rows = log_slopes(each, slopes, by_shape, model / root)
     gradient = rows @ (root * (1 - ratio))
     information = rows @ rows.T
     # the gain changes the data, not the model

@@ -42,10 +42,13 @@ class ConditionalCurve:
     discrete: bool  # whether the groups are the values of a list
 
     def swing(self) -> tuple[float, float]:
-        """Return the range of the mean over the middle 90 % of samples, and its error."""
+        """Return the range of the mean over the middle 90 % of samples, and its error.
+
+        Of a list over all values, but for those that hardly any sample has.
+        """
         end = np.cumsum(self.samples)
         centre = (end - self.samples / 2) / end[-1]
-        if self.discrete:  # without the values that hardly any sample has
+        if self.discrete:
             inside = self.samples >= max(2.0, _RARE * end[-1])
         else:
             inside = (centre >= _MIDDLE[0]) & (centre <= _MIDDLE[1])
@@ -109,7 +112,8 @@ def sensitivities(
 
     The samples may stand in any order; ``rows`` (n,) are their numbers in the study.
     """
-    orders = {name: _rising_order(values, rows) for name, values in parameters.items()}
+    by_row = np.argsort(rows, kind="stable")
+    orders = {name: _rising_order(values, by_row) for name, values in parameters.items()}
     return tuple(
         ControllerSensitivity(
             controller=each.controller,
@@ -123,7 +127,7 @@ def sensitivities(
     )
 
 
-def _rising_order(values: FloatArray, rows: IntArray) -> IntArray:
+def _rising_order(values: FloatArray, by_row: IntArray) -> IntArray:
     """Return what sorts values, (n,), with equal ones of a list in the order of their rows.
 
     Those of other parameters come in an order that has nothing to do with their samples.
@@ -132,10 +136,9 @@ def _rising_order(values: FloatArray, rows: IntArray) -> IntArray:
     ordered = values[order]
     if np.all(np.diff(ordered) > 0):
         return order
-    place = np.argsort(np.argsort(rows, kind="stable"))
     if not is_list(ordered):
-        place = np.random.default_rng(0).permutation(len(values))[place]
-    return np.lexsort((place, values))
+        by_row = by_row[np.random.default_rng(0).permutation(len(values))]
+    return by_row[np.argsort(values[by_row], kind="stable")]
 
 
 def _sensitivity(

@@ -58,12 +58,17 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
     ordered : (n,) ndarray
         The parameter's samples in rising order.
     result : (n,) ndarray
-        The results, in the same order.
+        The results, in the same order; those of one value of a list in the order of the samples.
 
     Returns
     -------
     VarianceIndex
         The index.
+
+    Raises
+    ------
+    ProblemError
+        If a result is not finite.
 
     Notes
     -----
@@ -76,9 +81,10 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
     subtracted (T. L. Kelley, Proc. Natl. Acad. Sci. 21, 554 (1935), doi:10.1073/pnas.21.9.554,
     for means). ``s^2`` is the scatter about the fit for independent samples. Samples of a
     Sobol sequence or a Latin hypercube scatter less about the mean of an interval: there
-    the jumps between neighbouring lines, of variance ``8 s^2 B / n``, tell how much. Where two
-    lines fit an interval clearly better than one (by an F-test), it is parted in two: a loop that
-    becomes unstable beyond some value of x leaves an edge.
+    the jumps between neighbouring lines, of variance ``8 s^2 B / n``, tell how much, and of a list
+    the means of the two halves of each value. Where two lines fit an interval clearly better than
+    one (by an F-test, without the sample farthest from one line, too), it is parted in two: a loop
+    that becomes unstable beyond some value of x leaves an edge.
 
     Examples
     --------
@@ -161,31 +167,32 @@ def _edges(values: FloatArray, starts: IntArray) -> IntArray:
     for start, group in zip(starts, np.split(values, starts[1:]), strict=True):
         m = len(group)
         least = max(_FEWEST_OF_LINE, m // 32)
-        both, _ = _two_lines(group)
-        inside = both[least : m - least + 1]
+        squares = _split_squares(group)
+        inside = squares[least : m - least + 1]
         if inside.size == 0:
             continue
         best = least + int(np.argmin(inside))
-        if not _is_clear(group, best):
+        if not _is_clear(group, squares, best):
             continue
         one, _ = _lines(group, np.zeros(1, dtype=np.int64))
         farthest = int(np.argmax(np.abs(group - one)))  # a single one makes no edge
-        if _is_clear(np.delete(group, farthest), best - (farthest < best)):
+        rest = np.delete(group, farthest)
+        if _is_clear(rest, _split_squares(rest), best - (farthest < best)):
             edges.append(int(start) + best)
     return np.array(edges, dtype=np.int64)
 
 
-def _two_lines(group: FloatArray) -> tuple[FloatArray, float]:
-    """Return the squares about two lines that meet before sample k, (m + 1,), and about one."""
+def _split_squares(group: FloatArray) -> FloatArray:
+    """Return the squares about two lines that meet before sample k, of one at the end, (m + 1,)."""
     before, after = _line_squares(group), _line_squares(group[::-1])[::-1]
-    return np.append(0.0, before) + np.append(after, 0.0), float(before[-1])
+    squares: FloatArray = np.append(0.0, before) + np.append(after, 0.0)
+    return squares
 
 
-def _is_clear(group: FloatArray, split: int) -> bool:
+def _is_clear(group: FloatArray, squares: FloatArray, split: int) -> bool:
     """Whether two lines that meet before a sample fit a group clearly better than one."""
-    both, one = _two_lines(group)
-    gained = one - float(both[split])
-    enough = gained * (len(group) - 4) > 2 * _CLEAR * both[split]
+    gained = float(squares[-1] - squares[split])
+    enough = gained * (len(group) - 4) > 2 * _CLEAR * squares[split]
     return bool(enough and gained > _ROUNDING * float(group @ group))
 
 
