@@ -265,8 +265,8 @@ def auto(parser: ArgumentParser) -> None:
         "frames after its training"
     )
     add_option(parser, "--method", record_methods(), text)
-    text = "norm as a multiple of the least norm, for methods with a bound"
-    add_option(parser, "--gamma-ratio", float, text, 1.2)
+    text = "norm as a multiple of the least norm, for methods with a bound (default 1.2)"
+    add_option(parser, "--gamma-ratio", float, text)
     add_option(parser, "--model", str, "configuration to write (default: the output's name, .yaml)")
     add_output(parser, GAIN_FILE)
 

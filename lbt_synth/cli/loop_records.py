@@ -43,6 +43,7 @@ from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
+from lbt_synth.validation import number
 
 if TYPE_CHECKING:  # as in command_repairs
     from lbt_synth.identification.auto import RecordedDesign
@@ -144,7 +145,9 @@ def _expected_lines(
     """Return lines known beforehand, from the arguments, a file, and accelerometers."""
     lines: list[LinePrior] = []
     if arguments.lines_hz is not None:
-        lines += load_lines([(f, arguments.lines_error_hz) for f in arguments.lines_hz])
+        error = number(arguments.lines_error_hz, "lines_error_hz", above=0)
+        frequencies = [number(each, "lines_hz", above=0) for each in arguments.lines_hz]
+        lines += load_lines([(each, error) for each in frequencies])
     if arguments.lines_file is not None:
         lines += load_lines(arguments.lines_file)
     if arguments.accelerometers is None:

@@ -30,11 +30,10 @@ from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.registry import gain_robust_method, method_named, record_methods
-from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.methods.request import PlantInputs, design_request, option_owners
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import choice, number, require_instance
+from lbt_synth.validation import choice, require_instance
 
-_GAMMA_RATIO = 1.2
 _APART = 3.0  # standard errors between gains that disagree
 LEAST_SECONDS = 8.0  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
@@ -89,7 +88,7 @@ def design_from_record(
     record: LoopRecord,
     *,
     method: str | None = None,
-    gamma_ratio: float = _GAMMA_RATIO,
+    gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
     assumed_gain: float = 1.0,
     announced: Sequence[LinePrior] = (),
@@ -119,7 +118,7 @@ def design_from_record(
     method : str, optional
         Method of synthesis that needs no more than a plant; chosen by default.
     gamma_ratio : float, optional
-        For methods with a bound: the norm as a multiple of the least one.
+        For methods with a bound: the norm as a multiple of the least one; 1.2 by default.
     sensor_gain, assumed_gain, announced
         As for :func:`identify`.
     imaging : Imaging, optional
@@ -170,7 +169,8 @@ def design_from_record(
     >>> bool(table[made.name].replayed_nm < 0.5 * table["what ran"].replayed_nm)
     True
     """
-    usable = _require_able(record, method, gamma_ratio)
+    defaults = {} if gamma_ratio is None else {"gamma_ratio": gamma_ratio}
+    usable = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
@@ -178,7 +178,7 @@ def design_from_record(
     first, _ = split_halves(record.stretches(), record.frames)
     half, allowed = identify_with_gains(record, stretches=first, **options)
     fit_model = partial(identify_likeliest, record, allowed=allowed, **options)
-    design = partial(_design, gamma_ratio=gamma_ratio)
+    design = partial(_design, defaults=defaults)
     if allowed is not None:
         assumptions += _judge_gains(record, half, accept_record)
     found = None
@@ -255,23 +255,19 @@ def _design(
     model: IdentifiedModel,
     options: Mapping[str, Any] = MappingProxyType({}),
     *,
-    gamma_ratio: float,
+    defaults: Mapping[str, Any],
 ) -> Design:
-    inputs = PlantInputs(plant=model.plant(), design_defaults={"gamma_ratio": gamma_ratio})
+    inputs = PlantInputs(plant=model.plant(), design_defaults=defaults)
     return design_request(method, options).build(inputs)
 
 
-def _require_able(record: LoopRecord, method: str | None, gamma_ratio: float) -> float:
-    """Return the usable seconds of a record; refuse it, a method or a ratio that cannot be."""
+def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> float:
+    """Return the usable seconds of a record; refuse it, or a method and options that cannot be."""
     require_instance(record, LoopRecord)
     if method is not None:
         choice(method, "method", record_methods())
-    number(
-        gamma_ratio,
-        "gamma_ratio",
-        at_least=1,
-        hint="At 1 the bound is the least one; far above it the filter is the Kalman filter.",
-    )
+    for option in defaults:  # refuses what the method does not take
+        design_request(method or option_owners(option)[0], defaults)
     _ = record.hardware  # refuses a record without a delay
     return require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
 

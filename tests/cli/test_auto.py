@@ -118,6 +118,12 @@ def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
 def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
     for options, words in (
         (("-o", tmp_path / "t.fits", "--gamma-ratio", 0.5), "--gamma-ratio must be at least 1"),
+        (
+            ("-o", tmp_path / "t.fits", "--method", "kalman", "--gamma-ratio", 1.1),
+            "--gamma-ratio goes with method hinf or mixed; got method kalman",
+        ),
+        (("-o", tmp_path / "t.fits", "--lines-hz", "nan"), "--lines-hz must be finite; got nan"),
+        (("-o", tmp_path / "t.fits", "--lines-hz", 12, "-5"), "--lines-hz must be above 0; got -5"),
         (("-o", tmp_path / "t.txt"), "must end in"),
         (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.fits"), "must end in .yaml"),
         (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.json"), "must end in .yaml"),

@@ -14,13 +14,11 @@ from lbt_synth.methods.registry import all_methods, reference_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import TipTiltPlant
 
-_GAMMA_RATIO = 1.2
-
 
 def candidate_designs(model: IdentifiedModel) -> dict[str, Callable[[], Design]]:
     """Return what builds each candidate for a model, by the name of its row."""
     plant = model.plant()
-    inputs = PlantInputs(plant=plant, design_defaults={"gamma_ratio": _GAMMA_RATIO})
+    inputs = PlantInputs(plant=plant)
     with_bands = [each for each in all_methods().values() if each.plant_section is not None]
     builders: dict[str, Callable[[], Design]] = {
         method.title: partial(design_request(method.name, {}).build, inputs)
