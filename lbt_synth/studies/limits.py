@@ -49,7 +49,8 @@ class LimitRow:
         "above the limit",
         unit="%",
         format=".2f",
-        help="Residual over the limit, less 1; nan where there is no limit, or it is 0",
+        help="Residual over the limit, less 1; nan where there is no limit, it is 0, or the design "
+        "reads other sensors, which the limit does not",
     )
     worst_nm: float = nm_column(
         "worst residual",
@@ -60,7 +61,7 @@ class LimitRow:
         "above the band limit",
         unit="%",
         format=".2f",
-        help="The same over the limit for the band, less 1; nan where there is none",
+        help="The same over the limit for the band, less 1; nan likewise",
     )
     phase_margin_deg: float = column(
         "phase margin",
@@ -177,15 +178,16 @@ def limits(
         loop = design.close(hardware, sensor_gain=truth.sensor_gain)
         residual_nm, ratio, curve = _evaluate_loop(loop, truth, imaging, shifts)
         worst_nm = float(np.max(curve)) if shifts.size else residual_nm
+        limit_nm, band_nm = (_limit_nm(loop, found) for found in (limit, band))
         rows.append(
             LimitRow(
                 design=name,
                 method=design.method,
                 residual_nm=residual_nm,
                 strehl=ratio,
-                above_limit_percent=above_percent(residual_nm, limit.rms_nm if limit else np.nan),
+                above_limit_percent=above_percent(residual_nm, limit_nm),
                 worst_nm=worst_nm,
-                above_band_limit_percent=above_percent(worst_nm, band.rms_nm if band else np.nan),
+                above_band_limit_percent=above_percent(worst_nm, band_nm),
                 phase_margin_deg=_phase_margin_deg(loop),
                 stable=loop.is_stable,
             )
@@ -201,6 +203,11 @@ def limits(
         residual_nm=frozen_copy(curves),
         frequency_hz=frequencies.pop() if len(frequencies) == 1 else None,
     )
+
+
+def _limit_nm(loop: AnyLoop, limit: ResidualLimit | BandLimit | None) -> float:
+    """Return a limit of the loop's own sensor; nan where a loop reads others, or there is none."""
+    return limit.rms_nm if limit is not None and isinstance(loop, ClosedLoop) else np.nan
 
 
 def _phase_margin_deg(loop: AnyLoop) -> float:

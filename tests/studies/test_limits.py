@@ -47,6 +47,15 @@ def test_study_of_an_unstable_design(config):
     lbt.report.figures.limits_figure(study)
 
 
+def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(fused, fused_config):
+    loop = (fused_config.hardware, fused_config.truth, fused_config.imaging)
+    designs = {"fused": fused, "own": fused_config.design("integrator")}
+    several, own = lbt.studies.limits(designs, *loop).rows
+    assert several.stable
+    assert np.isnan(several.above_limit_percent)
+    assert own.above_limit_percent > 0
+
+
 def test_bad_studies(config):
     good = (config.hardware, config.truth, config.imaging)
     with pytest.raises(lbt.errors.ProblemError, match="at least one design"):
