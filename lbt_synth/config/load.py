@@ -257,7 +257,8 @@ def read_mapping(source: Path) -> dict[str, Any]:
         problem = getattr(error, "problem", None) or error_reason(error)
         raise ConfigError(f"{source} is not valid YAML{where}: {problem}.") from error
     if not isinstance(raw, dict):
-        raise ConfigError(f"{source} must hold a mapping of sections; got {type(raw).__name__}.")
+        got = "nothing" if raw is None else f"a {type(raw).__name__}"
+        raise ConfigError(f"{source} must hold sections, each with its keys; got {got}.")
     return raw
 
 

@@ -104,8 +104,8 @@ def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        ("", "must hold a mapping"),
-        ("- 1\n- 2\n", "must hold a mapping"),
+        ("", "must hold sections, each with its keys; got nothing"),
+        ("- 1\n- 2\n", "must hold sections, each with its keys; got a list"),
         ("a: [1, 2\n", "not valid YAML"),
         ("version: 1\nversion: 1\n", "duplicate key"),
         ("a: !!python/object:os.system x\n", "not valid YAML"),

@@ -42,10 +42,11 @@ def select_series(
 ) -> Series:
     """Choose the columns of a record, and note which."""
     there, notes = contents.columns, contents.notes
+    notes += [f"{why}; it was left out" for why in contents.left_out]
     if not there:
-        raise ProblemError("the file holds no series of numbers.")
+        raise ProblemError(f"the file holds no series of numbers{_left_out(contents)}.")
     found = _assign_roles(there, columns) or _assign_by_kind(there, kind, notes)
-    kind = _find_kind(found, there) if kind is None else kind
+    kind = _find_kind(found, contents) if kind is None else kind
     if kind == "open_loop" and "open_loop" not in found and "measurements" in found:
         found["open_loop"] = found["measurements"]
     role = _series_role(found, kind)
@@ -53,7 +54,7 @@ def select_series(
         needed = [role for role in (_SERIES[kind][0], _BESIDE.get(kind)) if role is not None]
         raise ProblemError(
             f"a record of kind {kind} needs columns of {' and '.join(needed)}"
-            + _how_to_choose(there, *needed)
+            + _how_to_choose(contents, *needed)
         )
     clocks = () if kind == "spectrum" else CLOCKS
     chosen = {
@@ -135,7 +136,7 @@ def _assign_by_kind(columns: Sequence[Column], kind: str | None, notes: list[str
     return {}
 
 
-def _find_kind(found: Roles, columns: Sequence[Column]) -> str:
+def _find_kind(found: Roles, contents: Contents) -> str:
     """Return the kind of record that the names tell."""
     kinds = [kind for kind in KINDS if _series_role(found, kind) is not None]
     if len(kinds) == 1:
@@ -150,7 +151,7 @@ def _find_kind(found: Roles, columns: Sequence[Column]) -> str:
         )
     raise ProblemError(
         "names do not tell what the columns are"
-        + _how_to_choose(columns, "measurements", "commands")
+        + _how_to_choose(contents, "measurements", "commands")
         + " Or say what kind the record is."
     )
 
@@ -207,6 +208,14 @@ def join_names(columns: Sequence[Column]) -> str:
     return ", ".join(each.name or "a column without a name" for each in columns)
 
 
-def _how_to_choose(columns: Sequence[Column], *roles: str) -> str:
+def _left_out(contents: Contents) -> str:
+    """Return which arrays were left out, and why, to go on in a sentence."""
+    return f" ({'; '.join(contents.left_out)})" if contents.left_out else ""
+
+
+def _how_to_choose(contents: Contents, *roles: str) -> str:
     wanted = ", ".join(f"'{role}': ..." for role in roles)
-    return f"; got {join_names(columns)}. Choose by columns={{{wanted}}}, names or numbers from 0."
+    return (
+        f"; got {join_names(contents.columns)}{_left_out(contents)}. Choose by "
+        f"columns={{{wanted}}}, names or numbers from 0."
+    )

@@ -45,6 +45,7 @@ class Contents:
     # frame rate, delay and the like: values by the places that give them
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)  # arrays that are no series, and why
 
     def add_fact(self, fact: str, value: Any, where: str) -> None:
         """Add a unit, or a number that may be written as a text; note what is none."""
@@ -61,9 +62,9 @@ class Contents:
         said = name or "an array"
         table = np.atleast_1d(np.squeeze(values))
         if values.dtype.kind not in "fiub" or values.size == 0:
-            self.notes.append(f"{said} holds no real numbers and was left out")
+            self.left_out.append(f"{said} holds no real numbers")
         elif table.ndim > 2:
-            self.notes.append(f"{said} has {table.ndim} dimensions; it was left out")
+            self.left_out.append(f"{said} has {table.ndim} dimensions")
         elif table.ndim == 1:
             self.columns.append(parse_column(name, table.astype(np.float64), unit=unit))
         else:

@@ -61,6 +61,20 @@ def test_measurements_alone_are_not_taken_for_an_open_loop(tmp_path, series):
         lbt.load_record(path, frame_rate_hz=RATE)
 
 
+@pytest.mark.parametrize("strange", [1j, "text"])
+def test_an_array_that_holds_no_numbers_is_named(tmp_path, series, strange):
+    y, u = series
+    np.savez(tmp_path / "a.npz", measurements=np.full(y.shape, strange), commands=u, pol_nm=y)
+    with pytest.raises(
+        lbt.errors.ProblemError,
+        match=r"needs columns of measurements and commands; got .*"
+        r"\(measurements holds no real numbers\)\. Choose by",
+    ):
+        lbt.load_record(tmp_path / "a.npz", kind="closed_loop", frame_rate_hz=RATE, unit="nm")
+    seen = lbt.load_record(tmp_path / "a.npz", kind="open_loop", frame_rate_hz=RATE, unit="nm")
+    assert "measurements holds no real numbers; it was left out" in seen.health.notes
+
+
 def test_open_loop_and_commands(tmp_path, series):
     y, u = series
     path = write_csv(tmp_path / "a.csv", ["y_nm", "u_nm"], [y[:, 0], u[:, 0]])
