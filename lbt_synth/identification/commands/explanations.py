@@ -64,6 +64,8 @@ def _snap(angle_deg: float, mirrored: bool, law: ControlLaw | None) -> float:
     if law is not None and law.axis_matrix.kind not in ("zero", "general"):
         left, _, right = np.linalg.svd(law.gain)
         its_angle, its_mirror = _angle_deg((left @ right).T)
+        if law.axis_matrix.kind in ("diagonal", "swapped"):  # what couples the axes is noise
+            its_angle = 90.0 * round(its_angle / 90)
         if its_mirror == mirrored and _distance_deg(angle_deg, its_angle) < _LAW_DEG:
             near = [its_angle]
     nearest = min(near, key=lambda other: _distance_deg(angle_deg, other))

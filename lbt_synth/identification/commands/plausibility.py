@@ -87,7 +87,9 @@ def score_guesses(
 
     A loop that would have been unstable has not run.
     """
-    surprising = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
+    unusual = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
+    possible = _could_have_run(compared, record, law)
+    surprising = unusual | ~possible
     best = int(np.argmin(compared.contrast))
     if law is not None and not law.exact and surprising[best] and not surprising.all():
         saved = np.min(compared.contrast[~surprising]) - compared.contrast[best]
@@ -101,19 +103,8 @@ def score_guesses(
         ]
     )
     simple[0] = True
-    score = compared.contrast + _UNUSUAL * surprising + _GENERAL * ~simple
-    if law is not None and law.is_sure:
-        ones = np.ones((1, record.axes))
-        each = zip(compared.guesses, compared.gain.T, strict=True)
-        possible = np.array(
-            [
-                could_have_run(guess, np.vstack([gain, 0.3 * gain, *_TRIED * ones]), record, law)
-                for guess, gain in each
-            ]
-        )
-        if possible.any():
-            score = np.where(possible, score, np.inf)
-            surprising |= ~possible
+    score = compared.contrast + _UNUSUAL * unusual + _GENERAL * ~simple
+    score[~possible] = np.inf
     if surprising[0] and not surprising.all():  # the law says what is wrong
         score[1:][surprising[1:]] = np.inf
         away = abs(np.log(compared.gain / np.clip(compared.gain, *PLAUSIBLE_GAINS))).max(axis=0)
@@ -122,6 +113,22 @@ def score_guesses(
         if nearest < (_NEAR if memoryless else _NEARER * away[0]):  # and so does the sensor
             score[0] = np.inf
     return score, surprising
+
+
+def _could_have_run(compared: Comparison, record: LoopRecord, law: ControlLaw | None) -> BoolArray:
+    """Return which guesses make loops that have run; all where no law tells."""
+    every = np.ones(len(compared.guesses), dtype=np.bool_)
+    if law is None or not law.is_sure:
+        return every
+    tried = _TRIED * np.ones(record.axes)
+    each = zip(compared.guesses, compared.gain.T, strict=True)
+    possible = np.array(
+        [
+            could_have_run(guess, np.vstack([gain, 0.3 * gain, *tried]), record, law)
+            for guess, gain in each
+        ]
+    )
+    return possible if possible.any() else every
 
 
 def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:

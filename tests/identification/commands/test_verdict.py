@@ -51,6 +51,10 @@ def test_a_filter_is_known_although_its_measurements_were_rounded(method) -> Non
     assert options(4.0, shift=-2) == "--command-shift-frames 2"
     assert options(4.0, shift=1) == "--command-shift-frames -1"
     assert options(4.0, sign=-1.0) == "--command-sign 1 -1"
+    if method == "kalman":  # accepted, or with nothing to do with the measurements
+        assert options(2.0, shift=1) == "--command-shift-frames -1"
+    else:  # mirrored and rotated by some degrees
+        assert options(2.0, sign=-1.0) == "--command-sign 1 -1"
 
 
 @pytest.mark.parametrize("fault", FAULTS)
