@@ -19,8 +19,6 @@ from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fill_row
 
-_MOST_DEVIATIONS = 4.0  # standard errors between data and model that need no warning
-
 
 def run(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
@@ -100,7 +98,7 @@ def _add_comparison(
             "residual_nm": [ran.replayed_nm, best.replayed_nm],
             "strehl": [ran.strehl, best.strehl],
         }
-    if abs(best.deviations) > _MOST_DEVIATIONS:
+    if best.contradicts_model:
         more = "more" if best.deviations > 0 else "less"
         report.notes.append(
             f"warning: on unseen data the {found.name} leaves {more} than the model expects, by "

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.verdict import CommandVerdict
 from lbt_synth.storage.rows import column, table_row
@@ -19,7 +17,6 @@ class CommandRow:
     nats: float = column(
         "evidence", format=".0f", help="Log-likelihood over that of the record as given"
     )
-    gain: str = column("sensor gain, coarse", help="Sensor gain of each axis with it")
     repair: str = column("repair", help="Options that repair the record")
 
 
@@ -28,7 +25,6 @@ def command_row(verdict: CommandVerdict) -> CommandRow:
     return CommandRow(
         explanation=verdict.explanation,
         nats=verdict.nats,
-        gain=", ".join("-" if np.isnan(value) else f"{value:.3g}" for value in verdict.gain),
         repair=verdict.options,
     )
 

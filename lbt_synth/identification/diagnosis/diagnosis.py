@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lbt_synth.design import Design
+from lbt_synth.design.model_limits import limit_or_nan
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
@@ -40,6 +41,7 @@ from lbt_synth.identification.records.record_length import require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.storage.rows import fill_row
 from lbt_synth.validation import require_instance
 
@@ -78,6 +80,9 @@ class Diagnosis:
         Row of the comparison that leaves least, of the designs.
     best_design : Design or None
         The same design, for the model of the whole record.
+    limit_nm : float
+        Residual below which no linear controller comes, by the model of the whole record [nm rms];
+        nan where it is not known.
     given : GivenDesignRow or None
         A given design on this record.
     notes : tuple of str
@@ -98,6 +103,7 @@ class Diagnosis:
     comparison: PredictionTable | None = None
     best: str = ""
     best_design: Design | None = None
+    limit_nm: float = float("nan")
     given: GivenDesignRow | None = None
     notes: tuple[str, ...] = ()
 
@@ -242,6 +248,7 @@ def _examine_loop(
         comparison=comparison,
         best=best,
         best_design=best_design,
+        limit_nm=limit_or_nan(lambda: least_model_residual(model.plant())),
     )
     step(1)
     for name, design in given.items():

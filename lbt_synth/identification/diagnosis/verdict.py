@@ -9,7 +9,7 @@ from lbt_synth.identification.diagnosis.channels import AXES
 from lbt_synth.identification.diagnosis.diagnosis import Diagnosis
 from lbt_synth.identification.diagnosis.line_origins import LineRow
 from lbt_synth.identification.diagnosis.running_loop import count_frames, law_row
-from lbt_synth.identification.prediction.comparison import INTEGRATOR, LIMIT, RAN
+from lbt_synth.identification.prediction.comparison import INTEGRATOR, RAN
 from lbt_synth.storage.display_unit import nm_text
 
 NARROW = 0.3  # modulus margin
@@ -110,13 +110,14 @@ def _residual_sentence(found: Diagnosis) -> str:
     ]
     if not by_running:
         return f"By the model the {found.best} would leave {nm_text(whole)}: {_join(named)}."
-    measured = ""
+    measured = doubt = ""
     if ran is not None and np.isfinite(ran.replayed_nm):
         measured = (
             f"It leaves {nm_text(ran.replayed_nm, error_nm=ran.replayed_error_nm)} on unseen data "
             f"(Strehl ratio {ran.strehl:.3f}), by the model "
         )
-    return f"{measured or 'By the model it leaves '}{nm_text(whole)}: {_join(named)}."
+        doubt = ", which the data contradict" * ran.contradicts_model
+    return f"{measured or 'By the model it leaves '}{nm_text(whole)}{doubt}: {_join(named)}."
 
 
 def _direction_text(row: LineRow) -> str:
@@ -142,10 +143,9 @@ def _advice_sentence(found: Diagnosis) -> str:
     ran, best, slow = found.row(RAN), found.row(found.best), found.row(INTEGRATOR)
     if best is None or best.replayed is None:
         return "Record longer before anything is changed."
-    limit = found.row(LIMIT)
     bound = ""
-    if limit is not None:
-        bound = f"; by the model no linear controller leaves less than {nm_text(limit.model_nm)}"
+    if np.isfinite(found.limit_nm):
+        bound = f"; by the model no linear controller leaves less than {nm_text(found.limit_nm)}"
     leaves = f"{nm_text(best.replayed_nm, error_nm=best.replayed_error_nm)}"
     if ran is None or ran.replayed is None:
         return f"The {found.best} leaves least, {leaves} (Strehl ratio {best.strehl:.3f}{bound})."

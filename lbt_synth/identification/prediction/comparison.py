@@ -40,6 +40,7 @@ PREDICTOR = "least-squares predictor"
 LIMIT = "limit of performance"
 _RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
 _START_SHARE = 0.01  # of a measured mean square: what a start adds above that has a note
+_MOST_DEVIATIONS = 4.0  # standard errors between data and model that chance explains
 _AXES = ("tip", "tilt")
 _COLUMNS = {  # attribute of a row by heading
     "data_nm": "replayed_nm",
@@ -107,6 +108,11 @@ class PredictionRow:
         difference = self.replayed.total_nm2 - float(np.trace(self.model_nm2))
         error = self.replayed.total_error_nm2
         return difference / error if error > 0 else np.nan
+
+    @property
+    def contradicts_model(self) -> bool:
+        """Whether data and model are further apart than chance explains."""
+        return bool(abs(self.deviations) > _MOST_DEVIATIONS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

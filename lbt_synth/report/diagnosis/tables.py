@@ -59,7 +59,7 @@ def residual_tables(found: Diagnosis) -> list[Table]:
     """Return the tables of costs, of residuals on unseen data, and of a given design."""
     tables = []
     if found.costs:
-        caption = "What each part leaves by the model"
+        caption = "What each part leaves by the model of the whole record"
         if found.best:
             caption += f" (best design: {found.best})"
         tables.append(row_table(caption, found.costs))

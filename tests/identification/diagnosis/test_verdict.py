@@ -20,7 +20,23 @@ def test_of_a_good_record():
     assert f"It leaves {ran.replayed_nm:.3g} +- " in residual
     assert f"{found.costs[0].running_nm:.3g} nm of the {found.costs[0].part}" in residual
     assert advice.startswith(f"First change the controller: the {found.best} leaves ")
-    assert "; by the model no linear controller leaves less than" in advice
+    limit = f"; by the model no linear controller leaves less than {found.limit_nm:.3g} nm"
+    assert limit in advice
+    assert 0 < found.limit_nm < found.costs[-1].best_nm * (1 + 1e-9)  # of the same model
+
+
+def test_data_that_contradict_the_model_of_what_ran():
+    found = line_diagnosis()
+    assert ", which the data contradict" not in diagnosis_verdict(found)[1]
+    entries = tuple(
+        replace(entry, model_nm2=4 * entry.model_nm2) if entry.name == "what ran" else entry
+        for entry in found.comparison.entries
+    )
+    other = replace(found, comparison=replace(found.comparison, entries=entries))
+    assert (
+        f"{found.costs[-1].running_nm:.3g} nm, which the data contradict: "
+        in (diagnosis_verdict(other)[1])
+    )
 
 
 def test_of_one_that_must_not_be_used():
