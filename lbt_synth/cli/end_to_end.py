@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from argparse import Namespace
 from dataclasses import replace
@@ -15,7 +14,7 @@ from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.design import Design, FusedFilter
-from lbt_synth.errors import UnstableLoopError
+from lbt_synth.errors import GainFileError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import Calibration, EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.cases import summarise_run
@@ -25,6 +24,7 @@ from lbt_synth.report.figures import end_to_end_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.report.number_text import listing_text
 from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
+from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import column, fill_row, percent_column, table_row
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
@@ -147,7 +147,7 @@ def _telemetry(
         strehl=min(loop_run.strehl, 1.0),
         sensor_gain=gain if gain > 0 else None,
         controller_name=f"mixed: tip and tilt by {design.method}, integrators for the rest",
-        controller_digest=hashlib.sha256(Path(arguments.gain).read_bytes()).hexdigest(),
+        controller_digest=file_sha256(arguments.gain, GainFileError),
         metadata={
             "simulator": f"SPECULA {specula_version()}",
             "gain_file": Path(arguments.gain).name,

@@ -38,10 +38,16 @@ def run(arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:
         raise ProblemError("--seeds, --row-seeds and --jobs must be at least 1.")
+    cases = {_case_name(name): design for name, design in designs.items()}
+    if len(cases) < len(designs):
+        raise ProblemError(
+            "names of gain files must differ in letters or digits, because runs are kept under "
+            f"them; got {', '.join(designs)}."
+        )
     specula_version()
     rows = plan_tables(
         setup,
-        {_case_name(name): design for name, design in designs.items()},
+        cases,
         seeds=range(setup.seed, setup.seed + arguments.seeds),
         row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
         tables=arguments.tables,
@@ -83,4 +89,5 @@ def run(arguments: Namespace) -> Report:
 
 
 def _case_name(name: str) -> str:
-    return "".join(letter if letter.isalnum() else "_" for letter in Path(name).stem)
+    """Return a name of a design as that of files."""
+    return "".join(letter if letter.isalnum() else "_" for letter in name)

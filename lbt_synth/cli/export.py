@@ -8,11 +8,12 @@ from pathlib import Path
 
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.errors import ProblemError
-from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.errors import GainFileError, ProblemError
+from lbt_synth.files import load_gain
 from lbt_synth.interop import Exported, frame_cost, target_named
 from lbt_synth.interop.target import CERTIFICATE, target_names
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
 
 _SINGLE_SUFFICES = 1e-3  # of the largest command
@@ -52,7 +53,8 @@ def run(arguments: Namespace) -> Report:
     if target.contents and output.is_dir():
         places = [output / name for name in target.contents]
     require_writable(*places, inputs=[arguments.gain])
-    design, digest = load_with_digest(arguments.gain)
+    design = load_gain(arguments.gain)
+    digest = file_sha256(arguments.gain, GainFileError)
     with show_spinner("exporting", quiet=arguments.json):
         written = target.write(output, design, gain_digest=digest, **options)
     cost = written.cost or frame_cost(design)

@@ -145,7 +145,7 @@ def _expected_lines(
     """Return lines known beforehand, from the arguments, a file, and accelerometers."""
     lines: list[LinePrior] = []
     if arguments.lines_hz is not None:
-        error = number(arguments.lines_error_hz, "lines_error_hz", above=0)
+        error = number(arguments.lines_error_hz, "lines_error_hz", at_least=0)
         frequencies = [number(each, "lines_hz", above=0) for each in arguments.lines_hz]
         lines += load_lines([(each, error) for each in frequencies])
     if arguments.lines_file is not None:
@@ -230,7 +230,8 @@ def find_places(arguments: Namespace, model: str | Path | None, **others: Path) 
     outputs = list(places.values())
     if len({place.resolve() for place in outputs}) < len(outputs):
         raise OutputError(f"each output needs a name of its own; got {outputs[0]} twice.")
-    given = given_options(arguments, "file", "commands", "lines_file", "accelerometers")
+    read = ("file", "commands", "lines_file", "accelerometers", "earlier_model")
+    given = given_options(arguments, *(name for name in read if name in arguments))
     require_writable(*outputs, inputs=given.values())
     return places
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from lbt_synth.cli.loop_inputs import load_design
 from lbt_synth.cli.loop_records import load_series, record_imaging
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure
+from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
@@ -29,6 +30,8 @@ from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray, integer
 
 _FRAMES = 8000  # of a drawn disturbance
+_DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
+_ALWAYS = ("target", "file", "stroke", "wavelength_um", "output", "json", "unit", "show_unit")
 _FEWEST, _MOST = 256, 10_000_000  # of a record, and of a drawn disturbance
 
 
@@ -73,6 +76,7 @@ def run(arguments: Namespace) -> Report:
     given = [path for path in (arguments.gain, arguments.file) if path is not None]
     if arguments.output is not None:
         require_figure(arguments.output, inputs=given)
+    _refuse_idle_options(arguments)
     design = load_design(arguments.gain)
     with show_spinner("rehearsing", quiet=arguments.json):
         series = _drawn(arguments, design) if arguments.file is None else _recorded(arguments)
@@ -140,6 +144,15 @@ def _describe(
     )
 
 
+def _refuse_idle_options(arguments: Namespace) -> None:
+    """Refuse options of a record where none is given, and of a drawn disturbance where one is."""
+    drawn = arguments.file is None
+    for name, (option, usual) in command_options("rehearse").items():
+        idle = name not in (*_DRAWN, *_ALWAYS) if drawn else name in _DRAWN
+        if idle and getattr(arguments, name) != usual:
+            raise ProblemError(f"{option} goes {'with' if drawn else 'without'} --record.")
+
+
 def _recorded(arguments: Namespace) -> _Series:
     """Return the pseudo-open-loop series of a record, in its longest stretch of usable frames."""
     record = load_series(arguments)
@@ -173,6 +186,9 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
         )
     config = config_from_text(design.configuration, Path(arguments.gain))
     choose_config_unit(arguments, config)
+    imaging = config.imaging
+    if arguments.wavelength_um is not None:
+        imaging = replace(imaging, wavelength_um=arguments.wavelength_um)
     truth, rng = config.truth, np.random.default_rng(arguments.seed)
     frames = _FRAMES
     if arguments.frames is not None:
@@ -182,6 +198,6 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
         total_nm=draw_disturbance(truth, config.hardware, frames=frames, cases=1, rng=rng)[0],
         noise=draw_noise(truth, config.hardware, frames=frames, cases=1, rng=rng)[0],
         hardware=config.hardware,
-        imaging=config.imaging,
+        imaging=imaging,
         sensor_gain=truth.sensor_gain,
     )

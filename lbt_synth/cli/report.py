@@ -37,9 +37,9 @@ def run(arguments: Namespace) -> Report:
     choose_config_unit(arguments, config)
     designs = load_designs(arguments.gains, several_sensors=True)
     fused = {name: each for name, each in designs.items() if isinstance(each, FusedFilter)}
-    if fused:
-        return _report_several_sensors(arguments, config, designs, fused)
     files = dict(zip(designs, arguments.gains, strict=True))
+    if fused:
+        return _report_several_sensors(arguments, config, designs, fused, files)
     total = count_steps(len(designs)) + 1
     with count_progress(total=total, what="report", quiet=arguments.json) as count:
         found = design_report(config, designs, gain_files=files, advance=count)
@@ -74,6 +74,7 @@ def _report_several_sensors(
     config: Config,
     designs: Mapping[str, Design],
     fused: Mapping[str, FusedFilter],
+    files: Mapping[str, str],
 ) -> Report:
     """Write the page of designs of several sensors, which have no one transfer function."""
     if len(fused) < len(designs):
@@ -85,7 +86,12 @@ def _report_several_sensors(
         )
     with show_spinner("report", quiet=arguments.json):
         written, found = write_fused_report(
-            config, fused, arguments.output, pdf=arguments.pdf, title=arguments.title
+            config,
+            fused,
+            arguments.output,
+            gain_files=files,
+            pdf=arguments.pdf,
+            title=arguments.title,
         )
     report = Report()
     caption = f"Designs in the loop of {config.source.name}; {config.imaging.label}"

@@ -17,6 +17,7 @@ from lbt_synth.loop import residual_budget, strehl
 from lbt_synth.loop.fusion.simulation import READINGS, Drop
 from lbt_synth.report.figures import sensor_failure_figure
 from lbt_synth.report.figures.style import save_figure
+from lbt_synth.storage.summaries import count_text
 from lbt_synth.studies.sensor_failures import run_failures
 
 _DROP = re.compile(
@@ -44,7 +45,7 @@ def parse_drop(text: str) -> Drop:
 
 def run_fused(arguments: Namespace, config: Config, design: FusedFilter) -> Report:
     """Run the loop of a design of several sensors."""
-    for option in ("stroke", "telemetry"):
+    for option in ("stroke", "form", "telemetry"):
         if getattr(arguments, option) is not None:
             raise ProblemError(f"--{option} goes with a design of the loop's own sensor alone.")
     drops = [parse_drop(text) for text in arguments.drop or ()]
@@ -72,7 +73,8 @@ def run_fused(arguments: Namespace, config: Config, design: FusedFilter) -> Repo
             "wavelength_um": config.imaging.wavelength_um,
         }
     )
-    caption = f"{design.method} in the loop: {sizes['cases']} runs; {config.imaging.label}"
+    runs = count_text(sizes["cases"], "run")
+    caption = f"{design.method} in the loop: {runs}; {config.imaging.label}"
     report.add_rows("segments", caption, found.rows(config.imaging))
     if not truth.drifts:
         ratio = strehl(residual_budget(loop, truth), config.imaging)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.design.model_limits import above_percent, limit_or_nan
-from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
@@ -40,6 +38,7 @@ from lbt_synth.report.figures import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
+from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import column, columns, fill_row, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
 
@@ -236,7 +235,7 @@ def _first_case(
         config.hardware,
         sensor_gain=truth.sensor_gain,
         design=design,
-        controller_digest=hashlib.sha256(Path(gain_file).read_bytes()).hexdigest(),
+        controller_digest=file_sha256(gain_file, GainFileError),
         imaging=config.imaging,
         metadata={
             "case": 0,

@@ -6,14 +6,17 @@ import hashlib
 import os
 import platform
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import MappingProxyType
 
 import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
-from lbt_synth.storage.rows import column, table_row
+from lbt_synth.report.page.blocks import Listing, Section
+from lbt_synth.storage.input_files import read_bytes
+from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import Table
 
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
@@ -33,10 +36,7 @@ def read_source(path: str | os.PathLike[str], role: str) -> tuple[SourceFile, by
     """Read a file, and return its name and digest with its bytes."""
     source = Path(path)
     require_letters(source.name, f"name of the {role}")
-    try:
-        content = source.read_bytes()
-    except OSError as error:
-        raise FileError(f"cannot read {source}: {error.strerror}.", path=source) from error
+    content = read_bytes(source, FileError)
     digest = hashlib.sha256(content).hexdigest()
     return SourceFile(name=source.name, role=role, sha256=digest), content
 
@@ -89,6 +89,25 @@ def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
     return tuple(found)
 
 
-def versions_table(found: tuple[tuple[str, str], ...]) -> Table:
-    """Programs and libraries that made a page."""
-    return Table(caption="Made with", headings=("program", "version"), rows=found, words=(1,))
+def source_section(
+    files: Sequence[SourceFile] = (),
+    *,
+    versions: Sequence[tuple[str, str]] | None = None,
+    texts: Mapping[str, str] = MappingProxyType({}),
+    about: Table | None = None,
+) -> Section:
+    """Return the last section of a page: what it was made from, and by which programs.
+
+    Texts are listed under their captions.
+    """
+    made_with = tuple(program_versions() if versions is None else versions)
+    return Section(
+        key="sources",
+        title="Files and versions",
+        blocks=(
+            *([] if about is None else [about]),
+            *([row_table("Files that were read", files)] if files else []),
+            Table(caption="Made with", headings=("program", "version"), rows=made_with, words=(1,)),
+            *(Listing(caption=caption, text=text) for caption, text in texts.items()),
+        ),
+    )

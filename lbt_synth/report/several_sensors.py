@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from lbt_synth.config import Config
 from lbt_synth.design.fusion.failures import failure_rows
@@ -13,15 +14,14 @@ from lbt_synth.loop.fusion.simulation import Drop
 from lbt_synth.report.charts.description import Chart
 from lbt_synth.report.figures.sensor_failures import sensor_failure_panels
 from lbt_synth.report.number_text import listing_text
-from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import chart
 from lbt_synth.report.provenance import (
     creation_time,
-    creator_name,
-    program_versions,
+    read_source,
+    source_section,
     time_text,
-    versions_table,
 )
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, row_table
@@ -36,6 +36,7 @@ def write_fused_report(
     designs: Mapping[str, FusedFilter],
     path: str | os.PathLike[str],
     *,
+    gain_files: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
     pdf: str | os.PathLike[str] | None = None,
     title: str | None = None,
 ) -> tuple[tuple[Path, ...], TruthComparison]:
@@ -49,6 +50,8 @@ def write_fused_report(
         The designs by name.
     path, pdf : path-like
         Files to write, that end in .html and .pdf.
+    gain_files : mapping of str to path-like, optional
+        Files that designs came from, whose digests the page gives.
     title : str, optional
         Heading of the page.
 
@@ -65,6 +68,10 @@ def write_fused_report(
         If a design does not fit the loop, or a vibration drifts.
     """
     require_page_names(path, pdf)
+    source, content = read_source(config.source, "configuration")
+    text = content.decode("utf-8-sig", errors="replace")
+    gains = [read_source(file, f"gain file of {name}")[0] for name, file in gain_files.items()]
+    files = [source, *gains]
     found = compare_in_truth(designs, config)
     sections = [_summary_section(config, designs, found)]
     for number, (name, design) in enumerate(designs.items(), start=1):
@@ -76,21 +83,11 @@ def write_fused_report(
             row_table("Certificate, computed again", design.recertify().checks),
         )
         sections.append(Section(key=f"design-{number}", title=name, blocks=blocks))
-    sections.append(
-        Section(
-            key="sources",
-            title="Configuration and versions",
-            blocks=(
-                versions_table(program_versions()),
-                Listing(caption=config.source.name, text=config.source.read_text("utf-8")),
-            ),
-        )
-    )
+    sections.append(source_section(files, texts={source.name: text}))
     page = Page(
         title=title or f"Several sensors for {config.source.name}",
         subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
         sections=tuple(sections),
-        creator=creator_name(),
     )
     return write_page(page, path, pdf), found
 

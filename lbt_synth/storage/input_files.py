@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import json
 import os
 import stat
@@ -74,6 +75,12 @@ def read_bytes(
         limit = f"{most >> 20} MB" if most >> 20 else f"{most >> 10} kB"
         raise error(f"cannot read {path}: it is larger than {limit}.", path=Path(path))
     return content
+
+
+def file_sha256(path: str | os.PathLike[str], error: type[FileError]) -> str:
+    """Return the SHA-256 of a regular file, as ``sha256sum`` prints it."""
+    with open_input(path, error) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def read_json(path: str | os.PathLike[str], error: type[FileError]) -> Any:

@@ -275,6 +275,19 @@ def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, brief_night, op
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_earlier_model_is_not_overwritten(tmp_path, capsys, brief_night):
+    earlier = tmp_path / "m.yaml"
+    earlier.write_bytes(LBT_YAML.read_bytes())
+    status, _, error = run(
+        capsys,
+        *("identify", brief_night, "--accelerometers", "none.npy", "--no-figure"),
+        *("--earlier-model", earlier, "-o", earlier),
+    )
+    assert status == 2
+    assert "must not replace the input" in error
+    assert earlier.read_bytes() == LBT_YAML.read_bytes()
+
+
 def test_a_short_record_is_refused_with_the_length_it_needs(tmp_path, capsys):
     np.save(tmp_path / "y.npy", np.random.default_rng(0).standard_normal(900))
     for command, output in (("identify", "m.yaml"), ("auto", "t.fits")):

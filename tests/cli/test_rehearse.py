@@ -57,6 +57,10 @@ def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files
     data = json.loads(run(capsys, *words, "--json")[1])
     assert data["loops"][0]["largest_command_nm"] == 900
     assert data["loops"][0]["clipped_frames"] > 0
+    _, text, _ = run(capsys, *words, "--wavelength-um", 1.1, "--json")
+    blue = json.loads(text)["loops"][0]
+    assert blue["residual_nm"] == data["loops"][0]["residual_nm"]
+    assert blue["strehl"] < data["loops"][0]["strehl"]
 
 
 @pytest.mark.parametrize(
@@ -68,6 +72,14 @@ def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files
         (("gain.fits", "--for", "dao", "--frames", "-1"), "--frames must be at least 1; got -1"),
         (("gain.fits", "--for", "dao", "--stroke", "1e300"), "--stroke must be at most 1e+30"),
         (("gain.fits", "--for", "dao", "--frames", "0"), "--frames must be at least 1; got 0"),
+        (("gain.fits", "--for", "dao", "--kind", "open-loop"), "--kind goes with --record"),
+        (("gain.fits", "--for", "dao", "--sensor-gain", "0.5"), "--sensor-gain goes with --record"),
+        (("gain.fits", "--for", "dao", "--swap-axes"), "--swap-axes goes with --record"),
+        (
+            ("gain.fits", "--for", "dao", "--record", "night.fits", "--frames", "900"),
+            "--frames goes without --record",
+        ),
+        (("gain.fits", "--for", "dao", "--wavelength-um", "0"), "--wavelength-um must be above 0"),
     ],
 )
 def test_what_is_missing_is_said(capsys, monkeypatch, files, words, message):

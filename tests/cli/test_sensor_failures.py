@@ -34,6 +34,7 @@ def test_the_run_reaches_beyond_the_last_event(capsys, config_file, fused_file):
     data = json.loads(run(capsys, *arguments)[1])
     assert data["frames"] == 5500
     assert [row["sensors"] for row in data["segments"]] == ["none", "m2"]
+    assert " in the loop: 1 run; " in run(capsys, *arguments[:-1])[1]
 
 
 @pytest.mark.parametrize(
@@ -45,6 +46,7 @@ def test_the_run_reaches_beyond_the_last_event(capsys, config_file, fused_file):
         (("--drop", "m2@5s", "--frames", 1000), "--frames must reach beyond"),
         (("--stroke", 100), "--stroke goes with"),
         (("--telemetry", "t.fits"), "--telemetry goes with"),
+        (("--form", "estimator"), "--form goes with"),
         (("--sensor-gain", 30), "must be stable"),
     ],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import pytest
 from support.commands import run
 from support.several_sensors import write_config
@@ -10,10 +12,14 @@ import lbt_synth as lbt
 from lbt_synth.report.several_sensors import write_fused_report
 
 
-def test_a_page_has_the_table_of_failures_and_a_run(fused, fused_config, tmp_path):
-    files, found = write_fused_report(fused_config, {"both": fused}, tmp_path / "page.html")
+def test_a_page_has_the_table_of_failures_and_a_run(fused, fused_file, fused_config, tmp_path):
+    files, found = write_fused_report(
+        fused_config, {"both": fused}, tmp_path / "page.html", gain_files={"both": fused_file}
+    )
     text = files[0].read_text(encoding="utf-8")
     assert "When sensors fail" in text
+    for source in (fused_file, fused_config.source):
+        assert hashlib.sha256(source.read_bytes()).hexdigest() in text
     assert "each sensor missing in turn" in text
     assert found.rows[0].design == "both"
     limit = found.limit.rms_nm

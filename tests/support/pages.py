@@ -178,7 +178,6 @@ def whole_page(name: str = "first") -> Page:
     return Page(
         title=f"Page of {name}",
         subtitle=f"about {name}",
-        creator="lbt_synth test",
         sections=(
             Section(
                 key="summary",

@@ -20,12 +20,11 @@ from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table
 from lbt_synth.report.designs.verdict import verdict
 from lbt_synth.report.number_text import listing_text, number_text
-from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import paragraph
-from lbt_synth.report.provenance import creator_name, require_letters, time_text, versions_table
+from lbt_synth.report.provenance import require_letters, source_section, time_text
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import row_table
 
 
 def write_report(
@@ -92,22 +91,13 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
         Section(
             key="certificates", title="Certificates", blocks=tuple(_certificate_blocks(report))
         ),
-        Section(
-            key="sources",
-            title="Configuration and versions",
-            blocks=(
-                row_table("Files that were read", report.files),
-                versions_table(report.versions),
-                Listing(caption=source, text=report.config_text),
-            ),
-        ),
+        source_section(report.files, versions=report.versions, texts={source: report.config_text}),
     ]
     return Page(
         title=heading,
         subtitle=f"{count} design{'s' if count > 1 else ''}: {names}. Made "
         f"{time_text(report.made)}.",
         sections=tuple(sections),
-        creator=creator_name(),
     )
 
 

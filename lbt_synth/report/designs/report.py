@@ -170,7 +170,7 @@ def design_report(
     solved = any(design.solver.route in _CONVEX_ROUTES for design in designs.values())
     return DesignReport(
         config=config,
-        config_text=content.decode("utf-8", errors="replace"),
+        config_text=content.decode("utf-8-sig", errors="replace"),
         assessments=tuple(assessments),
         simulations=simulations,
         limits=limits,

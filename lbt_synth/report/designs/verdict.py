@@ -46,7 +46,7 @@ def verdict(report: DesignReport) -> str:
     if report.stable:
         sentences.insert(0, _least_sentence(report))
     # a number stays in one line with its unit
-    return re.sub(r"(?<=\d) (?=%|nm|mas|urad|Hz)", NO_BREAK, " ".join(sentences))
+    return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", NO_BREAK, " ".join(sentences))
 
 
 def _least_sentence(report: DesignReport) -> str:

@@ -21,7 +21,6 @@ from lbt_synth.report.number_text import print_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.words import paragraph
-from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Table
 
 
@@ -94,7 +93,7 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
             blocks=(*_print_tables(line_tables(found)), *spectrum_charts(found))
             or (Paragraph(text="No model was identified."),),
         ),
-        Section(key="sources", title="Files and versions", blocks=_source_blocks(read)),
+        provenance.source_section(read),
     ]
     return Page(
         title=f"Diagnosis of {name}",
@@ -102,7 +101,6 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
         f"{'1 axis' if record.axes == 1 else f'{record.axes} axes'}. Made "
         f"{provenance.time_text(provenance.creation_time())}.",
         sections=tuple(section for section in sections if section.blocks),
-        creator=provenance.creator_name(),
     )
 
 
@@ -132,8 +130,3 @@ def _verdict_blocks(found: Diagnosis) -> list[Block]:
         *residual_charts(found),
         *(Notice(text=print_text(f"{note[0].upper()}{note[1:]}")) for note in found.notes),
     ]
-
-
-def _source_blocks(read: Sequence[provenance.SourceFile]) -> tuple[Block, ...]:
-    tables = [row_table("Files that were read", read)] if read else []
-    return (*tables, provenance.versions_table(provenance.program_versions()))

@@ -49,7 +49,7 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
     2
     """
     _, frames, n = run.residual_nm.shape
-    names = ("tip", "tilt") if n <= 2 else [f"mode {i}" for i in range(n)]
+    names = ("tip", "tilt") if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
     shown = min(frames, int(np.ceil(_SERIES_S * run.frame_rate_hz)))
     time = np.arange(shown) / run.frame_rate_hz
     series, spectra = [], []

@@ -118,7 +118,10 @@ def league_page(
             title="How to read the standings",
             blocks=tuple(Paragraph(text=paragraph(name)) for name in ("league", "league-errors")),
         ),
-        _origin_section(sources),
+        provenance.source_section(
+            [provenance.read_source(path, "record")[0] for path in sources],
+            versions=provenance.program_versions(("pyrtcao",)),
+        ),
     )
     return Page(
         title="League of controllers",
@@ -129,7 +132,6 @@ def league_page(
             f"{provenance.time_text(provenance.creation_time())}."
         ),
         sections=sections,
-        creator=provenance.creator_name(),
     )
 
 
@@ -243,16 +245,4 @@ def _place_row(scores: RecordScores, name: str, title: str) -> PlaceRow:
         above_best=above,
         above_best_error=above_error,
         wins=sum(split.best == name for split in scores.splits),
-    )
-
-
-def _origin_section(sources: Sequence[str | os.PathLike[str]]) -> Section:
-    files = [provenance.read_source(path, "record")[0] for path in sources]
-    return Section(
-        key="origin",
-        title="Files and versions",
-        blocks=(
-            *([row_table("Files that were read", files)] if files else ()),
-            provenance.versions_table(provenance.program_versions(("pyrtcao",))),
-        ),
     )

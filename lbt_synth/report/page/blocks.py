@@ -62,7 +62,6 @@ class Page:
     title: str  # Its heading
     subtitle: str  # A line below, such as what it is about and when it was made
     sections: tuple[Section, ...]  # Its sections; the first one stands on the title page
-    creator: str  # Program and version that made it
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sections", tuple(self.sections))

@@ -12,6 +12,7 @@ from lbt_synth.report.charts.matplotlib_charts import chart_svg
 from lbt_synth.report.charts.scales import legend_entries
 from lbt_synth.report.number_text import print_text, unbroken_text
 from lbt_synth.report.page.blocks import Page
+from lbt_synth.report.provenance import creator_name
 
 # in a box of 34 times 14, around its middle
 _MARKER_PATHS = {
@@ -52,6 +53,7 @@ def page_html(page: Page) -> bytes:
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
     text = template.render(
         page=page,
+        creator=creator_name(),
         style=(here / "page.css").read_text(encoding="utf-8"),
         script=(here / "page.js").read_text(encoding="utf-8"),
         library=bokeh_script() if page.charts else "",

@@ -17,6 +17,7 @@ from lbt_synth.report.charts.matplotlib_charts import chart_png, chart_svg
 from lbt_synth.report.charts.paper_layout import lay_out
 from lbt_synth.report.number_text import print_text, unbroken_text
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.provenance import creator_name
 from lbt_synth.storage.tables import Cell, Table
 
 if TYPE_CHECKING:
@@ -60,8 +61,8 @@ def page_pdf(page: Page) -> bytes:
     pdf = Sheets(unit="in", format=(WIDTH, HEIGHT))
     pdf.creation_date = datetime.fromtimestamp(0, UTC)  # blanked below
     pdf.set_title(page.title)
-    pdf.set_author(page.creator)
-    pdf.set_creator(page.creator)
+    pdf.set_author(creator_name())
+    pdf.set_creator(creator_name())
     pdf.set_margins(_SIDE, _TOP)
     pdf.set_auto_page_break(auto=True, margin=_BOTTOM)
     pdf.c_margin = 0.0

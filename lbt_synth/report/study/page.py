@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.report.page.blocks import Page
 from lbt_synth.report.page.page_files import require_page_names, write_page
-from lbt_synth.report.provenance import creator_name, time_text
+from lbt_synth.report.provenance import time_text
 from lbt_synth.report.study.sections import StudyInfo, study_info, study_sections
 from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
 
@@ -95,5 +95,4 @@ def study_page(
             f"{count} {'controllers' if count > 1 else 'controller'}. Made {time_text(info.made)}."
         ),
         sections=tuple(sections),
-        creator=creator_name(),
     )

@@ -17,7 +17,6 @@ from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Sect
 from lbt_synth.report.page.words import paragraph
 from lbt_synth.report.study import charts
 from lbt_synth.storage.array_file import digest
-from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies import ControllerStatistics, Failure, Study, StudyStatistics
 from lbt_synth.studies.study import summary
@@ -78,7 +77,7 @@ def study_info(
         source, content = provenance.read_source(path, role)
         files.append(source)
         if place < len(roles):
-            texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8", "replace")
+            texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8-sig", "replace")
     return StudyInfo(
         name=study.source.name,
         samples=study.samples,
@@ -328,15 +327,9 @@ def _origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
     ]
     if info.computing_s is not None:
         rows.append(("computing time, of all processes together", _duration_text(info.computing_s)))
-    return Section(
-        key="origin",
-        title="Files and versions",
-        blocks=(
-            Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,)),
-            *([row_table("Files that were read", info.files)] if info.files else ()),
-            provenance.versions_table(info.versions),
-            *(Listing(caption=caption, text=text) for caption, text in info.texts.items()),
-        ),
+    about = Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,))
+    return provenance.source_section(
+        info.files, versions=info.versions, texts=info.texts, about=about
     )
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import refuse_replacing
 from lbt_synth.storage.file_locks import exclusive_lock
+from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.studies.study import store
 from lbt_synth.studies.study.batch_evaluation import evaluate_samples
 from lbt_synth.studies.study.engine import (
@@ -319,7 +320,7 @@ def _write_tables(
     manifest = manifest.write(
         folder,
         finished=True,
-        tables={path.name: store.file_digest(path) for path in tables},
+        tables={path.name: file_sha256(path, OutputError) for path in tables},
         settings=study.settings.model_dump(by_alias=True, exclude_none=True),
         failures=len(log.failures),
         retry=retry,

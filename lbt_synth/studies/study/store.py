@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import hashlib
 import itertools
 import json
 import re
@@ -28,7 +27,7 @@ from lbt_synth.storage.atomic_files import (
     remove_unfinished_files,
     write_atomically,
 )
-from lbt_synth.storage.input_files import open_input, read_bytes, read_json
+from lbt_synth.storage.input_files import file_sha256, open_input, read_bytes, read_json
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.study.parquet import read_parquet, write_parquet
 from lbt_synth.studies.study.schema import ControllerName
@@ -242,17 +241,11 @@ def remove_unfinished(folder: Path) -> None:
         remove_unfinished_files(place)
 
 
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with open_input(path, OutputError) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 def require_unchanged(folder: Path, manifest: Manifest) -> None:
     """Refuse tables of a finished study that were changed."""
     for name, digest in manifest.tables.items():
         path = folder / name
-        if path.exists() and file_digest(path) != digest:
+        if path.exists() and file_sha256(path, OutputError) != digest:
             refuse(path, f"is not as the study wrote it. Put that back, or {_DELETE.lower()}")
 
 

@@ -70,7 +70,7 @@ def test_the_page_is_complete(text, report, config):
         "Poles",
         "Step response",
         "Certificates",
-        "Configuration and versions",
+        "Files and versions",
     ):
         assert word in titles
     for heading in (

@@ -42,7 +42,6 @@ DOT = Curve(name="a", x=[1.0], y=[1.0])
             lambda: Page(
                 title="t",
                 subtitle="s",
-                creator="c",
                 sections=tuple(Section(key="a", title="a", blocks=()) for _ in range(2)),
             ),
             "keys of a page must be unique; got a twice",

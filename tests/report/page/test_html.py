@@ -102,7 +102,6 @@ def test_a_page_without_charts_has_no_script():
     page = Page(
         title="t",
         subtitle="s",
-        creator="c",
         sections=(Section(key="a", title="A", blocks=(Paragraph(text="words"),)),),
     )
     text = page_html(page).decode()

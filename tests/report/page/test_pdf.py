@@ -46,7 +46,6 @@ def test_high_charts_continue_on_the_next_sheet(count):
     page = Page(
         title="t",
         subtitle="s",
-        creator="c",
         sections=(
             Section(key="a", title="A", blocks=(Paragraph(text="a"),)),
             Section(key="b", title="B", blocks=(chart,)),
@@ -76,7 +75,7 @@ def test_bars_fit_a_sheet():
 def test_long_listings_and_tables_continue_on_the_next_sheet():
     def count(block):
         section = Section(key="a", title="A", blocks=(block,))
-        page = Page(title="t", subtitle="s", creator="c", sections=(section,))
+        page = Page(title="t", subtitle="s", sections=(section,))
         return pages_of(page_pdf(page))
 
     inside = HEIGHT - 0.6 - 0.65

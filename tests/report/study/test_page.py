@@ -108,7 +108,7 @@ def test_every_section_has_content_and_every_chart_its_words(page):
         "dependence",
         "worst",
         "reading",
-        "origin",
+        "sources",
     ]
     keys = [chart.key for chart in page.charts]
     assert keys == [
