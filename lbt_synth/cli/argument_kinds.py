@@ -25,6 +25,16 @@ def add_option(
     parser.add_argument(name, help=text, default=default, **more)
 
 
+def option_name(argument: str) -> str:
+    """Return an option as people write it, by the name of its argument."""
+    return f"--{argument.replace('_', '-')}"
+
+
+def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
+    """Return the options of those names that the command line gives."""
+    return {name: value for name in names if (value := getattr(arguments, name)) is not None}
+
+
 def add_switch(parser: _ActionsContainer, name: str, text: str) -> None:
     """Add an option without a value."""
     parser.add_argument(name, action="store_true", help=text)

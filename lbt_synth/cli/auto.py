@@ -8,9 +8,8 @@ from lbt_synth.cli import command_repairs, loop_records
 from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
-from lbt_synth.errors import ProblemError
 from lbt_synth.files.gain_file.store import require_gain_name
-from lbt_synth.identification import LoopRecord, RecordedDesign, SpectrumRecord, design_from_record
+from lbt_synth.identification import LoopRecord, RecordedDesign, design_from_record
 from lbt_synth.identification.auto import LEAST_SECONDS
 from lbt_synth.identification.method_choice import MethodChoice
 from lbt_synth.identification.prediction.comparison import RAN
@@ -24,13 +23,10 @@ def run(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
     gain = require_gain_name(arguments.output)
     places = loop_records.find_places(arguments, arguments.model, gain=gain)
-    record = loop_records.read_record(arguments, LEAST_SECONDS)
+    record = loop_records.require_series(
+        loop_records.read_record(arguments, LEAST_SECONDS), "auto tests its design on"
+    )
     choose_unit(arguments, record.diameter_m)
-    if isinstance(record, SpectrumRecord):
-        raise ProblemError(
-            "auto tests its design on the recorded series; got a spectrum. Try lbt-synth identify "
-            "and lbt-synth design."
-        )
     imaging = loop_records.record_imaging(arguments, record)
     with (
         count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count,

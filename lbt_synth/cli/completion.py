@@ -7,17 +7,12 @@ from collections.abc import Iterator
 
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.parser import COMMANDS, build_parser
-from lbt_synth.errors import MissingExtraError
 
 
 def run(arguments: Namespace) -> Report:
     """Print the script of a shell, made from the arguments of all commands."""
-    try:
-        import shtab
-    except ImportError as error:
-        raise MissingExtraError(
-            "the script of a shell needs shtab: pip install shtab.", extra="shtab"
-        ) from error
+    import shtab  # not needed to build the parser of another command
+
     parser = build_parser(*COMMANDS)
     for action in _takes_files(parser):
         if action.dest == "topic":  # of help

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from lbt_synth.cli.argument_kinds import given_options
 from lbt_synth.cli.design_description import describe_design
 from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.output import Report
@@ -21,8 +22,7 @@ _WORDING = Wording(method="--method {}", option="--{}")
 
 def run(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
-    options = {name: getattr(arguments, name) for name in option_names()}
-    given = {name: value for name, value in options.items() if value is not None}
+    given = given_options(arguments, *option_names())
     request = design_request(arguments.method, given, _WORDING)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
     config = load_config(arguments.config)

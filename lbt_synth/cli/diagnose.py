@@ -7,15 +7,15 @@ from dataclasses import asdict
 from typing import Any
 
 from lbt_synth.cli import loop_records
+from lbt_synth.cli.argument_kinds import given_options
 from lbt_synth.cli.display import choose_unit
-from lbt_synth.cli.loop_inputs import given_options, load_designs
+from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import (
     Diagnosis,
     LoopRecord,
-    SpectrumRecord,
     diagnose,
     diagnosis_verdict,
 )
@@ -66,12 +66,9 @@ def run(arguments: Namespace) -> Report:
 
 def _load(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
     """Load the record, or some of its axes."""
-    record = loop_records.load_series(arguments, axes)
-    if isinstance(record, SpectrumRecord):
-        raise ProblemError(
-            "diagnose examines recorded series; got a spectrum. Try lbt-synth identify."
-        )
-    return record
+    return loop_records.require_series(
+        loop_records.load_series(arguments, axes), "diagnose examines"
+    )
 
 
 def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
+from lbt_synth.cli.argument_kinds import given_options
 from lbt_synth.cli.display import choose_wavefront_unit
-from lbt_synth.cli.loop_inputs import given_options, load_design
+from lbt_synth.cli.loop_inputs import load_design
 from lbt_synth.cli.output import Report, json_value
-from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.design import Design, FusedFilter
@@ -22,10 +22,10 @@ from lbt_synth.interop.specula.fused_filter import unread_sensors
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.report.figures import end_to_end_figure
 from lbt_synth.report.figures.style import save_figure
-from lbt_synth.report.number_text import listing_text
-from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
+from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import column, fill_row, percent_column, table_row
+from lbt_synth.storage.words import listing_text
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
 _FILES = ("run.png", "telemetry.fits", "summary.json")

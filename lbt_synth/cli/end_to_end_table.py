@@ -5,17 +5,18 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
+from lbt_synth.cli.argument_kinds import option_name
 from lbt_synth.cli.display import choose_wavefront_unit
 from lbt_synth.cli.end_to_end import calibrate_setup, load_setup
+from lbt_synth.cli.engine import keep_finished
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.report.figures.end_to_end import end_to_end_table_figure
 from lbt_synth.report.figures.style import save_figure
-from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
+from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.rows import csv_rows, json_record, json_units, row_table
 from lbt_synth.studies import EndToEndEntry
 from lbt_synth.studies.paper.end_to_end import (
@@ -24,6 +25,7 @@ from lbt_synth.studies.paper.end_to_end import (
     rms_modal_difference,
     run_tables,
 )
+from lbt_synth.validation import integer
 
 _FILES = {"II": ("table_ii.csv",), "III": ("table_iii.csv", "table_iii.png", "table_iii.pdf")}
 
@@ -36,8 +38,8 @@ def run(arguments: Namespace) -> Report:
     choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
     designs = load_designs(arguments.gains)
-    if min(arguments.seeds, arguments.row_seeds, arguments.jobs) < 1:
-        raise ProblemError("--seeds, --row-seeds and --jobs must be at least 1.")
+    for name in ("seeds", "row_seeds", "jobs"):
+        integer(getattr(arguments, name), option_name(name), at_least=1)
     cases = {_case_name(name): design for name, design in designs.items()}
     if len(cases) < len(designs):
         raise ProblemError(
@@ -56,7 +58,10 @@ def run(arguments: Namespace) -> Report:
     make_directory(folder)
     case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
-    with count_progress(total=total, what="runs", quiet=arguments.json) as count:
+    with (
+        count_progress(total=total, what="runs", quiet=arguments.json) as count,
+        keep_finished(case_folder),
+    ):
         table = run_tables(
             setup, rows, case_folder, jobs=arguments.jobs, cache=arguments.cache, progress=count
         )

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
 
+from lbt_synth.cli.streams import print_error
 from lbt_synth.errors import ProblemError
 from lbt_synth.studies.study.cluster import connect_cluster
-
-
-def require_jobs(arguments: Namespace) -> None:
-    """Refuse a number of processes that is not above 0."""
-    if arguments.jobs < 1:
-        raise ProblemError(f"--jobs must be at least 1; got {arguments.jobs}.")
 
 
 def choose_engine(
@@ -25,3 +22,13 @@ def choose_engine(
             raise ProblemError("--dask-tls goes with --dask.")
         return nullcontext((None, None))
     return connect_cluster(arguments.dask, tls=arguments.dask_tls)
+
+
+@contextmanager
+def keep_finished(folder: Path) -> Iterator[None]:
+    """Say where what is finished stays if the user interrupts the rest."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print_error(f"what is finished is kept in {folder}; start it again to continue")
+        raise

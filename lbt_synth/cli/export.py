@@ -6,6 +6,7 @@ import math
 from argparse import Namespace
 from pathlib import Path
 
+from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.errors import GainFileError, ProblemError
@@ -36,15 +37,13 @@ class ExportFacts:
 def run(arguments: Namespace) -> Report:
     """Write the controller of a gain file for another program."""
     target = target_named(arguments.target)
-    options = {name: getattr(arguments, name) for name in _OPTIONS}
-    options = {name: value for name, value in options.items() if value is not None}
+    options = given_options(arguments, *_OPTIONS)
     for option in options:
         if option not in target.options:
             *some, last = (n for n in target_names() if option in target_named(n).options)
             fitting = f"{', '.join(some)} or {last}" if some else last
-            given = option.replace("_", "-")
             raise ProblemError(
-                f"--{given} goes with --for {fitting}; got --for {arguments.target}."
+                f"{option_name(option)} goes with --for {fitting}; got --for {arguments.target}."
             )
     output = Path(arguments.output)
     places = [output, *(output.parent / (output.stem + ending) for ending in target.endings[1:])]

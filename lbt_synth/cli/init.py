@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import config_schema, identified_config, telescope_template
 from lbt_synth.config.templates import example_files
@@ -18,7 +17,12 @@ from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.identification import LoopRecord, SpectrumRecord, identify, load_record
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.registry import default_method
-from lbt_synth.storage.atomic_files import require_ending, require_writable, write_together
+from lbt_synth.storage.atomic_files import (
+    make_directory,
+    require_ending,
+    require_writable,
+    write_together,
+)
 
 _SCHEMA = "lbt-synth.schema.json"
 _USUAL = "generic"  # the telescope of which nothing is known

@@ -12,18 +12,18 @@ from lbt_synth import studies
 from lbt_synth.cli import loop_records
 from lbt_synth.cli.command_repairs import judge_record
 from lbt_synth.cli.display import choose_unit
-from lbt_synth.cli.engine import choose_engine, require_jobs
+from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
-from lbt_synth.cli.streams import print_error
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import LoopRecord, SpectrumRecord
+from lbt_synth.identification import LoopRecord
 from lbt_synth.report import write_league_page
 from lbt_synth.report.league.page import standing_notes, verdict_text
-from lbt_synth.storage.atomic_files import refuse_replacing, write_atomically
+from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.rows import csv_rows
+from lbt_synth.storage.words import count_text
 from lbt_synth.studies.league.entries import choose_entries
+from lbt_synth.validation import integer
 
 _TABLE, _SCORES, _PAGE, _PRINT = "standings.csv", "scores.csv", "league.html", "league.pdf"
 _ODD = re.compile(r"[^A-Za-z0-9_.+-]+")
@@ -31,9 +31,8 @@ _ODD = re.compile(r"[^A-Za-z0-9_.+-]+")
 
 def run(arguments: Namespace) -> Report:
     """Run a league of all records; write its tables and its page."""
-    require_jobs(arguments)
-    if arguments.splits < 1:
-        raise ProblemError(f"--splits must be at least 1; got {arguments.splits}.")
+    for name in ("jobs", "splits"):
+        integer(getattr(arguments, name), f"--{name}", at_least=1)
     able = [entry for entry in choose_entries(arguments.entries).values() if not entry.missing]
     folder = Path(arguments.output)
     paths = [folder / name for name in (_TABLE, _SCORES, _PAGE)]
@@ -48,22 +47,18 @@ def run(arguments: Namespace) -> Report:
     with (
         choose_engine(arguments) as (executor, _),
         count_progress(total=total, what="entries on splits", quiet=arguments.json) as count,
+        keep_finished(folder),
     ):
-        try:
-            found = studies.run_league(
-                records,
-                folder,
-                entries=arguments.entries,
-                splits=arguments.splits,
-                jobs=arguments.jobs,
-                executor=executor,
-                progress=count,
-                options=options,
-            )
-        except KeyboardInterrupt:
-            note = f"what is finished is kept in {folder}; start it again to continue"
-            print_error(note)
-            raise
+        found = studies.run_league(
+            records,
+            folder,
+            entries=arguments.entries,
+            splits=arguments.splits,
+            jobs=arguments.jobs,
+            executor=executor,
+            progress=count,
+            options=options,
+        )
     files = [
         write_atomically(paths[0], csv_rows(found.standings)),
         write_atomically(paths[1], csv_rows(found.scores)),
@@ -77,9 +72,8 @@ def run(arguments: Namespace) -> Report:
 def _make_report(found: studies.LeagueResult, files: Sequence[Path], *, able: int) -> Report:
     report = Report(data={"records": [scores.name for scores in found.records]})
     splits = len(found.records[0].splits)
-    entries = "1 entry" if able == 1 else f"{able} entries"
-    parts = "1 split" if splits == 1 else f"{splits} splits"
-    caption = f"League: {entries}, {parts} of each record"
+    entries = count_text(able, "entry", "entries")
+    caption = f"League: {entries}, {count_text(splits, 'split')} of each record"
     report.add_rows("standings", caption, found.standings, hidden=("note",))
     report.data["failures"] = dict(found.failures)
     report.notes += [
@@ -120,9 +114,7 @@ def _read_records(
 
 def _read_series(arguments: Namespace) -> LoopRecord:
     """Return a record of series with a known delay."""
-    record = loop_records.read_record(arguments)
-    if isinstance(record, SpectrumRecord):
-        raise ProblemError("a league scores recorded series; got a spectrum.")
+    record = loop_records.require_series(loop_records.read_record(arguments), "a league scores")
     _ = record.hardware
     return record
 

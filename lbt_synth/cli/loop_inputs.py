@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config
@@ -14,11 +12,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.models import Truth
 from lbt_synth.models.loop_hardware import loop_differences
-
-
-def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
-    """Return the options of those names that the command line gives."""
-    return {name: value for name in names if (value := getattr(arguments, name)) is not None}
 
 
 def load_design(path: str, *, several_sensors: bool = False) -> Design:

@@ -10,8 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.command_repairs import given_repair
-from lbt_synth.cli.loop_inputs import given_options
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config, load_config
 from lbt_synth.config.write import config_text
@@ -43,6 +43,7 @@ from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import number
 
 if TYPE_CHECKING:  # as in command_repairs
@@ -62,6 +63,15 @@ def read_record(
     if isinstance(record, LoopRecord):
         record = record.bridged()
         require_length(record, seconds=least_seconds)
+    return record
+
+
+def require_series(record: LoopRecord | SpectrumRecord, what: str) -> LoopRecord:
+    """Return a record of series; refuse a spectrum, as ``what`` needs the series."""
+    if isinstance(record, SpectrumRecord):
+        raise ProblemError(
+            f"{what} recorded series; got a spectrum. Try lbt-synth identify and lbt-synth design."
+        )
     return record
 
 
@@ -151,9 +161,8 @@ def _expected_lines(
     if arguments.lines_file is not None:
         lines += load_lines(arguments.lines_file)
     if arguments.accelerometers is None:
-        for option in ("accelerometer_rate_hz", "acceleration_unit"):
-            if getattr(arguments, option) is not None:
-                raise ProblemError(f"--{option.replace('_', '-')} goes with --accelerometers.")
+        for option in given_options(arguments, "accelerometer_rate_hz", "acceleration_unit"):
+            raise ProblemError(f"{option_name(option)} goes with --accelerometers.")
     else:
         if isinstance(record, SpectrumRecord):
             raise ProblemError(
@@ -292,7 +301,7 @@ def _add_spectra(report: Report, record: SpectrumRecord) -> None:
     f = record.frequency_hz
     report.data["record"] = {"kind": "spectrum", "frequencies": f.size, "notes": record.notes}
     report.add_table(
-        f"Spectra of {_axes_text(record.axes)}",
+        f"Spectra of {count_text(record.axes, 'axis', 'axes')}",
         ("axis", "from [Hz]", "to [Hz]", "rms [nm]"),
         [
             (name, f[0], f[-1], f"{rms:.1f}")
@@ -305,7 +314,8 @@ def _add_spectra(report: Report, record: SpectrumRecord) -> None:
 def _add_series(report: Report, record: LoopRecord) -> None:
     health, names = record.health, axis_names(record.axes)
     report.data["record"] = record_data(record)
-    text = f"{record.duration_s:.4g} s, {_loop_kind(record)}, {_axes_text(record.axes)}"
+    axes = count_text(record.axes, "axis", "axes")
+    text = f"{record.duration_s:.4g} s, {_loop_kind(record)}, {axes}"
     rows = [
         (fault, series, "both" if axis is None else names[axis], *rest)
         for fault, series, axis, *rest in health.rows()
@@ -333,10 +343,6 @@ def record_data(record: LoopRecord) -> dict[str, Any]:
 
 def _loop_kind(record: LoopRecord) -> str:
     return "open loop" if record.commands is None else "closed loop"
-
-
-def _axes_text(count: int) -> str:
-    return "1 axis" if count == 1 else f"{count} axes"
 
 
 def add_model(report: Report, model: IdentifiedModel) -> None:

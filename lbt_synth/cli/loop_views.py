@@ -55,6 +55,7 @@ def show_view(
     figure: Callable[..., Any],
     points: Callable[[Mapping[str, Design], float], Sequence[Any]],
     kind: type[Any],
+    add_more: Callable[[Report, Mapping[str, Design], float], None] = lambda *_: None,
 ) -> Report:
     """Print the margins of designs, and write their figure and their points, rows of a kind."""
     require_outputs(arguments.output, inputs=arguments.gains)
@@ -74,6 +75,7 @@ def show_view(
         write_outputs(
             report, arguments.output, found, figure=lambda: figure(designs, sensor_gain=gain)
         )
+    add_more(report, designs, gain)
     return report
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from lbt_synth.cli.argument_kinds import option_name
 from lbt_synth.methods.method import Method
 from lbt_synth.methods.registry import all_methods, option_names
 
@@ -33,19 +34,15 @@ def add_method_options(parser: ArgumentParser) -> None:
             helps.setdefault(_help_text(method, name), []).append(method.name)
         text = "; ".join(f"{', '.join(names)}: {text}" for text, names in helps.items())
         if others := sorted({o for m in owners if name in m.exclusive for o in m.exclusive}):
-            text += f"; at most one of {', '.join(map(_flag, others))}"
+            text += f"; at most one of {', '.join(map(option_name, others))}"
         kinds = _kinds(owners[0].options.model_fields[name])
         words = dict.fromkeys(c for m in owners for c in _choices(m.options.model_fields[name]))
         parser.add_argument(
-            _flag(name),
+            option_name(name),
             type=next((kind for kind in (int, float) if kind in kinds), str),
             metavar=f"{{{','.join(words)}}}" if words else None,
             help=text.replace("%", "%%"),
         )
-
-
-def _flag(option: str) -> str:
-    return f"--{option.replace('_', '-')}"
 
 
 def _kinds(option: FieldInfo) -> tuple[Any, ...]:

@@ -1,4 +1,4 @@
-"""Directories and files that commands write: tables (.csv), figures, telemetry."""
+"""Files that commands write: tables (.csv), figures, telemetry."""
 
 from __future__ import annotations
 
@@ -7,25 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from lbt_synth.cli.output import Report
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.files.telemetry.aot import lost_fields
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.report.figures.style import FIGURE_ENDINGS, require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_writable, write_atomically
 from lbt_synth.storage.rows import csv_rows
-
-
-def make_directory(path: str | Path) -> Path:
-    """Make a directory if there is none, and return its path."""
-    folder = Path(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the directory {folder}: {error.strerror}.", path=folder
-        ) from error
-    return folder
 
 
 def require_figure(output: str, *, inputs: Sequence[str]) -> None:

@@ -6,10 +6,10 @@ from argparse import Namespace
 
 from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import track_progress
 from lbt_synth.methods.registry import design_title
 from lbt_synth.report.paper import PaperResult, write_paper
+from lbt_synth.storage.atomic_files import make_directory
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import json_record
 from lbt_synth.studies.paper.parameters import DIAMETER_M, TABLE_III, parameter_rows

@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.cli.display import choose_config_unit, choose_unit
 from lbt_synth.cli.loop_inputs import load_design
-from lbt_synth.cli.loop_records import load_series, record_imaging
+from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure
 from lbt_synth.cli.parser import command_options
@@ -18,7 +18,7 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import LoopRecord, require_length
+from lbt_synth.identification import require_length
 from lbt_synth.interop import rehearse
 from lbt_synth.loop import Imaging, Simulation, series_strehl
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
@@ -155,10 +155,7 @@ def _refuse_idle_options(arguments: Namespace) -> None:
 
 def _recorded(arguments: Namespace) -> _Series:
     """Return the pseudo-open-loop series of a record, in its longest stretch of usable frames."""
-    record = load_series(arguments)
-    if not isinstance(record, LoopRecord):
-        raise ProblemError("a rehearsal runs on recorded series; got a spectrum.")
-    record = record.bridged()
+    record = require_series(load_series(arguments), "a rehearsal runs on").bridged()
     require_length(record, frames=_FEWEST, seconds=0)
     choose_unit(arguments, record.diameter_m)
     gain = arguments.sensor_gain

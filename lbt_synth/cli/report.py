@@ -102,10 +102,9 @@ def _report_several_sensors(
 
 def _design_record(one: DesignAssessment) -> dict[str, Any]:
     """Return what JSON says of a design beside its row."""
-    good = good_range(one)
     return {
         "checks": [json_record(check) for check in one.checks],
-        "good_errors_hz": None if good is None else [good.low_hz, good.high_hz],
+        "good_errors_hz": good_range(one),
         "margins": None if one.margins is None else json_record(one.margins),
         "stable_sensor_gains": one.sensor_gains,
     }

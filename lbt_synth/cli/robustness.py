@@ -5,18 +5,21 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
 from lbt_synth import studies
+from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.loop_inputs import given_options, load_designs, truth_at_sensor_gain
+from lbt_synth.cli.loop_inputs import load_designs, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import count_progress, track_progress
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, stable_sensor_gains
 from lbt_synth.report.designs.assessment import require_compatible
@@ -143,11 +146,10 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
 
 def _bound_designs(arguments: Namespace) -> Report:
     """Bound the errors that the loops of gain files survive at the same time."""
-    given = {name: getattr(arguments, f"mu_{name}") for name in _SIZES}
-    for name, size in given.items():
-        if size is not None:
-            number(size, f"--mu-{name.replace('_', '-')}", at_least=0)
-    sizes = {name: size for name, size in given.items() if size is not None}
+    sizes: dict[str, Any] = {
+        name.removeprefix("mu_"): number(size, option_name(name), at_least=0)
+        for name, size in given_options(arguments, *(f"mu_{name}" for name in _SIZES)).items()
+    }
     rows = [
         replace(studies.structured_robustness(design, **sizes), design=name)
         for name, design in load_designs(arguments.gains).items()
@@ -195,8 +197,7 @@ def _parse_range(
 def _assumed_gain(name: str, design: Design, config: Config) -> float:
     """Return the sensor gain that a design assumes, relative to ``sensor.matrix``."""
     require_compatible(name, design, config.hardware)
-    own, here = design.hardware, config.hardware
-    assert own is not None  # the others were refused
+    own, here = require_hardware(design, "a map"), config.hardware
     unit = here.sensor / config.sensor_gain
     gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
     if not (gain > 0 and _close(own.sensor, gain * unit) and _close(own.influence, here.influence)):
@@ -215,10 +216,9 @@ def _stable_gains(
     design: Design, found: RobustnessMap, assumed: float
 ) -> list[tuple[float, float]]:
     """Return the interval of stable real sensor gains at each delay error, or nan for none."""
-    assert design.hardware is not None  # _assumed_gain has refused the others
-    intervals = []
+    hardware, intervals = require_hardware(design, "a map"), []
     for delay, stable in zip(found.delay_errors_frames, found.stable, strict=True):
-        real = replace(design.hardware, delay_frames=design.hardware.delay_frames + delay)
+        real = replace(hardware, delay_frames=hardware.delay_frames + delay)
         # around the gain that the design assumes, if the loop is stable there
         starts = [assumed, *found.sensor_gains[stable]]
         tried = (stable_sensor_gains(real, design.controller, nominal=s / assumed) for s in starts)
@@ -273,10 +273,9 @@ def _guarantee(
     design: Design, found: RobustnessMap, assumed: float, config: Config
 ) -> GuaranteedResidual:
     """Bound the residual over the frequencies and sensor gains of a map, at the design's delay."""
-    assert design.hardware is not None  # _assumed_gain has refused the others
     errors, gains = found.errors_hz, found.sensor_gains / assumed
     return guaranteed_residual(
-        design.hardware,
+        require_hardware(design, "a map"),
         design,
         config.truth,
         error_hz=(float(errors.min()), float(errors.max())),

@@ -7,7 +7,8 @@ from argparse import Namespace
 
 import numpy as np
 
-from lbt_synth.cli.loop_inputs import given_options, truth_at_sensor_gain
+from lbt_synth.cli.argument_kinds import given_options
+from lbt_synth.cli.loop_inputs import truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
@@ -17,7 +18,7 @@ from lbt_synth.loop import residual_budget, strehl
 from lbt_synth.loop.fusion.simulation import READINGS, Drop
 from lbt_synth.report.figures import sensor_failure_figure
 from lbt_synth.report.figures.style import save_figure
-from lbt_synth.storage.summaries import count_text
+from lbt_synth.storage.words import count_text
 from lbt_synth.studies.sensor_failures import run_failures
 
 _DROP = re.compile(

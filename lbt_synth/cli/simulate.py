@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.cli.argument_kinds import given_options
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.loop_inputs import given_options, loop_difference_notes, truth_at_sensor_gain
+from lbt_synth.cli.loop_inputs import loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
@@ -40,6 +41,7 @@ from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import column, columns, fill_row, json_record, json_units, table_row
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 
@@ -149,7 +151,7 @@ def _describe_simulation(
         "residual_exact_nm": factor * float(np.sqrt(np.mean(simulation.rms_nm**2))),
     }
     report.add_table(
-        f"{design.method} in the loop: {cases} run{'s' * (cases > 1)} of {frames} frames; "
+        f"{design.method} in the loop: {count_text(cases, 'run')} of {frames} frames; "
         f"{imaging.label}",
         ("quantity", "simulated", "exact", "unit"),
         [

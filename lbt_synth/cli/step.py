@@ -5,7 +5,6 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Mapping
 
-from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.loop_views import show_view
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
@@ -44,20 +43,22 @@ class StepFacts:
 
 def run(arguments: Namespace) -> Report:
     """Draw residual and command after a step, and print overshoot, settling time and margins."""
-    report = show_view(arguments, step_figure, _points, StepPoint)
-    steps = design_steps(load_designs(arguments.gains), sensor_gain=arguments.sensor_gain)
+    return show_view(arguments, step_figure, _points, StepPoint, _add_facts)
+
+
+def _add_facts(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:
+    """Add how the loops follow a step."""
     facts = [
         StepFacts(
             design=axes_name(name, [each.axis], alone=len(found) == 1),
             overshoot_percent=each.overshoot_percent,
             settling_s=each.settling_s,
         )
-        for name, found in steps.items()
+        for name, found in design_steps(designs, sensor_gain=sensor_gain).items()
         for each in found
     ]
     if facts:
         report.add_rows("steps", "After a step of the wavefront", facts)
-    return report
 
 
 def _points(designs: Mapping[str, Design], sensor_gain: float) -> list[StepPoint]:

@@ -9,17 +9,17 @@ from pathlib import Path
 
 from lbt_synth import studies
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.engine import choose_engine, require_jobs
+from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import make_directory
 from lbt_synth.cli.progress import count_progress, show_spinner
-from lbt_synth.cli.streams import print_error
 from lbt_synth.report import write_study_page
-from lbt_synth.storage.atomic_files import refuse_replacing
+from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.study.run import FinishedStudy, output_paths
 from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
 from lbt_synth.studies.study.summary import worst_table
+from lbt_synth.validation import integer
 
 _COUNTS = ("samples", "computed", "failures", "retry", "seconds")
 _WORST = 3  # rows of each controller that are printed; the page has more
@@ -27,7 +27,7 @@ _WORST = 3  # rows of each controller that are printed; the page has more
 
 def run(arguments: Namespace) -> Report:
     """Run a study, say what it would cost, or replay one of its rows."""
-    require_jobs(arguments)
+    integer(arguments.jobs, "--jobs", at_least=1)
     folder = Path(arguments.output)
     with show_spinner("reading the study, designing", quiet=arguments.json):
         loaded = studies.load_study(arguments.study, directory=folder)
@@ -51,7 +51,8 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
     if new:
         done = (
             f"{found.computed} of {found.samples} samples computed in "
-            f"{_duration(found.computing_s)}; with tables and page {_duration(found.seconds)}."
+            f"{duration_text(found.computing_s)}; with tables and page "
+            f"{duration_text(found.seconds)}."
         )
     failed = f"note: {found.failures} results failed, see {found.failed}."
     if found.retry:
@@ -112,34 +113,23 @@ def _compute(
 
     with choose_engine(arguments) as (executor, workers):
         make_directory(folder)
-        with count_progress(
-            total=loaded.samples, what="samples", quiet=arguments.json, rate=True
-        ) as count:
-            try:
-                study_run = studies.run_study(
-                    loaded,
-                    folder,
-                    executor=executor,
-                    jobs=arguments.jobs,
-                    workers=workers,
-                    progress=count,
-                    whole=summarise,
-                )
-            except KeyboardInterrupt:
-                note = f"what is finished is kept in {folder}; start it again to continue"
-                print_error(note)
-                raise
+        with (
+            count_progress(
+                total=loaded.samples, what="samples", quiet=arguments.json, rate=True
+            ) as count,
+            keep_finished(folder),
+        ):
+            study_run = studies.run_study(
+                loaded,
+                folder,
+                executor=executor,
+                jobs=arguments.jobs,
+                workers=workers,
+                progress=count,
+                whole=summarise,
+            )
     [(statistics, new)] = found
     return study_run, statistics, new
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.3g} s"
-    if seconds < 6000:
-        return f"{seconds / 60:.3g} min"
-    hours = seconds / 3600
-    return f"{hours:.3g} h" if hours < 100 else f"{hours / 24:.3g} days"
 
 
 def _sampling_notes(loaded: studies.Study) -> list[str]:
@@ -171,7 +161,7 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
         count = workers or arguments.jobs
     with show_spinner("measuring a batch", quiet=arguments.json):
         cost = studies.estimate_study(loaded, workers=count, local=workers is None)
-    where = f"{count} {'process' if count == 1 else 'processes'}"
+    where = count_text(count, "process", "processes")
     if workers is not None:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
     parameters = {p.name: p.distribution.text for p in loaded.parameters}
@@ -182,7 +172,7 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     report.add_table("Parameters", ("parameter", "distribution"), parameters.items())
     report.add_table("Controllers", ("controller", "what"), controllers.items())
     report.notes += [
-        f"the whole takes about {_duration(cost.seconds)} on {where}.",
+        f"the whole takes about {duration_text(cost.seconds)} on {where}.",
         *_sampling_notes(loaded),
         "nothing was written.",
     ]

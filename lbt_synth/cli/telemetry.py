@@ -17,6 +17,7 @@ from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, json_units, table_row
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 
@@ -96,8 +97,7 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     )
     seconds = telemetry.frames / telemetry.frame_rate_hz
     report.add_table(
-        f"{telemetry.frames} frames, {seconds:.6g} s, {telemetry.modes} "
-        f"mode{'s' if telemetry.modes > 1 else ''}",
+        f"{telemetry.frames} frames, {seconds:.6g} s, {count_text(telemetry.modes, 'mode')}",
         ("array", "shape", "axes", "unit", "rms"),
         [
             (

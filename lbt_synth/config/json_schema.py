@@ -7,16 +7,11 @@ from typing import Any
 from lbt_synth.config.schema import FileSection
 
 
-def config_schema(title: str = "lbt-synth") -> dict[str, Any]:
+def config_schema() -> dict[str, Any]:
     """Return the JSON schema of a configuration file.
 
     Every key has its description, with its unit. Rules over several keys, such as one of
     ``rms_nm`` and ``rms_mas``, are known to :func:`load_config` alone.
-
-    Parameters
-    ----------
-    title : str, optional
-        Name of the schema, which editors show.
 
     Returns
     -------
@@ -31,4 +26,4 @@ def config_schema(title: str = "lbt-synth") -> dict[str, Any]:
     'frame rate [Hz]'
     """
     dialect = "https://json-schema.org/draft/2020-12/schema"
-    return {"$schema": dialect, **FileSection.model_json_schema(), "title": title}
+    return {"$schema": dialect, **FileSection.model_json_schema(), "title": "lbt-synth"}

@@ -33,7 +33,6 @@ from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.fusion.plant import FusedPlant
-from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -110,7 +109,7 @@ class Config(Summarised):
         given = self.settings.robustness.errors_hz
         if given is not None:
             return given
-        lines = [line.frequency_hz for line in stationary_vibrations(self.truth.vibrations)]
+        lines = self.truth.lines_hz
         if not lines:
             return [0.0]
         stated = self.truth.frequency_errors_hz

@@ -23,7 +23,7 @@ from lbt_synth.design.certificate import (
 )
 from lbt_synth.design.expected_disturbance import ModeDisturbance, modelled_disturbance
 from lbt_synth.design.facts import FilterFacts, model_facts, summarise_design
-from lbt_synth.errors import NumericalError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
 from lbt_synth.linear.estimation_problem import decorrelate
 from lbt_synth.linear.matrix_functions import relative_distance
@@ -35,7 +35,8 @@ from lbt_synth.linear.riccati.filtering import (
 )
 from lbt_synth.loop import close_loop
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
-from lbt_synth.storage.summaries import Summarised, Summary, count_text
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
@@ -388,3 +389,11 @@ def filter_design(
         **claims,
     )
     return with_certificate(design, "Try the other route, or scale the states to similar sizes.")
+
+
+def require_hardware(design: Design, what: str) -> LoopHardware:
+    """Return the loop of a design; refuse one of a bare estimation problem."""
+    if design.hardware is not None:
+        return design.hardware
+    got = "one of a bare estimation problem. Design for the plant of a loop"
+    raise ProblemError(f"{what} needs the design of a loop; got {got}.")

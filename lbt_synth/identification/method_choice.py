@@ -87,27 +87,13 @@ def choose_method(
     design: Callable[[str, IdentifiedModel, Mapping[str, Any]], Design],
     is_safe: Callable[[Design], bool],
 ) -> MethodChoice:
-    """Choose the method of synthesis by forward chaining.
+    """Choose the default method, unless another one leaves clearly less in forward chaining.
 
-    Parameters
-    ----------
-    record : LoopRecord
-        The record.
-    half : IdentifiedModel
-        Identified from the training of the first of the two splits, half of the usable frames.
-    identify_past : callable
-        From ``stretches=`` and ``start=``, a model, to the model of these frames.
-    design : callable
-        From the name of a method, a model and options of the method to a design.
-    is_safe : callable
-        Whether the loop of a design is stable at all sensor gains that the record allows; asked
-        only of a method that would replace the default.
-
-    Returns
-    -------
-    MethodChoice
-        The default method, unless another one leaves clearly less. A method that fails or is
-        unstable is left out; if nothing can be compared, a note says why.
+    ``half`` is identified from the training of the first of the two splits, half of the usable
+    frames, and ``identify_past`` takes its ``stretches=`` and ``start=``. ``is_safe`` says whether
+    the loop of a design is stable at all sensor gains that the record allows, and is asked only of
+    a method that would replace the default. A method that fails or is unstable is left out; if
+    nothing can be compared, a note says why.
     """
 
     def build(name: str, split: ForwardSplit) -> Design:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 import lbt_synth
 from lbt_synth.design import Check, Design, FusedFilter, certify_loop
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.arithmetic_cost import FrameCost
 from lbt_synth.linear import Controller
@@ -64,9 +65,7 @@ def require_exportable(design: Design, written: Controller | None = None) -> Non
 
 def require_modal(design: Design, file: str) -> int:
     """Return the number of modes of a design whose measurements and commands are its modes."""
-    hardware = design.hardware
-    if hardware is None:
-        raise ProblemError(f"{file} needs the design of a loop; got a bare controller.")
+    hardware = require_hardware(design, file)
     identity = np.eye(hardware.modes)
     for name in ("sensor", "influence"):
         if not np.array_equal(getattr(hardware, name), identity):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Check, Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.export_checks import Exported
 from lbt_synth.interop.target import target_named
@@ -124,9 +125,7 @@ def rehearse(
     True
     """
     controller = as_controller(design)
-    path = design.hardware if hardware is None else hardware
-    if path is None:
-        raise ProblemError("a rehearsal needs the design of a loop; got a bare controller.")
+    path = require_hardware(design, "a rehearsal") if hardware is None else hardware
     total = float_array(total_nm, "total_nm")
     seen = (
         np.zeros((len(total), path.n_measurements))

@@ -61,9 +61,9 @@ class Target:
         """Names of the arguments of ``write``."""
         return tuple(signature(self.write).parameters)
 
-    def path_in(self, folder: Path, stem: str = "k") -> Path:
+    def path_in(self, folder: Path) -> Path:
         """Return a path in a folder that ``write`` takes."""
-        return folder / "".join([stem, *self.endings[:1]])
+        return folder / "".join(["k", *self.endings[:1]])
 
 
 def target_names() -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design, ShapedDesign
-from lbt_synth.design.result import EstimatorDesign
+from lbt_synth.design.result import EstimatorDesign, require_hardware
 from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.design.shaping.objectives import leaves
@@ -44,21 +44,13 @@ _ASKED = np.array([0.0031, 0.11, 0.37])  # parts of the frame rate
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rounding:
-    """Rounding of the arithmetic, as noise.
+    """Rounding of the arithmetic, as noise."""
 
-    Attributes
-    ----------
-    entry : Controller
-        From the noise (r,) of the sums to the command; A and C are those of the controller.
-    variance : callable
-        From the sensor gain and the rms of measurements and commands, (q,) and (m,), to the
-        variance of the noise, (r,).
-    signals : (s, n) ndarray, optional
-        Rows that read signals from the controller's state; their rms follow the measurements'.
-    """
-
+    # from the noise (r,) of the sums to the command; A and C are those of the controller
     entry: Controller
+    # from the sensor gain and the rms of measurements (q,) and commands (m,) to that of the noise
     variance: Callable[[float, FloatArray, FloatArray], FloatArray]
+    # rows (s, n) that read signals from the controller's state; their rms follow the measurements'
     signals: FloatArray | None = None
 
 
@@ -116,8 +108,7 @@ def prove_written(
     It is stable over the design's sensor gains; residual, arithmetic included, and modulus margin
     are within 1 % of the design's, and so is each demand of a shaped design of its limit.
     """
-    hardware = design.hardware
-    assert hardware is not None  # the callers refuse a design without a loop
+    hardware = require_hardware(design, "a check of what is written")
     low, high = proved_gains(design, hardware)
     count = 2 + int(np.log(high / low) / np.log(_STEP))
     gains = np.append(np.geomspace(low, high, count), 1.0)
@@ -163,8 +154,7 @@ def _residual_check(
     gain: float,
 ) -> Check:
     """Compare the residual, with what the rounding of the arithmetic and what is left out add."""
-    hardware = design.hardware
-    assert hardware is not None
+    hardware = require_hardware(design, "a check of what is written")
     n, m = hardware.modes, hardware.n_commands
     loops = [close_loop(hardware, c, sensor_gain=gain) for c in (design.controller, written)]
     before = mode_variances(design, loops[0], slice(n))

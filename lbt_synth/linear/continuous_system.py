@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.storage.summaries import Summarised, count_text
+from lbt_synth.storage.summaries import Summarised
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import ComplexArray, FloatArray, matrix, real_array, set_fields, square
 
 _SINGULAR = 1e-13  # reciprocal condition at which a point counts as a pole

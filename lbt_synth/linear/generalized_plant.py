@@ -11,7 +11,8 @@ from scipy.linalg import matrix_balance
 from lbt_synth.errors import DimensionError, NumericalError
 from lbt_synth.linear.continuous_system import ContinuousSystem, linear_system, require_same_time
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.storage.summaries import Summarised, count_text
+from lbt_synth.storage.summaries import Summarised
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, integer, matrix, number, set_fields, square
 
 _ILL_POSED = 1e-12

@@ -19,8 +19,9 @@ from lbt_synth.linear.batched import solve_stack
 from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.storage.rows import column, fact_table, table_row
-from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
+from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
 from lbt_synth.storage.warning_filters import ignore_warnings
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,

@@ -12,6 +12,7 @@ from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_syste
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, matrix
 
 LONGEST_DELAY = 20  # of a loop [frames]; each is a state of every matrix
@@ -145,7 +146,7 @@ class LoopHardware(Summarised):
         return fill_row(LoopFacts, self, settling_ms=settling_ms)
 
     def _brief(self) -> str:
-        axes = "1 axis" if self.modes == 1 else f"{self.modes} axes"
+        axes = count_text(self.modes, "axis", "axes")
         moving = "" if self.mirror is None else ", a mirror with dynamics"
         return f"{axes} at {self.frame_rate_hz:g} Hz, delay {self.delay_frames:g} frames{moving}"
 

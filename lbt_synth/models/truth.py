@@ -15,7 +15,8 @@ from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration.drifting import DriftingVibration
 from lbt_synth.models.vibration.in_a_loop import TrueVibration, stationary_vibrations
 from lbt_synth.storage.rows import fact_table
-from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
+from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
     Positive,
@@ -135,6 +136,11 @@ class Truth(Summarised):
             )
         return tuple(errors)
 
+    @property
+    def lines_hz(self) -> list[float]:
+        """Frequencies of the vibrations [Hz], rising, each once; one that drifts is refused."""
+        return sorted({line.frequency_hz for line in stationary_vibrations(self.vibrations)})
+
     def frequency_shifts_hz(self, error_hz: float) -> FloatArray:
         """Return how far each vibration moves, (vibrations,), if the one that moves most does so.
 
@@ -152,10 +158,9 @@ class Truth(Summarised):
         The line takes the share of the vibration that is nearest to it in frequency. Without
         vibrations it moves by the whole error.
         """
-        lines = stationary_vibrations(self.vibrations)
-        if not lines:
+        places = np.array(self.lines_hz)
+        if not places.size:
             return error_hz
-        places = np.array([line.frequency_hz for line in lines])
         nearest = np.argmin(np.abs(np.log(places / frequency_hz)))
         return float(self.frequency_shifts_hz(error_hz)[nearest])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 
 MINUS = "\u2212"  # as long as a plus
 DASH = "\u2013"  # where there is no number
@@ -39,9 +38,9 @@ def fixed_text(value: float, decimals: int) -> str:
     return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", MINUS)
 
 
-def signed_text(value: float, digits: int = 4) -> str:
+def signed_text(value: float) -> str:
     """Return a number with its sign: +0.5, −3, 0."""
-    text = number_text(value, digits)
+    text = number_text(value)
     return f"+{text}" if value > 0 else text
 
 
@@ -59,10 +58,3 @@ def print_text(text: str) -> str:
 def unbroken_text(text: str) -> str:
     """Keep a number, its sign and its error, and the two ends of an interval, in one line."""
     return re.sub(" (±|to) ", rf"{NO_BREAK}\1{NO_BREAK}", print_text(text))
-
-
-def listing_text(items: Sequence[str]) -> str:
-    """Return a list as a part of a sentence: a, b and c."""
-    if len(items) < 2:
-        return "".join(items)
-    return f"{', '.join(items[:-1])} and {items[-1]}"

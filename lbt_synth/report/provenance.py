@@ -6,18 +6,15 @@ import hashlib
 import os
 import platform
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import MappingProxyType
 
 import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
-from lbt_synth.report.page.blocks import Listing, Section
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.storage.rows import column, row_table, table_row
-from lbt_synth.storage.tables import Table
+from lbt_synth.storage.rows import column, table_row
 
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
 _WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
@@ -87,27 +84,3 @@ def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
         except PackageNotFoundError:
             found.append((name, "not installed"))
     return tuple(found)
-
-
-def source_section(
-    files: Sequence[SourceFile] = (),
-    *,
-    versions: Sequence[tuple[str, str]] | None = None,
-    texts: Mapping[str, str] = MappingProxyType({}),
-    about: Table | None = None,
-) -> Section:
-    """Return the last section of a page: what it was made from, and by which programs.
-
-    Texts are listed under their captions.
-    """
-    made_with = tuple(program_versions() if versions is None else versions)
-    return Section(
-        key="sources",
-        title="Files and versions",
-        blocks=(
-            *([] if about is None else [about]),
-            *([row_table("Files that were read", files)] if files else []),
-            Table(caption="Made with", headings=("program", "version"), rows=made_with, words=(1,)),
-            *(Listing(caption=caption, text=text) for caption, text in texts.items()),
-        ),
-    )

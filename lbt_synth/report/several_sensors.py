@@ -13,18 +13,18 @@ from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.loop.fusion.simulation import Drop
 from lbt_synth.report.charts.description import Chart
 from lbt_synth.report.figures.sensor_failures import sensor_failure_panels
-from lbt_synth.report.number_text import listing_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.page.source_section import source_section
 from lbt_synth.report.page.words import chart
 from lbt_synth.report.provenance import (
     creation_time,
     read_source,
-    source_section,
     time_text,
 )
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, row_table
+from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import TruthComparison, compare_in_truth
 from lbt_synth.studies.sensor_failures import run_failures
 
@@ -42,30 +42,8 @@ def write_fused_report(
 ) -> tuple[tuple[Path, ...], TruthComparison]:
     """Write the page of designs of several sensors, and as a PDF if that is wanted.
 
-    Parameters
-    ----------
-    config : Config
-        The loop; its truth must be stationary.
-    designs : mapping of str to FusedFilter
-        The designs by name.
-    path, pdf : path-like
-        Files to write, that end in .html and .pdf.
-    gain_files : mapping of str to path-like, optional
-        Files that designs came from, whose digests the page gives.
-    title : str, optional
-        Heading of the page.
-
-    Returns
-    -------
-    tuple of pathlib.Path, TruthComparison
-        The files, and the designs in the truth of the configuration.
-
-    Raises
-    ------
-    OutputError
-        If a name ends in something else, or a file cannot be written.
-    ProblemError
-        If a design does not fit the loop, or a vibration drifts.
+    The truth of the configuration must be stationary. The page gives the digests of the files that
+    designs came from.
     """
     require_page_names(path, pdf)
     source, content = read_source(config.source, "configuration")

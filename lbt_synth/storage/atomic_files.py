@@ -33,6 +33,18 @@ def require_ending(
     return target
 
 
+def make_directory(path: str | os.PathLike[str], *, parents: bool = True) -> Path:
+    """Make a directory, and its parents, if there is none, and return its path."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=parents, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the directory {folder}: {error.strerror}.", path=folder
+        ) from error
+    return folder
+
+
 def require_writable(
     *paths: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
 ) -> None:

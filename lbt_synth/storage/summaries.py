@@ -93,11 +93,6 @@ class Summarised:
         return f"<div>{''.join(parts)}</div>"
 
 
-def count_text(number: int, word: str) -> str:
-    """Return a number of things: 1 state, 2 states."""
-    return f"{number} {word}{'' if number == 1 else 's'}"
-
-
 def _short_text(value: Any) -> str:
     """Return a value in one line, an array by its shape."""
     if isinstance(value, np.ndarray):

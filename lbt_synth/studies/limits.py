@@ -193,7 +193,6 @@ def limits(
             )
         )
         curves.append(curve)
-    frequencies = {line.frequency_hz for line in vibrations}
     return LimitStudy(
         rows=tuple(rows),
         limit=limit,
@@ -201,7 +200,7 @@ def limits(
         band_hz=band_hz,
         shift_hz=frozen_copy(shifts),
         residual_nm=frozen_copy(curves),
-        frequency_hz=frequencies.pop() if len(frequencies) == 1 else None,
+        frequency_hz=truth.lines_hz[0] if len(truth.lines_hz) == 1 else None,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +43,6 @@ def mirror(
     imaging: Imaging,
     *,
     command_weight: float = 0.0,
-    more: Mapping[str, Design] | None = None,
 ) -> tuple[MirrorRow, ...]:
     """Compare designs on a moving mirror: what it costs to ignore its dynamics.
 
@@ -62,8 +60,6 @@ def mirror(
         The camera.
     command_weight : float, optional
         As for :func:`lqg`.
-    more : mapping of str to Design, optional
-        Further designs, by name.
 
     Returns
     -------
@@ -103,7 +99,6 @@ def mirror(
         "kalman, settled mirror": kalman(settled),
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
-        **(more or {}),
     }
     return tuple(_row(name, design, hardware, truth, imaging) for name, design in designs.items())
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop import (
     EnsembleVibration,
@@ -136,8 +137,8 @@ def default_methods() -> list[str]:
 
 
 def _row(design: Design, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
-    assert design.hardware is not None  # this module designs for plants
-    loop = close_loop(design.hardware, design.controller, sensor_gain=truth.sensor_gain)
+    hardware = require_hardware(design, "a row")
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     known = {"error_hz": error, "stable": loop.is_stable}
     if not loop.is_stable:
         return fill_row(RobustnessRow, design, **known)
@@ -302,7 +303,7 @@ def robustness_map(
 
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
     """Return the errors at which the vibration that moves most is within a band of the design."""
-    lines = [line.frequency_hz for line in stationary_vibrations(truth.vibrations)]
+    lines = truth.lines_hz
     expected = design.expected_disturbance()
     if not lines or expected is None:
         return None
@@ -314,12 +315,7 @@ def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
 
 def _checked_hardware(design: Design) -> LoopHardware:
     """Return the loop of a design, which has one or two axes."""
-    hardware = design.hardware
-    if hardware is None:
-        raise ProblemError(
-            "a map needs a design for a loop; got one of a bare estimation problem. Design for a "
-            "plant of tip_tilt_plant."
-        )
+    hardware = require_hardware(design, "a map")
     if hardware.modes > 2:
         raise DimensionError(
             f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."

@@ -35,21 +35,12 @@ class SegmentRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FailureRun:
-    """A run in which sensors fail.
-
-    Attributes
-    ----------
-    simulation : Simulation
-        The run.
-    segments : tuple of Segment
-        Times between failures and returns.
-    exact_nm : tuple of float
-        Exact stationary residual of each [nm rms]; nan where the loop is unstable, or a vibration
-        of the truth drifts.
-    """
+    """A run in which sensors fail."""
 
     simulation: Simulation
-    segments: tuple[Segment, ...]
+    segments: tuple[Segment, ...]  # times between failures and returns
+    # exact stationary residual of each [nm rms]; nan where the loop is unstable, or a vibration
+    # of the truth drifts
     exact_nm: tuple[float, ...]
 
     def rows(self, imaging: Imaging) -> list[SegmentRow]:
@@ -82,31 +73,7 @@ def run_failures(
     cases: int,
     seed: int,
 ) -> FailureRun:
-    """Run the loop of a configuration in which sensors fail.
-
-    Parameters
-    ----------
-    design : FusedFilter
-        The filter of several sensors.
-    config : Config
-        Its loop.
-    truth : Truth
-        What the loop meets.
-    drops : sequence of Drop
-        When sensors fail; none of them after the end of the run.
-    frames, cases, seed : int
-        Length of the run, independent runs, and the seed of their series.
-
-    Returns
-    -------
-    FailureRun
-        The run, beside exact answers.
-
-    Raises
-    ------
-    ProblemError
-        If a sensor that fails is not there.
-    """
+    """Run the loop of a configuration in which sensors fail, none after the end of the run."""
     filters = design.controllers
     simulation = simulate_fused(
         filters,

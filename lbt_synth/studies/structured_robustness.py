@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Block, StateSpace, mu_bound
 from lbt_synth.loop import ClosedLoop, close_loop
@@ -147,9 +148,7 @@ def _closed(design: Design | ClosedLoop) -> ClosedLoop:
     if isinstance(design, ClosedLoop):
         return design
     require_instance(design, Design, "design")
-    if design.hardware is None:
-        raise ProblemError("the design must know its hardware; close its loop and give that.")
-    return close_loop(design.hardware, design)
+    return close_loop(require_hardware(design, "structured robustness"), design)
 
 
 def uncertain_loop(

@@ -4,19 +4,9 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 
 import pytest
 from support.commands import run
-
-
-def test_without_its_library_it_says_what_to_install(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "shtab", None)
-    status, _, error = run(capsys, "completion", "bash")
-    assert (status, error) == (
-        2,
-        "lbt-synth: error: the script of a shell needs shtab: pip install shtab.\n",
-    )
 
 
 @pytest.mark.e2e

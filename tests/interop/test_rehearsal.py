@@ -103,7 +103,7 @@ def test_what_cannot_be_rehearsed_is_refused(slow):
     with pytest.raises(lbt.errors.UnstableLoopError):
         lbt.interop.rehearse(slow, "dao", PHASE, sensor_gain=4.0)
     bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
-    with pytest.raises(problem, match="bare controller"):
+    with pytest.raises(problem, match="bare estimation problem"):
         lbt.interop.rehearse(bare, "dao", PHASE)
     fused = lbt.design.fused_kalman(example_plant((SLOW,)))
     with pytest.raises(problem, match="got one of several sensors"):

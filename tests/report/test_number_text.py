@@ -6,7 +6,6 @@ import numpy as np
 
 from lbt_synth.report.number_text import (
     fixed_text,
-    listing_text,
     number_text,
     signed_text,
     unbroken_text,
@@ -32,8 +31,6 @@ def test_numbers_as_texts():
     assert signed_text(0.5) == "+0.5"
     assert signed_text(0.0) == "0"
     assert number_text(-0.0) == "0"
-    assert listing_text([]) == ""
-    assert listing_text(["a", "b", "c"]) == "a, b and c"
 
 
 def test_a_number_and_its_error_stay_in_one_line():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lbt_synth.storage.rows import column, fact_table, table_row
-from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
+from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
 from lbt_synth.storage.tables import Table
 
 
@@ -111,7 +111,3 @@ def test_a_curve_that_falls_to_nothing_is_shown_over_five_decades():
     page = html(Shown(values=np.eye(2), curve=sparkline(np.array([1.0, 1e-30, 1.0]))))
     (words,) = page.iter("figcaption")
     assert words.text.startswith("gain <sigma>: 1e-05 to 1,")
-
-
-def test_things_are_counted():
-    assert [count_text(n, "state") for n in (0, 1, 2)] == ["0 states", "1 state", "2 states"]

@@ -359,7 +359,7 @@ def test_wrong_axes_are_refused(kalman, settings, wrong, text):
 def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
     axes = {"errors_hz": [0, 1], "sensor_gains": [1]}
     walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.errors.ProblemError, match="needs a design for a loop"):
+    with pytest.raises(lbt.errors.ProblemError, match="a map needs the design of a loop"):
         lbt.studies.robustness_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
     with pytest.raises(lbt.errors.ProblemError, match="needs a vibration in the truth"):
         lbt.studies.robustness_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)

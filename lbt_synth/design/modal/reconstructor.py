@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, integer, matrix, number, read_only, real_array
 
 _NAMED = 5  # modes that a message lists
@@ -245,4 +246,4 @@ def name_modes(indices: Any) -> str:
         return f"mode {numbers[0]}"
     if len(numbers) > _NAMED:
         numbers = [*numbers[:_NAMED], f"{len(numbers) - _NAMED} more"]
-    return f"modes {', '.join(numbers[:-1])} and {numbers[-1]}"
+    return f"modes {listing_text(numbers)}"

@@ -21,6 +21,7 @@ from lbt_synth.files.telemetry.fields import (
 )
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, frozen_copy, real_array, require_instance, set_fields
 
 _SAME_TAPS = 1e-9  # largest difference between the taps of a file and those of its mirror
@@ -191,9 +192,9 @@ class Telemetry:
                 word = same.get(axis, axis)
                 needed, giver = sizes.setdefault(word, (size, layer.field))
                 if size != needed:
-                    words = f"{needed} {word}{'' if needed == 1 else 's'} to match {giver}"
                     raise DimensionError(
-                        f"{layer.field} must have {words}; got shape {array.shape}."
+                        f"{layer.field} must have {count_text(needed, word)} to match {giver}; "
+                        f"got shape {array.shape}."
                     )
             set_fields(self, **{layer.field: array})
         if self.times_s is not None and np.any(np.diff(self.times_s) <= 0):

@@ -44,26 +44,10 @@ class AxisMatrix:
 def classify_matrix(
     values: ArrayLike, errors: ArrayLike = 0.0, *, tolerance: float = _TOLERANCE
 ) -> AxisMatrix:
-    """Return what a matrix between axes does.
+    """Return what a matrix (n, n) of one or two axes does: the first kind that fits.
 
-    Parameters
-    ----------
-    values : (n, n) array_like
-        Matrix of one or two axes.
-    errors : float or (n, n) array_like, optional
-        Standard errors; elements within four of them count as zero.
-    tolerance : float, optional
-        Elements count as zero, too, below this part of the largest one.
-
-    Returns
-    -------
-    AxisMatrix
-        The structure: the first kind of the list that fits.
-
-    Raises
-    ------
-    ProblemError
-        If the matrix is not square and finite, or the tolerance negative.
+    Elements within four standard errors of zero, or below a part of the largest one, the tolerance,
+    count as zero.
 
     Examples
     --------

@@ -7,6 +7,7 @@ import numpy as np
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess, is_orthogonal
 from lbt_synth.identification.commands.repair import MIRROR, CommandRepair, rotation
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, IntArray
 
 _FINE_DEG = np.arange(-24.0, 25.0, 6.0)
@@ -96,7 +97,7 @@ def repair_guess(
         return CommandRepair(), None, []
     words = []
     if lag:
-        words = [f"they are recorded {lag} frame{'s' * (lag > 1)} late"]
+        words = [f"they are recorded {count_text(lag, 'frame')} late"]
     total = delay_frames + guess.shift_frames + lag
     other = total if total != delay_frames else None
     if other is not None:
@@ -134,7 +135,7 @@ def _repair_matrix(matrix: FloatArray) -> tuple[CommandRepair, str]:
 
 def recorded_early(frames: int) -> str:
     """Return the words for commands that know the future."""
-    return f"they are recorded {frames} frame{'s' * (frames > 1)} early, before their measurements"
+    return f"they are recorded {count_text(frames, 'frame')} early, before their measurements"
 
 
 def axes_apart(lags: IntArray) -> str:
@@ -142,7 +143,7 @@ def axes_apart(lags: IntArray) -> str:
     late = int(np.argmax(lags))
     frames = int(np.ptp(lags))
     return (
-        f"those of axis {late} follow their measurements {frames} frame{'s' * (frames > 1)} later "
+        f"those of axis {late} follow their measurements {count_text(frames, 'frame')} later "
         f"than those of axis {1 - late}; move one of them"
     )
 

@@ -40,24 +40,12 @@ _ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Guess:
-    """How recorded commands may reach the measurements.
-
-    Attributes
-    ----------
-    kind : str
-        "as given", "matrix", "shift", "increments" or "clipped".
-    matrix : (axes, axes) ndarray or None
-        From recorded commands to the axes of the measurements.
-    shift_frames : float
-        Frames by which the delay is longer than given.
-    limit_nm : (axes,) ndarray or None
-        Stroke beyond which requests were not applied [nm].
-    """
+    """How recorded commands may reach the measurements."""
 
     kind: GuessKind
-    matrix: FloatArray | None = None
-    shift_frames: float = 0.0
-    limit_nm: FloatArray | None = None
+    matrix: FloatArray | None = None  # from commands to the axes of the measurements, (axes, axes)
+    shift_frames: float = 0.0  # by which the delay is longer than given
+    limit_nm: FloatArray | None = None  # stroke beyond which requests were not applied, (axes,)
 
     @property
     def is_simple(self) -> bool:
@@ -85,27 +73,13 @@ def is_orthogonal(matrix: FloatArray) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Comparison:
-    """Guesses on one record.
-
-    Attributes
-    ----------
-    guesses : tuple of Guess
-        The guesses.
-    contrast : (guesses,) ndarray
-        Minus the logarithm of the likelihood of each.
-    axis_contrast : (axes, guesses) ndarray
-        The part of each axis, without the coherence of the axes.
-    gain : (axes, guesses) ndarray
-        Best gain of the sensor.
-    misfit : (guesses,) ndarray
-        Mean deviance of a band: about 1 if the coarse spectrum can describe the record.
-    """
+    """Guesses on one record."""
 
     guesses: tuple[Guess, ...]
-    contrast: FloatArray
-    axis_contrast: FloatArray
-    gain: FloatArray
-    misfit: FloatArray
+    contrast: FloatArray  # minus the log-likelihood of each, (guesses,)
+    axis_contrast: FloatArray  # that of each axis, without the coherence of both, (axes, guesses)
+    gain: FloatArray  # best gain of the sensor, (axes, guesses)
+    misfit: FloatArray  # mean deviance of a band: about 1 if the coarse spectrum fits, (guesses,)
 
     def dispersion(self, i: int) -> float:
         """Return the factor by which a misfit of guess i raises what decides, at least 1."""

@@ -13,6 +13,7 @@ from lbt_synth.identification.commands.explanations import axes_apart
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
 from lbt_synth.identification.commands.plausibility import could_have_run
 from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import BoolArray, FloatArray
 
 _SAME_ROWS = 0.05  # sine of the angle between the rows of a gain that are one
@@ -75,7 +76,7 @@ def find_slip(record: LoopRecord) -> str | None:
     for (start, _, one), (_, stop, other) in pairwise(known):
         late = other.lag_frames - one.lag_frames
         if late and _are_alike(one, other):
-            by = f"{abs(late)} frame{'s' * (abs(late) > 1)} {'later' if late > 0 else 'earlier'}"
+            by = f"{count_text(abs(late), 'frame')} {'later' if late > 0 else 'earlier'}"
             return (
                 f"from somewhere between the frames {start} and {stop} on they follow their "
                 f"measurements {by} than before, as if frames of one series were lost. Cut the "

@@ -38,6 +38,7 @@ from lbt_synth.identification.commands.repair import CommandRepair, repair_comma
 from lbt_synth.identification.commands.scale_search import find_scale
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_instance
 
 AS_GIVEN = "as given"
@@ -368,7 +369,7 @@ def _notes(found: _Best, delay_frames: float, lag: int) -> tuple[str, ...]:
     out = []
     if lag > 0:
         out.append(
-            f"warning: the commands follow measurements {lag} frame{'s' * (lag > 1)} earlier. If "
+            f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If "
             "the real-time computer takes that long, the total delay of a new design is "
             f"{delay_frames + lag:g} frames"
         )

@@ -82,11 +82,6 @@ def law_row(law: ControlLaw) -> LawRow:
     )
 
 
-def count_frames(count: int) -> str:
-    """Return a number of frames in words."""
-    return "1 frame" if count == 1 else f"{count} frames"
-
-
 def _distinct(texts: Iterable[str]) -> list[str]:
     """Return texts, or one of them where all are the same."""
     listed = list(texts)

@@ -8,9 +8,10 @@ from lbt_synth.design import model_integrator
 from lbt_synth.identification.diagnosis.channels import AXES
 from lbt_synth.identification.diagnosis.diagnosis import Diagnosis
 from lbt_synth.identification.diagnosis.line_origins import LineRow
-from lbt_synth.identification.diagnosis.running_loop import count_frames, law_row
+from lbt_synth.identification.diagnosis.running_loop import law_row
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, RAN
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.words import count_text, listing_text
 
 NARROW = 0.3  # modulus margin
 _GOOD_ENOUGH = 1.03  # times the least residual, that no change is worth
@@ -71,7 +72,7 @@ def _state_sentence(found: Diagnosis) -> str:
         if found.law.order <= 1:
             law = f"a {row.law} of gain {row.gain} ran"
         if row.lag_frames:
-            law += f", {count_frames(row.lag_frames)} late"
+            law += f", {count_text(row.lag_frames, 'frame')} late"
     if found.model is None or found.loop is None:
         return f"The record shows no fault, and {law}."
     gain = f"at the sensor gain of {found.loop.sensor_gain}"
@@ -109,7 +110,7 @@ def _residual_sentence(found: Diagnosis) -> str:
         if nm**2 >= _LEAST_PART * whole**2
     ]
     if not by_running:
-        return f"By the model the {found.best} would leave {nm_text(whole)}: {_join(named)}."
+        return f"By the model the {found.best} would leave {nm_text(whole)}: {listing_text(named)}."
     measured = doubt = ""
     if ran is not None and np.isfinite(ran.replayed_nm):
         measured = (
@@ -117,7 +118,7 @@ def _residual_sentence(found: Diagnosis) -> str:
             f"(Strehl ratio {ran.strehl:.3f}), by the model "
         )
         doubt = ", which the data contradict" * ran.contradicts_model
-    return f"{measured or 'By the model it leaves '}{nm_text(whole)}{doubt}: {_join(named)}."
+    return f"{measured or 'By the model it leaves '}{nm_text(whole)}{doubt}: {listing_text(named)}."
 
 
 def _direction_text(row: LineRow) -> str:
@@ -125,10 +126,6 @@ def _direction_text(row: LineRow) -> str:
     if row.origin in AXES:
         return f" in {row.origin}"
     return "" if np.isnan(row.direction_deg) else f" along {row.direction_deg:.0f} deg"
-
-
-def _join(items: list[str]) -> str:
-    return f"{', '.join(items[:-1])} and {items[-1]}" if len(items) > 1 else "".join(items)
 
 
 def _advice_sentence(found: Diagnosis) -> str:

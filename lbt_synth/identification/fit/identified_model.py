@@ -20,7 +20,8 @@ from lbt_synth.models import (
     tip_tilt_plant,
 )
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.summaries import Sparkline, Summarised, Summary, count_text
+from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 Kind = Literal["line", "broad", "turbulence"]

@@ -11,6 +11,7 @@ import numpy as np
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, half_angle_square, tukey
 from lbt_synth.identification.stretches import Stretches
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, IntArray
 
 _LARGE = 12.0  # standard deviations of the change of a correction
@@ -107,7 +108,7 @@ def cut_at_jumps(
         return stretches, []
     largest = max(jumps, key=lambda jump: jump.size)
     note = (
-        f"warning: {len(jumps)} jump{'s' if len(jumps) > 1 else ''} of the {series}, the largest "
+        f"warning: {count_text(len(jumps), 'jump')} of the {series}, the largest "
         f"at frame {largest.frame} with {largest.size:.0f} standard deviations"
     )
     if len(jumps) > _MOST_JUMPS:

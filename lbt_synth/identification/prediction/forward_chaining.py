@@ -217,29 +217,9 @@ def forward_split(
 ) -> ForwardSplit:
     """Identify the past of a split, and find the frames of its test that count.
 
-    Parameters
-    ----------
-    record : LoopRecord
-        The record; its delay must be known.
-    training, test : tuple of (start, stop)
-        A pair of :func:`forward_splits`.
-    model : IdentifiedModel, optional
-        Identified from the training with the options, if it is known.
-    **options
-        Those of :func:`identify`.
-
-    Returns
-    -------
-    ForwardSplit
-        The split.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of range, the delay is missing, or there are too few frames: the first
-        half second of each stretch does not count, where a controller has just started.
-    NumericalError
-        If the fit fails.
+    Training and test are a pair of :func:`forward_splits`; the model is that of the training, if it
+    is known. The first half second of each stretch does not count, where a controller has just
+    started.
     """
     require_instance(record, LoopRecord)
     settle = round(_START_S * record.frame_rate_hz)

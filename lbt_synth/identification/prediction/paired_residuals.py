@@ -154,18 +154,8 @@ def _error_of_chunks(series: FloatArray) -> float:
 def bootstrap_error(series: ArrayLike, block: int | None = None) -> float:
     """Return the standard error of a correlated series' mean, by a circular block bootstrap.
 
-    Parameters
-    ----------
-    series : (n,) array_like
-        The values, at least 8.
-    block : int, optional
-        Length of the blocks, at most a quarter of the values; by default
-        :func:`choose_block_length`.
-
-    Returns
-    -------
-    float
-        The error; that of infinitely many draws, as none are made.
+    It is that of infinitely many draws, as none are made. The series (n,) has at least 8 values, a
+    block at most a quarter of them; by default :func:`choose_block_length`.
 
     Examples
     --------
@@ -190,17 +180,9 @@ def bootstrap_error(series: ArrayLike, block: int | None = None) -> float:
 
 
 def choose_block_length(series: ArrayLike) -> int:
-    """Return the length of blocks that Politis and White found best for such a series.
+    """Return the length of blocks that Politis and White found best for such a series (n,).
 
-    Parameters
-    ----------
-    series : (n,) array_like
-        The values, at least 8.
-
-    Returns
-    -------
-    int
-        From 1 to a quarter of the values.
+    It is at most a quarter of the values, of which there are at least 8.
 
     Examples
     --------

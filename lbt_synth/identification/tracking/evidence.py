@@ -56,21 +56,8 @@ def prediction_errors(
 ) -> FloatArray:
     """Return the errors (frames, q) with which a filter, from rest, expects measurements.
 
-    They are what would be left if it ran and its sensor gain was right.
-
-    Parameters
-    ----------
-    design : FilterDesign
-        The filter, of a :class:`TipTiltPlant`.
-    measurements : (frames, q) ndarray
-        y(k) [nm].
-    corrections : (frames, n) ndarray
-        The corrections c(k) in them [nm].
-
-    Returns
-    -------
-    (frames, q) ndarray
-        ``y + S (c - c')`` [nm].
+    They are what would be left if it ran and its sensor gain was right: ``y + S (c - c')`` [nm] of
+    measurements y (frames, q) and the corrections c (frames, n) in them.
 
     Examples
     --------
@@ -103,14 +90,7 @@ def find_better(losses: FloatArray, running: int, frame_rate_hz: float) -> Evide
     A rival leaves clearly less if, over the last 0.4, 0.8, 1.6 or 3.2 s, its mean loss is less by
     at least 1 % and by so many standard errors as equal filters reach with a probability of 1 %.
 
-    Parameters
-    ----------
-    losses : (rivals, frames) ndarray
-        The square of what each leaves of the same frames, the oldest first.
-    running : int
-        The filter that runs.
-    frame_rate_hz : float
-        Frame rate [Hz].
+    Losses (rivals, frames) are the squares of what each leaves of the same frames, oldest first.
 
     Examples
     --------

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 _WIDTH = 96
@@ -45,7 +46,7 @@ def render_source(template: str, *, single: bool, **values: Any) -> tuple[str, s
     )
     environment.filters |= {
         "constant": lambda value: exact_constant(value, single=single),
-        "count": _count,
+        "count": count_text,
         "lines": _fill_lines,
     }
     values |= {
@@ -72,7 +73,3 @@ def wrap_sum(terms: Sequence[tuple[str, str]], column: int) -> str:
 def _fill_lines(values: Iterable[str]) -> str:
     """Return entries of an array, indented, over as many lines as they need."""
     return textwrap.fill(", ".join(values), _WIDTH, initial_indent="    ", subsequent_indent="    ")
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}" + ("" if number == 1 else "s")

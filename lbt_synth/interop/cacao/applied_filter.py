@@ -20,19 +20,9 @@ class AppliedFilter:
     The mirror gets the product itself: a positive command of cacao adds to the measurement, so
     that :meth:`step` returns its negative.
 
-    Parameters
-    ----------
-    matrix : (modes, steps * modes) array_like
-        A row per mode of the command.
-    delay_frames : float, optional
-        Total delay of the loop; the latency of cacao's index arithmetic is one frame more.
-    limit : float, optional
-        Largest modulus of a command that is applied; the history holds the applied commands.
-
-    Raises
-    ------
-    DimensionError
-        If the columns are not a whole number of frames.
+    The matrix (modes, steps * modes) has a row per mode of the command. The latency of cacao's
+    index arithmetic is one frame more than the total delay. The limit is that of the modulus of a
+    command that is applied; the history holds the applied commands.
 
     Examples
     --------

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lbt_synth.design import Check, Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.cacao.applied_filter import LONGEST_DELAY, AppliedFilter
 from lbt_synth.interop.cacao.truncation import CutFilter, predictive_filter
@@ -146,8 +147,7 @@ def export_cacao(
 def _require_loop(design: Design) -> LoopHardware:
     """Return the loop of a design; refuse one that cacao's history does not know."""
     require_modal(design, _FILE)
-    hardware = design.hardware
-    assert hardware is not None  # require_modal refuses a design without a loop
+    hardware = require_hardware(design, _FILE)
     if hardware.mirror is not None or hardware.delay_frames > LONGEST_DELAY:
         raise ProblemError(
             "the mirror must settle at once, with a total delay of at most "

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lbt_synth.design import Check, Design, ShapedDesign
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.dao.inner_loop import InnerLoop
 from lbt_synth.interop.dao.lattice_rounding import round_together
@@ -200,9 +201,9 @@ def _mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
     """Return the loop of each mode of a shaped design, made once for equal ones; none of others."""
     if not isinstance(design, ShapedDesign):
         return []
-    assert design.hardware is not None  # a shaped design is of a loop
+    hardware = require_hardware(design, "dao")
     found = {
-        mode: shaped_mode_loop(design.hardware, design.specifications[mode], order)
+        mode: shaped_mode_loop(hardware, design.specifications[mode], order)
         for mode in set(design.first_equal_modes)
     }
     return [found[mode] for mode in design.first_equal_modes]

@@ -16,19 +16,8 @@ class InnerLoop:
     ``-to_actuators u``; where one exceeds the limit it is clipped, and the memory holds the
     commands that were applied.
 
-    Parameters
-    ----------
-    matrix : (2 M + 1, modes) array_like
-        Rows ``b_0 .. b_M``, then ``a_1 .. a_M``.
-    to_actuators : (actuators, modes) array_like, optional
-        From modes to actuators; the identity by default.
-    limit : float, optional
-        Largest modulus of a voltage.
-
-    Raises
-    ------
-    DimensionError
-        If the number of rows is even, or the matrix to the actuators does not fit.
+    The matrix (2 M + 1, modes) has rows ``b_0 .. b_M``, then ``a_1 .. a_M``; ``to_actuators``
+    (actuators, modes) is the identity by default, and the limit that of a voltage's modulus.
 
     Examples
     --------

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
@@ -25,6 +25,7 @@ from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
 from lbt_synth.interop.pyrtc.pol_filter import pol_filter
 from lbt_synth.interop.target import CERTIFICATE, Arithmetic, Target
 from lbt_synth.interop.written_loop import prove_written, require_proved
+from lbt_synth.storage.atomic_files import make_directory
 from lbt_synth.validation import FloatArray
 
 _FIT_SECONDS = 20.0  # of pseudo-open-loop series that fit_predictor identifies
@@ -134,12 +135,7 @@ def export_pyrtc(
         require_proved(proved, "the arithmetic of pyRTC", _HINT)
         checks += whole.name_checks(part, proved)
         worst = max(worst, rehearsal_error(part.design, InnerLoop(part.design)))
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the directory {folder}: {error.strerror}.", path=folder
-        ) from error
+    make_directory(folder, parents=False)
     contents = {
         _CONFIG: _SYSTEM.format(
             origin=origin,

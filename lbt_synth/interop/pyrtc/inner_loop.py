@@ -13,14 +13,7 @@ from lbt_synth.validation import FloatArray
 class InnerLoop:
     """A design as pyRTC runs it: signals and commands in single precision, the filter in double.
 
-    It starts with a flat mirror.
-
-    Parameters
-    ----------
-    design : Design
-        A design that pyRTC can hold.
-    limit : float, optional
-        Largest modulus of a command, ``predictor.command_limit`` of the configuration.
+    It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
 
     Examples
     --------

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.written_loop import ROUNDOFF, Rounding
 from lbt_synth.linear import Controller, StateSpace
@@ -25,24 +26,13 @@ _LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single preci
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PolFilter:
-    """A controller in the units of pyRTC's commands.
+    """A controller in the units of pyRTC's commands."""
 
-    Attributes
-    ----------
-    delay_frames : int
-        Frames after which pyRTC takes a command away.
-    response : (m, m) ndarray
-        From commands to measurements: its interaction matrix.
-    taps : (frames,) ndarray
-        What the last commands, u(k-1) first, are of the correction that measurement k sees.
-    system : StateSpace
-        From the phase and noise without a correction to the command u, (m,) each; stable.
-    """
-
-    delay_frames: int
-    response: FloatArray
+    delay_frames: int  # after which pyRTC takes a command away
+    response: FloatArray  # from commands to measurements, (m, m): its interaction matrix
+    # what the last commands, u(k-1) first, are of the correction that measurement k sees, (frames,)
     taps: FloatArray
-    system: StateSpace
+    system: StateSpace  # from phase and noise without a correction to the command, (m,); stable
 
     @property
     def reconstructor(self) -> FloatArray:
@@ -136,9 +126,7 @@ class RunningPolFilter:
 
 def pol_filter(design: Design) -> PolFilter:
     """Return the filter that gives a design's commands in pyRTC; refuse a loop it cannot hold."""
-    hardware = design.hardware
-    if hardware is None:
-        raise ProblemError("pyRTC needs the design of a loop; got a bare controller.")
+    hardware = require_hardware(design, "pyRTC")
     response = hardware.sensor @ hardware.influence
     q, m = response.shape
     if q != m or np.linalg.cond(response) > _LARGEST_CONDITION:

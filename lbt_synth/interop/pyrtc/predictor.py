@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Design, integrator
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import design_from_record, loop_record
@@ -75,8 +76,8 @@ class GainFilePredictor:
                 f"{self.num_modes}. Lower loop.num_dropped_modes, or raise wfc.num_modes."
             )
         if self._other_gain > 0:  # refused where its loop is unstable
-            assert design.hardware is not None  # pol_filter refuses others
-            integrator(design.hardware.single_mode(), gain=self._other_gain)
+            hardware = require_hardware(design, "pyRTC")
+            integrator(hardware.single_mode(), gain=self._other_gain)
         self._design, self._found, self._filter = design, found, found.start(self._limit)
         self.reset()
 
@@ -86,8 +87,7 @@ class GainFilePredictor:
         The method is that of the gain file, or the best one where that needs more than a record.
         """
         history = np.asarray(pol_history, dtype=np.float64)[:, : self._own]
-        hardware = self._design.hardware
-        assert hardware is not None  # pol_filter refuses others
+        hardware = require_hardware(self._design, "pyRTC")
         if not self._found.is_whole:
             raise ProblemError(
                 "pyRTC's series is the phase for a mirror that settles at once and a delay of "

@@ -22,15 +22,6 @@ from lbt_synth.validation import FloatArray
 class AccompaniedFilter:
     """A filter of several sensors to step with the pyramid alone: it has the other readings.
 
-    Parameters
-    ----------
-    controller : PeriodicController
-        From the measurements of all sensors to the commands.
-    others : (frames, q) ndarray
-        Readings of the other sensors in each frame.
-    hardware : LoopHardware
-        Loop that the filter is designed for.
-
     Examples
     --------
     >>> import lbt_synth as lbt, numpy as np
@@ -44,8 +35,8 @@ class AccompaniedFilter:
     """
 
     controller: PeriodicController
-    others: FloatArray
-    hardware: LoopHardware
+    others: FloatArray  # readings of the other sensors in each frame, (frames, q)
+    hardware: LoopHardware  # that the filter is designed for
 
     def __post_init__(self) -> None:
         self.reset()
@@ -76,23 +67,11 @@ def unread_sensors(design: FusedFilter) -> tuple[str, ...]:
 def accompany_filter(
     design: FusedFilter, shaken: Truth, *, frames: int, settle_frames: int, seed: int
 ) -> AccompaniedFilter:
-    """Return a filter with the readings of its accelerometers in a run.
+    """Return a filter of tip and tilt with the readings of its accelerometers in a run.
 
-    Parameters
-    ----------
-    design : FusedFilter
-        The filter; its fall-back runs where it has wavefront sensors beside the pyramid.
-    shaken : Truth
-        Vibrations of the run, and how channels move with them.
-    frames, settle_frames, seed : int
-        As :func:`run_end_to_end` takes them: the readings follow the motions of that run.
-
-    Raises
-    ------
-    DimensionError
-        If the filter is not one of tip and tilt.
-    ProblemError
-        If no vibration moves a channel of the design.
+    Its fall-back runs where it has wavefront sensors beside the pyramid. ``shaken`` has the
+    vibrations of the run, and how channels move with them; frames and seed are those of
+    :func:`run_end_to_end`, whose motions the readings follow.
     """
     hardware, channels = design.loop_hardware, design.problem.suite.channels
     if (hardware.n_measurements, hardware.n_commands) != (2, 2):

@@ -19,26 +19,10 @@ from lbt_synth.validation import FloatArray
 def central_controller(
     plant: GeneralizedPlant, X: FloatArray, Y: FloatArray, gamma: float = np.inf
 ) -> StateSpace:
-    """Return the central controller of a level above the least one.
+    """Return the central controller, from y to u, of a level above the least one.
 
-    Parameters
-    ----------
-    plant : GeneralizedPlant
-        In discrete time.
-    X, Y : (n, n) ndarray
-        Stabilising solutions of control and of estimation at the level.
-    gamma : float
-        The level; infinite for the least variance.
-
-    Returns
-    -------
-    StateSpace
-        From y to u, with the order of the plant.
-
-    Raises
-    ------
-    NumericalError
-        If the level is not above the least one.
+    X and Y (n, n) are the stabilising solutions of control and of estimation at the level; an
+    infinite level is that of the least variance. NumericalError if it is not above the least one.
 
     Examples
     --------

@@ -30,15 +30,8 @@ READINGS = ("missing", "zero", "frozen")
 class Drop:
     """A sensor or channel that fails for a while.
 
-    Parameters
-    ----------
-    unit : str
-        The sensor or channel.
-    start_s, end_s : float
-        When it fails, and when it is back [s]; by default it stays away.
-    reading : {"missing", "zero", "frozen"}
-        What it reads: nothing, which is seen, so that the fall-back filter takes over; or zeros, or
-        its last reading, which the filter believes.
+    Its readings are missing, which is seen, so that the fall-back filter takes over; or they are
+    zero, or frozen at the last one, which the filter believes.
 
     Examples
     --------
@@ -80,35 +73,10 @@ def simulate_fused(
 ) -> Simulation:
     """Run a loop of several sensors, frame by frame.
 
-    Parameters
-    ----------
-    filters : mapping of frozenset of str to PeriodicController
-        The controller for each set of sensors and channels that are not read; the empty set has
-        that of all sensors. They share their states, so that a switch is without a jump.
-    suite : SensorSuite
-        The sensors beside the loop's own.
-    truth : Truth
-        Disturbances, how channels move with them, noise of the loop's own sensor, and its gain.
-    hardware : LoopHardware
-        Mirror, delay and own sensor.
-    frames, cases : int
-        Frames recorded, and independent runs.
-    seed : int, optional
-        Seed of the random series.
-    settle_frames : int, optional
-        Frames before those recorded.
-    drops : sequence of Drop, optional
-        When sensors fail, counted from the first frame recorded.
-
-    Returns
-    -------
-    Simulation
-        Series; the measurements are those of all sensors, held from one reading to the next.
-
-    Raises
-    ------
-    ProblemError
-        If a sensor that fails is not there, or has no filter.
+    There is a controller for each set of sensors and channels that are not read; the empty set has
+    that of all. They share their states, so that a switch is without a jump. Drops count from the
+    first frame recorded. The measurements are those of all sensors, held from one reading to the
+    next. ProblemError if a sensor that fails is not there, or has no filter.
     """
     frames = integer(frames, "frames", at_least=1)
     settle = integer(settle_frames, "settle_frames", at_least=0)

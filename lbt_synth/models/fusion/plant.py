@@ -23,7 +23,8 @@ from lbt_synth.models.fusion.sensors import (
 from lbt_synth.models.plant.parts import held_frames
 from lbt_synth.models.plant.tip_tilt import TipTiltPlant
 from lbt_synth.storage.rows import fact_table
-from lbt_synth.storage.summaries import Summarised, Summary, count_text
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import BoolArray, FloatArray, require_instance
 
 

@@ -345,16 +345,12 @@ class SensorSuite:
 def acceleration_taps(
     factor: complex, frequency_hz: float, frame_rate_hz: float, age_frames: float
 ) -> tuple[int, FloatArray]:
-    """Return the weights of a vibration's samples in the reading of a channel.
+    """Return the age of the newest sample, and the weights of samples in a channel's reading.
 
     The reading is the second difference ``age_frames`` ago, times a complex factor that two
     successive samples realise exactly at the vibration's frequency; so is a fraction of a frame.
-
-    Returns
-    -------
-    int, (t,) ndarray
-        Age of the newest sample, -1 for that of the frame to come, and the weights of it and of
-        those before [m/s^2 per nm].
+    The age is -1 for the frame to come; the weights (t,) [m/s^2 per nm] are those of the newest
+    sample and of those before.
 
     Examples
     --------

@@ -32,7 +32,8 @@ from lbt_synth.models.plant.full_state import FullStatePlant
 from lbt_synth.models.plant.parts import PlantParts, held_frames, noise_factor
 from lbt_synth.models.vibration.resonance import Vibration
 from lbt_synth.storage.rows import fact_table
-from lbt_synth.storage.summaries import Summary, count_text
+from lbt_synth.storage.summaries import Summary
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, frozen_copy, integer, one_or_each
 
 

@@ -23,9 +23,10 @@ from lbt_synth.report.figures.loop import (
 from lbt_synth.report.figures.open_loops import bode_panels, break_loop
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, map_panels, strehl_panel
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
-from lbt_synth.report.number_text import fixed_text, listing_text, number_text, signed_text
+from lbt_synth.report.number_text import fixed_text, number_text, signed_text
 from lbt_synth.report.page.words import chart
 from lbt_synth.storage.display_unit import nm_text, shown_unit
+from lbt_synth.storage.words import listing_text
 
 _PANELS = 6  # of one chart that has a panel per design: they fit a sheet
 
@@ -34,7 +35,7 @@ def transfer_charts(report: DesignReport) -> list[Chart]:
     """Singular values of the estimation error, and of the closed loops."""
     norms = {one.name: one.error_norms for one in report.assessments if one.error_norms is not None}
     names, f = report.names, report.frequency_hz
-    lines = sorted({line.frequency_hz for line in report.config.truth.vibrations})  # type: ignore[union-attr]
+    lines = report.config.truth.lines_hz
     rules = vibration_rules(lines, "true vibration" if len(lines) == 1 else "true vibrations")
     charts = []
     if norms:

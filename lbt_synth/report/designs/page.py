@@ -19,12 +19,14 @@ from lbt_synth.report.designs.charts import (
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table
 from lbt_synth.report.designs.verdict import verdict
-from lbt_synth.report.number_text import listing_text, number_text
+from lbt_synth.report.number_text import number_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.page.source_section import source_section
 from lbt_synth.report.page.words import paragraph
-from lbt_synth.report.provenance import require_letters, source_section, time_text
+from lbt_synth.report.provenance import require_letters, time_text
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.words import count_text, listing_text
 
 
 def write_report(
@@ -95,8 +97,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     ]
     return Page(
         title=heading,
-        subtitle=f"{count} design{'s' if count > 1 else ''}: {names}. Made "
-        f"{time_text(report.made)}.",
+        subtitle=f"{count_text(count, 'design')}: {names}. Made {time_text(report.made)}.",
         sections=tuple(sections),
     )
 
@@ -178,8 +179,7 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
     if not charts:
         return [Paragraph(text="No loop is stable, so none was simulated.")]
     frames = next(iter(report.simulations.values())).frames
-    runs = "1 run" if settings.cases == 1 else f"{settings.cases} runs"
-    text = f"{runs} of {frames} frames each, seed {settings.seed}."
+    text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
     return [Paragraph(text=text), *charts]
 
 

@@ -15,7 +15,6 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop.simulation.run import settling_frames
-from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
 from lbt_synth.report import provenance
 from lbt_synth.report.designs.assessment import DesignAssessment, assess_design, require_compatible
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
@@ -151,8 +150,7 @@ def design_report(
     count = advance or (lambda _: None)
     truth, hardware = config.truth, config.hardware
     errors = frequency_errors(config)
-    lines_hz = sorted({line.frequency_hz for line in stationary_vibrations(truth.vibrations)})
-    grid = frozen_copy(frequency_grid(hardware.frame_rate_hz, lines_hz))
+    grid = frozen_copy(frequency_grid(hardware.frame_rate_hz, truth.lines_hz))
     assessments = []
     for name, design in designs.items():
         assessments.append(assess_design(name, design, config, frequency_hz=grid, errors_hz=errors))
@@ -194,7 +192,7 @@ def frequency_errors(config: Config) -> FloatArray:
     Errors that would move a true vibration to 0 or to the Nyquist frequency are left out.
     Without vibrations there is only 0.
     """
-    lines = [line.frequency_hz for line in stationary_vibrations(config.truth.vibrations)]
+    lines = config.truth.lines_hz
     if not lines:
         return frozen_copy([0.0])
     fine = refine_values([*config.errors_hz, 0.0])

@@ -23,6 +23,7 @@ from lbt_synth.report.number_text import (
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Column, columns, row_table
 from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.storage.words import count_text
 
 # titles of what is an interval, not a column of the row
 _GOOD = "within 10 % of its best Strehl ratio [Hz]"
@@ -142,8 +143,7 @@ def _measured_text(value: float) -> str:
 
 def _certificate_cell(one: DesignAssessment) -> Cell:
     if one.certified:
-        count = len(one.checks)
-        return Cell(text=f"passed, {count} check{'s' if count > 1 else ''}", tone="good")
+        return Cell(text=f"passed, {count_text(len(one.checks), 'check')}", tone="good")
     failed = sum(not check.passed for check in one.checks)
     text = "NOT COMPUTED" if one.certificate_error else f"FAILED, {failed} of {len(one.checks)}"
     return Cell(text=text, tone="bad")
@@ -163,7 +163,7 @@ def _simulated_text(report: DesignReport, one: DesignAssessment) -> str:
 
 def _good_text(one: DesignAssessment) -> str:
     found = good_range(one)
-    return DASH if found is None else f"{signed_text(found.low_hz)} to {signed_text(found.high_hz)}"
+    return DASH if found is None else " to ".join(map(signed_text, found))
 
 
 def _gain_margin_text(one: DesignAssessment) -> str:

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
 
 from lbt_synth.report.designs.assessment import DesignAssessment
 from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.number_text import NO_BREAK, fixed_text, listing_text, signed_text
+from lbt_synth.report.number_text import NO_BREAK, fixed_text, signed_text
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.words import listing_text
 
 KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GoodRange:
-    """Frequency errors around its best over which a design keeps most of its Strehl ratio."""
+def good_range(one: DesignAssessment) -> tuple[float, float] | None:
+    """Return between which frequency errors [Hz] a design keeps 90 % of its best Strehl ratio.
 
-    low_hz: float  # Lower end [Hz], on the grid of the report
-    high_hz: float  # Upper end [Hz]
-
-
-def good_range(one: DesignAssessment) -> GoodRange | None:
-    """Return where a design keeps 90 % of its best Strehl ratio; None where it is unstable."""
+    None where it is unstable.
+    """
     if not one.stable:
         return None
     errors, strehls = one.curve.errors_hz, one.curve.strehl[0, 0]
@@ -32,7 +27,7 @@ def good_range(one: DesignAssessment) -> GoodRange | None:
     poor = np.flatnonzero(strehls < KEPT * np.max(strehls))
     first = int(np.max(poor[poor < best], initial=-1)) + 1
     last = int(np.min(poor[poor > best], initial=errors.size)) - 1
-    return GoodRange(low_hz=float(errors[first]), high_hz=float(errors[last]))
+    return float(errors[first]), float(errors[last])
 
 
 def verdict(report: DesignReport) -> str:

@@ -13,9 +13,10 @@ from lbt_synth.identification import Diagnosis
 from lbt_synth.linear import Controller
 from lbt_synth.report.charts.description import Axis, Bars, Chart, Curve, Mark, Panel
 from lbt_synth.report.figures.identification import identification_panels
-from lbt_synth.report.number_text import listing_text, number_text
+from lbt_synth.report.number_text import number_text
 from lbt_synth.report.page.words import chart
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.words import listing_text
 
 _POINTS = 400  # bands of a curve on a page, each with its least and its largest value
 _RESIDUAL = Axis(label="residual", unit="nm rms", low=0)

@@ -20,8 +20,10 @@ from lbt_synth.report.diagnosis.tables import (
 from lbt_synth.report.number_text import print_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.page.source_section import source_section
 from lbt_synth.report.page.words import paragraph
 from lbt_synth.storage.tables import Table
+from lbt_synth.storage.words import count_text
 
 
 def write_diagnosis(
@@ -93,12 +95,12 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
             blocks=(*_print_tables(line_tables(found)), *spectrum_charts(found))
             or (Paragraph(text="No model was identified."),),
         ),
-        provenance.source_section(read),
+        source_section(read),
     ]
     return Page(
         title=f"Diagnosis of {name}",
         subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "
-        f"{'1 axis' if record.axes == 1 else f'{record.axes} axes'}. Made "
+        f"{count_text(record.axes, 'axis', 'axes')}. Made "
         f"{provenance.time_text(provenance.creation_time())}.",
         sections=tuple(section for section in sections if section.blocks),
     )

@@ -60,9 +60,8 @@ def loop_curves(design: Design, config: Config) -> LoopCurves:
     """Return the curves of a design in the loop of a configuration."""
     hardware, truth = config.hardware, config.truth
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    lines = {line.frequency_hz for line in truth.vibrations}  # type: ignore[union-attr]
     density = {"points": _POINTS, "near": _NEAR_A_LINE}
-    grid = frequency_grid(hardware.frame_rate_hz, sorted(lines), **density)
+    grid = frequency_grid(hardware.frame_rate_hz, truth.lines_hz, **density)
     n, m = hardware.modes, hardware.n_commands
     response = loop.system.frequency_response(grid)
     returned = response[:, n + m :, n:].diagonal(axis1=1, axis2=2).T

@@ -14,6 +14,7 @@ from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.validation import FloatArray
 
+DECADES = 3.6  # of frequency that are drawn, below half the frame rate
 _DEEPEST = 1e5  # below the highest value: a zero at the Nyquist frequency is no scale
 _POINTS = 1200  # of a grid of frequencies
 FREQUENCY = Axis(label="frequency", unit="Hz", log=True)
@@ -113,7 +114,6 @@ def frequency_grid(
     rate_hz: float,
     special_hz: Sequence[float] = (),
     *,
-    decades: float = 3.6,
     points: int = _POINTS,
     near: int = 60,
 ) -> FloatArray:
@@ -122,7 +122,7 @@ def frequency_grid(
     It has so many points, and so many more near each special one, on either side of it.
     """
     nyquist = rate_hz / 2
-    grids = [np.geomspace(nyquist / 10**decades, nyquist, points)]
+    grids = [np.geomspace(nyquist / 10**DECADES, nyquist, points)]
     for centre in (*special_hz, nyquist):
         spread = np.geomspace(1e-4, 0.2, near)
         grids += [centre * (1 + spread), centre * (1 - spread), np.array([centre])]

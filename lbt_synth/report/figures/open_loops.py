@@ -14,10 +14,9 @@ from lbt_synth.loop import BrokenLoop, ClosedLoop, broken_loops, close_loop, loo
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.charts.scales import shorten
-from lbt_synth.report.figures.loop import FREQUENCY
+from lbt_synth.report.figures.loop import DECADES, FREQUENCY
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_DECADES = 3.6  # of frequency that are drawn, below half the frame rate
 _LOWEST_DB, _HIGHEST_DB = -40.0, 60.0
 _REACH = 2.5  # of a Nyquist plot from its centre
 _FAR = 8.0  # loop gain beyond which a Nyquist plot draws nothing
@@ -52,7 +51,7 @@ class OpenLoop:
         found = self.broken
         if found is None:
             return np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.complex128)
-        shown = found.frequency_hz >= found.frequency_hz[-1] / 10**_DECADES
+        shown = found.frequency_hz >= found.frequency_hz[-1] / 10**DECADES
         columns = found.frequency_hz, found.gain_db, found.phase_deg
         f, gain, phase = (column[shown] for column in columns)
         return f, gain, phase, found.response[shown]
@@ -347,7 +346,7 @@ def _phase_marks(found: BrokenLoop) -> list[tuple[float, list[float]]]:
 
 def _gain_marks(found: BrokenLoop) -> list[tuple[float, list[float]]]:
     """Return frequencies [Hz] of gain margins, and the gains [dB] that each lies between."""
-    least = found.frequency_hz[-1] / 10**_DECADES
+    least = found.frequency_hz[-1] / 10**DECADES
     return [
         (max(point.frequency_hz, least), [0.0, -20 * float(np.log10(point.gain))])
         for point in found.gain_margins

@@ -14,9 +14,11 @@ from lbt_synth.report.charts.description import Axis, Bars, Chart, Panel
 from lbt_synth.report.number_text import print_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
+from lbt_synth.report.page.source_section import source_section
 from lbt_synth.report.page.words import chart, paragraph
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, percent_column, row_table, table_row
+from lbt_synth.storage.words import count_text
 from lbt_synth.studies import LeagueResult, RecordScores, StandingRow
 from lbt_synth.studies.league.standings import relative_residual, root_with_error
 
@@ -118,7 +120,7 @@ def league_page(
             title="How to read the standings",
             blocks=tuple(Paragraph(text=paragraph(name)) for name in ("league", "league-errors")),
         ),
-        provenance.source_section(
+        source_section(
             [provenance.read_source(path, "record")[0] for path in sources],
             versions=provenance.program_versions(("pyrtcao",)),
         ),
@@ -126,9 +128,8 @@ def league_page(
     return Page(
         title="League of controllers",
         subtitle=(
-            f"{ran} {'entries' if ran > 1 else 'entry'} on {len(found.records)} "
-            f"{'records' if len(found.records) > 1 else 'record'}, {splits} "
-            f"{'splits' if splits > 1 else 'split'} each. Made "
+            f"{count_text(ran, 'entry', 'entries')} on {count_text(len(found.records), 'record')}, "
+            f"{count_text(splits, 'split')} each. Made "
             f"{provenance.time_text(provenance.creation_time())}."
         ),
         sections=sections,

@@ -13,6 +13,7 @@ from lbt_synth.report.page.blocks import Page
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import time_text
 from lbt_synth.report.study.sections import StudyInfo, study_info, study_sections
+from lbt_synth.storage.words import count_text
 from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
 
 
@@ -87,12 +88,11 @@ def study_page(
     """Return the page of a study's results; columns (n,) have one value per sample."""
     sections = study_sections(info, statistics, columns)
     varying = sum(np.ptp(np.asarray(columns[name])) > 0 for name in statistics.parameters)
-    count = len(statistics.controllers)
     return Page(
         title=f"Robustness study {info.name}",
         subtitle=(
             f"{statistics.samples} samples of {varying} parameters, "
-            f"{count} {'controllers' if count > 1 else 'controller'}. Made {time_text(info.made)}."
+            f"{count_text(len(statistics.controllers), 'controller')}. Made {time_text(info.made)}."
         ),
         sections=tuple(sections),
     )

@@ -14,10 +14,12 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import provenance
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Section
+from lbt_synth.report.page.source_section import source_section
 from lbt_synth.report.page.words import paragraph
 from lbt_synth.report.study import charts
 from lbt_synth.storage.array_file import digest
 from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.storage.words import duration_text
 from lbt_synth.studies import ControllerStatistics, Failure, Study, StudyStatistics
 from lbt_synth.studies.study import summary
 from lbt_synth.studies.study.controller_samples import (
@@ -326,16 +328,6 @@ def _origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
         ("digest of the study", info.digest),
     ]
     if info.computing_s is not None:
-        rows.append(("computing time, of all processes together", _duration_text(info.computing_s)))
+        rows.append(("computing time, of all processes together", duration_text(info.computing_s)))
     about = Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,))
-    return provenance.source_section(
-        info.files, versions=info.versions, texts=info.texts, about=about
-    )
-
-
-def _duration_text(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    if seconds < 7200:
-        return f"{seconds / 60:.1f} min"
-    return f"{seconds / 3600:.1f} h"
+    return source_section(info.files, versions=info.versions, texts=info.texts, about=about)

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 import lbt_synth
-from lbt_synth.errors import LbtSynthError, OutputError, ProblemError
+from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification import ForwardSplit, LinePrior, LoopRecord, PairedResiduals
 from lbt_synth.identification.prediction.forward_chaining import forward_split, record_splits
 from lbt_synth.identification.prediction.paired_residuals import chunk_squares
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.array_file import digest
+from lbt_synth.storage.atomic_files import make_directory
 from lbt_synth.storage.resumable_runs import Case
 from lbt_synth.studies.league.entries import Entry, all_entries, choose_entries
 from lbt_synth.studies.league.standings import (
@@ -130,11 +131,7 @@ def run_league(
     able = [name for name, entry in chosen.items() if not entry.missing]
     if not records:
         raise ProblemError("a league needs at least one record; got none.")
-    folder = Path(directory) / CASES
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make {folder}: {error.strerror}.", path=folder) from error
+    folder = make_directory(Path(directory) / CASES)
     scores, failures = [], {}
     for name, record in records.items():
         own = dict((options or {}).get(name, {}))

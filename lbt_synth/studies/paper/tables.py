@@ -8,6 +8,7 @@ from dataclasses import field, replace
 import numpy as np
 
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, optimal_integrator
+from lbt_synth.design.result import require_hardware
 from lbt_synth.loop import close_loop, residual_budget, strehl
 from lbt_synth.models import Truth
 from lbt_synth.storage.rows import column, table_row
@@ -105,6 +106,6 @@ def compare_with_paper(rows: list[RobustnessRow]) -> list[TableEntry]:
 
 
 def _strehl_percent(design: Design, truth: Truth) -> float:
-    assert design.hardware is not None  # this module designs for plants
-    loop = close_loop(design.hardware, design.controller, sensor_gain=truth.sensor_gain)
+    hardware = require_hardware(design, "a table")
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     return 100 * strehl(residual_budget(loop, truth), given.imaging())

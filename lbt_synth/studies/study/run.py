@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.storage.atomic_files import refuse_replacing
+from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.file_locks import exclusive_lock
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.studies.study import store
@@ -282,13 +281,9 @@ def _compute_missing(
             log.add(failures, seconds)
     missing = store.missing_rows(store.list_parts(folder), study.samples)
     log.computed = sum(stop - start for start, stop in missing)
-    try:
-        (folder / store.PARTS).mkdir(exist_ok=True)
-        if (folder / store.PARTS).is_symlink():
-            raise NotADirectoryError(errno.ENOTDIR, "it is a link")
-    except OSError as error:
-        why = f"cannot make the directory {folder / store.PARTS}: {error.strerror}."
-        raise OutputError(why, path=folder) from error
+    parts = make_directory(folder / store.PARTS)
+    if parts.is_symlink():
+        raise OutputError(f"cannot make the directory {parts}: it is a link.", path=folder)
     if log.computed < study.samples:
         progress(study.samples - log.computed)
     with contextlib.closing(run_batches(engine, missing)) as batches:

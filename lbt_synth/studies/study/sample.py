@@ -24,6 +24,7 @@ from lbt_synth.loop.fusion.simulation import simulate_fused
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
 from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.storage.words import count_text
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
     NOISE_FACTOR,
@@ -103,7 +104,7 @@ def find_number(content: Mapping[str, Any], path: str) -> float:
         if isinstance(key, int):
             if key >= len(here):
                 raise ConfigError(
-                    f"{path}: {place} has {len(here)} entr{'y' if len(here) == 1 else 'ies'}, "
+                    f"{path}: {place} has {count_text(len(here), 'entry', 'entries')}, "
                     f"counted from 0; got [{key}]."
                 )
             walked += f"[{key}]"

@@ -87,7 +87,11 @@ def test_the_noise_of_the_arithmetic_in_closed_form():
 
 
 BAD = [
-    (bare_design(lbt_designs()["kalman"].controller), lbt.errors.ProblemError, "bare controller"),
+    (
+        bare_design(lbt_designs()["kalman"].controller),
+        lbt.errors.ProblemError,
+        "needs the design of a loop",
+    ),
     (
         lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0], [0.5]]), gain=0.3),
         lbt.errors.ProblemError,
