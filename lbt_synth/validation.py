@@ -152,12 +152,15 @@ def semidefinite(
 
 
 def definite(value: Any, name: str, *, size: tuple[int, str] | None = None) -> FloatArray:
-    """Return a symmetric positive definite matrix."""
+    """Return a symmetric positive definite matrix, whatever the units of its rows."""
     out = symmetric(value, name, size=size)
-    least, scale = _extreme_eigenvalues(out)
-    if not np.all(least > 1e-14 * scale):
+    units = np.sqrt(np.maximum(np.diag(out), 0.0))
+    scaled = out / np.outer(units, units) if np.all(units > 0) else out
+    least, scale = _extreme_eigenvalues(scaled)
+    if not np.all(units > 0) or not np.all(least > 1e-14 * scale):
         raise DefinitenessError(
-            f"{name} must be positive definite; got a least eigenvalue of {np.min(least):.6g}."
+            f"{name} must be positive definite; got a least eigenvalue of "
+            f"{np.min(_extreme_eigenvalues(out)[0]):.6g}."
         )
     return out
 
@@ -170,10 +173,13 @@ def _extreme_eigenvalues(symmetric_matrix: FloatArray) -> tuple[FloatArray, Floa
 
 def number(value: Any, name: str, *, hint: str = "", **bounds: float) -> float:
     """Return a finite float ``above``, ``at_least``, ``below`` or ``at_most`` its bounds."""
-    if isinstance(value, bool | str | bytes) or value is None:
+    kind = getattr(getattr(value, "dtype", None), "kind", "f")
+    if isinstance(value, bool | str | bytes) or value is None or kind not in "fiu":
         raise ProblemError(f"{name} must be a number; got {value!r}.")
     try:
         out = float(value)
+    except OverflowError as error:
+        raise NonFiniteError(f"{name} must be finite; got a number beyond 1e308.") from error
     except (TypeError, ValueError) as error:
         raise ProblemError(f"{name} must be a number; got {value!r}.") from error
     if not math.isfinite(out):
@@ -259,6 +265,12 @@ def choice(value: Any, name: str, options: Sequence[str], **advice: str) -> str:
         text = f"{name} must be one of {', '.join(options)}; got {value!r}."
         raise ProblemError(text, **advice)
     return cast(str, value)
+
+
+def agree(one: FloatArray, other: FloatArray, tolerance: float = 1e-9) -> bool:
+    """Return whether arrays agree to a relative tolerance, or to a part of the largest entry."""
+    largest = float(np.max(np.abs(other), initial=0.0))
+    return bool(np.allclose(one, other, rtol=tolerance, atol=1e-3 * tolerance * largest))
 
 
 def text(value: Any, name: str) -> str:

@@ -56,6 +56,25 @@ def test_asymmetric_and_indefinite_covariances_are_refused():
         validation.definite([[1.0, 1.0], [1.0, 1.0]], "R")
 
 
+def test_definiteness_does_not_depend_on_units():
+    assert np.array_equal(validation.definite(np.diag([1.0, 1e-20]), "R"), np.diag([1.0, 1e-20]))
+    with pytest.raises(errors.DefinitenessError, match="R must be positive definite"):
+        validation.definite([[1.0, 1e-10], [1e-10, 1e-20]], "R")
+
+
+@pytest.mark.parametrize(
+    "value", [np.complex128(20 + 5j), 1j, np.True_, np.array("20"), np.array([1.0 + 0j])]
+)
+def test_what_only_looks_like_a_number_is_refused(value):
+    with pytest.raises(errors.ProblemError, match="x must be a number; got"):
+        validation.number(value, "x")
+
+
+def test_an_integer_beyond_all_floats_is_refused():
+    with pytest.raises(errors.NonFiniteError, match="x must be finite; got a number beyond 1e308"):
+        validation.number(10**400, "x")
+
+
 def test_rounding_asymmetry_is_symmetrised():
     out = validation.symmetric([[1.0, 0.5], [0.5 + 1e-15, 1.0]], "Q")
     assert np.array_equal(out, out.T)

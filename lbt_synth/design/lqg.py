@@ -32,7 +32,7 @@ from lbt_synth.design.facts import LqgFacts, model_facts
 from lbt_synth.design.result import UNCERTIFIED, EstimatorDesign, SolverReport, with_certificate
 from lbt_synth.errors import DimensionError, InfeasibleError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, solve_dare
-from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.lyapunov import output_variances, stationary_covariance, stationary_root
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
@@ -238,12 +238,12 @@ def loop_variances(
     total = loop.B[:, :n] @ model.L
     A = np.block([[model.A, np.zeros((states, loop.n_states))], [total, loop.A]])
     B = np.vstack([model.B, loop.B[:, n:] @ model.D])
-    covariance = stationary_covariance(A, B @ B.T)
+    root = stationary_root(A, B)
     powers = []
     for rows, shape in ((slice(n), np.eye(n)), (slice(n, n + m), hardware.influence)):
         C = shape @ np.hstack([loop.D[rows, :n] @ model.L, loop.C[rows]])
         D = shape @ loop.D[rows, n:] @ model.D
-        powers.append(float(np.trace(C @ covariance @ C.T) + np.trace(D @ D.T)))
+        powers.append(float(np.sum(output_variances(C, D, root))))
     return powers[0], powers[1]
 
 

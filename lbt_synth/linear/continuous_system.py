@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.other_systems import control_system, system_parts
@@ -90,28 +91,30 @@ class ContinuousSystem(Summarised):
     @classmethod
     def from_discrete(cls, system: StateSpace, rate: float) -> ContinuousSystem:
         """Map a discrete system back; one with a pole at ``z = -1`` raises a NumericalError."""
+        A, B, C, units = _balance(system.A, system.B, system.C)
         one = np.eye(system.n_states)
-        middle = one + system.A
+        middle = one + A
         if np.linalg.cond(middle) > 1 / _SINGULAR:
             raise NumericalError(
                 "the system has a pole at z = -1, which is an infinite one in continuous time. "
                 "Try a larger gamma_ratio, or give every control and measurement a weight.",
                 status="improper",
             )
-        back = _solve(middle, np.hstack([system.A - one, system.B]))
-        leaving = _solve(middle.T, system.C.T).T
+        back = _solve(middle, np.hstack([A - one, B]))
+        leaving = _solve(middle.T, C.T).T
         n, scale = system.n_states, math.sqrt(2 * rate)
         return cls(
-            A=rate * back[:, :n],
-            B=scale * back[:, n:],
-            C=scale * leaving,
-            D=system.D - system.C @ back[:, n:],
+            A=rate * units[:, None] * back[:, :n] / units,
+            B=scale * units[:, None] * back[:, n:],
+            C=scale * leaving / units,
+            D=system.D - C @ back[:, n:],
         )
 
 
 def _bilinear(
     A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, rate: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    A, B, C, units = _balance(A, B, C)
     one = np.eye(len(A))
     middle = rate * one - A
     if np.linalg.cond(middle) > 1 / _SINGULAR:
@@ -124,7 +127,18 @@ def _bilinear(
     leaving = _solve(middle.T, C.T).T
     n = len(A)
     scale = math.sqrt(2 * rate)
-    return solved[:, :n], scale * solved[:, n:], scale * leaving, D + C @ solved[:, n:]
+    discrete = units[:, None] * solved[:, :n] / units
+    entry, exit_ = scale * units[:, None] * solved[:, n:], scale * leaving / units
+    return discrete, entry, exit_, D + C @ solved[:, n:]
+
+
+def _balance(
+    A: FloatArray, B: FloatArray, C: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return A, B and C in balanced units of the states, and these units, powers of two (n,)."""
+    balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
+    scale = np.asarray(units, dtype=np.float64)
+    return np.asarray(balanced, dtype=np.float64), B / scale[:, None], C * scale, scale
 
 
 def _solve(M: FloatArray, right: FloatArray) -> FloatArray:

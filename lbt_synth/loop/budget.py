@@ -15,12 +15,12 @@ from scipy.linalg import block_diag
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.linear.panel_edges import panel_edges
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
-from lbt_synth.models.spectra import breakpoints_below
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, fill_row, nm_column, table_row
@@ -266,7 +266,8 @@ def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
     """Covariance of the residual that white noise of covariance ``factor factor'`` leaves."""
     n, s = loop.hardware.modes, loop.system.balanced()
     B, D = s.B[:, n:] @ factor, s.D[:n, n:] @ factor
-    return np.asarray(s.C[:n] @ stationary_covariance(s.A, B @ B.T) @ s.C[:n].T + D @ D.T)
+    root = np.hstack([s.C[:n] @ stationary_root(s.A, B), D])
+    return np.asarray(root @ root.T)
 
 
 def ar_covariance(loop: ClosedLoop, model: ARModel, directions: FloatArray) -> FloatArray:
@@ -284,11 +285,12 @@ def _directed_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray
     entry = np.zeros((s.n_states, order))
     entry[:, 0] = s.B[:, :n] @ direction
     A = np.block([[s.A, entry], [np.zeros((order, s.n_states)), model.companion]])
-    drive = np.zeros(len(A))
+    drive = np.zeros((len(A), 1))
     drive[s.n_states] = model.driving_rms_nm
     C = np.hstack([s.C[:n], np.zeros((n, order))])
     C[:, s.n_states] = s.D[:n, :n] @ direction
-    return np.asarray(C @ stationary_covariance(A, np.outer(drive, drive)) @ C.T)
+    root = C @ stationary_root(A, drive)  # what is left of a line is a small part of it
+    return np.asarray(root @ root.T)
 
 
 def _spectrum_covariance(
@@ -299,7 +301,7 @@ def _spectrum_covariance(
     def density(frequency: FloatArray) -> FloatArray:
         response = loop.sensitivity(frequency)[:, :, list(modes)]
         power = np.real(np.einsum("fij,fkj->fik", response, response.conj()))
-        return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
+        return np.asarray(spectrum_density(spectrum, frequency)[:, None, None] * power)
 
     nyquist = loop.hardware.frame_rate_hz / 2
     edges = np.concatenate([resonance_edges(loop), breakpoints_below(spectrum, nyquist)])

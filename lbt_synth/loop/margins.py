@@ -222,11 +222,14 @@ def _delay_margin_frames(loop: ClosedLoop) -> float:
     A part of a frame is no phase lag: an exposure then sees two commands. So poles decide.
     """
     hardware, matrices = loop.hardware, textbook_matrices([loop.controller])
+    # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
+    whole = np.arange(np.floor(hardware.delay_frames) + 1, _LONGEST + 1) - hardware.delay_frames
 
     def first_unstable(low: float, high: float) -> tuple[float, float] | None:
         """Return the step of an equal division in which the loop becomes unstable, or None."""
-        further = np.linspace(low, high, _DIVISION + 1)
-        gains = np.full(_DIVISION, loop.sensor_gain)
+        peaks = whole[(whole > low) & (whole < high)]
+        further = np.unique(np.concatenate([np.linspace(low, high, _DIVISION + 1), peaks]))
+        gains = np.full(further.size - 1, loop.sensor_gain)
         delays = hardware.delay_frames + further[1:]
         unstable = np.flatnonzero(~ClosedLoops.of(matrices, hardware, gains, delays).stable)
         return None if unstable.size == 0 else tuple(further[unstable[0] : unstable[0] + 2])

@@ -128,7 +128,8 @@ def variance_ratios(coefficients: FloatArray) -> FloatArray:
     ratio = np.ones(a.shape[:-1])
     while a.shape[-1]:
         r, rest = a[..., -1:], a[..., :-1]
-        shrink = (1 - r) * (1 + r)
-        ratio = ratio / shrink[..., 0]
-        a = (rest + r * rest[..., ::-1]) / shrink
+        ratio = ratio / ((1 - r) * (1 + r))[..., 0]
+        # (rest + r back) / ((1 - r) (1 + r)) without its cancellation near r = -1
+        back = rest[..., ::-1]
+        a = (rest + back) / (2 * (1 - r)) + (rest - back) / (2 * (1 + r))
     return np.asarray(ratio, dtype=np.float64)

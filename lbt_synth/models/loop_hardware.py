@@ -13,9 +13,10 @@ from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, matrix
+from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, integer, matrix
 
 LONGEST_DELAY = 20  # of a loop [frames]; each is a state of every matrix
+_MOST_MODES = 10_000
 
 
 @table_row
@@ -93,7 +94,8 @@ class LoopHardware(Summarised):
     mirror: PositionLoop | None = None
 
     def __post_init__(self) -> None:
-        sensor, influence, n = self.sensor_matrix, self.influence_matrix, self.modes
+        sensor, influence = self.sensor_matrix, self.influence_matrix
+        n = integer(self.modes, "modes", at_least=1, at_most=_MOST_MODES)
         if sensor is not None:
             sensor = matrix(sensor, "sensor_matrix")
             n = sensor.shape[1]

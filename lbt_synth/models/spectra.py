@@ -123,6 +123,22 @@ class SumSpectrum:
         return np.asarray(sum(part.psd(x) for part in self.parts), dtype=np.float64)
 
 
+def spectrum_density(spectrum: Spectrum, frequency_hz: FloatArray) -> FloatArray:
+    """Return the density of a spectrum [nm^2/Hz], one number of at least 0 for each frequency."""
+    density = np.asarray(spectrum.psd(frequency_hz))
+    if (
+        density.shape != frequency_hz.shape
+        or density.dtype.kind not in "fiu"
+        or not np.all(np.isfinite(density) & (density >= 0))
+    ):
+        raise ProblemError(
+            "a spectrum must return one finite number of at least 0 for each frequency; "
+            f"{type(spectrum).__name__}.psd does not between {np.min(frequency_hz):.6g} and "
+            f"{np.max(frequency_hz):.6g} Hz."
+        )
+    return density.astype(np.float64)
+
+
 def breakpoints_below(spectrum: Spectrum, limit_hz: float) -> FloatArray:
     """Frequencies in (0, limit) at which a spectrum declares kinks [Hz]."""
     points = np.asarray(getattr(spectrum, "breakpoints_hz", ()), dtype=np.float64)

@@ -35,6 +35,22 @@ def test_map_and_back():
         assert getattr(back, name) == pytest.approx(getattr(G, name), rel=1e-10, abs=1e-12)
 
 
+@pytest.mark.parametrize("scale", [1e8, 1e12])
+def test_units_of_the_states_do_not_matter(scale):
+    """A badly scaled matrix was taken for one with a pole at the rate."""
+    G, units = system(), np.array([1.0, scale, 1.0, 1 / scale])
+    other = ContinuousSystem(
+        A=G.A * units / units[:, None], B=G.B / units[:, None], C=G.C * units, D=G.D
+    )
+    mapped = other.to_discrete(3.0)
+    plain = G.to_discrete(3.0)
+    grid = np.linspace(0.01, 0.4, 20)
+    expected = plain.frequency_response(grid)
+    assert mapped.frequency_response(grid) == pytest.approx(expected, rel=1e-9)
+    back = ContinuousSystem.from_discrete(mapped, 3.0)
+    assert back.frequency_response(grid) == pytest.approx(G.frequency_response(grid), rel=1e-9)
+
+
 def test_norm_is_kept():
     G = system()
     highest = np.linalg.norm(G.frequency_response(np.geomspace(1e-4, 1e3, 4000)), 2, axis=(1, 2))

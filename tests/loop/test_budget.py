@@ -257,3 +257,37 @@ def test_a_budget_of_another_loop_is_refused():
         lbt.loop.model_budget(unstable.system, plant)
     with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
         lbt.design.model_integrator(predictions.a_truth())
+
+
+def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
+    """It is 1e-5 of the lines; the loop is the optimal one, which leaves the limit."""
+    air = lbt.models.ARModel(coefficients=[0.9998], driving_rms_nm=0.01, frame_rate_hz=4000)
+    lines = [
+        lbt.Vibration(frequency_hz=0.2, damping=1e-3, rms_nm=1000, direction=(1,)),
+        lbt.Vibration(frequency_hz=0.1, damping=0.05, rms_nm=300, direction=(1,)),
+    ]
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=4000, turbulence=air, noise_nm=0.03, vibrations=lines, modes=1
+    )
+    truth = lbt.Truth(turbulence=air, vibrations=lines, noise_nm=0.03)
+    found = lbt.residual_budget(lbt.close_loop(plant.hardware, lbt.kalman(plant)), truth)
+    limit = lbt.loop.least_residual(plant.hardware, truth)
+    assert found.rms_nm == pytest.approx(limit.rms_nm, rel=1e-9)
+    assert lbt.lqg(plant).certificate.passed
+
+
+@pytest.mark.parametrize("density", [-1.0, 1j, np.nan])
+def test_a_spectrum_that_is_none_is_refused(density):
+    class Odd:
+        def psd(self, frequency_hz):
+            return np.full(frequency_hz.shape, density)
+
+    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3))
+    truth = lbt.Truth(turbulence=Odd(), noise_nm=1.0)
+    for compute in (
+        lambda: lbt.residual_budget(loop, truth),
+        lambda: lbt.loop.least_residual(path, truth),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match="one finite number of at least 0"):
+            compute()

@@ -76,6 +76,25 @@ def test_the_delay_margin_is_that_of_the_simulated_loop():
     assert radius(margins.delay_frames) < 1 < radius(1.001 * margins.delay_frames)
 
 
+def test_the_delay_margin_does_not_step_over_a_whole_delay():
+    """At a whole delay the loop gain has a peak, here narrower than a step of the search."""
+    air = lbt.models.ARModel(coefficients=[0.9999], driving_rms_nm=0.05, frame_rate_hz=1000)
+    line = lbt.Vibration(frequency_hz=60, damping=0.003, rms_nm=50, direction=(1,))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=1000,
+        turbulence=air,
+        noise_nm=0.04,
+        vibrations=[line],
+        delay_frames=1.7,
+        modes=1,
+    )
+    filters = lbt.kalman(plant)
+    whole = lbt.close_loop(replace(plant.hardware, delay_frames=2.0), filters, sensor_gain=0.978)
+    assert whole.spectral_radius > 1.003
+    margin = lbt.loop_margins(lbt.close_loop(plant.hardware, filters, sensor_gain=0.978))
+    assert 0.29 < margin.delay_frames < 0.3
+
+
 def test_the_disk_margin_of_one_axis_is_the_norm_of_a_difference():
     """(S - T) / 2 of an integrator on the unit circle, by the closed form of its loop."""
     g = 0.5

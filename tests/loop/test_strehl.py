@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
-from scipy.special import j0
+from scipy.special import j0, jv
 
 import lbt_synth as lbt
 from lbt_synth.linear.quadrature import gauss_panels
@@ -113,6 +113,29 @@ def test_series_of_an_exact_sinusoid():
         np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]]
     )
     assert lbt.loop.series_strehl(series, CAMERA) == pytest.approx(exact, abs=1e-5)
+
+
+@pytest.mark.parametrize(("amplitude_nm", "wavelength_um"), [(4000.0, 0.5), (16000.0, 1.65)])
+def test_series_of_a_large_sinusoid(amplitude_nm, wavelength_um):
+    camera = lbt.Imaging(diameter_m=8.22, wavelength_um=wavelength_um)
+    phase = 2 * np.pi * 37 * (np.arange(50_000) + 0.5) / 50_000
+    series = np.stack([amplitude_nm * np.sin(phase), np.zeros(phase.size)], axis=1)
+    exact = lbt.loop.jitter_strehl(
+        np.zeros((2, 2)), imaging=camera, line_amplitudes_nm=[[amplitude_nm, 0]]
+    )
+    assert lbt.loop.series_strehl(series, camera) == pytest.approx(exact, rel=1e-6)
+
+
+@given(st.floats(0, 1e6), st.floats(0, 0.9))
+def test_a_star_that_jumps_between_two_places(jump_nm, obstruction):
+    """The image of an annular pupil at its distance, by Bessel functions."""
+    camera = lbt.Imaging(diameter_m=8.22, obstruction=obstruction)
+    found = lbt.loop.series_strehl([[jump_nm, 0.0], [-jump_nm, 0.0]], camera)
+    u = np.pi * camera.cycles_per_nm * jump_nm
+    discs = [jv(0, w) + jv(2, w) for w in (u, obstruction * u)]  # 2 J1(w) / w
+    expected = ((discs[0] - obstruction**2 * discs[1]) / (1 - obstruction**2)) ** 2
+    assert 0 <= found <= 1
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-14)
 
 
 @pytest.mark.parametrize(

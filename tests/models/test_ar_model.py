@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,6 +21,21 @@ def test_variance_against_a_lyapunov_equation(poles):
     drive[0, 0] = 9.0
     expected = solve_discrete_lyapunov(model.companion, drive)[0, 0]
     assert model.rms_nm**2 == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "damping", "rate_hz"),
+    [(0.1, 1e-4, 2000), (0.5, 1e-6, 10_000), (0.2, 1e-5, 3000), (0.1, 1e-3, 2000)],
+)
+def test_slow_lines_have_the_rms_they_claim(frequency_hz, damping, rate_hz):
+    """By the closed form of order 2, in 50 digits, from the same coefficients."""
+    line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=100)
+    model = line.ar_model(rate_hz)
+    with mpmath.workdps(50):
+        a1, a2, drive = (mpmath.mpf(float(v)) for v in (*model.coefficients, model.driving_rms_nm))
+        variance = drive**2 * (1 - a2) / ((1 + a2) * ((1 - a2) ** 2 - a1**2))
+        assert float(mpmath.sqrt(variance)) == pytest.approx(100, rel=1e-8)
+    assert model.rms_nm == pytest.approx(100, rel=1e-12)
 
 
 def test_ar_spectrum_integrates_to_its_variance():

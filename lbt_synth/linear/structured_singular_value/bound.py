@@ -19,7 +19,7 @@ from lbt_synth.linear.state_space import StateSpace, pointwise_response
 from lbt_synth.linear.structured_singular_value.blocks import Block, checked_blocks
 from lbt_synth.linear.structured_singular_value.power_iteration import destabilising_delta
 from lbt_synth.linear.structured_singular_value.scales import Scales, best_scales
-from lbt_synth.validation import ComplexArray, number
+from lbt_synth.validation import ComplexArray, number, real_array
 
 _GRID = 65
 _MOST_INTERVALS = 5000
@@ -99,7 +99,9 @@ def mu_bound(system: Any, blocks: Sequence[Block], *, tolerance: float = 1e-3) -
     """
     number(tolerance, "tolerance", at_least=1e-6, at_most=1)
     if not isinstance(system, StateSpace | tuple) and not hasattr(system, "dt"):
-        return _matrix_bound(np.atleast_2d(np.asarray(system, dtype=complex)), blocks)
+        constant = np.atleast_2d(np.asarray(system, dtype=complex))
+        real_array(np.abs(constant), "system")  # refuses what is not finite
+        return _matrix_bound(constant, blocks)
     G = StateSpace.of(system)
     given = checked_blocks(blocks, G.D.shape)
     upper, angles = upper_bound(G, given, tolerance)

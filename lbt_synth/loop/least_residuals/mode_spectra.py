@@ -14,7 +14,7 @@ from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.least_residuals.prediction import InnerFactor
 from lbt_synth.models import ARModel, FullStatePlant, LoopHardware, Spectrum, Vibration
-from lbt_synth.models.spectra import breakpoints_below, spectrum_key
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
 from lbt_synth.validation import FloatArray, real_array
 
 _COUPLING = 1e-9  # relative size above which an off-diagonal entry counts as coupling
@@ -35,13 +35,7 @@ class ModeSpectrum:
         nyquist = self.rate_hz / 2
         total = np.zeros(x.shape)
         for part in self.parts:
-            density = np.asarray(part.psd(x * nyquist), dtype=np.float64)
-            if density.shape != x.shape or not np.all(np.isfinite(density) & (density >= 0)):
-                raise ProblemError(
-                    "a spectrum must return one finite number of at least 0 for each frequency; "
-                    f"{type(part).__name__}.psd does not between 0 and {nyquist:.6g} Hz."
-                )
-            total = total + density * nyquist
+            total = total + spectrum_density(part, x * nyquist) * nyquist
         return total
 
     def edges(self, extra: Sequence[float] = ()) -> FloatArray:
