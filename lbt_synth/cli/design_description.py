@@ -43,7 +43,7 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
         report.notes += _loop_notes(design, design.hardware, report.data)
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *([] if margins is None else [margins]))
-    report.tables.append(without_units(printed) if margins is None else printed)
+    report.tables.append(printed if margins or design.several_sensors else without_units(printed))
     report.notes += described.notes
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
     report.data["assumptions"] = design.assumptions

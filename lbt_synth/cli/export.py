@@ -89,6 +89,8 @@ def list_targets() -> None:
 
 
 def _precision_notes(arguments: Namespace, written: Exported) -> list[str]:
+    if written.coefficients:
+        return [f"note: the coefficients are {written.coefficients}."]
     if arguments.precision == "single" and not written.error <= _SINGLE_SUFFICES:
         return [
             f"note: in single precision commands are off by {written.error:.2g} of the largest "

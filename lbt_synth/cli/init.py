@@ -71,9 +71,12 @@ def _refuse_taken(contents: Mapping[Path, str | None], *, force: bool) -> None:
         if path.is_file() and (text is None or path.read_bytes() != text.encode())
     ]
     if taken and not force:
-        raise OutputError(
-            f"{', '.join(taken)} would be replaced. Give another name by -o, or --force."
+        advice = (
+            "--force"
+            if all(Path(each).name == _SCHEMA for each in taken)
+            else ("another name by -o, or --force")
         )
+        raise OutputError(f"{', '.join(taken)} would be replaced. Give {advice}.")
 
 
 def _text_of_record(path: str, telescope: str | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config
@@ -12,6 +13,9 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.models import Truth
 from lbt_synth.models.loop_hardware import loop_differences
+
+if TYPE_CHECKING:  # it takes long to load
+    from lbt_synth.design import FusedFilter
 
 
 def load_design(path: str, *, several_sensors: bool = False) -> Design:
@@ -49,9 +53,25 @@ def _distinct_tails(paths: list[str]) -> list[str]:
 
 def loop_difference_notes(config: Config, design: Design) -> list[str]:
     """Say where a design was made for another loop than the configuration's."""
-    if design.hardware is None:
-        return []
-    return [f"note: {text}" for text in loop_differences(design.hardware, config.hardware)]
+    notes = []
+    if design.hardware is not None:
+        notes = loop_differences(design.hardware, config.hardware)
+    elif design.several_sensors:
+        own: FusedFilter = design  # type: ignore[assignment]
+        notes = loop_differences(own.loop_hardware, config.hardware)
+        here = config.fused_plant
+        if here is None or not here.suite.is_same(own.problem.suite):
+            notes.append(
+                "runs with the sensors of the gain file beside the loop's own, not with those of "
+                "the configuration."
+            )
+    return [f"note: {text}" for text in notes]
+
+
+def own_sensor_notes(config: Config) -> list[str]:
+    """Say that other sensors are not read, if the configuration has some."""
+    others = config.other_sensors
+    return [f"note: the loop's own sensor is read alone, without {others}."] if others else []
 
 
 def truth_at_sensor_gain(config: Config, sensor_gain: float | None) -> Truth:

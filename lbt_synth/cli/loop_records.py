@@ -15,7 +15,7 @@ from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config, load_config
 from lbt_synth.config.write import config_text
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
     AccelerometerTransfers,
@@ -236,12 +236,9 @@ def find_places(arguments: Namespace, model: str | Path | None, **others: Path) 
         places["figure"] = require_figure_name(figure)
     elif arguments.figure is not None:
         raise ProblemError("give one of --figure and --no-figure, not both.")
-    outputs = list(places.values())
-    if len({place.resolve() for place in outputs}) < len(outputs):
-        raise OutputError(f"each output needs a name of its own; got {outputs[0]} twice.")
     read = ("file", "commands", "lines_file", "accelerometers", "earlier_model")
     given = given_options(arguments, *(name for name in read if name in arguments))
-    require_writable(*outputs, inputs=given.values())
+    require_writable(*places.values(), inputs=given.values())
     return places
 
 

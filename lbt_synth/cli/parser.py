@@ -32,10 +32,30 @@ COMMANDS = {
 }
 
 
+class _StoreOnce(argparse._StoreAction):
+    """Store the value of an option; refuse a second one, which would replace it in silence."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        if option_string and getattr(namespace, self.dest, None) is not self.default:
+            raise argparse.ArgumentError(self, "give it once")
+        super().__call__(parser, namespace, values, option_string)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line: what is wrong, what was meant, and where help is."""
 
     _words: Sequence[str] = ()  # that it was given
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        for name in (None, "store"):
+            self.register("action", name, _StoreOnce)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Keep the words, so that an error can name one that is wrong."""

@@ -110,7 +110,10 @@ def run(arguments: Namespace) -> Report:
     report.add_facts("The target beside the design", facts)
     report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
     if series.noise is None:
-        report.notes.append("note: residuals hold the noise of the measurements.")
+        report.notes += [
+            "note: residuals hold the noise of the measurements.",
+            "note: Strehl ratios are of tip and tilt alone; the record knows no other modes.",
+        ]
     if design.hardware is not None:
         report.notes += [
             f"note: {text}" for text in loop_differences(design.hardware, series.hardware)

@@ -12,7 +12,7 @@ import numpy as np
 from lbt_synth import studies
 from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.loop_inputs import load_designs, truth_at_sensor_gain
+from lbt_synth.cli.loop_inputs import load_designs, own_sensor_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.parser import command_options
@@ -35,7 +35,7 @@ from lbt_synth.studies import (
     robustness_map,
 )
 from lbt_synth.studies.robustness import default_methods
-from lbt_synth.validation import FloatArray, frozen_copy, number
+from lbt_synth.validation import FloatArray, agree, frozen_copy, number
 
 _MOST_VALUES = 2001  # of frequency errors or sensor gains
 _SIZES = ("gain", "delay_frames", "mirror")  # of errors at the same time
@@ -96,6 +96,7 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
     report = Report()
     caption = f"Robustness to the vibration frequency; {config.imaging.label}"
     report.add_rows("rows", caption, rows)
+    report.notes += own_sensor_notes(config)
     write_outputs(report, arguments.output, rows, figure=lambda: robustness_figure(rows))
     return report
 
@@ -200,16 +201,12 @@ def _assumed_gain(name: str, design: Design, config: Config) -> float:
     own, here = require_hardware(design, "a map"), config.hardware
     unit = here.sensor / config.sensor_gain
     gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
-    if not (gain > 0 and _close(own.sensor, gain * unit) and _close(own.influence, here.influence)):
+    if not (gain > 0 and agree(own.sensor, gain * unit) and agree(own.influence, here.influence)):
         raise ProblemError(
             f"{name} must have the configuration's sensor and influence matrices, up to a sensor "
             "gain; it has others. Design it for this configuration."
         )
     return gain
-
-
-def _close(one: FloatArray, other: FloatArray) -> bool:
-    return np.allclose(one, other, rtol=1e-9, atol=1e-12 * float(np.max(np.abs(other))))
 
 
 def _stable_gains(
@@ -286,9 +283,10 @@ def _guarantee(
 def _guarantee_text(worst: GuaranteedResidual, found: RobustnessMap) -> str:
     """Return what holds between the points of a map."""
     low, high = found.sensor_gains.min(), found.sensor_gains.max()
+    delay = "the delay of the design, " if np.any(found.delay_errors_frames) else ""
     box = (
-        f"each vibration anywhere in its errors and the sensor gain of each axis anywhere from "
-        f"{low:.4g} to {high:.4g}"
+        f"{delay}each vibration anywhere in its errors and the sensor gain of each axis anywhere "
+        f"from {low:.4g} to {high:.4g}"
     )
     if np.isfinite(worst.upper_nm):
         return f"at most {nm_text(worst.upper_nm, '.4g')} are left with {box}: guaranteed"

@@ -8,7 +8,7 @@ from argparse import Namespace
 import numpy as np
 
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.loop_inputs import truth_at_sensor_gain
+from lbt_synth.cli.loop_inputs import loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
@@ -81,6 +81,7 @@ def run_fused(arguments: Namespace, config: Config, design: FusedFilter) -> Repo
         ratio = strehl(residual_budget(loop, truth), config.imaging)
         report.data["strehl_exact"] = ratio
         report.notes.append(f"Strehl ratio with all sensors, exact: {100 * ratio:.2f} %")
+    report.notes += loop_difference_notes(config, design)
     if arguments.output is not None:
         figure = sensor_failure_figure(
             found.simulation, found.segments, found.exact_nm, title=design.method

@@ -13,6 +13,8 @@ from lbt_synth.report.figures.open_loops import axes_name
 from lbt_synth.report.figures.step import design_steps
 from lbt_synth.storage.rows import column, table_row
 
+_SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
+
 
 @table_row
 class StepPoint:
@@ -54,7 +56,9 @@ def _add_facts(report: Report, designs: Mapping[str, Design], sensor_gain: float
             overshoot_percent=each.overshoot_percent,
             settling_s=each.settling_s,
         )
-        for name, found in design_steps(designs, sensor_gain=sensor_gain).items()
+        for name, found in design_steps(
+            designs, sensor_gain=sensor_gain, frames=_SETTLING_FRAMES
+        ).items()
         for each in found
     ]
     if facts:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.loop_inputs import own_sensor_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import track_progress
@@ -39,5 +40,6 @@ def run(arguments: Namespace) -> Report:
         f"the least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
         f"{nm_text(least.gamma_least, '.9g')}"
     )
+    report.notes += own_sensor_notes(config)
     write_outputs(report, arguments.output, points, figure=lambda: tradeoff_figure(points))
     return report

@@ -160,10 +160,14 @@ class Config(Summarised):
         with name_file(self.source):
             design = request.build(self)
         said = design.assumptions
-        if self.fused_plant is not None and not design.several_sensors:
-            others = ", ".join(self.fused_plant.suite.units[1:])
-            said = (*said, f"the loop's own sensor is read alone, without {others}")
+        if self.other_sensors and not design.several_sensors:
+            said = (*said, f"the loop's own sensor is read alone, without {self.other_sensors}")
         return replace(design, configuration=self.text, assumptions=said)
+
+    @property
+    def other_sensors(self) -> str:
+        """Names of the sensors and channels beside the loop's own, empty if there are none."""
+        return "" if self.fused_plant is None else ", ".join(self.fused_plant.suite.units[1:])
 
     @property
     def text(self) -> str:
@@ -247,7 +251,7 @@ def read_mapping(source: Path) -> dict[str, Any]:
         raise ConfigError(str(error)) from error
     except UnicodeDecodeError as error:
         where = f"{error.reason} at byte {error.start}"
-        raise ConfigError(f"{source} is no text in UTF-8: {where}.") from error
+        raise ConfigError(f"{source} is not UTF-8 text: {where}.") from error
     try:
         raw = _load_yaml(text)
     except Exception as error:  # the parsers of YAML raise whatever they like

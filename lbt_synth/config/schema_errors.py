@@ -24,6 +24,8 @@ def describe_error(
     more = f" ({len(details) - 1} more after this one.)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = _list_keys(schema, location[:-1])
+        if str(location[-1]) in known:
+            return f"{key} goes with another kind; leave it out, or change the kind.{more}", key
         return f"unknown key {key}; {suggest_word(str(location[-1]), known)}{more}", key
     missing = [_key_path(_plain_location(d)) for d in details if d["type"] == "missing"]
     if first["type"] == "missing":

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method
+from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method, require_several_sensors
 from lbt_synth.methods.method import DesignInputs
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ class HinfOptions(BoundOptions):
 
 def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign | FusedFilter:
     if inputs.fused_plant is not None:
+        require_several_sensors(options)
         from lbt_synth.design.fusion.fused_filter import fused_hinf
 
         return fused_hinf(inputs.fused_plant, **options.bound())

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import Horizon, filter_method
+from lbt_synth.methods.filters import Horizon, filter_method, require_several_sensors
 from lbt_synth.methods.method import DesignInputs, Section
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ class KalmanOptions(Section):
 
 def _build(inputs: DesignInputs, options: KalmanOptions) -> FilterDesign | FusedFilter:
     if inputs.fused_plant is not None:
+        require_several_sensors(options)
         from lbt_synth.design.fusion.fused_filter import fused_kalman
 
         return fused_kalman(inputs.fused_plant)

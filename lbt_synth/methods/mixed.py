@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from lbt_synth.errors import ProblemError
-from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method
+from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method, require_several_sensors
 from lbt_synth.methods.method import DesignInputs
 
 if TYPE_CHECKING:
@@ -31,13 +30,9 @@ class MixedOptions(BoundOptions):
 
 def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign | FusedFilter:
     if inputs.fused_plant is not None:
+        require_several_sensors(options)
         from lbt_synth.design.fusion.mixed import fused_mixed
 
-        if options.rms is not None:
-            raise ProblemError(
-                "rms bounds a filter of the loop's own sensor alone; with several sensors give "
-                "gamma or gamma_ratio."
-            )
         return fused_mixed(inputs.fused_plant, **options.bound())
     from lbt_synth.design.mixed import mixed
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.design.fusion.fused_filter import FusedFilter
-from lbt_synth.errors import UnstableLoopError
 from lbt_synth.linear import PeriodicController
 from lbt_synth.loop import Imaging, Simulation, residual_budget
-from lbt_synth.loop.fusion.fused_loop import close_fused_loop
+from lbt_synth.loop.fusion.fused_loop import FusedLoop, close_fused_loop
 from lbt_synth.loop.fusion.simulation import Drop, Segment, run_segments, simulate_fused
 from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models import Truth
@@ -28,9 +27,13 @@ class SegmentRow:
     sensors: str = column("sensors that fail")
     residual_nm: float = nm_column("simulated", unit="nm rms", format=".2f")
     exact_nm: float = nm_column(
-        "exact, once settled", unit="nm rms", format=".2f", missing="unstable"
+        "exact, once settled",
+        unit="nm rms",
+        format=".2f",
+        help="nan where the loop is unstable, a reading is frozen, or a vibration drifts",
     )
-    strehl: float = percent_column("Strehl")
+    strehl: float = percent_column("Strehl", help="nan where the loop is unstable")
+    stable: bool = column("stable", help="Whether the loop is stable with these sensors")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,15 +42,16 @@ class FailureRun:
 
     simulation: Simulation
     segments: tuple[Segment, ...]  # times between failures and returns
-    # exact stationary residual of each [nm rms]; nan where the loop is unstable, or a vibration
-    # of the truth drifts
+    # exact stationary residual of each [nm rms]; nan where the loop is unstable, a frozen reading
+    # adds an offset of its own, or a vibration of the truth drifts
     exact_nm: tuple[float, ...]
+    stable: tuple[bool, ...]  # whether the loop of each is
 
     def rows(self, imaging: Imaging) -> list[SegmentRow]:
         """Return a row per segment."""
         rate, residual = self.simulation.frame_rate_hz, self.simulation.residual_nm
         out = []
-        for segment, exact in zip(self.segments, self.exact_nm, strict=True):
+        for segment, exact, stable in zip(self.segments, self.exact_nm, self.stable, strict=True):
             first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
             part = residual[:, first:last]
             out.append(
@@ -57,7 +61,10 @@ class FailureRun:
                     sensors=segment.text or "none",
                     residual_nm=float(np.sqrt(np.mean(np.sum(part**2, axis=2)))),
                     exact_nm=exact,
-                    strehl=float(np.mean([series_strehl(case, imaging) for case in part])),
+                    strehl=float(np.mean([series_strehl(case, imaging) for case in part]))
+                    if stable
+                    else np.nan,
+                    stable=stable,
                 )
             )
         return out
@@ -87,27 +94,32 @@ def run_failures(
         drops=drops,
     )
     segments = run_segments(drops, frames / config.hardware.frame_rate_hz)
-    exact = tuple(_exact_nm(design, filters, config, truth, segment) for segment in segments)
-    return FailureRun(simulation=simulation, segments=segments, exact_nm=exact)
+    loops = [_segment_loop(design, filters, config, truth, segment) for segment in segments]
+    return FailureRun(
+        simulation=simulation,
+        segments=segments,
+        exact_nm=tuple(
+            np.nan
+            if truth.drifts or "frozen" in segment.wrong.values() or not loop.is_stable
+            else residual_budget(loop, truth).rms_nm
+            for segment, loop in zip(segments, loops, strict=True)
+        ),
+        stable=tuple(loop.is_stable for loop in loops),
+    )
 
 
-def _exact_nm(
+def _segment_loop(
     design: FusedFilter,
     filters: Mapping[frozenset[str], PeriodicController],
     config: Config,
     truth: Truth,
     segment: Segment,
-) -> float:
-    if truth.drifts:
-        return np.nan
-    loop = close_fused_loop(
+) -> FusedLoop:
+    """Return the loop of a segment, with its filter."""
+    return close_fused_loop(
         config.hardware,
         design.problem.suite,
         filters[frozenset(segment.missing)],
         sensor_gain=truth.sensor_gain,
         blind=(*segment.missing, *segment.wrong),
     )
-    try:
-        return residual_budget(loop, truth).rms_nm
-    except UnstableLoopError:
-        return np.nan

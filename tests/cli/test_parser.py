@@ -20,6 +20,14 @@ def test_a_mistyped_option_is_named(capsys, words, message) -> None:
     assert f"unrecognized arguments: {message}" in error
 
 
+def test_an_option_is_given_once(capsys) -> None:
+    words = ("--method", "kalman", "-o", "a.fits")
+    for more in (("-o", "b.fits"), ("--output", "b.fits"), ("--method", "hinf")):
+        status, _, error = run(capsys, "design", "a.yaml", *words, *more)
+        assert status == 2
+        assert "give it once" in error
+
+
 @pytest.mark.parametrize("words", [("--method", "kalman"), ("--meth", "kalman"), ("--", "--ou")])
 def test_a_missing_option_is_named_where_no_other_is_wrong(capsys, words) -> None:
     status, _, error = run(capsys, "design", "a.yaml", *words)

@@ -11,6 +11,8 @@ from support.several_sensors import CONFIG, write_config
 
 from lbt_synth.cli.sensor_failures import parse_drop
 
+_OTHER_SENSORS = "runs with the sensors of the gain file beside the loop's own"
+
 
 @pytest.fixture
 def config_file(tmp_path):
@@ -100,6 +102,50 @@ def test_verify_and_limits_take_it(tmp_path, capsys, fused_file):
     status, text, _ = run(capsys, "limits", few, fused_file)
     assert status == 0
     assert "fused" in text
+    assert _OTHER_SENSORS not in text
+
+
+@pytest.mark.parametrize("command", ["limits", "simulate", "report"])
+def test_other_sensors_than_those_of_the_configuration_are_named(
+    tmp_path, capsys, fused_file, command
+):
+    noisy = CONFIG.replace("noise_m_s2: 2.0e-4", "noise_m_s2: 2.0e-2")
+    few = write_config(tmp_path, noisy + "robustness: {errors_hz: [0]}\n")
+    output = ("-o", tmp_path / "a.html") if command == "report" else ()
+    status, text, _ = run(capsys, command, few, fused_file, *output)
+    assert status == 0
+    assert _OTHER_SENSORS in text
+
+
+def test_commands_that_read_the_own_sensor_alone_say_so(capsys, config_file):
+    for command in (("robustness", config_file), ("tradeoff", config_file, "--points", 2)):
+        status, text, _ = run(capsys, *command)
+        assert status == 0
+        assert "note: the loop's own sensor is read alone, without slow, m1, m2." in text
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("kalman", ("--horizon", 2)),
+        ("kalman", ("--route", "sdp")),
+        ("hinf", ("--route", "lmi")),
+        ("mixed", ("--taps", 8)),
+        ("mixed", ("--rms", 60)),
+    ],
+)
+def test_options_that_several_sensors_do_not_have(tmp_path, capsys, config_file, method, options):
+    gain = tmp_path / "q.fits"
+    status, _, error = run(capsys, "design", config_file, "--method", method, *options, "-o", gain)
+    assert status == 2
+    assert f"{options[0]} must be left out with several sensors" in error
+    assert not gain.exists()
+
+
+def test_a_design_has_units(tmp_path, capsys, fused_file):
+    text = run(capsys, "show", fused_file)[1]
+    (line,) = (row for row in text.splitlines() if row.lstrip().startswith("estimation error, rms"))
+    assert line.split()[-1] == "nm"
 
 
 def test_what_a_drop_says():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -32,5 +34,27 @@ def test_a_loop_that_a_blind_sensor_destabilises_has_no_exact_answer(fused, fuse
         fused, fused_config, fused_config.truth, [away, slow], frames=600, cases=1, seed=4
     )
     stable = np.isfinite(found.exact_nm[1])
+    assert found.stable == (True, stable)
+    last = found.rows(fused_config.imaging)[1]
+    assert last.stable == np.isfinite(last.strehl) == stable
     radius = fused.controllers[frozenset({"slow"})].to_statespace().radius_per_frame
     assert stable == (radius < 1)  # nothing closes the loop: the controller alone decides
+
+
+def test_a_frozen_reading_and_a_drift_have_no_exact_answer(fused, fused_config):
+    frozen = [Drop(unit="m1", start_s=0.5, reading="frozen")]
+    size = {"frames": 600, "cases": 1, "seed": 4}
+    found = run_failures(fused, fused_config, fused_config.truth, frozen, **size)
+    assert (np.isfinite(found.exact_nm).tolist(), found.stable) == ([True, False], (True, True))
+    line, *others = fused_config.truth.vibrations
+    moving = lbt.models.DriftingVibration(
+        start_hz=line.frequency_hz,
+        end_hz=line.frequency_hz + 0.1,
+        duration_s=1,
+        damping=0.01,
+        rms_nm=line.rms_nm,
+        direction=line.direction,
+    )
+    drifting = replace(fused_config.truth, vibrations=(moving, *others))
+    found = run_failures(fused, fused_config, drifting, [], **size)
+    assert (np.isfinite(found.exact_nm).tolist(), found.stable) == ([False], (True,))

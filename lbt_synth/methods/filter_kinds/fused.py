@@ -21,8 +21,8 @@ def _describe(design: FusedFilter) -> Description:
     ]
     if unseen:
         notes.append(
-            f"note: unstable where {'; '.join(unseen)} fails unseen. The computer of the loop has "
-            "to see this failure, and take the fall-back filter."
+            f"note: unstable if these fail unseen: {'; '.join(unseen)}. The computer of the loop "
+            "has to see such a failure, and take the fall-back filter."
         )
     return Description(
         facts=design.facts(),

@@ -9,7 +9,7 @@ the loop's own sensor, of delay d and period 1, has the age 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, TypeAlias
 
 import numpy as np
@@ -282,6 +282,14 @@ class SensorSuite:
                 f"got {', '.join(units[1:]) or 'no sensor'}."
             )
         set_fields(self, sensors=sensors, units=units)
+
+    def is_same(self, other: SensorSuite) -> bool:
+        """Whether both have the same sensors, in all that they are."""
+        return self.units == other.units and all(
+            type(one) is type(two)
+            and all(np.array_equal(getattr(one, f.name), getattr(two, f.name)) for f in fields(one))
+            for one, two in zip(self.sensors, other.sensors, strict=True)
+        )
 
     @property
     def wavefront(self) -> tuple[WavefrontSensor, ...]:

@@ -13,16 +13,19 @@ from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figu
 from lbt_synth.report.figures.loop import stable_curve
 from lbt_synth.report.figures.open_loops import axes_name, closed_loops
 
+SHOWN_FRAMES = 120
 Steps = dict[str, tuple[LoopStep, ...]]  # of each design; none where the loop is unstable
 
 
-def design_steps(designs: Mapping[str, Design], *, sensor_gain: float = 1.0) -> Steps:
+def design_steps(
+    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, frames: int = SHOWN_FRAMES
+) -> Steps:
     """Return the step responses of designs; axes that respond alike are one."""
     steps: Steps = {}
     for name, loop in closed_loops(designs, sensor_gain).items():
         unlike: list[LoopStep] = []
         for axis in range(loop.hardware.modes if loop.is_stable else 0):
-            found = step_response(loop, axis=axis)
+            found = step_response(loop, axis=axis, frames=frames)
             if not any(np.allclose(found.residual, each.residual) for each in unlike):
                 unlike.append(found)
         steps[name] = tuple(unlike)
