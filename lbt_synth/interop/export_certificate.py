@@ -56,4 +56,5 @@ def write_export(
         start=start,
         checks=tuple(checks),
         cost=cost,
+        coefficients=facts.get("coefficients", ""),
     )

@@ -79,12 +79,16 @@ def all_modes(
         raise ProblemError(f"modes must be at least {own}, those of the design; got {count}.")
     if other_gain is not None:
         if modes is None:
-            raise ProblemError("other_gain needs modes, the number of modes of the RTC; got none.")
+            raise ProblemError("other_gain needs the number of modes of the RTC: give modes.")
+        if count == own:
+            raise ProblemError(
+                f"other_gain must be left out: the design has all {own} modes. Or give modes, the "
+                "number of those of the RTC."
+            )
         loop = parts[0].design.hardware
         assert loop is not None  # require_modal refuses a design without a loop
         others = integrator(loop.single_mode(), gain=number(other_gain, "other_gain", above=0))
-        if count > own:
-            parts.append(ModeDesign(others, tuple(range(own, count))))
+        parts.append(ModeDesign(others, tuple(range(own, count))))
         own = count
     return AllModes(parts=parts, own=own, count=count)
 

@@ -36,7 +36,7 @@ def check_fits(content: bytes) -> None:
     ValueError: the checksum of its HDU 1 is wrong
     """
     if len(content) % BLOCK:
-        raise ValueError(f"it is truncated: {len(content)} bytes are no whole blocks of {BLOCK}")
+        raise ValueError(f"it is truncated: {len(content)} bytes are not whole blocks of {BLOCK}")
     start, number = 0, 0
     while start < len(content) and (number == 0 or content[start:].strip(b"\0 ")):
         if number == _MOST_UNITS:

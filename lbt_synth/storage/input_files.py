@@ -40,7 +40,7 @@ def open_regular(path: str | os.PathLike[str], flags: int) -> int:
     os.close(handle)
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    raise OSError(errno.EINVAL, "it is no regular file")
+    raise OSError(errno.EINVAL, "it is not a regular file")
 
 
 @contextlib.contextmanager
@@ -66,7 +66,7 @@ def read_bytes(
     >>> read_bytes("/dev/zero", FileError)
     Traceback (most recent call last):
         ...
-    lbt_synth.errors.FileError: cannot read /dev/zero: it is no regular file.
+    lbt_synth.errors.FileError: cannot read /dev/zero: it is not a regular file.
     """
     with open_input(path, error) as stream:
         size = os.fstat(stream.fileno()).st_size

@@ -134,7 +134,7 @@ def test_unreadable_files(tmp_path):
         lbt.load_config(tmp_path)
     binary = tmp_path / "b.yaml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(lbt.errors.ConfigError, match="is no text in UTF-8: .* at byte"):
+    with pytest.raises(lbt.errors.ConfigError, match="is not UTF-8 text: .* at byte"):
         lbt.load_config(binary)
 
 

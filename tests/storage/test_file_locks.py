@@ -31,7 +31,7 @@ def test_a_lock_with_content_or_another_name_stays(tmp_path):
 
 def test_a_pipe_is_no_lock(tmp_path):
     os.mkfifo(tmp_path / ".lock")
-    with pytest.raises(OutputError, match="no regular file"), exclusive_lock(tmp_path, "run"):
+    with pytest.raises(OutputError, match="not a regular file"), exclusive_lock(tmp_path, "run"):
         pass
 
 

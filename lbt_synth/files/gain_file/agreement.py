@@ -14,7 +14,7 @@ import numpy as np
 
 from lbt_synth.design.record import DesignRecord
 from lbt_synth.design.result import ORIGIN
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import agree, number
 
 _ARRAYS = 1e-9  # relative, of an entry; and a thousandth of that, of the largest
 _NUMBERS = 1e-6  # relative
@@ -55,7 +55,7 @@ def require_agreement(found: DesignRecord, expected: DesignRecord) -> None:
         array = found.arrays[name]
         if array.shape != own.shape:
             raise ValueError(f"{name} must be {own.shape} to match the design; got {array.shape}")
-        if not _close(array, own):
+        if not agree(array, own, _ARRAYS):
             apart = float(np.max(np.abs(array - own))) / max(float(np.max(np.abs(own))), 1e-300)
             raise ValueError(
                 f"{name} is not what plant, loop and gains make: it differs by {apart:.2g} of its "
@@ -111,11 +111,6 @@ def require_same(found: Any, expected: Any, name: str) -> None:
 def _kinds(names: Iterable[str]) -> set[str]:
     """Names of checks without their modes; 0.2 listed equal modes once."""
     return {re.sub(r"^mode \d+: ", "", name) for name in names}
-
-
-def _close(array: FloatArray, own: FloatArray) -> bool:
-    largest = float(np.max(np.abs(own), initial=0.0))
-    return bool(np.allclose(array, own, rtol=_ARRAYS, atol=1e-3 * _ARRAYS * largest))
 
 
 def _brief(value: Any) -> str:

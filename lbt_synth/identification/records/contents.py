@@ -185,7 +185,7 @@ def _read_text(out: Contents, content: bytes) -> None:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise TelemetryError("it is no text in UTF-8.") from error
+        raise TelemetryError("it is not UTF-8 text.") from error
     rows: list[tuple[int, str]] = []  # number of each line, from 1, and its text
     above = ""  # the last comment before the table, which may have the names
     for number, raw in enumerate(text.splitlines(), start=1):

@@ -215,7 +215,7 @@ def _checked_form(design: ModalDesign, form: str | None) -> str:
     if several and form == "plain":
         raise ProblemError(
             "a design of several sensors is exported in estimator form alone, which is given the "
-            "applied commands; got form plain. Leave the form out."
+            "applied commands; got form=plain. Leave it out."
         )
     return form
 
@@ -239,7 +239,7 @@ def _written_part(design: Design, *, given: bool, single: bool) -> Controller:
         if design.hardware is None:
             raise ProblemError(
                 "the estimator form needs the design of a loop: a bare filter has no commands to "
-                "be applied. Export it with form plain."
+                "be applied. Export it with form=plain."
             )
         own = estimator_form(design)
         inputs = np.hstack([own.B, own.applied])

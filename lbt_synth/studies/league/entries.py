@@ -27,7 +27,7 @@ from lbt_synth.methods.registry import method_named, plant_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.studies.league.integrators import hindsight_integrators, optimised_integrators
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, choice
 
 _TAPS = (32, 64)
 _ORDERS = (10, 20)
@@ -104,8 +104,7 @@ def choose_entries(names: Sequence[str] | None) -> dict[str, Entry]:
     """Return the entries of some names, all of them for None, in their order."""
     known = all_entries()
     for name in names or ():
-        if name not in known:
-            raise ProblemError(f"an entry must be one of {', '.join(known)}; got {name!r}.")
+        choice(name, "an entry", tuple(known))
     return {name: entry for name, entry in known.items() if names is None or name in names}
 
 

@@ -25,7 +25,7 @@ RATE = 500.0
         ("a.csv", b"y_nm,u_nm\n", "a heading and no rows"),
         ("a.csv", b"y_nm,u_nm\n1,2\n3\n", "line 3 must have 2 cells; got 1"),
         ("a.csv", b"# x\ny_nm,u_nm\n1,2\n3,up\n", "cell 2 of line 4 must be a number; got 'up'"),
-        ("a.csv", b"\xff\xfe\x00", "no text in UTF-8"),
+        ("a.csv", b"\xff\xfe\x00", "not UTF-8 text"),
         ("a.npy", b"\x93NUMPY garbage", "cannot read .*a.npy as .npy"),
         ("a.npz", b"PK garbage", "cannot read .*a.npz as .npz"),
         ("a.fits", b"SIMPLE", "cannot read .*a.fits as .fits"),
