@@ -32,8 +32,8 @@ COMMANDS = {
 }
 
 
-class _StoreOnce(argparse._StoreAction):
-    """Store the value of an option; refuse a second one, which would replace it in silence."""
+class _Store(argparse._StoreAction):
+    """Store the value of an option, the last one that is given; refuse a second output."""
 
     def __call__(
         self,
@@ -42,7 +42,7 @@ class _StoreOnce(argparse._StoreAction):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        if option_string and getattr(namespace, self.dest, None) is not self.default:
+        if self.dest == "output" and getattr(namespace, self.dest, None) is not self.default:
             raise argparse.ArgumentError(self, "give it once")
         super().__call__(parser, namespace, values, option_string)
 
@@ -55,7 +55,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         for name in (None, "store"):
-            self.register("action", name, _StoreOnce)
+            self.register("action", name, _Store)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Keep the words, so that an error can name one that is wrong."""
