@@ -158,9 +158,10 @@ class Truth(Summarised):
         The line takes the share of the vibration that is nearest to it in frequency. Without
         vibrations it moves by the whole error.
         """
-        places = np.array(self.lines_hz)
-        if not places.size:
+        lines = stationary_vibrations(self.vibrations)
+        if not lines:
             return error_hz
+        places = np.array([line.frequency_hz for line in lines])  # as the shifts are ordered
         nearest = np.argmin(np.abs(np.log(places / frequency_hz)))
         return float(self.frequency_shifts_hz(error_hz)[nearest])
 

@@ -113,7 +113,7 @@ def test_a_note_names_the_line_that_may_be_two() -> None:
 
 
 def test_a_note_names_a_line_that_is_hardly_separate() -> None:
-    axis = simulated(41.5, 2)
+    axis = simulated(41.2, 1)
     second = axis.lines[1]
     assert not list(describe_close_lines(axis, 1))
     model = axis.fitted_model
