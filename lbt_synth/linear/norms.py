@@ -296,5 +296,12 @@ def popov_angles(A: FloatArray, B: _Array, Q: _Array, S: _Array, R: _Array) -> F
         [[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, B.conj().T, R]]
     )
     with np.errstate(all="ignore"):
-        values = eigvals(F, E)
+        try:
+            values = eigvals(F, E)
+        except np.linalg.LinAlgError as error:
+            raise NumericalError(
+                "the eigenvalues of a symplectic pencil were not found. Try to scale the states to "
+                "similar sizes.",
+                status="eigenvalues",
+            ) from error
     return np.asarray(np.angle(values[np.isfinite(values) & (values != 0)]))

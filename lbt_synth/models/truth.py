@@ -100,6 +100,12 @@ class Truth(Summarised):
                     "turbulence must have a method psd(frequency_hz), or be None, or a sequence "
                     f"of these, one per mode; got {type(part).__name__}."
                 )
+        for each in self.vibrations:
+            if not isinstance(each, TrueVibration):
+                raise ProblemError(
+                    "vibrations must be Vibration, SinusoidalVibration or DriftingVibration; got "
+                    f"{type(each).__name__}."
+                )
         noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
         check_fields(
             self,

@@ -215,3 +215,12 @@ def test_the_norm_ofindependent_parts_is_the_largest_of_theirs(through):
     )
     assert len(independent_parts(mixed)) == 1
     assert float(lbt.hinf_norm(mixed)) == pytest.approx(max(2.0, through))
+
+
+def test_a_pencil_without_eigenvalues_is_refused_in_words(monkeypatch):
+    def fail(*_):
+        raise np.linalg.LinAlgError("ggev")
+
+    monkeypatch.setattr("lbt_synth.linear.norms.eigvals", fail)
+    with pytest.raises(lbt.errors.NumericalError, match="scale the states"):
+        lbt.hinf_norm(lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0, dt_s=1.0))

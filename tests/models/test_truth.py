@@ -88,3 +88,9 @@ def test_a_frequency_error_moves_each_vibration_by_its_share():
     with pytest.raises(lbt.errors.ProblemError, match="moves the one at 20 Hz to -5 Hz"):
         stated.with_frequency_error(-25.0)
     assert lbt.Truth(turbulence=None).frequency_shift_hz(30.0, 2.0) == 2.0
+
+
+@pytest.mark.parametrize("other", ["abc", 20.0, None])
+def test_what_is_no_vibration_is_refused(other):
+    with pytest.raises(lbt.errors.ProblemError, match="vibrations must be Vibration, Sinusoidal"):
+        lbt.Truth(turbulence=None, noise_nm=1.0, vibrations=(other,))
