@@ -189,7 +189,7 @@ def explore(parser: ArgumentParser) -> None:
     text = "host:port under which a browser reaches the page through a tunnel; repeatable"
     parser.add_argument("--origin", action="append", default=[], metavar="HOST:PORT", help=text)
     text = "directory that the page saves into (default: this one)"
-    parser.add_argument("-o", "--output", default=".", help=text)
+    add_output(parser, text, required=False, default=".")
 
 
 def simulate(parser: ArgumentParser) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from lbt_synth.cli.argument_kinds import option_name
 from lbt_synth.cli.display import choose_wavefront_unit
 from lbt_synth.cli.end_to_end import calibrate_setup, load_setup
-from lbt_synth.cli.engine import keep_finished
+from lbt_synth.cli.engine import keep_finished, require_counts
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
@@ -25,7 +24,6 @@ from lbt_synth.studies.paper.end_to_end import (
     rms_modal_difference,
     run_tables,
 )
-from lbt_synth.validation import integer
 
 _FILES = {"II": ("table_ii.csv",), "III": ("table_iii.csv", "table_iii.png", "table_iii.pdf")}
 
@@ -38,8 +36,7 @@ def run(arguments: Namespace) -> Report:
     choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
     designs = load_designs(arguments.gains)
-    for name in ("seeds", "row_seeds", "jobs"):
-        integer(getattr(arguments, name), option_name(name), at_least=1)
+    require_counts(arguments, "seeds", "row_seeds", "jobs")
     cases = {_case_name(name): design for name, design in designs.items()}
     if len(cases) < len(designs):
         raise ProblemError(

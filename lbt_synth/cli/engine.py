@@ -8,9 +8,17 @@ from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
+from lbt_synth.cli.argument_kinds import option_name
 from lbt_synth.cli.streams import print_error
 from lbt_synth.errors import ProblemError
 from lbt_synth.studies.study.cluster import connect_cluster
+from lbt_synth.validation import integer
+
+
+def require_counts(arguments: Namespace, *names: str) -> None:
+    """Refuse options that count something, such as ``jobs``, below 1."""
+    for name in names:
+        integer(getattr(arguments, name), option_name(name), at_least=1)
 
 
 def choose_engine(

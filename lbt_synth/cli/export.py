@@ -89,8 +89,11 @@ def list_targets() -> None:
 
 
 def _precision_notes(arguments: Namespace, written: Exported) -> list[str]:
-    if written.coefficients:
-        return [f"note: the coefficients are {written.coefficients}."]
+    if written.made_again:
+        return [
+            "note: the coefficients were made again for the arithmetic of the target; the loop "
+            "keeps what the gain file promises."
+        ]
     if arguments.precision == "single" and not written.error <= _SINGLE_SUFFICES:
         return [
             f"note: in single precision commands are off by {written.error:.2g} of the largest "

@@ -71,11 +71,8 @@ def _refuse_taken(contents: Mapping[Path, str | None], *, force: bool) -> None:
         if path.is_file() and (text is None or path.read_bytes() != text.encode())
     ]
     if taken and not force:
-        advice = (
-            "--force"
-            if all(Path(each).name == _SCHEMA for each in taken)
-            else ("another name by -o, or --force")
-        )
+        renamed = any(Path(each).name != _SCHEMA for each in taken)  # by -o
+        advice = "another name by -o, or --force" if renamed else "--force"
         raise OutputError(f"{', '.join(taken)} would be replaced. Give {advice}.")
 
 

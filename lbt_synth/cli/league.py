@@ -12,7 +12,7 @@ from lbt_synth import studies
 from lbt_synth.cli import loop_records
 from lbt_synth.cli.command_repairs import judge_record
 from lbt_synth.cli.display import choose_unit
-from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.engine import choose_engine, keep_finished, require_counts
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.errors import ProblemError
@@ -23,7 +23,6 @@ from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, wri
 from lbt_synth.storage.rows import csv_rows
 from lbt_synth.storage.words import count_text
 from lbt_synth.studies.league.entries import choose_entries
-from lbt_synth.validation import integer
 
 _TABLE, _SCORES, _PAGE, _PRINT = "standings.csv", "scores.csv", "league.html", "league.pdf"
 _ODD = re.compile(r"[^A-Za-z0-9_.+-]+")
@@ -31,8 +30,7 @@ _ODD = re.compile(r"[^A-Za-z0-9_.+-]+")
 
 def run(arguments: Namespace) -> Report:
     """Run a league of all records; write its tables and its page."""
-    for name in ("jobs", "splits"):
-        integer(getattr(arguments, name), f"--{name}", at_least=1)
+    require_counts(arguments, "jobs", "splits")
     able = [entry for entry in choose_entries(arguments.entries).values() if not entry.missing]
     folder = Path(arguments.output)
     paths = [folder / name for name in (_TABLE, _SCORES, _PAGE)]

@@ -6,7 +6,7 @@ from argparse import Namespace
 
 from lbt_synth import studies
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.loop_inputs import load_designs, loop_difference_notes
+from lbt_synth.cli.loop_inputs import load_designs, named_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
@@ -96,6 +96,4 @@ def _design_notes(
         )
     if study.band is None and len(config.truth.vibrations) > 1:
         notes.append("note: the limit over a range of frequencies is that of a single sinusoid.")
-    for name, design in designs.items():
-        notes += [f"{note[:-1]} ({name})." for note in loop_difference_notes(config, design)]
-    return notes
+    return notes + named_difference_notes(config, designs)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config
@@ -57,7 +58,7 @@ def loop_difference_notes(config: Config, design: Design) -> list[str]:
     if design.hardware is not None:
         notes = loop_differences(design.hardware, config.hardware)
     elif design.several_sensors:
-        own: FusedFilter = design  # type: ignore[assignment]
+        own = cast("FusedFilter", design)
         notes = loop_differences(own.loop_hardware, config.hardware)
         here = config.fused_plant
         if here is None or not here.suite.is_same(own.problem.suite):
@@ -66,6 +67,15 @@ def loop_difference_notes(config: Config, design: Design) -> list[str]:
                 "the configuration."
             )
     return [f"note: {text}" for text in notes]
+
+
+def named_difference_notes(config: Config, designs: Mapping[str, Design]) -> list[str]:
+    """Say so of designs by their names."""
+    return [
+        f"{note[:-1]} ({name})."
+        for name, design in designs.items()
+        for note in loop_difference_notes(config, design)
+    ]
 
 
 def own_sensor_notes(config: Config) -> list[str]:

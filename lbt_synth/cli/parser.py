@@ -32,30 +32,10 @@ COMMANDS = {
 }
 
 
-class _Store(argparse._StoreAction):
-    """Store the value of an option, the last one that is given; refuse a second output."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        if self.dest == "output" and getattr(namespace, self.dest, None) is not self.default:
-            raise argparse.ArgumentError(self, "give it once")
-        super().__call__(parser, namespace, values, option_string)
-
-
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line: what is wrong, what was meant, and where help is."""
 
     _words: Sequence[str] = ()  # that it was given
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        for name in (None, "store"):
-            self.register("action", name, _Store)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Keep the words, so that an error can name one that is wrong."""

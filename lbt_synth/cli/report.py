@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.loop_inputs import load_designs, loop_difference_notes
+from lbt_synth.cli.loop_inputs import load_designs, named_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.config import Config, load_config
@@ -96,8 +96,7 @@ def _report_several_sensors(
     report = Report()
     caption = f"Designs in the loop of {config.source.name}; {config.imaging.label}"
     report.add_rows("rows", caption, found.rows, hidden=("worst_nm", "above_band_limit_percent"))
-    for name, design in designs.items():
-        report.notes += [f"{note[:-1]} ({name})." for note in loop_difference_notes(config, design)]
+    report.notes += named_difference_notes(config, designs)
     report.note_files(written)
     return report
 

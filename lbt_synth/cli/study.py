@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lbt_synth import studies
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.engine import choose_engine, keep_finished, require_counts
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import write_study_page
@@ -19,7 +19,6 @@ from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.study.run import FinishedStudy, output_paths
 from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
 from lbt_synth.studies.study.summary import worst_table
-from lbt_synth.validation import integer
 
 _COUNTS = ("samples", "computed", "failures", "retry", "seconds")
 _WORST = 3  # rows of each controller that are printed; the page has more
@@ -27,7 +26,7 @@ _WORST = 3  # rows of each controller that are printed; the page has more
 
 def run(arguments: Namespace) -> Report:
     """Run a study, say what it would cost, or replay one of its rows."""
-    integer(arguments.jobs, "--jobs", at_least=1)
+    require_counts(arguments, "jobs")
     folder = Path(arguments.output)
     with show_spinner("reading the study, designing", quiet=arguments.json):
         loaded = studies.load_study(arguments.study, directory=folder)

@@ -266,8 +266,8 @@ def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str,
     require_instance(record, LoopRecord)
     if method is not None:
         choice(method, "method", record_methods())
-    for option in defaults:  # refuses what the method does not take
-        design_request(method or option_owners(option)[0], defaults)
+    if defaults:  # refuses what the method does not take
+        design_request(method or option_owners("gamma_ratio")[0], defaults)
     _ = record.hardware  # refuses a record without a delay
     return require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
 

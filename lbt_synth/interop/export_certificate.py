@@ -56,5 +56,4 @@ def write_export(
         start=start,
         checks=tuple(checks),
         cost=cost,
-        coefficients=facts.get("coefficients", ""),
     )

@@ -162,8 +162,8 @@ class Exported:
         The proof in the loop, with the numbers of the file.
     cost : FrameCost or None
         Arithmetic of a frame, if what is written is counted.
-    coefficients : str
-        Where the coefficients are from, if that is not the gain file alone.
+    made_again : bool
+        Whether the coefficients were made again for the arithmetic of the target.
     """
 
     files: tuple[Path, ...]
@@ -172,7 +172,7 @@ class Exported:
     start: Callable[[float], SteppedController]
     checks: tuple[Check, ...] = ()
     cost: FrameCost | None = None
-    coefficients: str = ""
+    made_again: bool = False
 
 
 def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:

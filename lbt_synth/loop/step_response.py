@@ -10,6 +10,7 @@ from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.loop.simulation.run import filter_series
 from lbt_synth.validation import FloatArray, frozen_copy, integer
 
+SHOWN_FRAMES = 120  # of a response, unless more are asked for
 _SETTLED = 0.05  # part of the step
 
 
@@ -47,7 +48,7 @@ class LoopStep:
         return float(self.time_s[after]) if after < self.time_s.size else float("nan")
 
 
-def step_response(loop: ClosedLoop, *, axis: int = 0, frames: int = 120) -> LoopStep:
+def step_response(loop: ClosedLoop, *, axis: int = 0, frames: int = SHOWN_FRAMES) -> LoopStep:
     """Return the response of a loop to a step of the wavefront.
 
     Parameters

@@ -88,7 +88,7 @@ def score_guesses(
     A loop that would have been unstable has not run.
     """
     unusual = np.array([_is_surprising(guess, law, lag) for guess in compared.guesses])
-    possible = _could_have_run(compared, record, law)
+    possible = _possible_guesses(compared, record, law)
     surprising = unusual | ~possible
     best = int(np.argmin(compared.contrast))
     if law is not None and not law.exact and surprising[best] and not surprising.all():
@@ -115,7 +115,9 @@ def score_guesses(
     return score, surprising
 
 
-def _could_have_run(compared: Comparison, record: LoopRecord, law: ControlLaw | None) -> BoolArray:
+def _possible_guesses(
+    compared: Comparison, record: LoopRecord, law: ControlLaw | None
+) -> BoolArray:
     """Return which guesses make loops that have run; all where no law tells."""
     every = np.ones(len(compared.guesses), dtype=np.bool_)
     if law is None or not law.is_sure:

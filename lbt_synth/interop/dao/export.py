@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,7 +120,7 @@ def export_dao(
     first = whole.parts[0].design
     lines = provenance_lines(first, gain_digest)
     content = _matrix_bytes(matrix, first, lines, fits=target.suffix.lower() == ".fits")
-    return write_export(
+    written = write_export(
         {target: content},
         target="dao",
         arithmetic=TARGET.arithmetic,
@@ -132,6 +133,7 @@ def export_dao(
         error=error,
         start=lambda limit: InnerLoop(matrix[:, : whole.own], limit=limit),
     )
+    return replace(written, made_again=again)
 
 
 class _Proved(NamedTuple):

@@ -8,12 +8,12 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.loop import LoopStep, step_response
+from lbt_synth.loop.step_response import SHOWN_FRAMES
 from lbt_synth.report.charts.description import Axis, Curve, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import stable_curve
 from lbt_synth.report.figures.open_loops import axes_name, closed_loops
 
-SHOWN_FRAMES = 120
 Steps = dict[str, tuple[LoopStep, ...]]  # of each design; none where the loop is unstable
 
 

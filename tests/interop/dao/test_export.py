@@ -103,6 +103,7 @@ def test_a_shaped_design_that_single_precision_breaks_is_made_again(
     assert max(written_radius(matrix, gain) for gain in np.geomspace(0.5, 1.2, 40)) < 1
     beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
     assert beside["coefficients"].startswith("made again for single precision")
+    assert written.made_again
     total, noise, own = shaped_run
     found = step_loop(InnerLoop(matrix), 1.0, shaped.hardware, total, noise)[0, 1000:, 0]
     assert np.std(found) == pytest.approx(np.std(own), rel=0.03)
@@ -110,9 +111,10 @@ def test_a_shaped_design_that_single_precision_breaks_is_made_again(
 
 
 def test_coefficients_of_the_gain_file_are_kept_where_they_pass(tmp_path, designs):
-    lbt.interop.export_dao(tmp_path / "k.npy", designs["kalman"])
+    written = lbt.interop.export_dao(tmp_path / "k.npy", designs["kalman"])
     beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
     assert beside["coefficients"] == "of the gain file, rounded"
+    assert not written.made_again
 
 
 @pytest.mark.study
