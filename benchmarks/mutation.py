@@ -1,0 +1,150 @@
+"""Mutants of the files that hold the promises, and how many of them the tests kill.
+
+A mutant turns a comparison, changes a number, turns a sign or drops a line. The choice depends on
+the function and on the statement's text alone: when code moves, name its new file in
+`mutation.json`, and its mutants stay. A mutant meets the tests that reach its line, what killed it
+last time first and quick ones next, until one fails. `--again` keeps the trace of the suite.
+"""
+
+import ast
+import concurrent.futures
+import hashlib
+import itertools
+import json
+import os
+import queue
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import reach
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "lbt_synth"
+RESULTS = ROOT / "benchmarks" / "mutation.json"
+TRACE = ROOT / ".mutation"  # not kept in the repository
+MUTANTS = 20  # of each row
+SECONDS = 45.0  # of tests that a mutant meets at most
+SUITE = ["-q", "-m", "not study and not e2e and not browser", "--doctest-modules"]
+# in pairs of opposites
+WORDS = ["Lt", "GtE", "Gt", "LtE", "Eq", "NotEq", "Is", "IsNot", "In", "NotIn", "Add", "Sub"]
+TURNED = {getattr(ast, word): getattr(ast, WORDS[i ^ 1]) for i, word in enumerate(WORDS)}
+
+
+def run_tests(folder, arguments, **options):
+    environment = os.environ | {"PYTHONPATH": f"{folder}:{folder / 'benchmarks'}"}
+    command = [sys.executable, "-m", "pytest", *SUITE, *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, check=False, **options)
+
+
+def mutations(node):
+    """Yield the kind of a mutation of one node, and a function that makes it."""
+    if isinstance(node, ast.Compare) and type(node.ops[0]) in TURNED:
+        yield "comparison", lambda: node.ops.__setitem__(0, TURNED[type(node.ops[0])]())
+    if isinstance(node, ast.BinOp | ast.AugAssign) and type(node.op) in TURNED:
+        yield "sign", lambda: setattr(node, "op", TURNED[type(node.op)]())
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        yield "sign", lambda: setattr(node, "op", ast.UAdd())
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        number = node.value + 1 if isinstance(node.value, int) or not node.value else 2 * node.value
+        yield "number", lambda: setattr(node, "value", number)
+
+
+def statement_mutants(statement, name):
+    """Yield (identity, kind, line, mutation) of a statement without those that it contains."""
+    skipped = [getattr(statement, "annotation", None)]
+    for block in ("body", "orelse", "finalbody", "handlers"):
+        skipped += getattr(statement, block, [])
+    pending, text, count = [statement], ast.unparse(statement).splitlines()[0], 0
+    while pending:
+        node = pending.pop()
+        for kind, mutate in mutations(node):
+            count += 1
+            yield f"{name} {kind} {count} {text}", kind, node.lineno, mutate
+        pending += [n for n in ast.iter_child_nodes(node) if n not in skipped]
+    target = getattr(getattr(statement, "targets", [None])[0], "id", None)
+    again = target and target in [getattr(n, "id", None) for n in ast.walk(statement.value)]
+    call = isinstance(getattr(statement, "value", None), ast.Call) and type(statement) is ast.Expr
+    if call or again or isinstance(statement, ast.AugAssign | ast.Raise):
+        drop = lambda: setattr(statement, "__class__", ast.Pass)  # noqa: E731
+        yield f"{name} dropped {text}", "dropped line", statement.lineno, drop
+
+
+def tree_mutants(tree, name=""):
+    for child in ast.iter_child_nodes(tree):
+        inside = f"{name}.{child.name}" if getattr(child, "name", None) else name
+        if isinstance(child, ast.stmt) and not isinstance(child, ast.Import | ast.ImportFrom):
+            yield from statement_mutants(child, inside)
+        yield from tree_mutants(child, inside)
+
+
+def choose(files):
+    """Return a row's mutants (identity, file, kind, line): five a kind, the rest by rank."""
+    mutants = {}
+    for file in files:
+        for identity, kind, line, _ in tree_mutants(ast.parse((PACKAGE / file).read_text())):
+            mutants.setdefault((identity, file), (kind, line))
+    rows = [(*key, *value) for key, value in mutants.items()]
+    rows.sort(key=lambda m: hashlib.sha256(m[0].encode()).hexdigest())
+    by_kind = [[m for m in rows if m[2] == kind] for kind in sorted({m[2] for m in rows})]
+    first = [m for kind_rows in by_kind for m in kind_rows[: MUTANTS // 4]]
+    return (first + [m for m in rows if m not in first])[:MUTANTS]
+
+
+def meet(mutant, copies, lines, seconds, killers):
+    """Return what kills a mutant, or None."""
+    identity, file, _, line = mutant
+    by_line, home = lines.get(str(PACKAGE / file), {}), f"test_{Path(file).name}"
+    tests = by_line.get(line) or set().union(*by_line.values())
+    order = sorted(tests, key=lambda t: (t != killers.get(identity), home not in t, seconds[t]))
+    count = sum(s <= SECONDS for s in itertools.accumulate(seconds[t] for t in order))
+    if not order:
+        return None
+    target = (copy := copies.get()) / "lbt_synth" / file
+    tree = ast.parse(original := target.read_text())
+    next(m for m in tree_mutants(tree) if m[0] == identity)[3]()
+    try:
+        target.write_text(ast.unparse(ast.fix_missing_locations(tree)))
+        (copy / "chosen").write_text("\n".join(order[: max(count, 1)]))
+        options = {"capture_output": True, "text": True, "timeout": 5 * SECONDS}
+        run = run_tests(copy, ["-x", "-p", "no:cacheprovider", "@chosen"], **options)
+    except subprocess.TimeoutExpired:
+        return "does not end"
+    finally:
+        target.write_text(original)
+        copies.put(copy)
+    failed = re.search("^(?:FAILED|ERROR) (.+?)(?: - |$)", run.stdout, re.MULTILINE)
+    return (failed[1] if failed else "cannot be imported") if run.returncode else None
+
+
+def main():
+    book = json.loads(RESULTS.read_text())
+    files = [str(PACKAGE / file) for row in book["files"].values() for file in row]
+    os.environ |= {"REACH_FOLDER": str(TRACE), "REACH_FILES": ":".join(files)}
+    if "--again" not in sys.argv:
+        shutil.rmtree(TRACE, ignore_errors=True)
+        run_tests(ROOT, ["-p", "reach", "-n", "2", "lbt_synth", "tests"])
+    lines, seconds = reach.load(TRACE)
+    killers, copies = {m["identity"]: m["killed_by"] for m in book["mutants"]}, queue.Queue()
+    rows = [(row, mutant) for row, names in book["files"].items() for mutant in choose(names)]
+    with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(2) as pool:
+        ignored = shutil.ignore_patterns(".*", "out", "__pycache__", "_build")
+        for name in "ab":
+            copies.put(Path(shutil.copytree(ROOT, Path(folder) / name, ignore=ignored)))
+        results = pool.map(lambda row: meet(row[1], copies, lines, seconds, killers), rows)
+        book["mutants"] = [
+            {"row": row, "identity": mutant[0], "killed_by": killer}
+            for (row, mutant), killer in zip(rows, results, strict=True)
+        ]
+    book["slowest_tests_s"] = dict(sorted(seconds.items(), key=lambda item: -item[1])[:300])
+    RESULTS.write_text(json.dumps(book, indent=1) + "\n")
+    for row in book["files"]:
+        killed = [m["killed_by"] is not None for m in book["mutants"] if m["row"] == row]
+        print(f"| {row} | {sum(killed)} of {len(killed)} |")
+
+
+if __name__ == "__main__":
+    main()
