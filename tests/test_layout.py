@@ -14,6 +14,7 @@ WITHOUT_A_ROOM = {
     "test_no_skips.py",
     "test_old_files.py",
     "test_public.py",
+    "test_size.py",
     "test_validation.py",
 }
 FILES = sorted(path.relative_to(TESTS) for path in TESTS.rglob("test_*.py"))
