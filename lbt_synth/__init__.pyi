@@ -19,7 +19,6 @@ from .design import kalman as kalman
 from .design import lqg as lqg
 from .design import mixed as mixed
 from .design import mixed_controller as mixed_controller
-from .design import mu_controller as mu_controller
 from .design import robust as robust
 from .errors import LbtSynthError as LbtSynthError
 from .files import load_gain as load_gain

@@ -316,13 +316,6 @@ def robustness(parser: ArgumentParser) -> None:
     text = "real delay less that of the design [frames] (default: the configuration's, else 0)"
     name, dest = "--delay-errors", "delay_errors_frames"
     add_option(fixed, name, float, text, nargs="+", dest=dest, metavar="FRAMES")
-    add_switch(fixed, "--mu", "bound errors that occur at the same time, instead of a map")
-    for name, text in (
-        ("--mu-gain", "relative error of each sensor gain, with --mu (default 0.3)"),
-        ("--mu-delay-frames", "error of the delay [frames], with --mu (default 0.2)"),
-        ("--mu-mirror", "relative error of the mirror's response, with --mu (default 0.1)"),
-    ):
-        add_option(fixed, name, float, text)
     add_outputs(parser)
 
 

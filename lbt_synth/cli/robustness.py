@@ -5,12 +5,11 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 
 from lbt_synth import studies
-from lbt_synth.cli.argument_kinds import given_options, option_name
+from lbt_synth.cli.argument_kinds import given_options
 from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.loop_inputs import load_designs, own_sensor_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
@@ -30,7 +29,6 @@ from lbt_synth.storage.rows import column, percent_column, row_table, table_row
 from lbt_synth.studies import (
     GuaranteedResidual,
     RobustnessMap,
-    StructuredRobustness,
     guaranteed_residual,
     robustness_map,
 )
@@ -38,7 +36,6 @@ from lbt_synth.studies.robustness import default_methods
 from lbt_synth.validation import FloatArray, agree, frozen_copy, number
 
 _MOST_VALUES = 2001  # of frequency errors or sensor gains
-_SIZES = ("gain", "delay_frames", "mirror")  # of errors at the same time
 _LISTED_GAINS = 8  # of more sensor gains, the table shows about so many
 
 
@@ -48,8 +45,6 @@ def run(arguments: Namespace) -> Report:
     _refuse_unused_options(arguments)
     config = load_config(arguments.config)
     choose_config_unit(arguments, config)
-    if arguments.mu:
-        return _bound_designs(arguments)
     return (_map_designs if arguments.gains else _redesign)(config, arguments)
 
 
@@ -57,20 +52,12 @@ def _refuse_unused_options(arguments: Namespace) -> None:
     """Refuse the options of redesigning beside gain files, and those of maps without them."""
     redesign: tuple[str, ...] = ("sensor_gain", "gamma_ratio")
     maps: tuple[str, ...] = ("errors_hz", "sensor_gains", "delay_errors_frames")
-    sizes = tuple(f"mu_{name}" for name in _SIZES)
     names = {name: words for name, (words, _) in command_options(arguments.command).items()}
     unused, reason = maps, "goes with gain files, whose designs stay as they are; name some"
     if arguments.gains:
         unused, reason = redesign, "is for redesigning, without gain files; the options of these "
         reason += f"are {', '.join(names[name] for name in maps)}"
     for name in given_options(arguments, *unused):
-        raise ProblemError(f"{names[name]} {reason}.")
-    if arguments.mu and not arguments.gains:
-        raise ProblemError("--mu goes with gain files, whose loops it bounds; name some.")
-    if arguments.mu and any(not each.lower().endswith(".csv") for each in arguments.output):
-        raise ProblemError("--mu has no figure: -o must end in .csv.")
-    beside, reason = (maps, "is for maps, without --mu") if arguments.mu else (sizes, "needs --mu")
-    for name in given_options(arguments, *beside):
         raise ProblemError(f"{names[name]} {reason}.")
 
 
@@ -143,41 +130,6 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
         figure=lambda: robustness_map_figure(maps),
     )
     return report
-
-
-def _bound_designs(arguments: Namespace) -> Report:
-    """Bound the errors that the loops of gain files survive at the same time."""
-    sizes: dict[str, Any] = {
-        name.removeprefix("mu_"): number(size, option_name(name), at_least=0)
-        for name, size in given_options(arguments, *(f"mu_{name}" for name in _SIZES)).items()
-    }
-    rows = [
-        replace(studies.structured_robustness(design, **sizes), design=name)
-        for name, design in load_designs(arguments.gains).items()
-    ]
-    report = Report()
-    report.add_rows("rows", "Errors at the same time, as parts of the given sizes", rows)
-    for row in rows:
-        report.notes.append(f"{row.design}: {_structured_text(row)}")
-    write_outputs(report, arguments.output, rows, figure=lambda: None)
-    return report
-
-
-def _structured_text(row: StructuredRobustness) -> str:
-    """Return what the bound of a gain file means."""
-    if row.proved >= 1:
-        text = f"stable for all errors up to the given sizes at once: proved, to {row.proved:.3g} "
-        text += "times these"
-    else:
-        text = f"stable for all errors at once up to {row.proved:.3g} times the given sizes: proved"
-    if not np.isfinite(row.unstable):
-        return f"{text}; no combination that destabilises was found"
-    return (
-        f"{text}; at {row.unstable:.3g} times them it oscillates at {row.frequency_hz:.4g} Hz with "
-        f"sensor gains times {row.sensor_gains}, delay and mirror off in gain by "
-        f"{row.delay_gain:.3f} and {row.mirror_gain:.3f}, in phase by {row.delay_phase_deg:+.1f} "
-        f"and {row.mirror_phase_deg:+.1f} deg"
-    )
 
 
 def _parse_range(

@@ -36,7 +36,3 @@ from .riccati.filtering import kalman_riccati as kalman_riccati
 from .state_space import Controller as Controller
 from .state_space import RunningController as RunningController
 from .state_space import StateSpace as StateSpace
-from .structured_singular_value.blocks import Block as Block
-from .structured_singular_value.bound import MuBound as MuBound
-from .structured_singular_value.bound import mu_bound as mu_bound
-from .structured_singular_value.scales import Scales as Scales

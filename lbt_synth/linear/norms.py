@@ -26,8 +26,6 @@ from lbt_synth.validation import ComplexArray, FloatArray
 _TOLERANCE = 2e-11
 _CAREFUL = 8
 
-_Array = FloatArray | ComplexArray
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HinfNorm:
@@ -283,7 +281,9 @@ def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
     return float(careful[best]), float(angles[high[best]])
 
 
-def popov_angles(A: FloatArray, B: _Array, Q: _Array, S: _Array, R: _Array) -> FloatArray:
+def popov_angles(
+    A: FloatArray, B: FloatArray, Q: FloatArray, S: FloatArray, R: FloatArray
+) -> FloatArray:
     """Angles of the generalised eigenvalues of a symplectic pencil; no matrix is inverted.
 
     ``z [x; A'p + Q x + S'w; 0] = [A x + B w; p; S x + B'p + R w]`` with the adjoint state p. For
@@ -291,10 +291,8 @@ def popov_angles(A: FloatArray, B: _Array, Q: _Array, S: _Array, R: _Array) -> F
     the real part of a scalar response, ``Q = 0``, ``S = C`` and ``R = 2 (D - level)``.
     """
     (n, m), zero = B.shape, np.zeros
-    E = np.block([[np.eye(n), zero((n, n + m))], [Q, A.T, S.conj().T], [zero((m, 2 * n + m))]])
-    F = np.block(
-        [[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, B.conj().T, R]]
-    )
+    E = np.block([[np.eye(n), zero((n, n + m))], [Q, A.T, S.T], [zero((m, 2 * n + m))]])
+    F = np.block([[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, B.T, R]])
     with np.errstate(all="ignore"):
         try:
             values = eigvals(F, E)

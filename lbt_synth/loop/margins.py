@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from lbt_synth.linear import Block, Controller, hinf_norm
+from lbt_synth.errors import NumericalError
+from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.held_controller import HasController
-from lbt_synth.linear.norms import independent_parts
-from lbt_synth.linear.structured_singular_value.bound import upper_bound
+from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
+from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
@@ -25,6 +26,11 @@ _WIDEST = 1e4
 _AT_ONCE = 32  # gains, whose loops are in memory together
 _DIVISION, _DIVISIONS = 64, 3  # of the delays in which the delay margin is sought
 _DISK_TOLERANCE = 1e-4  # of the disk margin, relative
+_GRID = 65  # angles at which the search for the least disk margin begins
+_MOST_INTERVALS = 5000  # of angles; a loop of two axes needs some ten
+_POINT = 1e-12  # rad per sample; a narrower interval is a point
+_MOST_RATIO = 1e8  # of scales, where nothing comes back from a channel; far from overflow
+_SWEEPS = 10  # of the balancing over all channels; two channels need one
 _LONGEST = 100  # delay up to which it is sought [frames]
 
 
@@ -213,7 +219,68 @@ def _disk_margin(loop: ClosedLoop) -> float:
     S = loop.output_sensitivity()
     centred = replace(S, D=S.D - np.eye(len(S.D)) / 2)
     parts = independent_parts(centred)  # each measurement is an input and an output of its part
-    return 1 / max(upper_bound(p, (Block(),) * len(p.D), _DISK_TOLERANCE)[0] for p in parts)
+    return 1 / max(channel_norm(part) for part in parts)
+
+
+def channel_norm(system: StateSpace) -> float:
+    """Bound the structured singular value of a stable system with as many outputs as inputs.
+
+    The uncertainty is diagonal. Scales D that suit one angle bound it by the norm of
+    ``D G D^-1`` on an interval, as far as the level sets reach, and intervals cover all angles.
+    """
+    norm = hinf_norm(system).upper
+    if len(system.D) == 1 or norm == 0:
+        return norm
+    balanced = system.balanced()
+    peak = 0.0
+
+    def scaled_system(angle: float) -> StateSpace:
+        """Return the system in the scales that suit an angle, at which the peak may rise."""
+        nonlocal peak
+        response = pointwise_response(system, np.exp(1j * np.array([angle])))[0]
+        scales = channel_scales(np.abs(response))
+        peak = max(peak, float(np.linalg.norm(scales[:, None] * response / scales, 2)))
+        left, right = scales[:, None], 1 / scales
+        B, C, D = balanced.B * right, left * balanced.C, left * balanced.D * right
+        return replace(balanced, B=B, C=C, D=D)
+
+    angles = np.concatenate([np.linspace(0, np.pi, _GRID), np.angle(system.poles)])
+    for angle in fold_angles(angles, 0, np.pi):
+        scaled_system(angle)
+    intervals = [(0.0, np.pi)]
+    for _ in range(_MOST_INTERVALS):
+        if not intervals:
+            return min(peak * (1 + _DISK_TOLERANCE), norm)
+        low, high = intervals.pop()
+        middle = (low + high) / 2
+        scaled = scaled_system(middle)
+        crossings = fold_angles(level_angles(scaled, peak * (1 + _DISK_TOLERANCE)), low, high)
+        below = crossings[crossings < middle].max(initial=low)
+        above = crossings[crossings > middle].min(initial=high)
+        intervals += [(a, b) for a, b in ((low, below), (above, high)) if b - a > _POINT]
+    raise NumericalError(
+        f"the disk margin is at most {1 / peak:.6g}, but its bound does not close with "
+        f"{_MOST_INTERVALS} intervals of frequency. Scale the axes to similar sizes.",
+        status="level sets",
+    )
+
+
+def channel_scales(response: FloatArray) -> FloatArray:
+    """Return one scale per channel that makes rows and columns of moduli (q, q) alike.
+
+    Off the diagonal they minimise the Frobenius norm: E. E. Osborne, J. ACM 7, 338 (1960),
+    doi:10.1145/321043.321048. For two channels, whose determinant no scale changes, they minimise
+    the largest singular value as well.
+    """
+    moduli = response * ~np.eye(len(response), dtype=bool)
+    tiny = max(float(moduli.max()) / _MOST_RATIO, np.finfo(float).tiny)
+    scales = np.ones(len(moduli))
+    for _ in range(_SWEEPS):
+        for i in range(len(moduli)):
+            row = float(np.linalg.norm(scales[i] * moduli[i] / scales))
+            column = float(np.linalg.norm(scales * moduli[:, i] / scales[i]))
+            scales[i] *= np.sqrt(max(column, tiny) / max(row, tiny))
+    return np.asarray(np.clip(scales / scales.max(), 1 / _MOST_RATIO, 1.0))
 
 
 def _delay_margin_frames(loop: ClosedLoop) -> float:

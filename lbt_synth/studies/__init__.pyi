@@ -14,8 +14,6 @@ from .robustness import RobustnessMap as RobustnessMap
 from .robustness import RobustnessRow as RobustnessRow
 from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
-from .structured_robustness import StructuredRobustness as StructuredRobustness
-from .structured_robustness import structured_robustness as structured_robustness
 from .study.batch_evaluation import evaluate_samples as evaluate_samples
 from .study.load import load_study as load_study
 from .study.replay import Replay as Replay

@@ -147,20 +147,6 @@ def test_another_delay_in_the_configuration_gets_a_note(tmp_path, capsys, files)
     assert "stable sensor gains with a delay error of +1 frames: none found" in text
 
 
-def test_errors_at_the_same_time(tmp_path, capsys, files, kalman):
-    table = tmp_path / "mu.csv"
-    sizes = ("--mu-gain", 0.2, "--mu-delay-frames", 0, "--mu-mirror", 0.1)
-    status, text, _ = run(
-        capsys, "robustness", CONFIG, files["kalman"], "--mu", *sizes, "-o", table
-    )
-    assert status == 0
-    assert "kalman: stable for all errors up to the given sizes at once: proved, to" in text
-    (row,) = csv.DictReader(table.read_text().splitlines())
-    expected = lbt.studies.structured_robustness(kalman, gain=0.2, delay_frames=0, mirror=0.1)
-    assert float(row["proved"]) == pytest.approx(expected.proved)
-    assert float(row["unstable"]) >= float(row["proved"])
-
-
 def test_command_without_gain_files_is_as_before(tmp_path, capsys, settings):
     text = LBT_YAML.read_text()
     start = text.index("  errors_hz")
@@ -188,11 +174,6 @@ BAD = [
     ((CONFIG, "MIXED"), "mixed must have the configuration's sensor and influence matrices"),
     ((CONFIG, "KALMAN", "--sensor-gain", "0.5"), "--sensor-gain is for redesigning"),
     ((CONFIG, "KALMAN", "--gamma-ratio", "1.1"), "--gamma-ratio is for redesigning"),
-    ((CONFIG, "--mu"), "--mu goes with gain files"),
-    ((CONFIG, "KALMAN", "--mu-gain", "0.3"), "--mu-gain needs --mu"),
-    ((CONFIG, "KALMAN", "--mu", "--mu-mirror", "-1"), "--mu-mirror must be at least 0"),
-    ((CONFIG, "KALMAN", "--mu", "--errors-hz", "0", "1", "2"), "--errors-hz is for maps"),
-    ((CONFIG, "KALMAN", "--mu", "-o", "mu.png"), "must end in .csv"),
     ((CONFIG, "--errors-hz", "-1", "1", "3"), "--errors-hz goes with gain files"),
     ((CONFIG, "--sensor-gains", "0.5", "1", "3"), "--sensor-gains goes with gain files"),
     ((CONFIG, "--delay-errors", "0"), "--delay-errors goes with gain files"),

@@ -49,7 +49,6 @@ class ControllerFacts:
     gamma_least: float | None = column("least gamma, reached by a controller")
     gamma_infeasible: float | None = column("gamma that no controller reaches")
     rms: float | None = column("rms of z for white w of unit variance")
-    mu: float | None = column("bound of the structured singular value")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,9 +75,7 @@ class ControllerDesign(Summarised):
     certificate : Certificate
         The checks, computed from the matrices of plant and controller alone.
     method, route : str
-        "h2", "hinf", "mixed" or "mu", and how it was solved.
-    mu : float
-        Bound of the structured singular value of the closed loop (nan where no blocks were given).
+        "h2", "hinf" or "mixed", and how it was solved.
     regularised : float
         Share of the errors and disturbances that was added because the plant's own equations are
         singular, or leave rounding alone; mostly 0. The certificate is that of the plant as given.
@@ -96,7 +93,6 @@ class ControllerDesign(Summarised):
     certificate: Certificate
     method: str
     route: str
-    mu: float = np.nan
     regularised: float = 0.0
 
     def _brief(self) -> str:
@@ -112,7 +108,6 @@ class ControllerDesign(Summarised):
             gamma_least=_given(self.gamma_least),
             gamma_infeasible=_given(self.gamma_infeasible),
             rms=_given(self.rms),
-            mu=_given(self.mu),
         )
         notes = [] if self.witness is None else [f"below: {self.witness.reason}"]
         if self.regularised:

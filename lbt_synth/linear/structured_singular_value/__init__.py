@@ -1,1 +1,0 @@
-"""The structured singular value: how much uncertainty in several places a system survives."""
