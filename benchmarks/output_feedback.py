@@ -1,14 +1,12 @@
 """Controllers of random generalised plants: the least gamma against SLICOT, and its proof.
 
     python benchmarks/output_feedback.py [--plants 1000] [--first 0]
-    python benchmarks/output_feedback.py continuous [--plants 200]
     python benchmarks/output_feedback.py singular [--plants 200]
     python benchmarks/output_feedback.py least [--plants 30]
 
 The plants have 2 to 20 states, spectral radii of 0.5 to 1.3, and all feedthroughs. SLICOT's
 SB10DD is asked for a level 1e-6 below our least gamma, and its controller is judged by its
-closed loop. ``continuous`` does the same with SB10AD for plants in continuous time with D11 = 0.
-``singular`` takes the weight of the control or the noise away, and compares the least
+closed loop. ``singular`` takes the weight of the control or the noise away, and compares the least
 gamma with that of a plant with weights and noise of 1e-5. ``least`` compares the coefficients of
 the controller of the least gamma with those at 1.05 times it, and times both routes, for 10 states.
 """
@@ -18,7 +16,6 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -26,8 +23,7 @@ import slycot
 
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.linear import ContinuousSystem, GeneralizedPlant, StateSpace
-from lbt_synth.linear.output_feedback.discrete_form import discrete_form
+from lbt_synth.linear import GeneralizedPlant, StateSpace
 
 
 def random_plant(seed: int, states: tuple[int, int] = (2, 20)) -> GeneralizedPlant:
@@ -43,39 +39,26 @@ def random_plant(seed: int, states: tuple[int, int] = (2, 20)) -> GeneralizedPla
     return GeneralizedPlant(A=A, **{name: rng.normal(size=size) for name, size in sizes.items()})
 
 
-def continuous_plant(seed: int) -> GeneralizedPlant:
-    """Draw the matrices of a plant in continuous time, with poles about a square of n."""
-    plant = random_plant(seed)
-    rng = np.random.default_rng([seed, 1])
-    n = len(plant.A)
-    A = rng.normal(size=(n, n)) - rng.uniform(0, 2) * np.eye(n)
-    return replace(plant, A=A, D11=0 * plant.D11, dt_s=None)
-
-
 def slicot_norm(plant: GeneralizedPlant, gamma: float) -> float:
-    """Norm of the loop of SB10DD or SB10AD at a level; infinite where it fails or is unstable."""
-    P, form = plant, discrete_form(plant)
+    """Norm of the loop of SB10DD at a level; infinite where it fails or is unstable."""
+    P = plant
     m1, m2, p1, p2 = P.sizes
     B, C = np.hstack([P.B1, P.B2]), np.vstack([P.C1, P.C2])
     D = np.block([[P.D11, P.D12], [P.D21, P.D22]])
     given = (len(P.A), m1 + m2, p1 + p2, m2, p2, gamma, P.A, B, C, D)
     try:
-        if P.dt_s is None:
-            parts = dict(zip("ABCD", slycot.sb10ad(*given, job=4)[1:5], strict=True))
-            K = ContinuousSystem(**parts).to_discrete(form.rate)
-        else:
-            K = StateSpace(**dict(zip("ABCD", slycot.sb10dd(*given)[1:5], strict=True)))
-        loop = form.closed_loop(form.scaled(K))[2]
+        K = StateSpace(**dict(zip("ABCD", slycot.sb10dd(*given)[1:5], strict=True)))
+        loop = plant.closed_loop(K)
         return lbt.hinf_norm(loop).upper if loop.spectral_radius < 1 else np.inf
     except (slycot.exceptions.SlycotError, LbtSynthError):
         return np.inf
 
 
-def compare(first: int, count: int, draw: Callable[[int], GeneralizedPlant]) -> None:
+def compare(first: int, count: int) -> None:
     """Print what became of each plant."""
     lower, failed, refused, gaps, times = 0, 0, [], [], []
     for seed in range(first, first + count):
-        plant = draw(seed)
+        plant = random_plant(seed)
         start = time.process_time()
         try:
             design = lbt.hinf_controller(plant)
@@ -157,7 +140,7 @@ def _next_to(plant: GeneralizedPlant, share: float) -> GeneralizedPlant:
 def main() -> None:
     """Run the comparison."""
     parser = argparse.ArgumentParser()
-    kinds = ("regular", "continuous", "singular", "least")
+    kinds = ("regular", "singular", "least")
     parser.add_argument("what", nargs="?", choices=kinds, default="regular")
     parser.add_argument("--plants", type=int)
     parser.add_argument("--first", type=int, default=0)
@@ -167,10 +150,8 @@ def main() -> None:
         compare_singular(given.first, given.plants or 200)
     elif given.what == "least":
         compare_least(given.first, given.plants or 30)
-    elif given.what == "continuous":
-        compare(given.first, given.plants or 200, continuous_plant)
     else:
-        compare(given.first, given.plants or 1000, random_plant)
+        compare(given.first, given.plants or 1000)
 
 
 if __name__ == "__main__":

@@ -33,11 +33,11 @@ mirror = lbt.linear.StateSpace(
 
 
 def weight(corner_hz):
-    """Return ``(s / 2 + w) / (s + 0.001 w)`` in discrete time."""
+    """Return ``(s / 2 + w) / (s + 0.001 w)`` by the bilinear map, which keeps its norm."""
     w = 2 * np.pi * corner_hz
-    continuous = lbt.linear.linear_system(scipy.signal.TransferFunction([0.5, w], [1.0, 1e-3 * w]))
-    found = continuous.to_discrete(2 / dt_s)
-    return lbt.linear.StateSpace(A=found.A, B=found.B, C=found.C, D=found.D, dt_s=dt_s)
+    continuous = scipy.signal.tf2ss([0.5, w], [1.0, 1e-3 * w])
+    A, B, C, D, _ = scipy.signal.cont2discrete(continuous, dt_s, method="bilinear")
+    return lbt.linear.StateSpace(A=A, B=B, C=C, D=D, dt_s=dt_s)
 
 
 for corner_hz in (10, 20, 40, 80):

@@ -194,26 +194,25 @@ def bound_check(norm: float, bound: float) -> Check:
 
 
 def certify_error(
-    error: StateSpace, *, stability: str = "spectral radius of the filter", white: bool = True
+    error: StateSpace, *, stability: str = "spectral radius of the filter"
 ) -> Certificate:
     """Certify a system from disturbance to estimation error.
 
     The checks are stability, the variance by a Lyapunov equation and its adjoint, and the norm by
-    level sets and on a frequency grid. ``stability`` names the first check. Without ``white`` the
-    disturbance is no white noise, and the variance means nothing.
+    level sets and on a frequency grid. ``stability`` names the first check.
     """
-    return _examine_error(error, stability, white)[0]
+    return _examine_error(error, stability)[0]
 
 
 def _examine_error(
-    error: StateSpace, stability: str = "spectral radius of the filter", white: bool = True
+    error: StateSpace, stability: str = "spectral radius of the filter"
 ) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
     """Return the certificate of an error, with its norm and covariance if it is stable."""
     stable = _stability_check(stability, error.spectral_radius)
     if not stable.passed:
         infinite = frozen_copy(np.full(len(error.C), np.inf))
         return Certificate(checks=(stable,), gamma=np.inf, rms_per_output=infinite), None, None
-    P, variances, checks = _examine_variance(error) if white else (None, np.empty(0), ())
+    P, variances, checks = _examine_variance(error)
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     highest = float(np.max(largest_singular_values(error, grid)))

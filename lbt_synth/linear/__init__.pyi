@@ -1,5 +1,3 @@
-from .continuous_system import ContinuousSystem as ContinuousSystem
-from .continuous_system import linear_system as linear_system
 from .estimation_problem import EstimationProblem as EstimationProblem
 from .estimator_form import EstimatorForm as EstimatorForm
 from .estimator_form import RunningEstimator as RunningEstimator

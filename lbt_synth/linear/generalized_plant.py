@@ -8,12 +8,20 @@ from typing import Any, cast
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from lbt_synth.errors import DimensionError, NumericalError
-from lbt_synth.linear.continuous_system import ContinuousSystem, linear_system, require_same_time
+from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.linear.other_systems import SAMPLE_FIRST
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, integer, matrix, number, set_fields, square
+from lbt_synth.validation import (
+    FloatArray,
+    integer,
+    matrix,
+    number,
+    require_instance,
+    set_fields,
+    square,
+)
 
 _ILL_POSED = 1e-12
 _ZERO = cast(FloatArray, None)  # of a feedthrough that is not given
@@ -23,8 +31,7 @@ _ZERO = cast(FloatArray, None)  # of a feedthrough that is not given
 class GeneralizedPlant(Summarised):
     """Plant from disturbances w and controls u to errors z and measurements y.
 
-    ``x+ = A x + B1 w + B2 u``, ``z = C1 x + D11 w + D12 u``, ``y = C2 x + D21 w + D22 u``, with
-    ``x+ = x(k+1)``, or dx/dt where ``dt_s`` is None.
+    ``x(k+1) = A x + B1 w + B2 u``, ``z = C1 x + D11 w + D12 u``, ``y = C2 x + D21 w + D22 u``.
 
     Parameters
     ----------
@@ -36,13 +43,13 @@ class GeneralizedPlant(Summarised):
         State to error and to measurement.
     D11, D12, D21, D22 : array_like, optional
         Feedthroughs (p1, m1), (p1, m2), (p2, m1), (p2, m2); zero where not given.
-    dt_s : float or None, optional
-        Sampling period [s]; None for continuous time.
+    dt_s : float, optional
+        Sampling period [s]; 1 when the samples have no physical rate.
 
     Raises
     ------
     ProblemError
-        If a matrix is not finite or the sizes clash.
+        If a matrix is not finite, the sizes clash, or there is no sampling period.
 
     Examples
     --------
@@ -69,7 +76,7 @@ class GeneralizedPlant(Summarised):
     D12: FloatArray = _ZERO
     D21: FloatArray = _ZERO
     D22: FloatArray = _ZERO
-    dt_s: float | None = 1.0
+    dt_s: float = 1.0
 
     def __post_init__(self) -> None:
         A = square(self.A, "A")
@@ -88,14 +95,16 @@ class GeneralizedPlant(Summarised):
         for word, value in (("B1", B1.T), ("B2", B2.T), ("C1", C1), ("C2", C2)):
             if not len(value):
                 raise DimensionError(f"{word} must have at least one signal; got {value.shape}.")
-        if self.dt_s is not None:
-            set_fields(self, dt_s=number(self.dt_s, "dt_s", above=0))
+        if self.dt_s is None or self.dt_s == 0:
+            raise ProblemError(
+                f"the plant must be in discrete time; got dt_s={self.dt_s}. {SAMPLE_FIRST}"
+            )
+        set_fields(self, dt_s=number(self.dt_s, "dt_s", above=0))
 
     def _brief(self) -> str:
         words = ("state", "disturbance", "control", "error", "measurement")
         sizes = (len(self.A), *self.sizes)
-        text = ", ".join(count_text(*each) for each in zip(sizes, words, strict=True))
-        return text + (", continuous time" if self.dt_s is None else "")
+        return ", ".join(count_text(*each) for each in zip(sizes, words, strict=True))
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -109,51 +118,47 @@ class GeneralizedPlant(Summarised):
         Parameters
         ----------
         system : object
-            As :func:`linear_system` takes it.
+            A StateSpace, or what :meth:`StateSpace.of` takes.
         measurements, controls : int
             Numbers of the last outputs and of the last inputs.
 
         Raises
         ------
         ProblemError
-            If no disturbance or no error is left.
+            If no disturbance or no error is left, or the system is in continuous time.
         """
-        G = linear_system(system)
+        G = StateSpace.of(system)
         p, m = G.D.shape
         q = integer(measurements, "measurements", at_least=1, at_most=p - 1)
         r = integer(controls, "controls", at_least=1, at_most=m - 1)
-        return cls(
-            **_partition(G.A, G.B, G.C, G.D, p - q, m - r),
-            dt_s=require_same_time(G),
-        )
+        return cls(**_partition(G, p - q, m - r), dt_s=G.dt_s)
 
     @property
-    def whole(self) -> StateSpace | ContinuousSystem:
+    def whole(self) -> StateSpace:
         """System from [w; u] to [z; y]."""
         B, C = np.hstack([self.B1, self.B2]), np.vstack([self.C1, self.C2])
         D = np.block([[self.D11, self.D12], [self.D21, self.D22]])
-        if self.dt_s is None:
-            return ContinuousSystem(A=self.A, B=B, C=C, D=D)
         return StateSpace(A=self.A, B=B, C=C, D=D, dt_s=self.dt_s)
 
-    def with_whole(self, system: StateSpace | ContinuousSystem) -> GeneralizedPlant:
+    def with_whole(self, system: StateSpace) -> GeneralizedPlant:
         """Return the plant of another system with the same partition."""
         m1, _, p1, _ = self.sizes
-        parts = _partition(system.A, system.B, system.C, system.D, p1, m1)
-        return GeneralizedPlant(**parts, dt_s=require_same_time(system))
+        return GeneralizedPlant(**_partition(system, p1, m1), dt_s=system.dt_s)
 
-    def closed_loop(self, controller: StateSpace | ContinuousSystem) -> Any:
+    def closed_loop(self, controller: StateSpace) -> StateSpace:
         """Return the system from w to z with ``u = K y``.
 
         Parameters
         ----------
-        controller : StateSpace or ContinuousSystem
-            From y (p2) to u (m2), in textbook form and in the plant's time.
+        controller : StateSpace
+            From y (p2) to u (m2), in textbook form.
 
         Raises
         ------
         DimensionError
             If the controller does not fit.
+        ProblemError
+            If it is no StateSpace, or has another sampling period.
         NumericalError
             If ``I - D22 D`` is singular, so that the loop has no solution.
 
@@ -164,13 +169,14 @@ class GeneralizedPlant(Summarised):
         >>> P.closed_loop(lbt.linear.StateSpace(A=0.0, B=0.0, C=0.0, D=-1.0)).spectral_radius
         0.0
         """
+        require_instance(controller, StateSpace, "controller")
         _, m2, _, p2 = self.sizes
         K = controller
         if K.D.shape != (m2, p2):
             raise DimensionError(
                 f"the controller must map {p2} measurements to {m2} controls; got D {K.D.shape}."
             )
-        require_same_time(self.whole, K)
+        require_same_period(self.dt_s, K)
         x, w, y = len(self.A), self.B1.shape[1], invert_well_posed(self.D22, K.D)
         # y = loop (C2 x + D21 w + D22 C xk)
         measured = y @ np.hstack([self.C2, self.D22 @ K.C, self.D21])
@@ -188,6 +194,14 @@ class GeneralizedPlant(Summarised):
         return replace(K, A=rows[:, :n], B=rows[:, n:], C=error[:, :n], D=error[:, n:])
 
 
+def require_same_period(dt_s: float, system: StateSpace) -> None:
+    """Refuse a system with another sampling period than the plant's."""
+    if system.dt_s != dt_s:
+        raise ProblemError(
+            f"all systems must have one sampling period; got {dt_s:.6g} s and {system.dt_s:.6g} s."
+        )
+
+
 def invert_well_posed(D22: FloatArray, D: FloatArray) -> FloatArray:
     """Return ``(I - D22 D)^-1``, (p2, p2); refuse a singular one, in any units of y."""
     loop, (units, _) = matrix_balance(np.eye(len(D22)) - D22 @ D, permute=False, separate=True)
@@ -202,11 +216,9 @@ def invert_well_posed(D22: FloatArray, D: FloatArray) -> FloatArray:
     return np.asarray(units[:, None] * np.linalg.inv(loop) / units)
 
 
-def _partition(
-    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, p1: int, m1: int
-) -> dict[str, Any]:
+def _partition(system: StateSpace, p1: int, m1: int) -> dict[str, Any]:
     """Parts of a system whose first p1 outputs are errors, first m1 inputs disturbances."""
-    first, last, own, other = slice(p1), slice(p1, None), slice(m1), slice(m1, None)
-    parts = {"A": A, "B1": B[:, own], "B2": B[:, other], "C1": C[first], "C2": C[last]}
-    parts |= {"D11": D[first, own], "D12": D[first, other]}
-    return parts | {"D21": D[last, own], "D22": D[last, other]}
+    A, B, C, D = system.A, system.B, system.C, system.D
+    parts = {"A": A, "B1": B[:, :m1], "B2": B[:, m1:], "C1": C[:p1], "C2": C[p1:]}
+    parts |= {"D11": D[:p1, :m1], "D12": D[:p1, m1:]}
+    return parts | {"D21": D[p1:, :m1], "D22": D[p1:, m1:]}

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear.continuous_system import ContinuousSystem, linear_system, require_same_time
-from lbt_synth.linear.generalized_plant import GeneralizedPlant
+from lbt_synth.linear.generalized_plant import GeneralizedPlant, require_same_period
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.linear.weights import Weight, constant_weight, stack_weights, weigh_plant
 from lbt_synth.validation import matrix
@@ -25,7 +24,7 @@ def mixed_sensitivity(
     Parameters
     ----------
     plant : object
-        G, as :func:`linear_system` takes it.
+        G: a StateSpace, or what :meth:`StateSpace.of` takes.
     performance, control, robustness : object or float, optional
         The weights W1, W2 and W3: a system, a matrix or a number. A system of one input and one
         output weighs each signal. At least one must be given.
@@ -38,7 +37,7 @@ def mixed_sensitivity(
     Raises
     ------
     ProblemError
-        If there is no weight, or systems differ in time.
+        If there is no weight, a system is in continuous time, or sampling periods differ.
     DimensionError
         If a weight does not fit.
 
@@ -54,7 +53,7 @@ def mixed_sensitivity(
     >>> lbt.linear.mixed_sensitivity(lag, performance=W1, control=0.1)
     <GeneralizedPlant: 2 states, 1 disturbance, 1 control, 2 errors, 1 measurement>
     """
-    G = linear_system(plant)
+    G = StateSpace.of(plant)
     p, m = G.D.shape
     given = {"performance": performance, "control": control, "robustness": robustness}
     # what each weight reads of the states, of w and of u
@@ -66,7 +65,9 @@ def mixed_sensitivity(
     names = [name for name, value in given.items() if value is not None]
     if not names:
         raise ProblemError("give at least one of performance, control and robustness.")
-    weight = stack_weights(_weight(given[name], name, len(reads[name][0]), G) for name in names)
+    weight = stack_weights(
+        _weight(given[name], name, len(reads[name][0]), G.dt_s) for name in names
+    )
     C1, D11, D12 = (np.vstack([reads[name][i] for name in names]) for i in range(3))
     loop = GeneralizedPlant(
         A=G.A,
@@ -78,18 +79,18 @@ def mixed_sensitivity(
         D12=D12,
         D21=np.eye(p),
         D22=-G.D,
-        dt_s=require_same_time(G),
+        dt_s=G.dt_s,
     )
     return weigh_plant(loop, weight)
 
 
-def _weight(value: Any, name: str, size: int, like: StateSpace | ContinuousSystem) -> Weight:
-    """Return a weight of signals of some size, in the time of a system."""
+def _weight(value: Any, name: str, size: int, dt_s: float) -> Weight:
+    """Return a weight of signals of some size, with a sampling period."""
     if isinstance(value, int | float | np.ndarray):
         weight = constant_weight(matrix(value, name))
     else:
-        W = linear_system(value)
-        require_same_time(like, W)
+        W = StateSpace.of(value)
+        require_same_period(dt_s, W)
         weight = Weight(W.A, W.B, W.C, W.D)
     if weight.D.shape == (1, 1):
         weight = stack_weights([weight] * size)

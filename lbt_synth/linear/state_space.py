@@ -137,11 +137,6 @@ class StateSpace(LinearSystem):
         if isinstance(system, StateSpace):
             return system
         A, B, C, D, dt_s = system_parts(system)
-        if dt_s is None:
-            raise ProblemError(
-                "the system must be in discrete time; got a continuous one (dt = 0). "
-                "Try control.sample_system(system, dt)."
-            )
         return cls(A=A, B=B, C=C, D=D, dt_s=dt_s)
 
     def to_control(self) -> Any:

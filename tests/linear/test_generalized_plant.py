@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
 from support.generalized_plants import random_plant
@@ -58,5 +59,16 @@ def test_bad_loops():
         P.closed_loop(StateSpace(A=0.0, B=np.zeros((1, 2)), C=0.0, D=np.zeros((1, 2))))
     with pytest.raises(NumericalError, match="not well posed"):
         P.closed_loop(StateSpace(A=0.0, B=0.0, C=0.0, D=1.0))
-    with pytest.raises(ProblemError, match="same time"):
-        P.closed_loop(lbt.linear.ContinuousSystem(A=-1.0, B=1.0, C=1.0, D=0.0))
+    with pytest.raises(ProblemError, match="one sampling period; got 1 s and 0.1 s"):
+        P.closed_loop(StateSpace(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=0.1))
+    with pytest.raises(ProblemError, match="must be a StateSpace"):
+        P.closed_loop(lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0))
+
+
+@pytest.mark.parametrize("dt_s", [None, 0])
+def test_a_plant_in_continuous_time_is_refused(dt_s):
+    with pytest.raises(ProblemError, match='Sample it first.*method="bilinear"'):
+        GeneralizedPlant(A=0.5, B1=1.0, B2=1.0, C1=1.0, C2=1.0, dt_s=dt_s)
+    two = control.ss([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
+    with pytest.raises(ProblemError, match='Sample it first.*method="bilinear"'):
+        GeneralizedPlant.of(two, measurements=1, controls=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import control
 import numpy as np
 import pytest
+from support.generalized_plants import sampled
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
@@ -40,14 +41,17 @@ def test_design_of_a_textbook_plant():
     """S. Skogestad's disturbance process (section 2.6.3): the norm stays near one."""
     G = control.tf([200.0], np.polymul([10.0, 1.0], np.polymul([0.05, 1.0], [0.05, 1.0])))
     W1 = control.tf([1 / 1.5, 10.0], [1.0, 10.0 * 1e-4])
-    design = lbt.hinf_controller(mixed_sensitivity(G, performance=W1, control=1.0))
+    plant = mixed_sensitivity(sampled(G, 0.1), performance=sampled(W1, 0.1), control=1.0)
+    design = lbt.hinf_controller(plant)
     assert design.gamma == pytest.approx(1.37, abs=0.01)  # the book's table says 1.37
 
 
 def test_bad_weights():
     with pytest.raises(ProblemError, match="at least one of performance"):
         mixed_sensitivity(G)
-    with pytest.raises(ProblemError, match="same time"):
+    with pytest.raises(ProblemError, match="one sampling period"):
+        mixed_sensitivity(G, performance=sampled(control.tf([1.0], [1.0, 1.0]), 0.2))
+    with pytest.raises(ProblemError, match="must be in discrete time"):
         mixed_sensitivity(G, performance=control.tf([1.0], [1.0, 1.0]))
     with pytest.raises(DimensionError, match="robustness must take 1 signals"):
         mixed_sensitivity(G, robustness=np.ones((1, 3)))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
+import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 from support.systems import random_system
@@ -19,6 +21,26 @@ def test_round_trip_through_python_control():
     for name in "ABCD":
         assert np.array_equal(getattr(back, name), getattr(system, name))
     assert back.dt_s == 0.002
+
+
+def test_systems_of_python_control_and_scipy():
+    assert lbt.linear.StateSpace.of(control.tf([1.0], [1.0, 0.5], 0.1)).dt_s == 0.1
+    assert lbt.linear.StateSpace.of(control.tf([1.0], [1.0, 0.5], True)).dt_s == 1.0
+    assert lbt.linear.StateSpace.of(scipy.signal.dlti([1.0], [1.0, 0.5], dt=0.2)).dt_s == 0.2
+    with pytest.raises(lbt.errors.ProblemError, match="a system must be"):
+        lbt.linear.StateSpace.of(3.0)
+
+
+def test_a_continuous_system_is_refused_with_the_map_that_keeps_its_norm():
+    """The norm of s / (s + 1) is one; a zero-order hold of half a second makes it 1.24."""
+    lead = control.tf([1.0, 0.0], [1.0, 1.0])
+    for system in (lead, control.ss(lead), scipy.signal.lti([1.0, 0.0], [1.0, 1.0])):
+        with pytest.raises(lbt.errors.ProblemError, match=r'sample_system\(.*method="bilinear"\)'):
+            lbt.linear.StateSpace.of(system)
+    kept = control.sample_system(control.ss(lead), 0.5, method="bilinear")
+    held = control.sample_system(control.ss(lead), 0.5)
+    assert float(lbt.hinf_norm(kept)) == pytest.approx(1.0, rel=1e-9)
+    assert float(lbt.hinf_norm(held)) == pytest.approx(2 / (1 + np.exp(-0.5)), rel=1e-9)
 
 
 def test_frequency_response_against_python_control():

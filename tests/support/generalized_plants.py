@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import control
 import numpy as np
 from scipy.linalg import block_diag
 
 import lbt_synth as lbt
 
 
-def random_plant(seed, *, n=None, dt_s=1.0, D22=True, D12=None, D21=None):
+def random_plant(seed, *, n=None, D22=True, D12=None, D21=None):
     """A generalised plant of 2 to 20 states, stable or unstable, with all feedthroughs."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 21)) if n is None else n
@@ -23,19 +24,34 @@ def random_plant(seed, *, n=None, dt_s=1.0, D22=True, D12=None, D21=None):
     A = draw(n, n)
     size = rng.uniform(0.5, 1.3)
     A = A * (size / np.max(np.abs(np.linalg.eigvals(A))))
-    if dt_s is None:
-        A = draw(n, n) - rng.uniform(0, 2) * np.eye(n)
     parts = {"A": A, "B1": draw(n, m1), "B2": draw(n, m2), "C1": draw(p1, n), "C2": draw(p2, n)}
     parts |= {"D11": draw(p1, m1), "D12": draw(p1, m2), "D21": draw(p2, m1)}
-    if dt_s is None:
-        parts["D11"] = np.zeros((p1, m1))
     if D22:
         parts["D22"] = 0.3 * draw(p2, m2)
     if D12 is not None:
         parts["D12"] = D12 * parts["D12"]
     if D21 is not None:
         parts["D21"] = D21 * parts["D21"]
-    return lbt.linear.GeneralizedPlant(**parts, dt_s=dt_s)
+    return lbt.linear.GeneralizedPlant(**parts)
+
+
+def sampled(system, dt_s=1.0):
+    """A continuous system of python-control at a sampling period, with the norm that it has."""
+    return control.sample_system(control.ss(system), dt_s, method="bilinear")
+
+
+def sampled_plant(seed, *, n):
+    """A random plant of some states in continuous time, without D11, sampled."""
+    drawn = random_plant(seed, n=n)
+    plant = replace(drawn, D11=0 * drawn.D11)
+    rng = np.random.default_rng(seed + 10**5)
+    A = rng.normal(size=(n, n)) - rng.uniform(0, 2) * np.eye(n)
+    whole = replace(plant.whole, A=A)
+    _, controls, _, measurements = plant.sizes
+    continuous = control.ss(whole.A, whole.B, whole.C, whole.D)
+    return lbt.linear.GeneralizedPlant.of(
+        sampled(continuous), measurements=measurements, controls=controls
+    )
 
 
 def lightly_damped_plant(seed):

@@ -11,8 +11,8 @@ from lbt_synth.design.output_feedback.result import (
     first_certified,
 )
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.output_feedback.discrete_form import discrete_form
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
+from lbt_synth.linear.output_feedback.scaled_plant import scaled_plant
 
 
 def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
@@ -21,7 +21,7 @@ def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
     Parameters
     ----------
     plant : GeneralizedPlant
-        In discrete time. w is white, of unit variance per sample.
+        The plant. w is white, of unit variance per sample.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
     DetectabilityError
         If no controller stabilises the plant; with the mode and its eigenvector.
     ProblemError
-        If the plant is in continuous time.
+        If it is no plant.
     NumericalError
         If an equation was not solved.
     CertificateError
@@ -58,19 +58,19 @@ def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
     >>> round(lbt.h2_controller(P).rms ** 4, 6)
     5.0
     """
-    form = discrete_form(plant, continuous=False)
+    scaled = scaled_plant(plant)
 
     def design(equations: TwoRiccati, share: float) -> ControllerDesign:
         return certified_controller(
-            form,
-            checked_loop(form, equations.least_variance()),
+            scaled,
+            checked_loop(scaled, equations.least_variance()),
             method="h2",
             route="riccati",
             regularised=share,
             least_rms=_least_rms(equations) if share == 0 else np.nan,
         )
 
-    return first_certified(form, design)
+    return first_certified(scaled, design)
 
 
 def _least_rms(equations: TwoRiccati) -> float:

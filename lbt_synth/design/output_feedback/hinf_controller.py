@@ -16,9 +16,9 @@ from lbt_synth.design.output_feedback.result import (
 )
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.lower_bound import NO_PROOF, infeasible_control_level
+from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
 from lbt_synth.validation import choice
 
 if TYPE_CHECKING:
@@ -48,8 +48,7 @@ def hinf_controller(
     Parameters
     ----------
     plant : GeneralizedPlant
-        In discrete or, with ``dt_s=None``, in continuous time; D11 and D22 may be anything,
-        D12 and D21 singular.
+        The plant. D11 and D22 may be anything, D12 and D21 singular.
     gamma : float, optional
         Bound on the H-infinity norm from w to z.
     gamma_ratio : float, optional
@@ -102,18 +101,18 @@ def hinf_controller(
     choice(route, "route", ("riccati", "lmi"))
     far_above = "the controller is that of least variance"
     gamma, gamma_ratio = checked_bounds(gamma, gamma_ratio, far_above=far_above)
-    form = discrete_form(plant)
+    scaled = scaled_plant(plant)
 
     def design(equations: TwoRiccati, share: float) -> ControllerDesign:
-        bracket = Bracket(form, equations, route)
+        bracket = Bracket(scaled, equations, route)
         requested = bracket.least * (gamma_ratio or 1.0) if gamma is None else gamma
         bracket.require(requested)
         above = None
         if requested > bracket.least * (1 + _AT_LEAST):
             above = _central(equations, requested)
         return certified_controller(
-            form,
-            bracket.reached if above is None else checked_loop(form, above),
+            scaled,
+            bracket.reached if above is None else checked_loop(scaled, above),
             method="hinf",
             route=route,
             gamma_requested=max(requested, bracket.least),
@@ -124,25 +123,25 @@ def hinf_controller(
             hint="Try a larger gamma_ratio.",
         )
 
-    return first_certified(form, design)
+    return first_certified(scaled, design)
 
 
 class Bracket:
     """The least gamma between the norm of a controller and a level that is proved infeasible."""
 
-    def __init__(self, form: DiscreteForm, equations: TwoRiccati, route: str = "riccati") -> None:
+    def __init__(self, scaled: ScaledPlant, equations: TwoRiccati, route: str = "riccati") -> None:
         solution = equations.least_level()
-        self.reached = _least_controller(form, equations, solution.gamma)
+        self.reached = _least_controller(scaled, equations, solution.gamma)
         self.least = self.reached.certificate.gamma
-        candidates = [NO_PROOF, *equations.proofs(solution, form.plant)]
-        levels = [(infeasible_control_level(form.plant, each), each) for each in candidates]
+        candidates = [NO_PROOF, *equations.proofs(solution, scaled.plant)]
+        levels = [(infeasible_control_level(scaled.plant, each), each) for each in candidates]
         proofs = [max(levels, key=lambda each: each[0])]
         loose = proofs[0][0] < self.least * (1 - _LOOSE)
         if route == "lmi":
-            proofs.append(_inequality_proof(form.plant, solution.gamma))
-        elif loose and len(form.plant.A) <= _LARGEST_LMI:
+            proofs.append(_inequality_proof(scaled.plant, solution.gamma))
+        elif loose and len(scaled.plant.A) <= _LARGEST_LMI:
             with suppress(NumericalError):
-                proofs.append(_inequality_proof(form.plant, solution.gamma))
+                proofs.append(_inequality_proof(scaled.plant, solution.gamma))
         proved, self.witness = max(proofs, key=lambda each: each[0])
         if proofs[0][0] > _SAME_REASON * self.least:  # an inequality gives no reason in words
             self.witness = replace(self.witness, reason=proofs[0][1].reason)
@@ -174,7 +173,7 @@ def _inequality_proof(plant: GeneralizedPlant, gamma: float) -> tuple[float, Con
     return infeasible_control_level(plant, witness), witness
 
 
-def _least_controller(form: DiscreteForm, equations: TwoRiccati, least: float) -> CheckedLoop:
+def _least_controller(scaled: ScaledPlant, equations: TwoRiccati, least: float) -> CheckedLoop:
     """Return the loop next to the least level, as near as its numbers allow."""
     best: CheckedLoop | None = None
     for apart in _APART:
@@ -182,7 +181,7 @@ def _least_controller(form: DiscreteForm, equations: TwoRiccati, least: float) -
         if controller is None:
             continue
         with suppress(NumericalError):  # a loop that is not well posed
-            found = checked_loop(form, controller)
+            found = checked_loop(scaled, controller)
             if not found.certificate.passed:
                 continue
             if best is None or found.certificate.gamma < best.certificate.gamma:

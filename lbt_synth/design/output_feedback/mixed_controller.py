@@ -14,9 +14,9 @@ from lbt_synth.design.output_feedback.result import (
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.norms import hinf_norm
-from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm, discrete_form
 from lbt_synth.linear.output_feedback.free_parameter import free_parameter
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
+from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import integer, number
 
@@ -35,7 +35,7 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
     Parameters
     ----------
     plant : GeneralizedPlant
-        In discrete time.
+        The plant.
     gamma : float
         Bound on the H-infinity norm.
     taps : int
@@ -78,14 +78,14 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
     """
     gamma = number(gamma, "gamma", above=0)
     taps = integer(taps, "taps", at_least=1, at_most=400)
-    form = discrete_form(plant, continuous=False)
+    scaled = scaled_plant(plant)
 
     def design(equations: TwoRiccati, share: float) -> ControllerDesign:
-        checked = checked_loop(form, equations.least_variance())
+        checked = checked_loop(scaled, equations.least_variance())
         if checked.certificate.gamma > gamma:
-            checked = checked_loop(form, _quietest(form, equations, gamma, taps))
+            checked = checked_loop(scaled, _quietest(scaled, equations, gamma, taps))
         return certified_controller(
-            form,
+            scaled,
             checked,
             method="mixed",
             route="free parameter",
@@ -94,12 +94,12 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
             hint="Try a larger gamma, or more taps.",
         )
 
-    return first_certified(form, design)
+    return first_certified(scaled, design)
 
 
-def _quietest(form: DiscreteForm, equations: TwoRiccati, gamma: float, taps: int) -> StateSpace:
+def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: int) -> StateSpace:
     """Return the controller of least variance below a level, if there is one."""
-    bracket = Bracket(form, equations)
+    bracket = Bracket(scaled, equations)
     bracket.require(gamma)
     loop = free_parameter(equations)
     frequency_hz = np.linspace(0, 0.5 / loop.T11.dt_s, _POINTS)
@@ -117,7 +117,7 @@ def _quietest(form: DiscreteForm, equations: TwoRiccati, gamma: float, taps: int
                 gamma_least=bracket.least,
             ) from error
         controller = loop.controller(found)
-        peak = hinf_norm(form.plant.closed_loop(controller))
+        peak = hinf_norm(scaled.plant.closed_loop(controller))
         if peak.upper <= gamma:
             break
         frequency_hz = np.unique(np.append(frequency_hz, peak.peak_frequency_hz))

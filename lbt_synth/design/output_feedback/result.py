@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -23,18 +22,15 @@ from lbt_synth.errors import (
     ProblemError,
     SynthesisError,
 )
-from lbt_synth.linear.continuous_system import ContinuousSystem
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.output_feedback.discrete_form import DiscreteForm
 from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.lower_bound import ControlWitness, infeasible_control_level
+from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant
 from lbt_synth.linear.state_space import StateSpace, sigma_sparkline
 from lbt_synth.storage.rows import column, fact_table, row_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 
 _SHARES = (0.0, 1e-6, 1e-5, 1e-4)  # of the errors and disturbances, added in turn
-
-System: TypeAlias = StateSpace | ContinuousSystem
 
 
 @table_row
@@ -48,7 +44,7 @@ class ControllerFacts:
     gamma_requested: float | None = column("gamma requested")
     gamma_least: float | None = column("least gamma, reached by a controller")
     gamma_infeasible: float | None = column("gamma that no controller reaches")
-    rms: float | None = column("rms of z for white w of unit variance")
+    rms: float = column("rms of z for white w of unit variance")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,14 +55,14 @@ class ControllerDesign(Summarised):
     ----------
     plant : GeneralizedPlant
         The plant.
-    controller : StateSpace or ContinuousSystem
-        From y to u, in textbook form and in the plant's time: ``u = K y``.
-    closed_loop : StateSpace or ContinuousSystem
+    controller : StateSpace
+        From y to u, in textbook form: ``u = K y``.
+    closed_loop : StateSpace
         From w to z.
     gamma : float
         H-infinity norm of the closed loop, recomputed.
     rms : float
-        Standard deviation of z for white w of unit variance per sample (nan in continuous time).
+        Standard deviation of z for white w of unit variance per sample.
     gamma_requested, gamma_least, gamma_infeasible : float
         The bound that was given; the norm that a controller achieves; and a level that none
         reaches, proved by ``witness``. Where they were not computed they are nan.
@@ -82,8 +78,8 @@ class ControllerDesign(Summarised):
     """
 
     plant: GeneralizedPlant
-    controller: System
-    closed_loop: System
+    controller: StateSpace
+    closed_loop: StateSpace
     gamma: float
     rms: float
     gamma_requested: float = np.nan
@@ -107,14 +103,12 @@ class ControllerDesign(Summarised):
             gamma_requested=_given(self.gamma_requested),
             gamma_least=_given(self.gamma_least),
             gamma_infeasible=_given(self.gamma_infeasible),
-            rms=_given(self.rms),
+            rms=self.rms,
         )
         notes = [] if self.witness is None else [f"below: {self.witness.reason}"]
         if self.regularised:
             notes.append(f"singular problem, regularised by a share of {self.regularised:g}")
-        loop, curve = self.closed_loop, None
-        if isinstance(loop, StateSpace):
-            curve = sigma_sparkline(loop, "largest singular value from w to z")
+        curve = sigma_sparkline(self.closed_loop, "largest singular value from w to z")
         tables = [
             fact_table("Controller", facts),
             row_table("Certificate", self.certificate.checks),
@@ -128,23 +122,22 @@ def _given(value: float) -> float | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CheckedLoop:
-    """A controller and its loop, in the time that was given, with the checks of the loop."""
+    """A controller and its loop, with the checks of the loop."""
 
-    controller: System
-    loop: System
+    controller: StateSpace
+    loop: StateSpace
     certificate: Certificate
 
 
-def checked_loop(form: DiscreteForm, controller: StateSpace) -> CheckedLoop:
-    """Close the loop of a controller in the discrete form, and check it."""
-    K, loop, discrete = form.closed_loop(controller)
-    name = "spectral radius of the closed loop"
-    certificate = certify_error(discrete, stability=name, white=form.rate is None)
+def checked_loop(scaled: ScaledPlant, controller: StateSpace) -> CheckedLoop:
+    """Close the loop of a controller of the scaled plant, and check it."""
+    K, loop = scaled.closed_loop(controller)
+    certificate = certify_error(loop, stability="spectral radius of the closed loop")
     return CheckedLoop(controller=K, loop=loop, certificate=certificate)
 
 
 def first_certified(
-    form: DiscreteForm, design: Callable[[TwoRiccati, float], ControllerDesign]
+    scaled: ScaledPlant, design: Callable[[TwoRiccati, float], ControllerDesign]
 ) -> ControllerDesign:
     """Return the design of the first equations that lead to one, the plant's own or next to it.
 
@@ -154,7 +147,7 @@ def first_certified(
     refusal: ValueError | SynthesisError
     for share in _SHARES:
         try:
-            equations = form.equations(share)
+            equations = scaled.equations(share)
         except (ProblemError, SynthesisError, np.linalg.LinAlgError) as error:
             refusal = error
             continue
@@ -172,7 +165,7 @@ def first_certified(
 
 
 def certified_controller(
-    form: DiscreteForm,
+    scaled: ScaledPlant,
     checked: CheckedLoop,
     *,
     method: str,
@@ -201,18 +194,18 @@ def certified_controller(
             how = "closed loop against the Riccati equations"
             checks.append(Check("rms over the least, less 1", above, VARIANCE_TOLERANCE, how))
         if witness is not None:
-            proved = infeasible_control_level(form.plant, witness)
+            proved = infeasible_control_level(scaled.plant, witness)
             above = gamma_infeasible / max(proved, 1e-300) - 1
             how = "pairs that no measurement shows and no control moves"
             name = "infeasible level over the level proved, less 1"
             checks.append(Check(name, above, INFEASIBLE_TOLERANCE, how))
     certificate = replace(certificate, checks=tuple(checks)).require(hint)
     return ControllerDesign(
-        plant=form.given,
+        plant=scaled.given,
         controller=checked.controller,
         closed_loop=checked.loop,
         gamma=certificate.gamma,
-        rms=certificate.rms if form.rate is None else np.nan,
+        rms=certificate.rms,
         gamma_requested=gamma_requested,
         gamma_least=gamma_least,
         gamma_infeasible=gamma_infeasible,

@@ -56,7 +56,7 @@ def central_controller(
     state, control = injection[:n], injection[n:]
     C, D = control @ C2 - F, -control
     observer = StateSpace(
-        A=A - state @ C2 + plant.B2 @ C, B=state + plant.B2 @ D, C=C, D=D, dt_s=plant.dt_s or 1.0
+        A=A - state @ C2 + plant.B2 @ C, B=state + plant.B2 @ D, C=C, D=D, dt_s=plant.dt_s
     )
     return with_seen_controls(observer, plant.D22)
 

@@ -58,7 +58,7 @@ class FreeParameter:
             B=rows[:, size:],
             C=control[:, :size],
             D=control[:, size:],
-            dt_s=P.dt_s or 1.0,
+            dt_s=P.dt_s,
         )
         return with_seen_controls(K, P.D22)
 
@@ -71,7 +71,7 @@ def free_parameter(equations: TwoRiccati) -> FreeParameter:
     through = np.linalg.solve(estimation.weight, seen.T).T
     control_unit = np.linalg.inv(np.linalg.cholesky(control.weight).T)
     innovation_unit = np.linalg.inv(np.linalg.cholesky(estimation.weight))
-    dt_s = P.dt_s or 1.0
+    dt_s = P.dt_s
     B2, D12 = P.B2 @ control_unit, P.D12 @ control_unit
     C2, D21 = innovation_unit @ P.C2, innovation_unit @ P.D21
     return FreeParameter(

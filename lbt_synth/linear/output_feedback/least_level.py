@@ -30,7 +30,6 @@ from lbt_synth.validation import FloatArray
 
 _TOLERANCE = 1e-11
 _NOTHING = 1e-6  # part of the level of the least variance that counts as none
-_HIGHEST = 1e-6  # angle from the Nyquist frequency at which the map has no frequency any more
 _SLOW = 0.99  # a pole of the worst case beyond this may belong to a steady oscillation
 
 
@@ -44,13 +43,10 @@ class LevelSolution:
 
 
 class TwoRiccati:
-    """The two equations of a plant in discrete time, at any level.
+    """The two equations of a plant, at any level."""
 
-    If the plant is the bilinear map of one in continuous time, ``rate`` is that of the map [1/s].
-    """
-
-    def __init__(self, plant: GeneralizedPlant, rate: float | None = None) -> None:
-        self.plant, self.rate = plant, rate
+    def __init__(self, plant: GeneralizedPlant) -> None:
+        self.plant = plant
         self.control = FullInformation(control_side(plant))
         self.estimation = FullInformation(estimation_side(plant))
 
@@ -111,12 +107,8 @@ class TwoRiccati:
         return found[min(found)]
 
     def _frequency_text(self, angle: float) -> str:
-        """Return the frequency of an angle on the unit circle, in the plant that was given."""
-        if self.rate is None:
-            return f"{angle / (2 * np.pi * (self.plant.dt_s or 1.0)):.6g} Hz"
-        if np.pi - angle < _HIGHEST:
-            return "the highest frequencies"
-        return f"{self.rate * np.tan(angle / 2) / (2 * np.pi):.6g} Hz"
+        """Return the frequency of an angle on the unit circle."""
+        return f"{angle / (2 * np.pi * self.plant.dt_s):.6g} Hz"
 
     def proofs(self, solution: LevelSolution, plant: GeneralizedPlant) -> list[ControlWitness]:
         """Return what may prove of a plant, this or the one next to it, that no level is lower.

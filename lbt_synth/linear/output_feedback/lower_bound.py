@@ -88,7 +88,7 @@ def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -
     Parameters
     ----------
     plant : GeneralizedPlant
-        In discrete time.
+        The plant.
     witness : ControlWitness
         The pairs; what measurements would show or controls move is removed first.
 

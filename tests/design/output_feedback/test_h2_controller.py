@@ -8,7 +8,6 @@ from scipy.linalg import solve_discrete_lyapunov
 from support.generalized_plants import random_plant
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -44,8 +43,3 @@ def test_scalar_closed_form():
         D21=[[0.0, 1.0]],
     )
     assert lbt.h2_controller(plant).rms ** 4 == pytest.approx(5.0)
-
-
-def test_continuous_time_is_refused():
-    with pytest.raises(ProblemError, match="discrete time"):
-        lbt.h2_controller(random_plant(3, n=3, dt_s=None))

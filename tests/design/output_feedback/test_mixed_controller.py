@@ -8,9 +8,9 @@ from support.common_lyapunov import common_lyapunov_rms
 from support.generalized_plants import random_plant
 
 import lbt_synth as lbt
-from lbt_synth.errors import InfeasibleError, ProblemError
-from lbt_synth.linear.output_feedback.discrete_form import discrete_form
+from lbt_synth.errors import InfeasibleError
 from lbt_synth.linear.output_feedback.free_parameter import free_parameter
+from lbt_synth.linear.output_feedback.scaled_plant import scaled_plant
 
 
 @pytest.mark.parametrize("seed", [1, 2, 6])
@@ -25,13 +25,13 @@ def test_never_worse_than_one_lyapunov_matrix(seed):
 
 
 def test_variance_is_least_variance_and_size_of_the_filter():
-    form = discrete_form(random_plant(3, n=4))
-    equations = form.equations(0.0)
+    scaled = scaled_plant(random_plant(3, n=4))
+    equations = scaled.equations(0.0)
     loop = free_parameter(equations)
     taps = 0.3 * np.random.default_rng(0).normal(size=(5, *loop.through.shape))
-    closed = form.plant.closed_loop(loop.controller(taps))
+    closed = scaled.plant.closed_loop(loop.controller(taps))
     assert closed.spectral_radius < 1
-    least = lbt.h2_controller(form.plant).rms
+    least = lbt.h2_controller(scaled.plant).rms
     rms = lbt.design.certificate.certify_error(closed).rms
     assert rms**2 == pytest.approx(least**2 + np.sum(taps**2), rel=1e-9)
 
@@ -49,5 +49,3 @@ def test_bounds_that_cannot_be_met():
         lbt.mixed_controller(plant, gamma=0.9 * least)
     with pytest.raises(InfeasibleError, match="with 1 taps"):
         lbt.mixed_controller(plant, gamma=1.002 * least, taps=1)
-    with pytest.raises(ProblemError, match="discrete time"):
-        lbt.mixed_controller(random_plant(3, n=3, dt_s=None), gamma=9.0)

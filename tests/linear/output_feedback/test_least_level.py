@@ -7,7 +7,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.generalized_plants import lightly_damped_plant, random_plant, stacked
+from support.generalized_plants import (
+    lightly_damped_plant,
+    random_plant,
+    sampled_plant,
+    stacked,
+)
 
 import lbt_synth as lbt
 from lbt_synth.linear.lmi.output_feedback import least_level_lmi
@@ -95,10 +100,10 @@ def test_least_level_of_nothing_left():
     assert lbt.hinf_controller(plant).gamma_least < 1e-9
 
 
-@pytest.mark.parametrize("seed", [5, 18, 27, 34])
+@pytest.mark.parametrize("seed", [8, 14, 23, 40])
 def test_a_least_variance_of_nothing(seed):
     """Zeros are stable and D12, D21 square: the least variance leaves rounding."""
-    plant = random_plant(seed, n=3, dt_s=None)
+    plant = sampled_plant(seed, n=3)
     assert plant.D12.shape[0] == plant.D12.shape[1]
     assert plant.D21.shape[0] == plant.D21.shape[1]
     assert lbt.hinf_controller(plant).gamma_least < 1e-9
