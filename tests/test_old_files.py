@@ -28,7 +28,7 @@ def old_design(name):
 
 
 def test_there_is_a_gain_file_of_each_method_and_format():
-    assert len(GAIN_FILES) == 7
+    assert len(GAIN_FILES) == 6
     assert {name.rpartition(".")[2] for name in GAIN_FILES} == {"fits", "json", "npz"}
 
 

@@ -30,8 +30,6 @@ from .output_feedback.h2_controller import h2_controller as h2_controller
 from .output_feedback.hinf_controller import hinf_controller as hinf_controller
 from .output_feedback.mixed_controller import mixed_controller as mixed_controller
 from .output_feedback.result import ControllerDesign as ControllerDesign
-from .polytopic import PolytopicDesign as PolytopicDesign
-from .polytopic import polytopic as polytopic
 from .result import Design as Design
 from .result import EstimatorDesign as EstimatorDesign
 from .result import FilterDesign as FilterDesign

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.loop import close_loop, loop_margins
@@ -83,26 +83,6 @@ class LqgFacts:
 
 
 @table_row
-class PolytopicFacts:
-    """What a filter guarantees over its interval, beside the worst that was found."""
-
-    rms: float = column("estimation error at the centre, rms", unit="nm")
-    gamma: float = column("estimation error at the centre, H-infinity norm", unit="nm")
-    residual_nm: float | None = column("residual in its model, rms", unit="nm")
-    limit_nm: float | None = column(LIMIT_IN_MODEL, unit="nm")
-    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
-    half_width_hz: float = column("half width of the interval of frequencies", unit="Hz")
-    low_hz: float = column("interval of frequencies, from", unit="Hz")
-    high_hz: float = column("interval of frequencies, to", unit="Hz")
-    norm: str = column("norm that is bounded on the interval")
-    bound_guaranteed: float = column("norm on the interval, guaranteed", unit="nm", format=".9g")
-    worst_achieved: float = column("norm on the interval, worst found", unit="nm", format=".9g")
-    guaranteed_over_found: float = column("  guaranteed over found", format=".6f")
-    worst_frequency_hz: float = column("  found at", unit="Hz")
-    bound_programme: float = column("  bound of the programme", unit="nm", format=".9g")
-
-
-@table_row
 class RobustFacts:
     """What a robust controller is, beside the limits over its bands."""
 
@@ -114,14 +94,14 @@ class RobustFacts:
     long_objective_nm: tuple[float, ...] = column(unit="nm")
 
 
-def model_facts(kind: type[Facts], design: EstimatorDesign, *sources: Any, **given: Any) -> Facts:
+def model_facts(kind: type[Facts], design: EstimatorDesign) -> Facts:
     """Return a row of a design with residual and limit of its own model, None without a loop."""
     from lbt_synth.design.model_limits import model_limit
 
     names = ("residual_nm", "limit_nm", "above_limit_percent")
     found = (None, None, None) if design.hardware is None else model_limit(design)
     limits = dict(zip(names, found, strict=True))
-    return fill_row(kind, design, *sources, **limits, **given)
+    return fill_row(kind, design, **limits)
 
 
 def summarise_design(design: Design) -> Summary:

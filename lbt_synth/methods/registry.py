@@ -37,7 +37,7 @@ def all_methods() -> dict[str, Method]:
     --------
     >>> from lbt_synth.methods.registry import all_methods
     >>> ", ".join(all_methods())
-    'hinf, integrator, kalman, lqg, mixed, polytopic, robust'
+    'hinf, integrator, kalman, lqg, mixed, robust'
     """
     return dict(sorted(_registered().items()))
 

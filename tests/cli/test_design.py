@@ -10,7 +10,6 @@ import pytest
 from support.commands import run
 from support.plants import LBT_YAML, ROOT, lbt_axis_plant
 from support.robust_config import SMALL, robust_writer
-from support.vibration_config import write_vibration
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
@@ -166,66 +165,25 @@ def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
     assert "as if the mirror settled at once" in capsys.readouterr().out
 
 
-def test_the_command_line(tmp_path, capsys):
-    config, target = str(LBT_YAML), str(tmp_path / "p.fits")
-    design = ["design", config, "--method", "polytopic", "-o", target]
-    assert main([*design, "--half-width-hz", "0.5", "--norm", "h2"]) == 0
-    assert main([*design, "--half-width-hz", "0.5"]) == 0
-    capsys.readouterr()
-    assert main(["show", target, "--matrices"]) == 0
-    out = capsys.readouterr().out
-    for text in (
-        "norm on the interval, guaranteed",
-        "norm on the interval, worst found",
-        "guaranteed over found",
-        "1.000000",
-        "predictor_A",
-    ):
-        assert text in out
-    assert main(["show", target, "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
-    assert shown["guaranteed_over_found"] == pytest.approx(1.0, abs=1e-6)
-    assert shown["method"] == "polytopic-hinf"
-    assert main(["verify", target]) == 0
-    assert main(["sigma", target, "-o", str(tmp_path / "s.png")]) == 0
-    assert main(["simulate", config, target, "--frames", "400", "--cases", "1"]) == 0
-    capsys.readouterr()
-    for wrong, text in (
+@pytest.mark.parametrize(
+    ("method", "option", "value", "text"),
+    [
         (
-            design,
-            "needs --half-width-hz, the half width of the interval of vibration frequencies [Hz]; try --half-width-hz 1",
+            "kalman",
+            "--gamma",
+            "200",
+            "--gamma goes with --method hinf or mixed; got --method kalman",
         ),
+        ("kalman", "--taps", "3", "--taps goes with --method mixed; got --method kalman"),
         (
-            [*design, "--half-width-hz", "1", "--gamma", "200"],
-            "--gamma goes with --method hinf or mixed; got --method polytopic",
+            "mixed",
+            "--route",
+            "lmi",
+            "--route goes with --method hinf or kalman; got --method mixed",
         ),
-        ([*design, "--half-width-hz", "1", "--taps", "3"], "--taps goes with --method mixed"),
-        (
-            [*design, "--half-width-hz", "1", "--route", "lmi"],
-            "--route goes with --method hinf or kalman; got --method polytopic",
-        ),
-        ([*design, "--half-width-hz", "25"], "must have a frequency above that"),
-        (
-            ["design", config, "--method", "kalman", "--norm", "h2", "-o", target],
-            "--norm goes with --method polytopic; got --method kalman",
-        ),
-        (
-            ["design", config, "--method", "hinf", "--half-width-hz", "1", "-o", target],
-            "--half-width-hz goes with --method polytopic",
-        ),
-        (
-            [
-                "design",
-                str(write_vibration(tmp_path, spread_hz=1.0)),
-                "--method",
-                "polytopic",
-                "--half-width-hz",
-                "1",
-                "-o",
-                target,
-            ],
-            "one uncertain frequency at a time",
-        ),
-    ):
-        assert main(wrong) == 2
-        assert text in capsys.readouterr().err
+    ],
+)
+def test_an_option_of_another_method_is_refused(tmp_path, capsys, method, option, value, text):
+    target = str(tmp_path / "p.fits")
+    assert main(["design", CONFIG, "--method", method, option, value, "-o", target]) == 2
+    assert text in capsys.readouterr().err

@@ -54,7 +54,7 @@ def test_wrong_commands(tmp_path, capsys):
     for extra, text in (
         (
             ("--horizon", "2"),
-            "--horizon goes with --method hinf or kalman or mixed or polytopic; got --method lqg. Set loop.delay_frames",
+            "--horizon goes with --method hinf or kalman or mixed; got --method lqg. Set loop.delay_frames",
         ),
         (("--gain", "1"), "--gain goes"),
         (("--route", "sdp"), "--route goes with --method hinf or kalman; got --method lqg"),

@@ -58,7 +58,7 @@ def test_two_axes_on_the_command_line(tmp_path, capsys):
                 "-o",
                 str(tmp_path / "k.fits"),
             ],
-            "--horizon goes with --method hinf or kalman or mixed or polytopic; got --method integrator",
+            "--horizon goes with --method hinf or kalman or mixed; got --method integrator",
         ),
         (
             [

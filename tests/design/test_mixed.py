@@ -199,9 +199,12 @@ def panic(*arguments, **options):
 def test_a_solver_that_panics_below_cvxpy_is_an_error_of_ours(monkeypatch):
     import cvxpy
 
+    from lbt_synth.linear.lmi.solver import solve
+
     monkeypatch.setattr(cvxpy.Problem, "solve", panic)
+    size = cvxpy.Variable(nonneg=True)
     with pytest.raises(lbt.errors.NumericalError, match="numbers out of its range"):
-        lbt.design.polytopic(lbt_axis_plant(), half_width_hz=1.0)
+        solve(cvxpy.Minimize(size), [size >= 1])
 
 
 def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):

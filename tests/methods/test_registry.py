@@ -26,7 +26,7 @@ from lbt_synth.methods.registry import (
 )
 
 CONFIG = str(LBT_YAML)
-BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "polytopic", "robust")
+BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "robust")
 
 
 @pytest.fixture
@@ -39,7 +39,6 @@ def leaky():
 def test_methods_by_name(leaky):
     assert tuple(name for name in all_methods() if name != "leaky") == BUILT_IN
     assert method_named("leaky") is leaky
-    assert method_of_design("polytopic-h2") is method_named("polytopic")
     assert method_of_design("shaped") is method_named("robust")
     assert [m.name for m in reference_methods()] == ["integrator", "kalman", "hinf"]
     assert [m.name for m in reference_methods(estimators_only=True)] == ["kalman", "hinf"]
@@ -152,7 +151,7 @@ def method_names_in(path):
     """Names of methods among the strings of a file that are no docstrings."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
-    return strings & {*BUILT_IN, "polytopic-hinf", "polytopic-h2", "shaped"}
+    return strings & {*BUILT_IN, "shaped"}
 
 
 def test_an_option_that_no_method_has(tmp_path, capsys):

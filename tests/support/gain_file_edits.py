@@ -82,7 +82,6 @@ ORIGINALS = {
     "least": lambda: lbt.hinf(lbt_axis_plant(modes=2), gamma_ratio=1, route="riccati"),
     "mixed": lambda: lbt.mixed(lbt_axis_plant(modes=1), gamma_ratio=1.1, taps=4),
     "lqg": lambda: lbt.lqg(slow_plant(2.0, shell(), modes=2), command_weight=0.01),
-    "polytopic": lambda: lbt.design.polytopic(lbt_axis_plant(), half_width_hz=1.0),
     "shaped": shaped_design,
     "fused": lambda: fused_original(bounded=False),
     "fused_hinf": lambda: fused_original(bounded=True),
@@ -180,7 +179,7 @@ def changes(value, rng):
         yield from (("no number", float("nan")), ("no number", float("inf")))
         yield from (("type", str(value)), ("type", True), ("type", [value]), ("type", {}))
     elif isinstance(value, str):
-        words = ("kalman", "hinf", "mixed", "integrator", "lqg", "polytopic-h2", "shaped", "plant")
+        words = ("kalman", "hinf", "mixed", "integrator", "lqg", "shaped", "plant")
         yield from (("word", word) for word in (*words, value + " x", value[:-1], "", "\ud800"))
         yield from (("type", 3), ("type", [value]), ("type", {value: 1}))
     elif isinstance(value, list):

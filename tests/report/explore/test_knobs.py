@@ -19,7 +19,6 @@ def test_the_knobs_of_a_configuration(tmp_path):
     assert knobs["hinf-gamma_ratio"].methods == {"hinf"}
     assert knobs["spread"].methods == {"hinf", "kalman", "lqg", "mixed"}
     assert (knobs["robust-modulus_margin"].low, knobs["robust-modulus_margin"].value) == (0.2, 0.45)
-    assert knobs["polytopic-half_width_hz"].unit == "Hz"
     assert knobs["wind"].value == 20.0
     assert knobs["noise"].value == pytest.approx(config.noise_nm)
     for knob in knobs.values():

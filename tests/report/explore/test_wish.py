@@ -13,8 +13,6 @@ def test_options_are_those_of_the_method(config):
     assert request.given == {"route": "riccati", "gamma_ratio": 1.7}
     _, request = fulfil(Wish(method="kalman", values=values), knobs, config)
     assert request.given == {}
-    _, request = fulfil(Wish(method="polytopic"), knobs, config)
-    assert request.given == {"half_width_hz": 1.0}
 
 
 def test_a_value_stays_within_reach_of_its_slider(config):

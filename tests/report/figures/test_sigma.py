@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.figures import legend
-from support.intervals import IntervalDesigns
 
 import lbt_synth as lbt
 from lbt_synth.report.charts.description import Curve
@@ -49,16 +48,6 @@ def test_empty_figures_are_refused():
     ):
         with pytest.raises(lbt.errors.ProblemError, match="at least one"):
             empty()
-
-
-@pytest.fixture(scope="module")
-def made():
-    return IntervalDesigns()
-
-
-def test_the_sigma_figure_draws_its_error(made):
-    figure = lbt.report.figures.sigma_figure({"interval": made["hinf", 1.0]}, unit_weights=True)
-    assert len(figure.axes) == 3
 
 
 def test_a_zero_at_the_nyquist_frequency_is_no_scale():

@@ -237,10 +237,9 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
             "route goes with design: hinf or kalman; got design: mixed",
             None,
         ),
-        ({"controllers": "{a: {design: polytopic}}"}, "needs half_width_hz", None),
         (
             {"controllers": "{a: {design: lqg, horizon: 2}}"},
-            "horizon goes with design: hinf or kalman or mixed or polytopic; got design: lqg",
+            "horizon goes with design: hinf or kalman or mixed; got design: lqg",
             None,
         ),
         (
