@@ -265,7 +265,7 @@ def attack_moving_gain(seed: int) -> None:
     path = draw(rng, 1)[0]
     own = next(c for c in controllers(rng, path) if lbt.close_loop(path, c).is_stable)
     moving = lbt.loop.moving_gain(lbt.close_loop(path, own))
-    low, high = moving.fast_low, moving.fast_high
+    low, high = moving.moving_low, moving.moving_high
 
     def growth(word: np.ndarray) -> float:
         product = np.eye(len(matrix(path, own, np.ones(1))))

@@ -35,5 +35,3 @@ from .result import EstimatorDesign as EstimatorDesign
 from .result import FilterDesign as FilterDesign
 from .result import SolverReport as SolverReport
 from .robust import robust as robust
-from .scheduled import ScheduledFilter as ScheduledFilter
-from .scheduled import scheduled_filter as scheduled_filter

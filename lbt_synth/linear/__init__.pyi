@@ -7,13 +7,6 @@ from .infeasibility_proof import Witness as Witness
 from .infeasibility_proof import infeasible_level as infeasible_level
 from .lyapunov import stationary_covariance as stationary_covariance
 from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
-from .moving_parameter.destabilising import DestabilisingSequence as DestabilisingSequence
-from .moving_parameter.destabilising import destabilising_sequence as destabilising_sequence
-from .moving_parameter.family import ParameterFamily as ParameterFamily
-from .moving_parameter.stability_proof import BlockProof as BlockProof
-from .moving_parameter.stability_proof import StabilityProof as StabilityProof
-from .moving_parameter.stability_proof import prove_any_speed as prove_any_speed
-from .moving_parameter.stability_proof import prove_rate as prove_rate
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values

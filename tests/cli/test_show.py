@@ -68,5 +68,5 @@ def test_intervals_of_a_gain_that_moves(capsys, gains, command):
     assert "proved while it moves at any speed, from" in text
     _, text, _ = run(capsys, command, gains["kalman"], "--json")
     moving = json.loads(text)["moving_gain"]
-    assert moving["constant_low"] < moving["broken_low"] < moving["fast_low"] < 1
-    assert moving["rate_per_s"] == 1
+    assert moving["constant_low"] < moving["moving_low"] < 1
+    assert 1 < moving["moving_high"] < moving["constant_high"]

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimatorForm, RunningController, RunningEstimator
 from lbt_synth.linear.block_filtering import filter_series as filter_series
 from lbt_synth.linear.held_controller import HasController, as_controller
@@ -17,7 +16,7 @@ from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.summaries import Summarised
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number, positive
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _SETTLED = 1e-4  # decay of the slowest mode after which a loop has settled
 _MOST_SETTLING = 200_000  # frames
@@ -87,7 +86,6 @@ def simulate(
     seed: int = 0,
     settle_frames: int | None = None,
     stroke: float | None = None,
-    sensor_gains: ArrayLike | None = None,
 ) -> Simulation:
     """Close the loop in the time domain.
 
@@ -117,8 +115,6 @@ def simulate(
         loop has decayed to 1e-4 (1000 frames for a stepped controller).
     stroke : float, optional
         Largest modulus of a command that the mirror applies; without a limit by default.
-    sensor_gains : (settle_frames + frames,) array_like, optional
-        Real sensor gain of each frame, in place of that of the truth, for one that moves.
 
     Returns
     -------
@@ -131,7 +127,7 @@ def simulate(
         If the loop of a :class:`Controller` is unstable or marginally stable.
     ProblemError
         If a value is out of range, sizes clash, or a stepped controller returns
-        commands that are not finite, as those of a loop that a moving gain destabilises.
+        commands that are not finite.
 
     Examples
     --------
@@ -159,8 +155,7 @@ def simulate(
     else:
         controller = as_controller(controller, others=", an object with step(y) and reset()")
         loop = close_loop(hardware, controller, sensor_gain=truth.sensor_gain)
-        if sensor_gains is None:
-            loop.require_stable()
+        loop.require_stable()
         default = settling_frames(loop.spectral_radius)
     settle = default
     if settle_frames is not None:
@@ -172,16 +167,15 @@ def simulate(
             f"frames x cases must fit into {_MOST_GIGABYTES:g} GB; got {frames} x {cases}, which "
             f"need {gigabytes:.3g} GB. Run fewer cases at once, with different seeds."
         )
-    gains = _gains(truth, sensor_gains, settle, frames)
     disturbance_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     size = {"frames": settle + frames, "cases": cases}
     total = draw_disturbance(truth, hardware, rng=disturbance_rng, zero_frame=settle, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
-    if isinstance(controller, Controller) and stroke is None and sensor_gains is None:
+    if isinstance(controller, Controller) and stroke is None:
         outputs = filter_series(loop.system, np.concatenate([total, noise], axis=2))
     else:
         own = controller.start() if isinstance(controller, Controller) else controller
-        outputs = step_loop(own, gains, hardware, total, noise, stroke=limit)
+        outputs = step_loop(own, truth.sensor_gain, hardware, total, noise, stroke=limit)
     return record_run(total, outputs, hardware, settle=settle, seed=seed)
 
 
@@ -199,19 +193,6 @@ def record_run(
         frame_rate_hz=hardware.frame_rate_hz,
         seed=seed,
     )
-
-
-def _gains(truth: Truth, given: ArrayLike | None, settle: int, frames: int) -> FloatArray:
-    """Return the real sensor gain of each frame, (settle + frames,)."""
-    if given is None:
-        return np.full(settle + frames, truth.sensor_gain)
-    gains = positive(given, "sensor_gains")
-    if gains.shape != (settle + frames,):
-        raise DimensionError(
-            f"sensor_gains must have one value for each of {settle} frames of settling and "
-            f"{frames} others; got {gains.shape}. Set settle_frames."
-        )
-    return gains
 
 
 def settling_frames(radius: float) -> int:
@@ -249,7 +230,7 @@ def step_controller(
 
 def step_loop(
     controller: SteppedController | RunningController | RunningEstimator,
-    sensor_gain: float | FloatArray,
+    sensor_gain: float,
     hardware: LoopHardware,
     total: FloatArray,
     noise: FloatArray,
@@ -258,15 +239,13 @@ def step_loop(
 ) -> FloatArray:
     """Run the loop one frame at a time, as written in :class:`LoopHardware`.
 
-    The mirror clips commands at the stroke, which then are those applied. The sensor gain is one,
-    or (frames,).
+    The mirror clips commands at the stroke, which then are those applied.
 
     Return ``phi_res, u, y`` side by side, (cases, frames, n + m + q).
     """
     cases, frames, n = total.shape
     m, q = hardware.n_commands, hardware.n_measurements
-    taps, gains = hardware.mirror_taps, np.broadcast_to(sensor_gain, frames)
-    sensor, influence = hardware.sensor, hardware.influence
+    taps, sensor, influence = hardware.mirror_taps, hardware.sensor, hardware.influence
     out = np.zeros((cases, frames, n + m + q))
     for phase, white, left in zip(total, noise, out, strict=True):
         controller.reset()
@@ -274,7 +253,7 @@ def step_loop(
         commands = np.zeros((len(taps), m))  # u(k), u(k-1), ...
         residuals, applied, measured = np.split(left, [n, n + m], axis=1)
         for k in range(frames):
-            y = gains[k] * sensor @ residual + white[k]
+            y = sensor_gain * sensor @ residual + white[k]
             u = step_controller(controller, y, m, frame=k, applied=commands[0])
             commands[1:] = commands[:-1]
             commands[0] = u if stroke == np.inf else np.clip(u, -stroke, stroke)

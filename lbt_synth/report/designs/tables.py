@@ -28,9 +28,7 @@ from lbt_synth.storage.words import count_text
 # titles of what is an interval, not a column of the row
 _GOOD = "within 10 % of its best Strehl ratio [Hz]"
 _GAIN_MARGIN, _STABLE_GAINS = "gain margin, factors", "stable real sensor gains"
-_SLOW_GAINS = "proved while the gain moves by at most 1 per second"
-_FAST_GAINS = "proved while it moves at any speed"
-_BREAKING_GAINS = "destabilised by a gain that moves in"
+_MOVING_GAINS = "proved while the gain moves at any speed"
 _OWN_CELLS: dict[str, Callable[[DesignReport, DesignAssessment], str | Cell]] = {
     "certified": lambda _, one: _certificate_cell(one),
     "stable": lambda _, one: _stability_cell(one),
@@ -38,9 +36,7 @@ _OWN_CELLS: dict[str, Callable[[DesignReport, DesignAssessment], str | Cell]] = 
     _GOOD: lambda _, one: _good_text(one),
     _GAIN_MARGIN: lambda _, one: _gain_margin_text(one),
     _STABLE_GAINS: lambda _, one: _stable_gains_text(one),
-    _SLOW_GAINS: lambda report, one: _moving_text(report, one, "slow"),
-    _FAST_GAINS: lambda report, one: _moving_text(report, one, "fast"),
-    _BREAKING_GAINS: lambda report, one: _moving_text(report, one, "broken"),
+    _MOVING_GAINS: lambda report, one: _moving_text(report, one),
 }
 _DESIGN = ("method", "route", "n_states", "multiplications", "gamma", "estimation_rms", "certified")
 _LOOP = (
@@ -50,7 +46,7 @@ _LOOP = (
 _RANGE = ("worst_nm", "worst_strehl", _GOOD)
 _MARGINS = (
     *("modulus", _GAIN_MARGIN, "phase_deg", "delay_frames", "crossover_hz", _STABLE_GAINS),
-    *(_SLOW_GAINS, _FAST_GAINS, _BREAKING_GAINS),
+    _MOVING_GAINS,
 )
 
 
@@ -178,8 +174,10 @@ def _stable_gains_text(one: DesignAssessment) -> str | Cell:
     return ", ".join(interval_text(low, high, 4) for low, high in one.sensor_gains)
 
 
-def _moving_text(report: DesignReport, one: DesignAssessment, kind: str) -> str:
-    """Return an interval of a gain that moves, in real sensor gains as those above it."""
-    found = (getattr(one.moving, f"{kind}_{end}", None) for end in ("low", "high"))
-    low, high = (np.nan if end is None else report.config.sensor_gain * end for end in found)
+def _moving_text(report: DesignReport, one: DesignAssessment) -> str:
+    """Return the interval of a gain that moves, in real sensor gains as those above it."""
+    if one.moving is None:
+        return DASH
+    gain = report.config.sensor_gain
+    low, high = gain * one.moving.moving_low, gain * one.moving.moving_high
     return DASH if np.isnan(low) else interval_text(low, high, 4)

@@ -50,10 +50,17 @@ def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
     moves, passed = shape_for_a_gain("MovingSensorGain", 0.3, 1.5)
     assert passed.passed
     assert not failed.passed
-    assert "proved 0.3 to 1.5" in passed.name
-    assert "proved 0.3 to 1.5" not in failed.name
-    broken = lbt.loop.moving_gain(lbt.close_loop(still.hardware, still))
-    assert 0.3 < broken.broken_low < broken.broken_high < 1.5
+    assert passed.name == "circle criterion of a moving gain, 0.3 to 1.5"
+    low, high = (
+        lbt.close_loop(still.hardware, still, sensor_gain=gain).system for gain in (0.3, 1.5)
+    )
+    assert max(low.spectral_radius, high.spectral_radius) < 1
+    switched = [
+        np.linalg.matrix_power(low.A, p) @ np.linalg.matrix_power(high.A, q)
+        for p in range(1, 13)
+        for q in range(1, 13)
+    ]
+    assert np.max(np.abs(np.linalg.eigvals(switched))) > 1
     assert moves.objective_nm[0] > still.objective_nm[0]
 
 

@@ -180,22 +180,3 @@ def test_simulation_by_taps_is_that_of_the_states():
     by_states = lbt.simulate(slow.controller, truth, **same)
     by_taps = lbt.simulate(slow.controller.start(), truth, **same)
     np.testing.assert_allclose(by_states.residual_nm, by_taps.residual_nm, atol=1e-9)
-
-
-def test_a_gain_for_each_frame(axis_plant):
-    """A constant one is that of the truth; one that rises is seen in the measurements."""
-    controller, path = lbt.kalman(axis_plant).controller, axis_plant.hardware
-    settings = {"hardware": path, "frames": 300, "settle_frames": 100, "seed": 3}
-    calm = lbt.Truth(turbulence=None, noise_nm=10.0, sensor_gain=0.7)
-    expected = lbt.simulate(controller, calm, **settings)
-    for given in (controller, lbt.kalman(axis_plant), lbt.linear.estimator_form(controller)):
-        found = lbt.simulate(given, calm, sensor_gains=np.full(400, 0.7), **settings)
-        np.testing.assert_allclose(found.residual_nm, expected.residual_nm, atol=1e-6)
-    course = np.linspace(0.5, 1.0, 400)
-    runs = [lbt.simulate(controller, calm, sensor_gains=g * course, **settings) for g in (1, 1.1)]
-    apart = (runs[1].measurements - runs[0].measurements)[0, 0, 0]
-    assert apart != 0
-    with pytest.raises(lbt.errors.DimensionError, match="100 frames of settling and 300 others"):
-        lbt.simulate(controller, calm, sensor_gains=course[:300], **settings)
-    with pytest.raises(lbt.errors.ProblemError, match="sensor_gains must be above 0"):
-        lbt.simulate(controller, calm, sensor_gains=course - 0.5, **settings)
