@@ -1,27 +1,50 @@
-"""The league on simulated records that change: wind, seeing, lines, noise, sensor gain.
+"""Designs of the package and their rivals on records: trained on the past, scored on the future.
 
-    python benchmarks/league.py [--records 12] [--jobs 2] [--seconds 30] -o league_benchmark/
+    python benchmarks/league.py [RECORD ...] [--records 7] [--seconds 30] [--splits 3]
+    python benchmarks/league.py --errors [--records 300] [--seconds 15]
 
-Record k has the change number k modulo 7; 0 is none. Two axes, an integrator runs. The table is
-that of ``lbt-synth league``; below it, for each entry, how far it is above the best on each record
-(residual with noise, %), and the share of records on which it is within 1 %. It resumes.
+Without files, record k is simulated with the change number k modulo 7; 0 is none. Two axes, an
+integrator runs. What competes on a split has learned from the frames before it only; the best
+integrator in hindsight alone knows the test. The table has the measured residual above the best of
+each record (with noise, geometric mean, %), its standard error, and the share of records within
+1 %; then the same per record.
+
+``--errors`` tells how well the standard errors of paired differences cover the truth. Random loops
+of one axis have turbulence, up to four lines and noise. A Kalman filter with the exact model is
+compared with one whose lines are 0.5 Hz off, and with the best integrator, on one series each. The
+table has the share of records on which the measured difference is within one and within two
+standard errors of that of the exact residuals.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.models.resonance_spectrum import coefficients
-from lbt_synth.storage.rows import row_table
-from lbt_synth.studies.league.standings import relative_residual
 
 CHANGES = ("none", "wind", "seeing", "drifting", "dying", "flux", "gain")
 DELAY, GAIN = 2, 0.35
+AR_ORDER = 20  # of the predictor, as pyRTC's default
+GAIN_TOLERANCE = 1e-3  # of the search for the best integrator
+CHUNK_S = 0.05  # of the squares whose differences are paired
+NEAR = 0.01  # of the best residual: as good as the best
+RATE_HZ = 800.0  # of the loops for --errors
+SHIFT_HZ = 0.5  # of the lines of the wrong model
+
+
+def sampled_resonance(frequency_hz, damping, rate):
+    """Return a1, a2 and the driving rms of a sampled resonance of unit variance, damping < 1."""
+    omega = 2 * np.pi * frequency_hz / rate
+    a1 = 2 * np.exp(-damping * omega) * np.cos(omega * np.sqrt(1 - damping**2))
+    a2 = -np.exp(-2 * damping * omega)
+    return a1, a2, np.sqrt((1 + a2) * ((1 - a2) ** 2 - a1**2) / (1 - a2))
 
 
 def resonance(rng, frames, rate, frequency_hz, damping, rms_nm):
@@ -29,10 +52,10 @@ def resonance(rng, frames, rate, frequency_hz, damping, rms_nm):
     frequency = np.broadcast_to(frequency_hz, frames)
     level = np.broadcast_to(rms_nm, frames)
     if np.ptp(frequency) == 0:
-        a1, a2, drive = coefficients(2 * np.pi * frequency[0] / rate, damping)
+        a1, a2, drive = sampled_resonance(frequency[0], damping, rate)
         more = 20 * round(rate / (2 * np.pi * frequency[0] * damping))
         white = rng.standard_normal(frames + more)
-        unit = lfilter([np.sqrt(drive)], [1, -a1, -a2], white)[more:]
+        unit = lfilter([drive], [1, -a1, -a2], white)[more:]
         return level * unit
     phase = 2 * np.pi * np.cumsum(frequency) / rate
     width = 2 * np.pi * np.mean(frequency) * damping / rate
@@ -88,40 +111,211 @@ def simulate_record(seed: int, seconds: float) -> lbt.identification.LoopRecord:
     )
 
 
+def best_gain(left: Callable[[float], float], hardware: lbt.models.LoopHardware) -> float:
+    """Return the gain of an integrator that leaves least, below the limit of stability."""
+    limit = lbt.design.integrator_gain_limit(hardware.delay_frames)
+    gains = np.geomspace(0.02, 0.95, 24) * limit  # finer than the width of a minimum
+    values = [left(gain) for gain in gains]
+    k = int(np.argmin(values))
+    bracket = gains[max(k - 1, 0)], gains[min(k + 1, len(gains) - 1)]
+    options = {"xatol": GAIN_TOLERANCE * gains[k]}
+    return float(minimize_scalar(left, bounds=bracket, method="bounded", options=options).x)
+
+
+def integrators(hardware: lbt.models.LoopHardware, gains: Sequence[float]) -> lbt.Controller:
+    """Return an integrator per axis."""
+    eye = np.eye(len(gains))
+    B = np.diag(gains) @ np.linalg.inv(hardware.sensor)
+    return lbt.Controller(A=eye, B=B, C=eye, D=np.zeros_like(eye), dt_s=hardware.dt_s)
+
+
+def best_integrator(split: lbt.identification.ForwardSplit) -> lbt.Controller:
+    """Return the integrators that leave least of the test itself: no integrator leaves less."""
+    axes = split.hardware.modes
+
+    def left(gain: float, axis: int) -> float:
+        return float(
+            np.mean(split.replay(integrators(split.hardware, [gain] * axes))[:, axis] ** 2)
+        )
+
+    gains = [best_gain(lambda gain, i=axis: left(gain, i), split.hardware) for axis in range(axes)]
+    return integrators(split.hardware, gains)
+
+
+def ar_filter(split: lbt.identification.ForwardSplit) -> lbt.Design:
+    """Return a Kalman filter for an AR model of each axis by Yule-Walker, as pyRTC's ar_kalman."""
+    start, stop = max(split.training, key=lambda stretch: stretch[1] - stretch[0])
+    hardware, models = split.hardware, []
+    for z in split.open_loop[start:stop].T:
+        z = z - np.mean(z)
+        r = np.array([z[: len(z) - lag] @ z[lag:] / len(z) for lag in range(AR_ORDER + 1)])
+        a = solve_toeplitz(r[:-1], r[1:])
+        models.append(
+            lbt.models.ARModel(
+                coefficients=a,
+                driving_rms_nm=np.sqrt(r[0] - a @ r[1:]),
+                frame_rate_hz=hardware.frame_rate_hz,
+            )
+        )
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=hardware.frame_rate_hz,
+        turbulence=models,
+        noise_nm=[axis.noise_nm for axis in split.model.axes],
+        delay_frames=hardware.delay_frames,
+        sensor_matrix=hardware.sensor,
+        modes=hardware.modes,
+    )
+    return lbt.kalman(plant)
+
+
+def fir_predictor(split: lbt.identification.ForwardSplit, taps: int) -> lbt.Controller:
+    """Return the best FIR predictor of the training."""
+    return lbt.identification.least_squares_predictor(
+        split.open_loop, split.hardware, taps=taps, stretches=split.training
+    ).controller
+
+
+ENTRIES: dict[str, Callable[[lbt.identification.ForwardSplit], lbt.Controller | lbt.Design]] = {
+    "best integrator": best_integrator,
+    f"AR({AR_ORDER}) filter": ar_filter,
+    "least squares, 32 taps": lambda split: fir_predictor(split, 32),
+    "least squares, 64 taps": lambda split: fir_predictor(split, 64),
+    "data-driven H2, order 10": lambda split: lbt.identification.spectral_design(
+        split.open_loop, split.hardware, order=10, stretches=split.training
+    ),
+    "Kalman": lambda split: lbt.kalman(split.model.plant()),
+    "H-infinity, 1.2 of least": lambda split: lbt.hinf(split.model.plant(), gamma_ratio=1.2),
+    "automatic": lambda split: lbt.design_from_record(split.past).design,
+}
+
+
+def relative_residual(pair: lbt.identification.PairedResiduals, name: str) -> tuple[float, float]:
+    """Return a measured residual over the least one, less 1, and its standard error."""
+    least = pair.measured_nm2(pair.best)
+    difference, error = pair.above(name, pair.best)
+    ratio = np.sqrt(1 + difference / least)
+    return ratio - 1, error / (2 * ratio * least)
+
+
+def play(records: dict[str, lbt.identification.LoopRecord], splits: int) -> None:
+    """Print the table of the league."""
+    chains = {}
+    for name, record in records.items():
+        try:
+            chains[name] = lbt.identification.forward_chain(record, ENTRIES, splits=splits)
+        except lbt.LbtSynthError as error:
+            print(f"{name} is not in the table: {error}")
+            continue
+        for entry, why in chains[name].failures.items():
+            print(f"{entry} is not in the table of {name}: {why}")
+    rows = []
+    for entry in ENTRIES:
+        pairs = {name: chain.residuals for name, chain in chains.items()}
+        ratios = {
+            name: relative_residual(pair, entry)
+            for name, pair in pairs.items()
+            if entry in pair.squares_nm2
+        }
+        if ratios:
+            above, errors = np.array(list(ratios.values())).T
+            mean = np.expm1(np.mean(np.log1p(above)))
+            error = np.linalg.norm(errors) / len(errors)
+            near = np.sum(above <= NEAR) / len(chains)
+            rows.append((-len(ratios), mean, error, near, entry, ratios))
+    print(f"\n{'above the best [%]':26s}   mean     +- within 1 %", *(f"{n:>12}" for n in chains))
+    for _, mean, error, near, entry, ratios in sorted(rows, key=lambda row: row[:2]):
+        cells = [f"{100 * ratios[n][0]:12.2f}" if n in ratios else f"{'-':>12}" for n in chains]
+        print(f"{entry:26s} {100 * mean:6.2f} {100 * error:6.2f} {100 * near:8.0f} %", *cells)
+
+
+def draw_plant(rng, shift_hz: float = 0.0) -> lbt.models.TipTiltPlant:
+    corner, rms = np.exp(rng.uniform(np.log(0.3), np.log(3))), rng.uniform(200, 600)
+    a1, a2, drive = sampled_resonance(corner, 0.7, RATE_HZ)
+    lines = [
+        lbt.Vibration(
+            frequency_hz=rng.uniform(8, 90) + shift_hz,
+            damping=float(np.exp(rng.uniform(np.log(0.002), np.log(0.03)))),
+            rms_nm=rng.uniform(10, 100),
+            direction=(1.0,),
+        )
+        for _ in range(int(rng.integers(1, 5)))
+    ]
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=RATE_HZ,
+        turbulence=lbt.models.ARModel(
+            coefficients=[a1, a2], driving_rms_nm=rms * drive, frame_rate_hz=RATE_HZ
+        ),
+        vibrations=lines,
+        noise_nm=float(np.exp(rng.uniform(np.log(3), np.log(25)))),
+        modes=1,
+    )
+
+
+def chunk_squares(measured) -> np.ndarray:
+    """Return the mean squares of chunks, (chunks,), of a residual (frames, 1)."""
+    size = round(CHUNK_S * RATE_HZ)
+    count = len(measured) // size
+    return np.mean(measured[: count * size, 0].reshape(count, size) ** 2, axis=1)
+
+
+def deviations(seed: int, frames: int) -> dict[str, float]:
+    """Return how many standard errors two measured differences are from the truth."""
+    plant = draw_plant(np.random.default_rng([3, seed]))
+    wrong = draw_plant(np.random.default_rng([3, seed]), shift_hz=SHIFT_HZ)
+    truth = lbt.Truth(
+        turbulence=plant.turbulence[0],
+        vibrations=plant.vibrations,
+        noise_nm=float(np.sqrt(plant.R[0, 0])),
+    )
+    designs = {
+        "exact": lbt.kalman(plant),
+        "lines 0.5 Hz off": lbt.kalman(wrong),
+        "integrator": lbt.design.model_integrator(plant),
+    }
+    chunks, exact = {}, {}
+    for name, design in designs.items():
+        run = lbt.simulate(
+            design.controller, truth, hardware=plant.hardware, frames=frames, seed=seed,
+            settle_frames=8000,
+        )  # fmt: skip
+        chunks[name] = chunk_squares(run.measurements[0])
+        loop = lbt.close_loop(plant.hardware, design.controller)
+        exact[name] = lbt.residual_budget(loop, truth).rms_nm ** 2
+    pair = lbt.identification.PairedResiduals(squares_nm2=chunks)
+    found = {}
+    for name in ("lines 0.5 Hz off", "integrator"):
+        difference, error = pair.above(name, "exact")
+        found[name] = (difference - exact[name] + exact["exact"]) / error
+    return found
+
+
+def print_errors(records: int, seconds: float) -> None:
+    """Print how often measured differences are within their standard errors of the truth."""
+    every = [deviations(seed, round(seconds * RATE_HZ)) for seed in range(records)]
+    for name in every[0]:
+        size = np.abs([errors[name] for errors in every])
+        print(
+            f"exact against {name:18s} within 1 error {100 * np.mean(size < 1):.0f} %, "
+            f"within 2 {100 * np.mean(size < 2):.0f} %; rms {np.sqrt(np.mean(size**2)):.2f}"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--records", type=int, default=12)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=30)
-    parser.add_argument("--entries", nargs="+")
-    parser.add_argument("-o", "--output", default="league_benchmark")
-    given = parser.parse_args()
-    records = {
-        f"{seed:02d}-{CHANGES[seed % len(CHANGES)]}": simulate_record(seed, given.seconds)
-        for seed in range(given.records)
+    parser.add_argument("files", nargs="*", metavar="RECORD", help="what loops recorded")
+    parser.add_argument("--records", type=int, help="simulated records (default 7; errors 300)")
+    parser.add_argument("--seconds", type=float, help="of each (default 30; errors 15)")
+    parser.add_argument("--splits", type=int, default=3)
+    parser.add_argument("--errors", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.errors:
+        print_errors(arguments.records or 300, arguments.seconds or 15)
+        return
+    records = {Path(path).stem: lbt.load_record(path) for path in arguments.files} or {
+        f"{seed:02d}-{CHANGES[seed % len(CHANGES)]}": simulate_record(seed, arguments.seconds or 30)
+        for seed in range(arguments.records or len(CHANGES))
     }
-    found = lbt.studies.run_league(
-        records, Path(given.output), entries=given.entries, jobs=given.jobs
-    )
-    for name, why in found.failures.items():
-        print(f"{name}: {why}")
-    table = row_table("League", found.standings, without=("note",))
-    for row in (table.headings, *table.rows):
-        print(f"{row[0]:>4}  {row[1]:30s}", *(f"{cell:>18}" for cell in row[2:]))
-    names = [each.name for each in found.records]
-    print(f"\n{'above the best [%]':30s}", *(f"{name:>12}" for name in names), "within 1 %")
-    for row in found.standings:
-        if row.records:
-            above = [
-                100 * relative_residual(each.total, row.name)[0]
-                if row.name in each.total.squares_nm2
-                else np.nan
-                for each in found.records
-            ]
-            near = 100 * np.mean([value <= 1 for value in above])
-            print(f"{row.entry:30s}", *(f"{value:12.2f}" for value in above), f"{near:8.0f} %")
-        if row.note:
-            print(f"{row.entry:30s} {row.note}")
+    play(records, arguments.splits)
 
 
 if __name__ == "__main__":

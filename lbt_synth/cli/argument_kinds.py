@@ -127,7 +127,7 @@ def add_faults(parser: ArgumentParser) -> None:
 
 
 def add_engine(parser: ArgumentParser) -> None:
-    """Add what runs the samples of a study or the entries of a league."""
+    """Add what runs the samples of a study."""
     engine = parser.add_mutually_exclusive_group()
     add_option(engine, "--jobs", int, "processes", 1)
     text = "Dask scheduler that runs it instead, as tcp://host:8786; it can run code here: trust it"

@@ -23,9 +23,7 @@ from lbt_synth.cli.argument_kinds import (
     add_unit,
 )
 from lbt_synth.cli.record_arguments import (
-    add_acceptance,
     add_missing_facts,
-    add_prior_knowledge,
     add_record,
     add_repairs,
     add_series,
@@ -269,21 +267,6 @@ def auto(parser: ArgumentParser) -> None:
     add_option(parser, "--gamma-ratio", float, text)
     add_option(parser, "--model", str, "configuration to write (default: the output's name, .yaml)")
     add_output(parser, GAIN_FILE)
-
-
-def league(parser: ArgumentParser) -> None:
-    """Score controllers on records: trained on the past, tested on the future; resumes."""
-    text = "what loops recorded: files as identify takes them, all of one kind"
-    parser.add_argument("files", nargs="+", metavar="record", help=text)
-    add_output(parser, "directory to write into")
-    add_option(parser, "--splits", int, "tests of each record, in its second half", 3)
-    add_option(parser, "--entries", str, "those that compete (default: all)", nargs="+")
-    add_engine(parser)
-    add_switch(parser, "--pdf", "write the page as a PDF, too (league.pdf)")
-    add_missing_facts(parser)
-    add_repairs(parser)
-    add_acceptance(parser)
-    add_prior_knowledge(parser)
 
 
 def diagnose(parser: ArgumentParser) -> None:

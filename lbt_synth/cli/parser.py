@@ -22,7 +22,7 @@ COMMANDS = {
         *(arguments.export, arguments.rehearse),
         *(arguments.sigma, arguments.bode, arguments.nyquist, arguments.nichols, arguments.step),
         *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
-        *(arguments.diagnose, arguments.league),
+        arguments.diagnose,
         *(arguments.robustness, arguments.tradeoff, arguments.limits, arguments.report),
         arguments.explore,
         *(arguments.end_to_end, arguments.end_to_end_table),

@@ -4,5 +4,4 @@ from .designs.page import write_report as write_report
 from .designs.report import DesignReport as DesignReport
 from .designs.report import design_report as design_report
 from .diagnosis.page import write_diagnosis as write_diagnosis
-from .league.page import write_league_page as write_league_page
 from .study.page import write_study_page as write_study_page

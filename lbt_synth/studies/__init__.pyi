@@ -1,8 +1,3 @@
-from .league.run import LeagueResult as LeagueResult
-from .league.run import run_league as run_league
-from .league.standings import RecordScores as RecordScores
-from .league.standings import ScoreRow as ScoreRow
-from .league.standings import StandingRow as StandingRow
 from .limits import LimitRow as LimitRow
 from .limits import LimitStudy as LimitStudy
 from .limits import limits as limits

@@ -52,7 +52,6 @@ CASES = {
     "diagnose": ("series.fits", ("series.fits", "-o", "OUT.html")),
     "diagnose pdf": ("series.fits", ("series.fits", "-o", "a.html", "--pdf", "OUT.pdf")),
     "diagnose gain": ("gain.fits", ("series.fits", "gain.fits", "-o", "OUT.html")),
-    "league": ("series.fits", ("series.fits", "-o", "."), "standings.csv"),
     "identify": ("series.fits", ("series.fits", "-o", "a.yaml", "--figure", "OUT.png")),
     "identify commands": (
         "config.yaml",

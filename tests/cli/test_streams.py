@@ -169,7 +169,6 @@ SAID = {  # what each command does with files that are there, its status, and a 
     "identify": (("NIGHT", "-o", "\u00b1.txt"), 2, "got '+-.txt'"),
     "auto": (("\u2212.fits", "-o", "OUT.fits"), 2, "cannot read -.fits"),
     "diagnose": (("\u2264.fits",), 2, "cannot read <=.fits"),
-    "league": (("NIGHT", "-o", "OUT", "--entries", "\u00b5"), 2, "got 'u'"),
     "robustness": (("CONFIG", "GAIN", "--errors-hz", "0", "1", "2"), 0, "Strehl"),
     "tradeoff": (("CONFIG", "--points", "2", "--taps", "2"), 0, "norm"),
     "limits": (("CONFIG", "\u00e9.fits"), 2, "\\xe9.fits"),

@@ -168,25 +168,6 @@ class ForwardSplit:
         residual = self.record.measurements / np.array(self.model.sensor_gains)
         return np.concatenate([residual[start:stop] for start, stop in self.test])
 
-    def leave(
-        self, residual: Callable[[FloatArray], FloatArray], *, before: int | None = None
-    ) -> FloatArray:
-        """Return what something leaves of the test, (frames, axes) [nm].
-
-        Parameters
-        ----------
-        residual : callable
-            From the series z(k) of contiguous frames, (k, axes), to the measured residual e(k) of
-            the same frames; e(k) may depend on z up to frame k only.
-        before : int, optional
-            Frames before the test that it runs over, at most; all that are usable by default.
-        """
-        out = []
-        for (start, stop), (first, _) in zip(self.test, self.replayed, strict=True):
-            begin = first if before is None else max(first, start - before)
-            out.append(residual(self.open_loop[begin:stop])[start - begin :])
-        return np.concatenate(out)
-
     def replay(self, controller: Controller) -> FloatArray:
         """Return the measured residual of a controller in the test, (frames, axes) [nm].
 

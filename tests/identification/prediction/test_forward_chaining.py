@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import runpy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.night import GAIN, night_record, simulated_night
+from support.plants import ROOT
+from support.short_split import short_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
@@ -150,3 +153,19 @@ def test_the_past_is_the_record_as_it_was(record, split):
     assert split.past.stretches() == split.training
     again = lbt.identify(split.past, **split.options)
     assert again.sensor_gains == split.model.sensor_gains
+
+
+def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
+    """The script of the benchmarks ranks a filter of the model above the best integrator."""
+    league = runpy.run_path(str(ROOT / "benchmarks/league.py"))
+    names = ("best integrator", "least squares, 32 taps", "Kalman")
+    entries = {name: league["ENTRIES"][name] for name in names}
+    monkeypatch.setitem(league["play"].__globals__, "ENTRIES", entries)
+    short = replace(short_record(), usable=np.arange(9000) < 600)
+    league["play"]({"night": short_record(), "brief": short}, 2)
+    failure, _, heading, *rows = capsys.readouterr().out.splitlines()
+    assert failure.startswith("brief is not in the table: each test needs")
+    assert heading.split()[-1] == "night"
+    assert [row[:26].strip() for row in rows] == ["Kalman", "least squares, 32 taps", names[0]]
+    assert float(rows[0].split()[-1]) == 0.0
+    assert float(rows[2].split()[-1]) > 20

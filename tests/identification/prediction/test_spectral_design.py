@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.league import GAIN, PATH, TRUTH, short_split
 from support.predictions import SHELL
+from support.short_split import GAIN, PATH, TRUTH, short_split
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError

@@ -1,1 +1,0 @@
-"""The league: rivals trained on the past of records and scored on what followed."""
