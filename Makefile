@@ -26,9 +26,9 @@ endif
 # the packages of the runs in other programs come after the default check, into the same place
 $(VENV)/.ready-e2e: $(VENV)/.ready
 ifdef UV
-	$(UV) pip install --quiet --python $(BIN)/python -e ".[e2e,aot,dask,parquet,pyrtc]"
+	$(UV) pip install --quiet --python $(BIN)/python -e ".[e2e,aot,dask,pyrtc]"
 else
-	$(BIN)/python -m pip install --quiet -e ".[e2e,aot,dask,parquet,pyrtc]"
+	$(BIN)/python -m pip install --quiet -e ".[e2e,aot,dask,pyrtc]"
 endif
 	@touch $@
 

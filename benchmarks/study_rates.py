@@ -19,7 +19,7 @@ import lbt_synth as lbt
 
 ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
-HEAD = f"version: 1\nconfig: {EXAMPLES / 'lbt.yaml'}\nseed: 1\nresults: parquet\n"
+HEAD = f"version: 1\nconfig: {EXAMPLES / 'lbt.yaml'}\nseed: 1\n"
 POINTS = """
 parameters:
   truth.vibrations[0].frequency_hz: {uniform: [18, 22]}

@@ -10,6 +10,7 @@ from scipy.stats import qmc
 
 import lbt_synth as lbt
 from lbt_synth.studies.study.percentiles import percentiles
+from lbt_synth.studies.study.sensitivity import first_order_index
 
 KINDS = ("independent", "latin hypercube", "sobol")
 
@@ -42,9 +43,7 @@ def index_errors(repeats=100):
                 u = draw(kind, n, 6, seed)
                 y = ishigami(u)
                 orders = [np.argsort(u[:, j]) for j in range(4)]
-                found.append(
-                    [lbt.studies.first_order_index(u[o, j], y[o]) for j, o in enumerate(orders)]
-                )
+                found.append([first_order_index(u[o, j], y[o]) for j, o in enumerate(orders)])
             values = np.array([[each.value for each in row] for row in found])
             errors = np.array([[each.error for each in row] for row in found])
             rms = 100 * np.sqrt(np.mean((values - exact_indices()) ** 2, axis=0))
@@ -56,64 +55,22 @@ def index_errors(repeats=100):
             )
 
 
-def corrections(repeats=100):
-    """Ours, none, and the full one for independent samples."""
-    print(
-        "\nIshigami: rms error of the first index, and mean error of the sum of six [points], for"
-    )
-    print("the correction from the joints, none, and that for independent samples")
-    for n in (1024, 4096):
-        for kind in KINDS:
-            first, total = np.zeros((repeats, 3)), np.zeros((repeats, 3))
-            for seed in range(repeats):
-                u = draw(kind, n, 6, seed)
-                y = ishigami(u)
-                for j in range(6):
-                    order = np.argsort(u[:, j])
-                    found = lbt.studies.first_order_index(u[order, j], y[order])
-                    p, left = 2 * found.groups, 1 - found.value - found.correction
-                    row = [found.value, 1 - left, 1 - left - (p - 1) / (n - p) * left]
-                    total[seed] += row
-                    if j == 0:
-                        first[seed] = row
-            exact = exact_indices()
-            rms = 100 * np.sqrt(np.mean((first - exact[0]) ** 2, axis=0))
-            bias = 100 * (total.mean(axis=0) - exact.sum())
-            print(
-                f"{n:6d}  {kind:16s}",
-                " ".join(f"{value:5.2f}" for value in rms),
-                "  | ",
-                " ".join(f"{value:+5.2f}" for value in bias),
-            )
-
-
-def correlation_ratio(y, groups):
-    """One mean for each of so many intervals, with Kelley's correction; y in order of x."""
-    n = len(y)
-    starts = np.arange(groups) * n // groups
-    counts = np.diff(np.append(starts, n))
-    rest = y - np.repeat(np.add.reduceat(y, starts) / counts, counts)
-    return 1 - (n - 1) / (n - groups) * np.sum(rest**2) / np.sum((y - y.mean()) ** 2)
-
-
 def pairs_of_a_sobol_sequence():
     """A function of one parameter alone, and the index of each of the seven others."""
     print("\nSobol sequences of eight parameters, y = exp(-25 (x_i - 1/2)^2): the largest index")
-    print("of any other parameter in 20 sequences [%], its ratio to its standard error, and the")
-    print("largest correlation ratio with as many intervals as the square root of n [%]")
+    print("of any other parameter in 20 sequences [%], and its ratio to its standard error")
     for n in (512, 1024, 2048, 4096, 16384):
-        worst, ratio, means = 0.0, 0.0, 0.0
+        worst, ratio = 0.0, 0.0
         for seed in range(20):
             u = draw("sobol", n, 8, seed)
             y = np.exp(-25 * (u - 0.5) ** 2)
             for j in range(8):
                 order = np.argsort(u[:, j])
                 for i in set(range(8)) - {j}:
-                    found = lbt.studies.first_order_index(u[order, j], y[order, i])
+                    found = first_order_index(u[order, j], y[order, i])
                     worst = max(worst, found.value)
                     ratio = max(ratio, found.value / found.error)
-                    means = max(means, correlation_ratio(y[order, i], round(n**0.5)))
-        print(f"{n:6d}  {100 * worst:5.2f}  {ratio:4.1f}  {100 * means:5.2f}")
+        print(f"{n:6d}  {100 * worst:5.2f}  {ratio:4.1f}")
 
 
 def coverage(repeats=2000, n=512):
@@ -160,7 +117,6 @@ def cost(n=2**20):
 
 if __name__ == "__main__":
     index_errors()
-    corrections()
     pairs_of_a_sobol_sequence()
     coverage()
     cost()

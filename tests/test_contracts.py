@@ -21,7 +21,6 @@ FORBIDDEN = {
         "distributed",
         "Only studies.study.cluster imports distributed",
     ),
-    "studies/new_table.py": ("pyarrow", "Only studies.study.parquet imports pyarrow"),
     "report/page/new_chart.py": ("bokeh", "Only report.charts.bokeh_* imports bokeh"),
     "report/page/new_sheet.py": ("fpdf", "Only report.page.pdf imports fpdf"),
     "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),

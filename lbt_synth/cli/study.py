@@ -20,7 +20,7 @@ from lbt_synth.studies.study.run import FinishedStudy, output_paths
 from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
 from lbt_synth.studies.study.summary import worst_table
 
-_COUNTS = ("samples", "computed", "failures", "retry", "seconds")
+_COUNTS = ("samples", "computed", "failures", "seconds")
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -54,8 +54,6 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
             f"{duration_text(found.seconds)}."
         )
     failed = f"note: {found.failures} results failed, see {found.failed}."
-    if found.retry:
-        failed += " Those that ended their process are tried again when the study is started again."
     return Report(
         data={name: getattr(found, name) for name in _COUNTS}
         | {

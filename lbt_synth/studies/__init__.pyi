@@ -24,7 +24,6 @@ from .study.study import BatchResult as BatchResult
 from .study.study import Failure as Failure
 from .study.study import Study as Study
 from .study.summary import summary_tables as summary_tables
-from .study.variance_index import first_order_index as first_order_index
 from .tradeoff import TradeoffPoint as TradeoffPoint
 from .tradeoff import tradeoff as tradeoff
 from .truth_comparison import TruthComparison as TruthComparison

@@ -210,7 +210,7 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
         patch.setattr(lbt, "__version__", "9.9.9")
         status, _, error = run(capsys, *arguments)
         assert status == 2
-        assert "must have lbt_synth 9.9.9, as here" in error
+        assert "all workers must have lbt_synth 9.9.9, as here" in error
     assert not (tmp_path / "out").exists()
     status, _, error = run(capsys, *arguments)
     assert status == 0, error

@@ -89,16 +89,23 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     return batch
 
 
+def are_evaluated_together(study: Study, controller: StudyController) -> bool:
+    """Whether many samples of a controller can be evaluated at once."""
+    if study.settings.evaluation != "exact":
+        return False
+    if controller.design is None:
+        return _is_kalman_for_sample(controller) and study.config.fused_plant is None
+    return not controller.design.several_sensors
+
+
 def _evaluate_groups(
     study: Study, controller: StudyController, values: FloatArray
 ) -> Iterator[tuple[IntArray, EnsembleResiduals, FloatArray]]:
     """Yield what could be evaluated together: rows, residuals, Strehl ratios."""
+    if not are_evaluated_together(study, controller):
+        return
     design = controller.design
-    for_sample = _is_kalman_for_sample(controller) and study.config.fused_plant is None
-    if study.settings.evaluation != "exact" or (design is None and not for_sample):
-        return
-    if design is not None and design.several_sensors:
-        return
+    for_sample = design is None
     matrices = None if design is None else textbook_matrices([design.controller])
     reads = ensemble.read_config(study.config, designs=for_sample)
     for rows in _find_groups(study, values, reads):

@@ -1,4 +1,4 @@
-"""Reduce a million samples to some hundred points for the charts of a study."""
+"""Groups and bins that reduce a million samples of a study to some hundred points."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.studies.study.variance_index import is_list
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.validation import FloatArray, IntArray, frozen_copy
 
 _POINTS = 200  # of a cumulative distribution
 _BINS = 30  # of a histogram, at most
 _CELLS = 32  # along either axis of a map, at most
 _WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
+_MOST_VALUES = 32  # a parameter with more distinct values is continuous
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 
 
@@ -24,6 +24,26 @@ class BinnedMap:
     y: FloatArray  # (ny,)
     mean: FloatArray  # (ny, nx); nan in a cell without samples
     samples: FloatArray  # number in each cell, (ny, nx)
+
+
+def is_list(ordered: FloatArray) -> bool:
+    """Whether a parameter, given in rising order, takes few values, as from a list of a study."""
+    distinct = 1 + int(np.count_nonzero(np.diff(ordered)))
+    return distinct <= min(_MOST_VALUES, max(2, len(ordered) // 5))
+
+
+def value_starts(ordered: FloatArray) -> IntArray:
+    """Return the first index of each value of a list, given in rising order."""
+    return np.concatenate(([0], 1 + np.flatnonzero(np.diff(ordered)))).astype(np.int64)
+
+
+def group_starts(ordered: FloatArray, groups: int) -> IntArray:
+    """Return the first index of each of some groups of about equal size, in rising order.
+
+    Equal values are in one group, so that the order of their samples is of no matter.
+    """
+    n = len(ordered)
+    return np.unique(np.searchsorted(ordered, ordered[np.arange(groups) * n // groups]))
 
 
 def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import lbt_synth
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.load import read_mapping, validate_sections
 from lbt_synth.config.samples import Keys
@@ -17,7 +18,6 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, refuse_config
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
-from lbt_synth.methods.integrator import METHOD as INTEGRATOR
 from lbt_synth.methods.request import Wording, design_request
 from lbt_synth.studies.study.sample import (
     Sample,
@@ -29,21 +29,6 @@ from lbt_synth.studies.study.sample import (
 from lbt_synth.studies.study.schema import ParameterSection, StudySection
 from lbt_synth.studies.study.store import read_designs, read_manifest
 from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController, result_columns
-
-# the digest names these options of a controller also where they are not given
-_OPTIONS_IN_DIGEST = {
-    *("route", "horizon", "gamma", "gamma_ratio", "rms", "taps"),
-    *("norm", "half_width_hz", "command_weight", "gain"),
-}
-# keys of a configuration that came later: where they are not given, the digest is that of before
-_LATER_KEYS = {
-    *("units", "frequency_error_hz", "frequency_error_percent", INTEGRATOR.name),
-    *("sensors", "accelerometers"),
-}
-_ERRORS_IN_DIGEST = [x / 2 for x in range(-7, 8)]  # where none are given; no study uses them
-# The oldest version whose results this one repeats to rounding: studies that it began are read
-# and resumed. Raise it with any change that moves a result.
-_SAME_RESULTS_SINCE = "0.1.0"
 
 
 def load_study(
@@ -172,31 +157,17 @@ def _designed_controller(study: Study, name: str, stored: Design | None) -> Stud
 
 
 def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> str:
-    """Return the digest of all that decides the results: not names of files, nor their format."""
-    study = settings.model_dump(by_alias=True, exclude={"config", "results"})
+    """Return the digest of all that decides the results: not the names of files."""
+    study = settings.model_dump(by_alias=True, exclude={"config"})
     for section in study["controllers"].values():
         del section["file"]
-        section |= dict.fromkeys(_OPTIONS_IN_DIGEST - section.keys())
-    whole = _without_later_keys(config.settings.model_dump())
-    if whole["robustness"]["errors_hz"] is None:
-        whole["robustness"]["errors_hz"] = _ERRORS_IN_DIGEST
     content = {
-        "version": _SAME_RESULTS_SINCE,
+        "version": lbt_synth.__version__,
         "study": study,
-        "config": whole,
+        "config": config.settings.model_dump(),
         "gains": gains,
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _without_later_keys(values: Any) -> Any:
-    """Leave out keys that came later and are not given."""
-    if isinstance(values, list):
-        return [_without_later_keys(value) for value in values]
-    if not isinstance(values, dict):
-        return values
-    kept = {k: v for k, v in values.items() if v is not None or k not in _LATER_KEYS}
-    return {key: _without_later_keys(value) for key, value in kept.items()}
 
 
 def _parameters(settings: StudySection, config: Config, source: Path) -> tuple[Parameter, ...]:

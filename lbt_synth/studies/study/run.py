@@ -5,40 +5,41 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.file_locks import exclusive_lock
 from lbt_synth.storage.input_files import file_sha256
+from lbt_synth.storage.thread_limits import limit_threads
+from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.studies.study import store
-from lbt_synth.studies.study.batch_evaluation import evaluate_samples
+from lbt_synth.studies.study.batch_evaluation import are_evaluated_together, evaluate_samples
 from lbt_synth.studies.study.engine import (
-    FIRST_ROWS,
-    GROWTH,
-    MOST_ROWS,
     Evaluate,
-    Workers,
-    run_batches,
+    InlineExecutor,
+    TimedBatch,
+    cut_parts,
+    evaluate_parts,
 )
-from lbt_synth.studies.study.parquet import require_parquet
-from lbt_synth.studies.study.store import (
-    read_results,
-    results_path,
-    write_failures,
-    write_results,
-)
+from lbt_synth.studies.study.store import read_results, write_failures, write_results
 from lbt_synth.studies.study.study import Failure, Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
 _MOST_JOBS = 64
+# Rows of a part whose samples are evaluated together: some tenths of a second, of which the check
+# of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
+# each sample takes milliseconds or seconds, a killed study shall lose few of them.
+_ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
+_PARTS_PER_WORKER = 4  # at least, so that none waits long for the last
+_IN_FLIGHT = 2  # parts per worker, so that none waits for the next
+_MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
 _LONG_ENOUGH_S = 1.0
-_NUMBER_BYTES = {"csv": 13, "parquet": 8}  # of a result in the table
-_PART_BYTES = 8
+_NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,8 +65,6 @@ class StudyRun:
         How many of them this run computed.
     failures : int
         Controllers of samples that have no result.
-    retry : int
-        How many of these are tried again when the study is started again.
     computing_s, seconds : float
         Time of this run until the last row was computed, and to its end [s].
     """
@@ -76,7 +75,6 @@ class StudyRun:
     samples: int
     computed: int
     failures: int
-    retry: int
     computing_s: float
     seconds: float
 
@@ -116,10 +114,10 @@ def run_study(
 ) -> StudyRun:
     """Run what is missing of a study, and write its results.
 
-    Every finished batch is a file in ``parts``, written completely or not at all: a study that
-    is killed at any moment resumes where it was. When all rows are computed, ``results.csv`` or
-    ``results.parquet`` is written with one row per sample in order, and ``failed.csv`` with the
-    failures; then the parts are removed.
+    Every part, a fixed number of rows, is a file in ``parts`` as soon as it is computed, written
+    completely or not at all: a study that is killed at any moment, or whose worker died, resumes
+    where it was. When all rows are computed, ``results.csv`` is written with one row per sample in
+    order, and ``failed.csv`` with the failures; then the parts are removed.
 
     Parameters
     ----------
@@ -128,13 +126,13 @@ def run_study(
     directory : path-like
         An existing directory.
     executor : concurrent.futures.Executor, optional
-        Runs the batches; any executor, also a Dask ``Client.get_executor()``. It is left open.
+        Runs the parts; any executor, also a Dask ``Client.get_executor()``. It is left open.
     jobs : int, optional
         Processes, if there is no executor: at most eight per processor of the machine, or 64.
         With 1 the study runs in this process.
     workers : int, optional
-        How many batches the executor runs at once, if it does not say so itself; twice as many
-        are in flight.
+        How many parts the executor runs at once, if it does not say so itself; twice as many are
+        in flight.
     evaluate : callable, optional
         ``evaluate(study, values, start)`` returns the :class:`BatchResult` of rows of
         ``study.values``. Other processes must be able to import it by name.
@@ -158,9 +156,7 @@ def run_study(
         If the directory belongs to another study, is in use or cannot be written, files in it
         would be replaced, or its results were changed.
     NumericalError
-        If processes keep dying, or an executor breaks; what is finished is kept.
-    MissingExtraError
-        If the results are to be Parquet and pyarrow is not installed.
+        If a worker dies, or an executor breaks; what is finished is kept.
 
     Examples
     --------
@@ -181,11 +177,9 @@ def run_study(
     if jobs > most:
         raise ProblemError(f"jobs must be at most {most} on this machine; got {jobs}.")
     if executor is not None:
-        known = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
-        workers = integer(known, "workers", at_least=1)
+        at_once = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
+        jobs = integer(at_once, "workers", at_least=1)
     folder = Path(directory)
-    if study.settings.results == "parquet":
-        require_parquet()
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
     computed, computing_s = 0, 0.0
@@ -197,34 +191,54 @@ def run_study(
             store.remove_parts(folder)  # a run was killed while it removed them
             count(study.samples)
             if whole is not None:
-                found, spent = read_results(folder, study), manifest.computing_seconds
-                whole(FinishedStudy(columns=found, computing_s=spent, new=False))
+                columns, spent = read_results(folder, study), manifest.computing_seconds
+                whole(FinishedStudy(columns=columns, computing_s=spent, new=False))
         else:
-            options: dict[str, Any] = {"jobs": jobs, "executor": executor, "workers": workers}
-            try:
-                with Workers(study, evaluate=evaluate, **options) as engine:
-                    log = _compute_missing(study, folder, count, engine)
-                    computed, computing_s = log.computed, time.perf_counter() - began
-                    manifest = _write_tables(folder, study, manifest, log, began, whole, engine)
-            finally:  # a process may have been ended while it wrote
-                store.remove_unfinished(folder)
+            log, missing = _read_parts(study, folder)
+            computed = sum(stop - start for start, stop in missing)
+            if computed < study.samples:
+                count(study.samples - computed)
+            if missing:
+                with _choose_executor(executor, jobs) as chosen:
+                    parts = cut_parts(missing, _part_rows(study, jobs))
+                    in_flight = 1 if isinstance(chosen, InlineExecutor) else _IN_FLIGHT * jobs
+                    batches = evaluate_parts(study, parts, evaluate, chosen, in_flight=in_flight)
+                    _write_parts(study, folder, batches, log, count)
+            computing_s = time.perf_counter() - began
+            manifest = _write_tables(folder, study, manifest, log, began, whole)
     return StudyRun(
         directory=folder,
-        results=results_path(folder, study),
+        results=folder / store.RESULTS,
         failed=folder / store.FAILED,
         samples=study.samples,
         computed=computed,
         failures=manifest.failures,
-        retry=manifest.retry,
         computing_s=computing_s,
         seconds=time.perf_counter() - began,
     )
 
 
+@contextlib.contextmanager
+def _choose_executor(executor: Executor | None, jobs: int) -> Iterator[Executor]:
+    """Provide the caller's executor, new processes with one thread each, or this process."""
+    with ExitStack() as environment:
+        if executor is None and jobs > 1:
+            environment.enter_context(limit_threads())
+            executor = environment.enter_context(WorkerPool(jobs))
+        yield executor or InlineExecutor()
+
+
+def _part_rows(study: Study, workers: int) -> int:
+    """Return the number of rows of a part."""
+    together = all(are_evaluated_together(study, each) for each in study.controllers)
+    share = -(-study.samples // (_PARTS_PER_WORKER * workers))
+    return min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share)
+
+
 def output_paths(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, without its parts."""
     designs = [f"{c.name}.fits" for c in study.controllers if c.is_designed]
-    tables = [results_path(folder, study).name, store.FAILED, store.PAGE, store.PRINT]
+    tables = [store.RESULTS, store.FAILED, store.PAGE, store.PRINT]
     return [folder / name for name in (store.MANIFEST, *tables, *designs)]
 
 
@@ -234,10 +248,9 @@ def _begin(folder: Path, study: Study) -> store.Manifest:
     if manifest is not None:
         store.read_designs(folder, manifest)
         if manifest.finished:
-            written = results_path(folder, study).exists() and (folder / store.FAILED).exists()
-            if written:
+            if all((folder / name).exists() for name in (store.RESULTS, store.FAILED)):
                 store.require_unchanged(folder, manifest)
-            if manifest.retry or not written:
+            else:
                 manifest = manifest.write(folder, finished=False, tables={})
     else:
         if store.list_parts(folder):
@@ -256,9 +269,8 @@ def _begin(folder: Path, study: Study) -> store.Manifest:
 
 @dataclass(slots=True)
 class _Log:
-    """What a run computed, and what all parts say of their results."""
+    """What all parts say of their results."""
 
-    computed: int = 0  # rows of this run
     failures: list[Failure] = field(default_factory=list)
     seconds: float = 0.0  # of their batches
 
@@ -268,30 +280,31 @@ class _Log:
         self.seconds += seconds
 
 
-def _compute_missing(
-    study: Study, folder: Path, progress: Callable[[int], None], engine: Workers
-) -> _Log:
-    """Compute the rows that no part has, and those to try again."""
-    log = _Log()
-    for part in store.list_parts(folder):
+def _read_parts(study: Study, folder: Path) -> tuple[_Log, list[store.RowRange]]:
+    """Return what the parts of earlier runs say, and the rows that none of them has."""
+    log, parts = _Log(), store.list_parts(folder)
+    for part in parts:
         _, failures, seconds = store.read_part(part, study)
-        if any(failure.retry for failure in failures):
-            part.path.unlink()  # a part of one row, see the engine
-        else:
-            log.add(failures, seconds)
-    missing = store.missing_rows(store.list_parts(folder), study.samples)
-    log.computed = sum(stop - start for start, stop in missing)
-    parts = make_directory(folder / store.PARTS)
-    if parts.is_symlink():
-        raise OutputError(f"cannot make the directory {parts}: it is a link.", path=folder)
-    if log.computed < study.samples:
-        progress(study.samples - log.computed)
-    with contextlib.closing(run_batches(engine, missing)) as batches:
+        log.add(failures, seconds)
+    return log, store.missing_rows(parts, study.samples)
+
+
+def _write_parts(
+    study: Study,
+    folder: Path,
+    batches: Generator[TimedBatch, None, None],
+    log: _Log,
+    progress: Callable[[int], None],
+) -> None:
+    """Write each part as it comes."""
+    if make_directory(folder / store.PARTS).is_symlink():
+        path = folder / store.PARTS
+        raise OutputError(f"cannot make the directory {path}: it is a link.", path=folder)
+    with contextlib.closing(batches):
         for batch, seconds in batches:
             part = store.write_part(folder, study, batch, seconds)
             log.add(batch.failures, seconds)
             progress(part.stop - part.start)
-    return log
 
 
 def _write_tables(
@@ -301,30 +314,22 @@ def _write_tables(
     log: _Log,
     began: float,
     whole: Callable[[FinishedStudy], None] | None,
-    engine: Workers,
 ) -> store.Manifest:
     """Write the results of all parts, then the manifest, then remove the parts."""
     parts = store.list_parts(folder)
-    wait_for_results = engine.begin(write_results, folder, study, parts)
-    failed = write_failures(folder, log.failures)
+    tables = write_results(folder, study, parts), write_failures(folder, log.failures)
     if whole is not None:
-        found = read_results(folder, study, parts)
-        whole(FinishedStudy(columns=found, computing_s=log.seconds, new=True))
-    tables = wait_for_results(), failed
-    retry = sum(failure.retry for failure in log.failures)
+        columns = read_results(folder, study, parts)
+        whole(FinishedStudy(columns=columns, computing_s=log.seconds, new=True))
     manifest = manifest.write(
         folder,
         finished=True,
         tables={path.name: file_sha256(path, OutputError) for path in tables},
-        settings=study.settings.model_dump(by_alias=True, exclude_none=True),
         failures=len(log.failures),
-        retry=retry,
-        computed_last=log.computed,
         seconds=manifest.seconds + time.perf_counter() - began,
         computing_seconds=log.seconds,
     )
-    if not retry:  # else the parts are needed to try again
-        store.remove_parts(folder)
+    store.remove_parts(folder)
     return manifest
 
 
@@ -358,17 +363,16 @@ def estimate_study(
     (True, 1974272)
     """
     workers = integer(workers, "workers", at_least=1)
-    start, size, rows, seconds = 0, FIRST_ROWS, 1, 0.0
+    start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
     evaluate(study, study.values(0, 1), 0)  # warms up
     while seconds < _LONG_ENOUGH_S and start < study.samples:
         values = study.values(start, min(start + size, study.samples))
         before = time.perf_counter()
         evaluate(study, values, start)
         seconds, rows = time.perf_counter() - before, len(values)
-        start, size = start + rows, min(GROWTH * size, MOST_ROWS)
+        start, size = start + rows, _MEASURED_ROWS * size
     at_once = min(workers, os.cpu_count() or 1) if local else workers
-    numbers = len(study.columns)
-    table = _NUMBER_BYTES[study.settings.results] * numbers
+    table = _NUMBER_BYTES * len(study.columns)
     parts = _PART_BYTES * len(study.result_columns)
     return Estimate(
         measured_rows=rows,

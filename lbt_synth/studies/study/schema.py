@@ -200,7 +200,6 @@ class StudySection(Section):
     samples: Annotated[int, Field(ge=1, le=2**30)]
     sampling: Literal["sobol", "latin_hypercube"] = "sobol"
     seed: Annotated[int, Field(ge=0)] = 0
-    results: Literal["csv", "parquet"] = "csv"
     evaluation: Literal["exact", "simulation"] = "exact"
     controllers: Annotated[
         dict[ControllerName, ControllerSection],

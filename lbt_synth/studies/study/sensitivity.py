@@ -7,23 +7,31 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from lbt_synth.studies.study.binning import group_starts, is_list, value_starts
 from lbt_synth.studies.study.controller_samples import ControllerSamples
 from lbt_synth.studies.study.percentiles import mean_and_error
-from lbt_synth.studies.study.variance_index import (
-    FEWEST,
-    NO_INDEX,
-    VarianceIndex,
-    first_order_index,
-    group_starts,
-    is_list,
-    value_starts,
-)
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, frozen_copy
 
 _GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # samples, and groups if there are fewer
 _MOST_GROUPS = 32
 _MIDDLE = 0.05, 0.95
 _RARE = 0.01  # of the samples, too few for a value of a list
+_FEWEST = 20  # samples for an index
+# With more groups than 8 and fewer samples, one parameter of a Sobol sequence inherits up to 9 % of
+# another (benchmarks/study_statistics.py)
+_FEW_GROUPS, _MANY_SAMPLES = 8, 4096
+_CONSTANT = 1e-12  # of the largest result: a smaller scatter is rounding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VarianceIndex:
+    """First-order index of one parameter."""
+
+    value: float  # about 0 without an effect; nan if the result or the parameter is constant
+    error: float  # standard error for independent samples; an overestimate for stratified ones
+
+
+NO_INDEX = VarianceIndex(value=np.nan, error=np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,14 +114,10 @@ class ControllerSensitivity:
 
 
 def sensitivities(
-    controllers: Sequence[ControllerSamples], parameters: Mapping[str, FloatArray], rows: IntArray
+    controllers: Sequence[ControllerSamples], parameters: Mapping[str, FloatArray]
 ) -> tuple[ControllerSensitivity, ...]:
-    """Return the sensitivity of each controller's Strehl ratio to each parameter, (n,) each.
-
-    The samples may stand in any order; ``rows`` (n,) are their numbers in the study.
-    """
-    by_row = np.argsort(rows, kind="stable")
-    orders = {name: _rising_order(values, by_row) for name, values in parameters.items()}
+    """Return the sensitivity of each controller's Strehl ratio to each parameter, (n,) each."""
+    orders = {name: np.argsort(values) for name, values in parameters.items()}
     return tuple(
         ControllerSensitivity(
             controller=each.controller,
@@ -127,20 +131,6 @@ def sensitivities(
     )
 
 
-def _rising_order(values: FloatArray, by_row: IntArray) -> IntArray:
-    """Return what sorts values, (n,), with equal ones of a list in the order of their rows.
-
-    Those of other parameters come in an order that has nothing to do with their samples.
-    """
-    order = np.argsort(values)  # several times as quick as a stable one
-    ordered = values[order]
-    if np.all(np.diff(ordered) > 0):
-        return order
-    if not is_list(ordered):
-        by_row = by_row[np.random.default_rng(0).permutation(len(values))]
-    return by_row[np.argsort(values[by_row], kind="stable")]
-
-
 def _sensitivity(
     name: str, values: FloatArray, each: ControllerSamples, order: IntArray, ranks: FloatArray
 ) -> ParameterSensitivity:
@@ -148,7 +138,7 @@ def _sensitivity(
     if not each.evaluated.all():
         order = order[each.evaluated[order]]
     ordered, strehl = values[order], each.strehl[order]
-    if len(ordered) < FEWEST or ordered[0] == ordered[-1]:
+    if len(ordered) < _FEWEST or ordered[0] == ordered[-1]:
         return ParameterSensitivity(parameter=name)
     curve = conditional_curve(ordered, strehl, each.unstable[order])
     swing, error = curve.swing()
@@ -162,6 +152,69 @@ def _sensitivity(
         swing_error=error,
         curve=curve,
     )
+
+
+def first_order_index(ordered: FloatArray, result: FloatArray) -> VarianceIndex:
+    """Return ``Var(E[y | x]) / Var(y)`` of a result y (n,) for a parameter in rising order (n,).
+
+    The mean given x is a line in each of n^(1/3) groups of equal size, at most 8 below 4096
+    samples (E. Plischke, E. Borgonovo, C. L. Smith, Eur. J. Oper. Res. 226, 536 (2013)), and one
+    value for each of a list.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.studies.study.sensitivity import first_order_index
+    >>> x = (np.arange(1000) + 0.5) / 1000
+    >>> round(first_order_index(x, x).value, 6)
+    1.0
+    """
+    n = len(ordered)
+    largest = float(np.max(np.abs(result), initial=0.0))
+    if n < _FEWEST or ordered[0] == ordered[-1] or largest == 0:
+        return NO_INDEX
+    spread = result / largest - np.mean(result / largest)
+    total = float(spread @ spread)
+    if total <= n * _CONSTANT**2:
+        return NO_INDEX
+    if is_list(ordered):
+        starts = value_starts(ordered)
+        coefficients = len(starts)
+        counts = np.diff(np.append(starts, n))
+        fit = np.repeat(np.add.reduceat(spread, starts) / counts, counts)
+        scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
+    else:
+        groups = round(n ** (1 / 3))
+        starts = group_starts(ordered, groups if n >= _MANY_SAMPLES else min(groups, _FEW_GROUPS))
+        coefficients = 2 * len(starts)
+        fit, jumps = _lines(spread, _rank_ordered(ordered), starts)
+        scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
+        # a jump between lines of n / B samples has 8 B / n of the variance of their scatter,
+        # which is less for even samples than for independent ones
+        scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
+    squares = (spread - fit) ** 2
+    unexplained = float(np.sum(squares)) / total
+    # a fit follows some of the scatter (T. L. Kelley, Proc. Natl. Acad. Sci. 21, 554 (1935))
+    correction = (coefficients - 1) * scatter / total
+    # what a sample adds to the index, to first order; at least the error of an index of 0
+    influence = (squares - unexplained * spread * spread) * (n / total)
+    least = unexplained * (2 * (coefficients - 1)) ** 0.5 / n
+    error = max(float(np.std(influence)) / n**0.5, least)
+    return VarianceIndex(value=1 - unexplained - correction, error=error)
+
+
+def _lines(
+    values: FloatArray, ranks: FloatArray, starts: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return lines over the rank, one for each group, at every sample, and the jumps between."""
+    counts = np.diff(np.append(starts, len(values)))
+    means = np.add.reduceat(values, starts) / counts
+    place = ranks - np.repeat(starts + (counts + 1) / 2, counts)
+    widths = np.add.reduceat(place * place, starts)
+    slopes = np.add.reduceat(place * values, starts) / np.where(widths > 0, widths, 1.0)
+    rises = slopes * counts / 2
+    fit = np.repeat(means, counts) + np.repeat(slopes, counts) * place
+    return fit, (means - rises)[1:] - (means + rises)[:-1]
 
 
 def conditional_curve(
@@ -184,7 +237,7 @@ def conditional_curve(
         starts = value_starts(ordered)
     else:
         groups = next((k for limit, k in _GROUPS if n < limit), _MOST_GROUPS)
-        starts = group_starts(n, groups)
+        starts = group_starts(ordered, groups)
     rows = []
     for group in np.split(np.arange(n), starts[1:]):
         inside, here = ordered[group], strehl[group]

@@ -211,7 +211,7 @@ def study_statistics(
             for each, loss in zip(found, _losses(found), strict=True)
         ),
         comparisons=tuple(_compare(first, second) for first, second in combinations(found, 2)),
-        sensitivities=sensitivities(found, values, rows),
+        sensitivities=sensitivities(found, values),
     )
 
 

@@ -29,12 +29,11 @@ from lbt_synth.storage.atomic_files import (
 )
 from lbt_synth.storage.input_files import file_sha256, open_input, read_bytes, read_json
 from lbt_synth.storage.tables import csv_bytes
-from lbt_synth.studies.study.parquet import read_parquet, write_parquet
 from lbt_synth.studies.study.schema import ControllerName
 from lbt_synth.studies.study.study import BatchResult, Failure, Study
 from lbt_synth.validation import FloatArray
 
-MANIFEST, PARTS, FAILED = "study.json", "parts", "failed.csv"
+MANIFEST, PARTS, RESULTS, FAILED = "study.json", "parts", "results.csv", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
 _DELETE = "Delete it, and it is computed again."
@@ -42,7 +41,7 @@ _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all 
 RowRange = tuple[int, int]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-TableName = Literal["results.csv", "results.parquet", "failed.csv"]
+TableName = Literal["results.csv", "failed.csv"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,11 +74,8 @@ class Manifest(BaseModel):
     # digests of the gain files of the designs for the whole study, and of the finished tables
     designs: dict[ControllerName, Sha256]
     tables: dict[TableName, Sha256]
-    settings: dict[str, Any] = {}
     finished: bool
     failures: int
-    retry: int  # failures that are tried again
-    computed_last: int = 0  # rows that the last run computed
     seconds: Seconds  # of all runs that reached their end
     computing_seconds: Seconds  # of all batches, summed over processes
 
@@ -105,10 +101,8 @@ def new_manifest(study: Study) -> Manifest:
         controllers={c.name: c.origin for c in study.controllers},
         designs={},
         tables={},
-        settings=study.settings.model_dump(by_alias=True, exclude_none=True),
         finished=False,
         failures=0,
-        retry=0,
         seconds=0.0,
         computing_seconds=0.0,
     )
@@ -257,27 +251,19 @@ def remove_parts(folder: Path) -> None:
         (folder / PARTS).rmdir()
 
 
-def results_path(folder: Path, study: Study) -> Path:
-    """Return the path of the table of results."""
-    return folder / f"results.{study.settings.results}"
-
-
 def write_results(folder: Path, study: Study, parts: Sequence[Part]) -> Path:
     """Write the table of results part by part, completely or not at all.
 
-    A CSV table has 12 digits for parameters and 9 for results; a Parquet table has all digits.
+    Parameters have 12 digits, results 9.
     """
-    path = results_path(folder, study)
-    blocks = (_part_rows(study, part) for part in parts)
+    path = folder / RESULTS
     with open_atomically(path) as stream:
-        if study.settings.results == "parquet":
-            write_parquet(stream, study.columns, blocks)
-            return path
         stream.write((",".join(study.columns) + "\n").encode())
         formats = [_PARAMETER] * len(study.parameters) + [_RESULT] * len(study.result_columns)
         line = ",".join(["%d", *formats]) + "\n"
-        for block in blocks:
-            stream.write("".join([line % tuple(row) for row in block.tolist()]).encode())
+        for part in parts:
+            rows = _part_rows(study, part).tolist()
+            stream.write("".join([line % tuple(row) for row in rows]).encode())
     return path
 
 
@@ -310,8 +296,8 @@ def read_results(folder: Path, study: Study, parts: Sequence[Part] = ()) -> dict
         results = np.concatenate([read_part(part, study)[0] for part in parts])
         columns = [np.arange(float(study.samples)), *study.values().T, *results.T]
         return dict(zip(study.columns, map(np.ascontiguousarray, columns), strict=True))
-    path = results_path(folder, study)
-    found = (read_parquet if study.settings.results == "parquet" else _read_csv)(path)
+    path = folder / RESULTS
+    found = _read_csv(path)
     size = len(next(iter(found.values()), ()))
     if tuple(found) != study.columns or size != study.samples:
         refuse(
@@ -337,12 +323,9 @@ def read_row(folder: Path, study: Study, row: int, parts: Sequence[Part]) -> dic
         if part.holds(row):
             found = read_part(part, study)[0][row - part.start]
             return dict(zip(study.result_columns, found.tolist(), strict=True))
-    path = results_path(folder, study)
+    path = folder / RESULTS
     if not path.exists():
         return {}
-    if study.settings.results == "parquet":
-        table = read_results(folder, study)
-        return {name: float(table[name][row]) for name in study.result_columns}
     with open_input(path, OutputError) as stream:
         cells = next(itertools.islice(stream, row + 1, None), b"").decode().split(",")
         if len(cells) != len(study.columns) or cells[0] != str(row):

@@ -167,15 +167,11 @@ class Failure:
         Name of the controller.
     error : str
         What went wrong.
-    retry : bool
-        Whether it is tried again when the study is started again: its process died, which need
-        not be the sample's fault.
     """
 
     row: int
     controller: str
     error: str
-    retry: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

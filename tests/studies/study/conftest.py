@@ -7,9 +7,9 @@ NAN = float("nan")
 
 
 @pytest.fixture
-def small_batches(monkeypatch):
-    """As if every row took long: batches are shares of what is left."""
-    monkeypatch.setattr("lbt_synth.studies.study.engine._CRUMB_SECONDS", 0.0)
+def small_parts(monkeypatch):
+    """Parts of seven rows."""
+    monkeypatch.setattr("lbt_synth.studies.study.run._ROWS_TOGETHER", 7)
 
 
 @pytest.fixture

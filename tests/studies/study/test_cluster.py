@@ -1,21 +1,20 @@
-"""The Dask cluster of a study: workers that die, and its log."""
+"""A study on a Dask cluster."""
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
 import signal
-import socket
-import threading
 import time
+from functools import partial
+from pathlib import Path
 
-import numpy as np
 import pytest
-from support.studies import assert_whole, evaluate_quickly, read_table, study_file
+from support.studies import assert_whole, evaluate_quickly, study_file
 
 import lbt_synth as lbt
+from lbt_synth.errors import NumericalError
 from lbt_synth.studies.study.cluster import connect_cluster
+from lbt_synth.studies.study.store import list_parts
 
 PARAMETERS = (
     "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, truth.sensor_gain: {uniform: [0.5, 1]}, "
@@ -23,106 +22,37 @@ PARAMETERS = (
 )
 
 
-def waits(study, values, start):
-    time.sleep(0.02 * len(values))
+def kills_its_worker(study, values, start):
+    """Rows 30 and on end their process, until a file says that one has died."""
+    once = Path(os.environ["STUDY_DIED"])
+    if start >= 30 and not once.exists():
+        time.sleep(0.5)  # so that the first rows are written
+        once.write_text("")
+        os.kill(os.getpid(), signal.SIGKILL)
     return evaluate_quickly(study, values, start)
 
 
 @pytest.mark.e2e
-def test_a_worker_killed_on_dask(tmp_path, cluster):
-    from distributed import Client
-
+def test_a_worker_killed_on_dask(tmp_path, monkeypatch):
+    """Two workers, of which one is killed: the study is started again, and nothing is lost."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
     study = lbt.studies.load_study(study_file(tmp_path, samples="60", parameters=PARAMETERS))
     folder = tmp_path / "out"
     folder.mkdir()
-    killed = []
-
-    def kill(done):
-        if not killed:
-            victim = next(iter(client.run(os.getpid).values()))
-            os.kill(victim, signal.SIGKILL)
-            killed.append(victim)
-
-    with Client(cluster, set_as_default=False) as client:
-        result = lbt.studies.run_study(
-            study,
-            folder,
-            executor=client.get_executor(pure=False),
-            workers=2,
-            evaluate=waits,
-            progress=kill,
-        )
-    assert killed
-    assert (result.computed, result.failures) == (60, 0)
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
+    with distributed.LocalCluster(**options) as cluster:
+        cluster.scheduler.allowed_failures = 0  # one death is enough
+        with connect_cluster(cluster.scheduler_address) as (executor, workers):
+            assert workers == 2
+            run = partial(
+                lbt.studies.run_study, study, folder, executor=executor, workers=workers,
+                evaluate=kills_its_worker,
+            )  # fmt: skip
+            with pytest.raises(NumericalError, match="start the study again"):
+                run()
+            kept = sum(part.stop - part.start for part in list_parts(folder))
+            assert 0 < kept < 60
+            again = run()
+    assert (again.computed, again.failures) == (60 - kept, 0)
     assert_whole(folder, study)
-
-
-def poison(study, values, start):
-    if start <= 4 < start + len(values):
-        os._exit(5)
-    return evaluate_quickly(study, values, start)
-
-
-@pytest.mark.e2e
-def test_a_row_that_kills_its_workers_on_dask(tmp_path, cluster, monkeypatch):
-    from distributed import Client
-
-    study = lbt.studies.load_study(study_file(tmp_path, samples="6", parameters=PARAMETERS))
-    folder = tmp_path / "out"
-    folder.mkdir()
-    monkeypatch.setattr(cluster.scheduler, "allowed_failures", 0)  # one death is enough
-    with Client(cluster, set_as_default=False) as client:
-        result = lbt.studies.run_study(
-            study, folder, executor=client.get_executor(pure=False), workers=2, evaluate=poison
-        )
-    assert (result.failures, result.retry) == (1, 1)
-    found = read_table(folder / "results.csv")
-    assert np.flatnonzero(np.isnan(found["slow.strehl"])).tolist() == [4]
-    again = lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert (again.computed, again.retry) == (1, 0)
-    assert_whole(folder, study)
-
-
-@pytest.mark.e2e
-def test_dask_logs_no_tracebacks(capsys, cluster):
-    """A scheduler that is gone is told by our error alone."""
-    logger = logging.getLogger("distributed.client")
-    with connect_cluster(cluster.scheduler_address):
-        logger.error("a traceback")
-        assert not logger.isEnabledFor(logging.ERROR)
-    assert logger.isEnabledFor(logging.ERROR)
-    assert "a traceback" not in capsys.readouterr().err
-
-
-ANSWERS = {
-    "silent": b"",
-    "a web server": b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n",
-    "a shell": b"SSH-2.0-OpenSSH_9.2p1\r\n",
-    "endless": b"\xff" * 64,
-}
-
-
-@pytest.mark.e2e
-@pytest.mark.parametrize("who", ANSWERS)
-def test_what_is_no_scheduler_is_refused_in_time(monkeypatch, who):
-    pytest.importorskip("distributed")
-    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 1)
-    kept = []
-
-    def answer():
-        with contextlib.suppress(OSError):
-            while True:
-                kept.append(listener.accept()[0])
-                kept[-1].sendall(ANSWERS[who])
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        threading.Thread(target=answer, daemon=True).start()
-        port = listener.getsockname()[1]
-        with (
-            pytest.raises(lbt.errors.ProblemError, match="no Dask scheduler answers at"),
-            connect_cluster(f"tcp://127.0.0.1:{port}"),
-        ):
-            pass
-        listener.shutdown(socket.SHUT_RDWR)
-    for each in kept:
-        each.close()

@@ -61,7 +61,7 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
         assert found == pytest.approx(again.fresh[f"{name}.strehl"], rel=1e-9)
 
 
-@pytest.mark.usefixtures("small_batches")
+@pytest.mark.usefixtures("small_parts")
 def test_a_row_of_an_unfinished_study(tmp_path):
     study, folder = load_small_study(tmp_path, samples="60"), make_folder(tmp_path)
     assert lbt.studies.replay_row(study, folder, 3).stored == {}

@@ -32,7 +32,7 @@ def test_a_run_and_its_results(tmp_path):
         [],
     )
     run = lbt.studies.run_study(study, folder, progress=counts.append)
-    assert (run.samples, run.computed, run.failures, run.retry) == (50, 50, 0, 0)
+    assert (run.samples, run.computed, run.failures) == (50, 50, 0)
     assert sum(counts) == 50
     assert_whole(folder, study, lbt.studies.evaluate_samples)
     assert (folder / "failed.csv").read_text() == "row,controller,error\n"
@@ -56,8 +56,7 @@ def test_a_finished_study_is_not_run_again(tmp_path):
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_call_that_fails_leaves_no_unfinished_table(tmp_path):
-    """Another process may be writing it."""
+def test_a_call_that_fails_is_repeated(tmp_path):
     study, folder = load_small_study(tmp_path, samples="60000"), make_folder(tmp_path)
 
     def fail(results):
@@ -85,12 +84,12 @@ def test_failures_are_listed_and_their_rows_are_there(tmp_path):
     lines = (folder / "failed.csv").read_text().splitlines()[1:]
     assert [line.split(",")[:2] for line in lines] == [[str(row), "tight"] for row in noisy]
     assert all("failed its certificate" in line for line in lines)
-    assert (run.failures, run.retry) == (4, 0)
+    assert run.failures == 4
     assert np.all(np.isnan(found["tight.strehl"][noisy]))
     assert not np.any(np.isnan(found["a.strehl"]))
 
 
-@pytest.mark.usefixtures("small_batches")
+@pytest.mark.usefixtures("small_parts")
 def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
     study, folder = load_small_study(tmp_path, samples="100"), make_folder(tmp_path)
     seen = []
@@ -120,7 +119,7 @@ def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
     assert_whole(folder, study)
 
 
-@pytest.mark.usefixtures("small_batches")
+@pytest.mark.usefixtures("small_parts")
 def test_other_studies_and_damage_are_refused(tmp_path):
     study, folder = load_small_study(tmp_path, samples="60", controllers=TWO), make_folder(tmp_path)
 
@@ -263,7 +262,7 @@ def test_jobs_without_number(tmp_path, monkeypatch):
         lbt.studies.run_study(load_small_study(tmp_path), make_folder(tmp_path), jobs=81)
 
 
-@pytest.mark.usefixtures("small_batches")
+@pytest.mark.usefixtures("small_parts")
 @pytest.mark.parametrize("calls", [1, 5, 9])
 def test_a_full_disk(tmp_path, monkeypatch, calls):
     """The manifest and the design, parts, the results: whatever cannot be written."""

@@ -10,15 +10,13 @@ from scipy import stats
 from support.study_results import draw_points, make_columns
 
 import lbt_synth as lbt
-from lbt_synth.studies.study.sensitivity import conditional_curve
-from lbt_synth.studies.study.summary import (
-    varying_parameters,
-)
+from lbt_synth.studies.study.sensitivity import conditional_curve, first_order_index
+from lbt_synth.studies.study.summary import varying_parameters
 
 
 def index(parameter, result):
     order = np.argsort(parameter, kind="stable")
-    return lbt.studies.first_order_index(parameter[order], result[order])
+    return first_order_index(parameter[order], result[order])
 
 
 def ishigami(u, a=7.0, b=0.1):
@@ -77,11 +75,9 @@ def test_standard_errors_are_those_of_repeated_samples():
 
 
 def test_even_samples_are_not_corrected_as_if_they_were_independent():
+    """The correction of independent samples is 31 / 4064 of the unexplained part."""
     u = draw_points("sobol", 4096, 3, seed=3)
-    independent = draw_points("independent", 4096, 3, seed=3)
-    even, other = index(u[:, 2], ishigami(u)), index(independent[:, 2], ishigami(independent))
-    assert even.correction < 0.1 * other.correction
-    assert abs(even.value) < 1e-3
+    assert abs(index(u[:, 2], ishigami(u)).value) < 1e-3
 
 
 def test_a_parameter_without_effect_has_no_index():
@@ -100,7 +96,6 @@ def test_a_list_has_its_values_as_groups():
     found = index(values, result)
     mean = 0.5 * 0.2 + 0.3 * 0.8 + 0.2 * 0.5
     between = 0.5 * (0.2 - mean) ** 2 + 0.3 * (0.8 - mean) ** 2 + 0.2 * (0.5 - mean) ** 2
-    assert found.groups == 3
     assert found.value == pytest.approx(between / (between + 0.01), abs=4 * found.error)
     ordered = np.argsort(values, kind="stable")
     curve = conditional_curve(values[ordered], exact[ordered], exact[ordered] < 0)
@@ -192,12 +187,61 @@ def test_rank_correlation_is_scipys(ties):
 
 @pytest.mark.parametrize("kind", ["independent", "latin", "sobol"])
 @pytest.mark.parametrize("n", [512, 4096])
-def test_an_edge_within_an_interval_is_not_missed(kind, n):
+def test_an_edge_is_blurred_within_its_group_alone(kind, n):
     """A loop that is unstable beyond 0.9 has a Strehl ratio of 0 there."""
     u = draw_points(kind, n, 2, seed=2)
     x, y = u.T
     found = index(x, np.where(x > 0.9, 0.0, 0.8 - 0.2 * y))
     between, within = 0.09 * 0.7**2, 0.9 * 0.2**2 / 12
-    assert abs(found.value - between / (between + within)) < 3 * found.error
-    assert found.error < 0.02
-    assert index(x, (x < 0.37) * 1.0).value == pytest.approx(1, abs=4e-3)
+    blurred = (
+        0.7**2 / 4 / (16 if n == 4096 else 8)
+    )  # a step in the middle of a group, without a line
+    missing = between / (between + within) - found.value
+    assert -3 * found.error < missing < blurred / (between + within) + 3 * found.error
+
+
+def test_one_odd_sample_makes_no_index():
+    """One unstable loop of 1000 gave a parameter without effect an index of 0.8."""
+    rng = np.random.default_rng(0)
+    quiet = 0.82 + 0.005 * rng.normal(size=1000)
+    found = []
+    for place in rng.integers(0, 1000, 60):
+        result = quiet.copy()
+        result[place] = 0.0
+        found.append(first_order_index(np.arange(1000.0), result).value)
+    assert np.max(np.abs(found)) < 0.05
+
+
+def test_a_list_of_independent_samples_keeps_its_correction():
+    rng = np.random.default_rng(1)
+    found = [
+        first_order_index(np.sort(rng.integers(0, 10, 1024) * 1.0), rng.normal(size=1024)).value
+        for _ in range(100)
+    ]
+    assert abs(np.mean(found)) < 0.003
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_the_order_of_tied_samples_makes_no_index(shuffled):
+    """A grid of 64 x 64 gave the parameter without effect 0.32."""
+    one, other = (each.ravel() for each in np.meshgrid(np.arange(64.0), np.arange(64.0)))
+    order = np.random.default_rng(1).permutation(4096) if shuffled else np.arange(4096)
+    columns = make_columns({"a": other[order], "b": one[order]}, {"k": one[order] / 64})
+    (found,) = lbt.studies.study_statistics(columns, ["a", "b"], ["k"]).sensitivities
+    assert abs(found.find("a").index.value) < 0.01
+    assert found.find("b").index.value == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-170, 1.0, 1e300])
+def test_the_index_knows_no_scale(scale):
+    x = np.linspace(0, 1, 100)
+    assert first_order_index(x, scale * x).value == pytest.approx(1)
+
+
+def test_a_value_that_one_sample_has_makes_no_swing():
+    rng = np.random.default_rng(0)
+    x = np.append(rng.choice([10.0, 20.0], 4095), 30.0)
+    columns = make_columns({"x": x}, {"a": np.append(0.5 + 0.1 * rng.random(4095), 0.9)})
+    (found,) = lbt.studies.study_statistics(columns, ["x"], ["a"]).sensitivities
+    assert found.find("x").swing < 0.01
+    assert np.isfinite(found.find("x").swing_error)
