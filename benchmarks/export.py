@@ -12,21 +12,6 @@ from lbt_synth.interop.c import export as c_export
 CONFIG = lbt.load_config("examples/lbt.yaml")
 
 
-def transfer_functions(folder: Path) -> None:
-    """Transfer functions over the number of lines that the filter knows."""
-    for lines in (1, 2, 3, 4, 5):
-        plant = CONFIG.plant
-        if lines > 1:
-            plant = lbt.models.spread_plant(plant, half_width_hz=3.5, lines=lines)
-        design = lbt.kalman(plant)
-        try:
-            written = lbt.interop.export_iir(folder / "iir.fits", design)
-            said = f"double {written.error:.1e}, single {written.error_single:.1e}"
-        except lbt.errors.NumericalError as error:
-            said = f"double {error.residual:.1e}: refused"
-        print(f"{lines} lines an axis, {design.controller.n_states} states: {said}")
-
-
 def source(folder: Path) -> None:
     """Operations, and what single precision changes."""
     prior = lbt.models.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)
@@ -83,5 +68,4 @@ def forms() -> None:
 if __name__ == "__main__":
     forms()
     with tempfile.TemporaryDirectory() as place:
-        transfer_functions(Path(place))
         source(Path(place))

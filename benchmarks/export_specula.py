@@ -1,12 +1,11 @@
-"""Load files into SPECULA's own filters and step them beside our controller.
+"""Load a gain file into SPECULA's own SsrFilter and step it beside our controller.
 
 Needs the extra ``e2e`` (``make e2e`` installs it); from the repository::
 
-    python benchmarks/export_specula.py {double,single} GAIN.fits [TRANSFER_FUNCTIONS.fits]
+    python benchmarks/export_specula.py {double,single} GAIN.fits
 
-The gain file is given to SsrFilter, the transfer functions (``lbt-synth export --for iir``)
-to IirFilter. Printed: the largest difference of the commands over the largest command, in the
-closed loop of examples/lbt.yaml and on 150 random measurements.
+Printed: the largest difference of the commands over the largest command, in the closed loop of
+examples/lbt.yaml and on 150 random measurements.
 """
 
 import sys
@@ -15,22 +14,21 @@ import numpy as np
 
 sys.path.insert(0, "tests")  # what drives SPECULA is what the tests use
 
-from support.specula_filters import commands, noise_series, relative, simulated
+from support.exports import relative
+from support.specula_filters import commands, noise_series, simulate_commands
 
 import lbt_synth as lbt
 
 CONFIG = "examples/lbt.yaml"
 
 if __name__ == "__main__":
-    precision, gain, *transfer = sys.argv[1:]
+    precision, gain = sys.argv[1:]
     controller = lbt.load_gain(gain).controller
     run = controller.start()
-    loop = simulated(controller, CONFIG)
     noise = np.array([run.step(y) for y in noise_series(controller.B.shape[1])])
-    named = [f"ssr:{gain}", *(f"iir:{file}" for file in transfer)]
-    found = commands(("double", "single").index(precision), CONFIG, named)
-    for text, (their_loop, their_noise) in zip(named, found, strict=True):
-        print(
-            f"{text}, {precision}: loop {relative(their_loop, loop):.1e}, "
-            f"random measurements {relative(their_noise, noise):.1e}"
-        )
+    loop = simulate_commands(controller, CONFIG)
+    ((their_loop, their_noise),) = commands(("double", "single").index(precision), CONFIG, [gain])
+    print(
+        f"{gain}, {precision}: loop {relative(their_loop, loop):.1e}, "
+        f"random measurements {relative(their_noise, noise):.1e}"
+    )

@@ -21,8 +21,7 @@ import numpy.typing as npt
 
 import lbt_synth as lbt
 from lbt_synth.interop import Exported
-from lbt_synth.interop.dao.inner_loop import InnerLoop
-from lbt_synth.interop.iir.export import DirectForm
+from lbt_synth.interop.dao.direct_form import InnerLoop
 from lbt_synth.interop.target import target_named, target_names
 from lbt_synth.linear.block_filtering import filter_series
 
@@ -33,8 +32,6 @@ CASES: dict[str, tuple[str, dict[str, str]]] = {
     "C, double": ("c", {}),
     "C, single": ("c", {"precision": "single"}),
     "C, single, estimator": ("c", {"precision": "single", "form": "estimator"}),
-    "transfer functions, double": ("iir", {}),
-    "transfer functions, single": ("iir", {"precision": "single"}),
     "MATLAB": ("matlab", {}),
     "dao": ("dao", {}),
     "cacao": ("cacao", {}),
@@ -158,14 +155,6 @@ def run_target(target: str, options: dict[str, str], written: Exported, *series:
             return np.asarray(u)
 
         return run_steps(textbook, *series)
-    if target == "iir":
-        from astropy.io import fits
-
-        with fits.open(files[0]) as units:
-            num, den = (np.tile(units[name].data, (LOOPS, 1)) for name in ("NUM", "DEN"))
-        kind = np.float32 if options.get("precision") == "single" else np.float64
-        filters = DirectForm(num, den, kind)
-        return run_steps(lambda y: filters.step(y.ravel()).reshape(y.shape), *series)
     if target == "cacao":
         twins = [written.start(np.inf) for _ in range(LOOPS)]
         return run_steps(lambda y: np.array(list(map(step_twin, twins, y))), *series)

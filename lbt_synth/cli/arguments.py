@@ -76,7 +76,7 @@ def export(parser: ArgumentParser) -> None:
     _add_target(parser)
     types = ("double", "single")
     _add_form(parser, "c")
-    text = "c: type of all numbers; iir: SPECULA's (default double)"
+    text = "c: type of all numbers (default double)"
     add_option(parser, "--precision", types, text)
     text = "c: prefix of the C names (default: the output's name without its ending)"
     add_option(parser, "--name", str, text)

@@ -99,14 +99,4 @@ def _precision_notes(arguments: Namespace, written: Exported) -> list[str]:
             f"note: in single precision commands are off by {written.error:.2g} of the largest "
             "one. Export with --precision double."
         ]
-    if arguments.target == "iir" and not written.error_single <= _SINGLE_SUFFICES:
-        effect = (
-            "the loop is unstable"
-            if math.isinf(written.error_single)
-            else f"commands are off by {written.error_single:.2g} of the largest one"
-        )
-        return [
-            f"note: in single precision, SPECULA's default, {effect} with this transfer function. "
-            "Run it with precision 0, or use the gain file itself with SsrFilter."
-        ]
     return []

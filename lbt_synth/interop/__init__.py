@@ -1,8 +1,8 @@
 """Controllers in other people's programs.
 
-One folder per program: ``c`` writes C99 source, ``dao`` the matrix of a real-time computer, ``iir``
-a filter file of SPECULA, ``matlab`` a MATLAB file, ``pyrtc`` a configuration and the predictor that
-it names. Before a file is written, what it holds is run beside the controller.
+One folder per program: ``c`` writes C99 source, ``dao`` the matrix of a real-time computer,
+``matlab`` a MATLAB file, ``pyrtc`` a configuration and the predictor that it names. Before a file
+is written, what it holds is run beside the controller.
 ``specula`` runs a design end to end, on optics simulated by SPECULA.
 """
 

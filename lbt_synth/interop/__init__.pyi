@@ -4,7 +4,6 @@ from .c.export import export_c as export_c
 from .cacao.export import export_cacao as export_cacao
 from .dao.export import export_dao as export_dao
 from .export_checks import Exported as Exported
-from .iir.export import export_iir as export_iir
 from .matlab.export import export_mat as export_mat
 from .pyrtc.export import export_pyrtc as export_pyrtc
 from .pyrtc.replay import pyrtc_commands as pyrtc_commands

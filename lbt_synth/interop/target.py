@@ -71,7 +71,7 @@ def target_names() -> tuple[str, ...]:
 
     >>> from lbt_synth.interop.target import target_names
     >>> target_names()
-    ('c', 'cacao', 'dao', 'iir', 'matlab', 'pyrtc')
+    ('c', 'cacao', 'dao', 'matlab', 'pyrtc')
     """
     exports = Path(__file__).parent.glob("*/export.py")
     return tuple(sorted(path.parent.name for path in exports))

@@ -11,7 +11,7 @@ import pytest
 from scipy.io import loadmat
 from support.commands import run
 from support.compiled import Compiled
-from support.exports import lbt_config, lbt_designs, transfer_functions, with_controller
+from support.exports import lbt_config, lbt_designs, with_controller
 
 import lbt_synth as lbt
 
@@ -59,36 +59,18 @@ def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
     Compiled(out, name="tip")
 
 
-def test_export_mat_and_iir_at_the_terminal(tmp_path, capsys, designs, gains):
+def test_export_mat_and_dao_at_the_terminal(tmp_path, capsys, designs, gains):
     out = tmp_path / "k.mat"
     assert run(capsys, "export", gains["hinf"], "--for", "matlab", "-o", out)[0] == 0
     assert loadmat(out, simplify_cells=True)["new_state"]["A"].shape == (10, 10)
-    out = tmp_path / "k.fits"
-    status, text, _ = run(capsys, "export", gains["kalman"], "--for", "iir", "-o", out)
+    arguments = ("export", gains["kalman"], "--for", "dao", "-o", tmp_path / "k.fits")
+    status, text, _ = run(capsys, *arguments)
     assert status == 0
     assert "difference from the controller" in text
     assert "note:" not in text
-    assert transfer_functions(out)[0].shape == (2, 5)
 
 
-@pytest.mark.parametrize(
-    ("half_width_hz", "effect"), [(1.0, "the loop is unstable"), (3.5, "commands are off by 0.")]
-)
-def test_a_transfer_function_that_single_precision_breaks_gets_a_note(
-    tmp_path, capsys, loaded, half_width_hz, effect
-):
-    prior = lbt.kalman(lbt.models.spread_plant(loaded.plant, half_width_hz=half_width_hz, lines=3))
-    gain = lbt.save_gain(tmp_path / "g.fits", prior)
-    arguments = ("export", gain, "--for", "iir", "-o", tmp_path / "k.fits")
-    status, text, _ = run(capsys, *arguments)
-    assert status == 0
-    assert f"note: in single precision, SPECULA's default, {effect}" in text
-    data = json.loads(run(capsys, *arguments, "--json")[1])
-    assert data["stable_single"] is ("unstable" not in effect)
-    assert data["error"] < 1e-6
-
-
-def test_c_that_single_precision_breaks_gets_the_same_note(tmp_path, capsys, monkeypatch):
+def test_c_that_single_precision_breaks_gets_a_note(tmp_path, capsys, monkeypatch):
     """An integrator beside large states that the command subtracts again."""
     slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
     large = lbt.Controller(
@@ -123,16 +105,16 @@ BAD = [
     (
         ("KALMAN", "--for", "matlab", "-o", "k.mat", "--precision", "single"),
         2,
-        "--precision goes with --for c or iir",
+        "--precision goes with --for c",
     ),
-    (("KALMAN", "--for", "iir", "-o", "k.fits", "--form", "plain"), 2, "--form goes with --for c"),
+    (("KALMAN", "--for", "dao", "-o", "k.fits", "--form", "plain"), 2, "--form goes with --for c"),
     (("KALMAN", "--for", "c", "-o", "k.c", "--precision", "half"), 2, "invalid choice"),
     (("KALMAN", "--for", "c", "-o", "k.c", "--name", "2x"), 2, "prefix of the C names"),
     (("KALMAN", "--for", "c", "-o", "kal man.c"), 2, "must end in .c"),
     (("KALMAN", "--for", "c", "-o", "k.mat"), 2, "must end in .c"),
     (("KALMAN", "--for", "matlab", "-o", "k.c"), 2, "must end in .mat"),
-    (("KALMAN", "--for", "iir", "-o", "k.mat"), 2, "must end in .fits"),
-    (("KALMAN", "--for", "iir", "-o", "KALMAN"), 2, "must not replace the input"),
+    (("KALMAN", "--for", "cacao", "-o", "k.mat"), 2, "must end in .fits"),
+    (("KALMAN", "--for", "cacao", "-o", "KALMAN"), 2, "must not replace the input"),
     (("KALMAN", "--for", "c", "-o", "none/k.c"), 2, "no directory none"),
     (("KALMAN", "--for", "pyrtc", "-o", "none/k"), 2, "no directory none"),
     (("KALMAN", "--for", "pyrtc", "-o", "DAMAGED.fits"), 2, "cannot make the directory"),
@@ -141,7 +123,11 @@ BAD = [
     (("KALMAN", "-o", "k.c"), 2, "required"),
     (("none.fits", "--for", "c", "-o", "k.c"), 2, "cannot read none.fits"),
     (("DAMAGED.fits", "--for", "c", "-o", "k.c"), 2, "damaged"),
-    (("PRIOR", "--for", "iir", "-o", "k.fits"), 1, "do not hold the poles"),
+    (
+        ("PRIOR", "--for", "dao", "--order", "40", "-o", "k.npy"),
+        1,
+        "must keep what its design promises",
+    ),
 ]
 
 

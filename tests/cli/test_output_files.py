@@ -23,7 +23,7 @@ WITHOUT_INPUTS = {"paper", "init", "schema", "help", "completion", "explore"}
 CASES = {
     "design": ("config.yaml", ("config.yaml", "--method", "integrator", "-o", "OUT.fits")),
     "export mat": ("gain.fits", ("gain.fits", "--for", "matlab", "-o", "OUT.mat")),
-    "export iir": ("gain.fits", ("gain.fits", "--for", "iir", "-o", "OUT.fits")),
+    "export dao": ("gain.fits", ("gain.fits", "--for", "dao", "-o", "OUT.fits")),
     "export c": ("gain.fits", ("gain.fits", "--for", "c", "-o", "OUT.c")),
     "export pyrtc": (
         "gain.fits",
@@ -121,7 +121,7 @@ def test_an_output_that_is_an_input_is_refused(
 @pytest.mark.parametrize(
     ("command", "arguments", "source"),
     [
-        ("export", ("gain.fits", "--for", "iir", "-o", "gain.fits"), "gain.fits"),
+        ("export", ("gain.fits", "--for", "dao", "-o", "gain.fits"), "gain.fits"),
         ("simulate", ("config.yaml", "gain.fits", "--telemetry", "./gain.fits"), "gain.fits"),
         ("telemetry", ("series.fits", "-o", "../DIR/series.fits"), "series.fits"),
         pytest.param(

@@ -14,7 +14,6 @@ pytestmark = pytest.mark.usefixtures("short_rehearsal")
 EXPORTS = {
     "k.c": lbt.interop.export_c,
     "k.mat": lbt.interop.export_mat,
-    "k.fits": lbt.interop.export_iir,
     "k.npy": lbt.interop.export_dao,
 }
 

@@ -27,7 +27,7 @@ def response(column, z):
 def steps(control, columns, frames=40):
     """Commands of a controller and of the matrix, run beside each other on white measurements."""
     rng = np.random.default_rng(0)
-    twin = lbt.interop.dao.inner_loop.InnerLoop(columns)
+    twin = lbt.interop.dao.direct_form.InnerLoop(columns)
     series = rng.standard_normal((frames, columns.shape[1]))
     return np.array([control.step(y) for y in series]), np.array([twin.step(y) for y in series])
 

@@ -30,7 +30,7 @@ def test_the_page_has_the_table_of_the_targets():
 
 
 def test_each_folder_with_an_export_is_a_target_and_has_an_oracle():
-    assert {"c", "cacao", "dao", "iir", "matlab", "pyrtc"} <= set(target_names())
+    assert {"c", "cacao", "dao", "matlab", "pyrtc"} <= set(target_names())
     assert set(target_names()) <= set(ORACLES) | WITHOUT_ORACLE
     assert not set(ORACLES) & WITHOUT_ORACLE
 

@@ -6,7 +6,6 @@ import copy
 from functools import cache
 
 import numpy as np
-from astropy.io import fits
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
@@ -66,16 +65,3 @@ def with_controller(design, controller):
     other = copy.copy(design)
     set_fields(other, controller=controller)
     return other
-
-
-def transfer_functions(path):
-    """Read as SPECULA does: HDUs by position, coefficients ascending in z, right-aligned."""
-    with fits.open(path, checksum=True) as units:
-        assert units[0].header["VERSION"] == 1
-        assert units[0].data is None
-        assert [unit.name for unit in units[1:]] == ["ORDNUM", "ORDDEN", "NUM", "DEN"]
-        ordnum, ordden, num, den = (np.array(units[i].data) for i in range(1, 5))
-    assert num.shape == den.shape
-    assert ordnum.tolist() == ordden.tolist() == [num.shape[1]] * len(num)
-    assert np.all(den[:, -1] == 1)
-    return num, den

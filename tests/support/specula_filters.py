@@ -1,9 +1,9 @@
-"""SPECULA's filters, driven as its simulation drives them; run by the tests of ``interop.iir.export``.
+"""SPECULA's state-space filter, driven as its simulation drives it, in a process of its own.
 
 The precision of SPECULA is one for a process and is chosen before its classes are imported,
 so each precision is a process of its own::
 
-    python tests/support/specula_filters.py PRECISION OUTPUT.npz CONFIG CLASS:FILE ...
+    python tests/support/specula_filters.py PRECISION OUTPUT.npz CONFIG FILE ...
 """
 
 from __future__ import annotations
@@ -52,24 +52,19 @@ class Triggered:
         return np.array(command.value, dtype=np.float64)
 
 
-def commands(precision, config, named):
-    """Commands of each CLASS:FILE, in the loop of a configuration and on given measurements."""
+def commands(precision, config, files):
+    """Commands of each gain file, in the loop of a configuration and on given measurements."""
     import specula
 
     specula.init(-1, precision=precision)
-    from specula.data_objects.iir_filter_data import IirFilterData
     from specula.data_objects.ssr_filter_data import SsrFilterData
-    from specula.processing_objects.iir_filter import IirFilter
     from specula.processing_objects.ssr_filter import SsrFilter
 
-    classes = {"ssr": (SsrFilterData, SsrFilter), "iir": (IirFilterData, IirFilter)}
     results = []
-    for text in named:
-        kind, file = text.split(":", 1)
-        data_class, filter_class = classes[kind]
-        data = data_class.restore(file)
+    for file in files:
+        data = SsrFilterData.restore(file)
         assert data.dtype == (np.float64, np.float32)[precision]
-        theirs = Triggered(lambda f=filter_class, d=data: f(d), data.nfilter)
+        theirs = Triggered(lambda d=data: SsrFilter(d), data.nfilter)
         loop = simulate_commands(theirs, config)
         theirs.reset()
         results.append((loop, [theirs.step(y) for y in noise_series(data.nfilter)]))
@@ -89,8 +84,8 @@ def simulate_commands(controller, config):
     ).commands[0]
 
 
-def main(precision, output, config, *named):
-    series = commands(int(precision), config, named)
+def main(precision, output, config, *files):
+    series = commands(int(precision), config, files)
     keyed = {f"loop{i}": loop for i, (loop, _) in enumerate(series)}
     keyed |= {f"noise{i}": noise for i, (_, noise) in enumerate(series)}
     np.savez(output, **keyed)

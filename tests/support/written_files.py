@@ -90,7 +90,7 @@ def random_options(name, rng):
         }
     if name == "cacao":
         return {} if rng.random() < 0.7 else {"steps": int(rng.integers(8, 400))}
-    return {"precision": str(rng.choice(list(SINGLE)))} if name == "iir" else {}
+    return {}
 
 
 def taps(hardware):
@@ -174,17 +174,8 @@ def judge_matlab(files, design, options):
     return bool(loop.radius() < 1 and decays(design.hardware, run))
 
 
-def judge_iir(files, design, options):
-    """Take the polynomials, close the loop in exact numbers, and run the recursion."""
-    kind = SINGLE[options["precision"]]
-    with fits.open(files[0]) as units:
-        num, den = (np.array(units[name].data).astype(kind) for name in ("NUM", "DEN"))
-    assert np.all(den[:, -1] == 1)
-    return judge_recursion(design.hardware, num[:, ::-1], -den[:, -2::-1], kind)
-
-
 def judge_dao(files, design, options):
-    """Take the rows of the matrix; the rest as for transfer functions."""
+    """Take the rows of the matrix, close the loop in exact numbers, and run the recursion."""
     matrix = np.load(files[0])
     order = len(matrix) // 2
     return judge_recursion(
@@ -278,7 +269,6 @@ WITHOUT_ORACLE = set()  # targets that only the tests of their own folder judge
 ORACLES = {
     "c": judge_c,
     "dao": judge_dao,
-    "iir": judge_iir,
     "matlab": judge_matlab,
     "pyrtc": judge_pyrtc,
     "cacao": judge_cacao,

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lbt_synth.design import Check, Design, ShapedDesign
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import ProblemError
-from lbt_synth.interop.dao.inner_loop import InnerLoop
+from lbt_synth.interop.dao.direct_form import InnerLoop, direct_form, direct_form_rows
 from lbt_synth.interop.dao.lattice_rounding import round_together
 from lbt_synth.interop.dao.mode_loop import DirectFormLoop, shaped_mode_loop
 from lbt_synth.interop.dao.refit import refit
@@ -24,8 +23,6 @@ from lbt_synth.interop.export_checks import (
     provenance_lines,
     rehearsal_error,
 )
-from lbt_synth.interop.iir.export import axis_polynomials
-from lbt_synth.interop.iir.realisation import build_controller
 from lbt_synth.interop.modes import ModalDesign, all_modes
 from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.interop.written_loop import ROUNDOFF, Rounding, prove_written, require_proved
@@ -147,7 +144,8 @@ class _Proved(NamedTuple):
 def _proved_columns(design: Design, order: int) -> _Proved:
     """Return the columns of a design, proved in the arithmetic of the RTC."""
     exact = direct_form_rows(design.controller, order)
-    rounded = exact.astype(np.float32)
+    with np.errstate(over="ignore"):  # what is beyond the range becomes infinite, and is refused
+        rounded = exact.astype(np.float32)
     loops = _mode_loops(design, order)
     checks = prove_written(design, *_as_computed(rounded, design, loops))
     made_again = not all(check.passed for check in checks) and _can_make_again(loops, exact)
@@ -158,33 +156,14 @@ def _proved_columns(design: Design, order: int) -> _Proved:
     return _Proved(rounded, checks, made_again)
 
 
-def direct_form_rows(controller: Controller, order: int) -> FloatArray:
-    """Return the matrix (2 order + 1, modes) of a controller, before it is rounded."""
-    rows = np.zeros((2 * order + 1, len(controller.C)))
-    for mode, (num, den) in enumerate(axis_polynomials(controller)):
-        needed = len(den) - 1
-        if needed > order:
-            raise ProblemError(
-                f"order must be at least {needed}, that of the controller of mode {mode + 1}; got "
-                f"{order}. Raise it there and in the RTC's configuration, or design with fewer "
-                "states."
-            )
-        rows[: needed + 1, mode] = num[::-1] / den[-1]
-        rows[order + 1 : order + 1 + needed, mode] = -den[-2::-1] / den[-1]
-    return rows
-
-
 def _as_computed(
     rounded: NDArray[np.float32], design: Design, loops: list[DirectFormLoop]
 ) -> tuple[Controller, Rounding]:
     """Return the controller with the matrix's numbers, and what its arithmetic adds."""
     rows, dt_s = rounded.astype(np.float64), design.controller.dt_s
-    order, modes = len(rows) // 2, rows.shape[1]
-    num = rows[order::-1].T
-    den = np.hstack([-rows[:order:-1].T, np.ones((modes, 1))])
-    sums = np.zeros_like(num)
-    sums[:, -1] = 1.0
-    written, entry = (build_controller(top, den, dt_s) for top in (num, sums))
+    order, added = len(rows) // 2, rows.copy()
+    added[: order + 1] = np.eye(order + 1, 1)  # an error of the sum enters as b_0 y(k) does
+    written, entry = (direct_form(matrix, dt_s) for matrix in (rows, added))
 
     def variance(sensor_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         """Add up the rounding of each product and of each partial sum."""

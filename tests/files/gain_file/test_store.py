@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import astuple
 
 import numpy as np
@@ -11,11 +13,12 @@ import pytest
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.exports import relative
 from support.gain_files import DESIGNS, ENDINGS
 from support.lqg import shell, slow_plant
-from support.shaping import (
-    shaped_design,
-)
+from support.plants import LBT_YAML, ROOT
+from support.shaping import shaped_design
+from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
 from lbt_synth.storage.array_file import digest
@@ -413,3 +416,57 @@ def test_an_edited_header_card_is_found(tmp_path, old, new):
 def test_only_designs_are_saved(tmp_path):
     with pytest.raises(lbt.errors.OutputError, match="holds a Design; got int"):
         lbt.save_gain(tmp_path / "g.fits", 3)
+
+
+SCRIPT = ROOT / "tests" / "support" / "specula_filters.py"
+NAMES = ["kalman", "hinf", "integrator"]
+LIMITS = (1e-12, 1e-5)  # in double and in single precision
+
+
+@pytest.fixture(scope="module")
+def simulated_designs():
+    loaded = lbt.load_config(LBT_YAML)
+    return {
+        "kalman": lbt.kalman(loaded.plant),
+        "hinf": lbt.hinf(loaded.plant, gamma_ratio=1.2),
+        "integrator": lbt.design.optimal_integrator(loaded.hardware, loaded.truth),
+    }
+
+
+@pytest.fixture(scope="module", params=[0, 1], ids=["double", "single"])
+def specula_run(request, simulated_designs, tmp_path_factory):
+    """Commands of each gain file in SPECULA, in the closed loop and on given measurements."""
+    folder = tmp_path_factory.mktemp("specula")
+    output = folder / "commands.npz"
+    files = [lbt.save_gain(folder / f"{name}.fits", simulated_designs[name]) for name in NAMES]
+    done = subprocess.run(
+        [sys.executable, SCRIPT, str(request.param), output, LBT_YAML, *files],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    with np.load(output) as data:
+        series = {name: (data[f"loop{i}"], data[f"noise{i}"]) for i, name in enumerate(NAMES)}
+    return request.param, series
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("name", NAMES)
+def test_the_closed_loop_is_that_of_our_simulator(simulated_designs, specula_run, name):
+    """Same disturbance and noise: SPECULA's filter in the loop, and our simulator."""
+    precision, series = specula_run
+    expected = simulate_commands(simulated_designs[name].controller, LBT_YAML)
+    assert np.max(np.abs(expected)) > 100  # nm: there is something to correct
+    assert relative(series[name][0], expected) < LIMITS[precision]
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("name", NAMES)
+def test_the_same_measurements_give_the_same_commands(simulated_designs, specula_run, name):
+    """The gain file untouched, against the stepped controller, on measurements of no loop."""
+    precision, series = specula_run
+    ours = simulated_designs[name].controller.start()
+    expected = np.array([ours.step(y) for y in noise_series(2)])
+    assert relative(series[name][1], expected) < LIMITS[precision]

@@ -12,7 +12,7 @@ from astropy.io import fits
 from support.exports import relative
 
 import lbt_synth as lbt
-from lbt_synth.interop.dao.inner_loop import InnerLoop
+from lbt_synth.interop.dao.direct_form import InnerLoop
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.loop.simulation.run import step_loop
 

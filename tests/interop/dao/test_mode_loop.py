@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.interop.dao.export import direct_form_rows
+from lbt_synth.interop.dao.direct_form import direct_form, direct_form_rows
 from lbt_synth.interop.dao.mode_loop import ROUNDING, shaped_mode_loop
 from lbt_synth.interop.dao.refit import _widened
-from lbt_synth.interop.iir.export import build_controller
 from lbt_synth.interop.written_loop import _rounding_left
 from lbt_synth.loop.closed_loop import radii_by_gain
 
@@ -75,10 +74,8 @@ def test_rounding_in_the_loop_is_that_of_the_lyapunov_equation(case, shaped):
     """
     loop, own = case
     c = _widened(loop, own)
-    num, den = c[20::-1][None], np.concatenate([-c[:20:-1], [1.0]])[None]
-    sums = np.zeros_like(num)
-    sums[:, -1] = 1.0
-    written, entry = (build_controller(top, den, shaped.controller.dt_s) for top in (num, sums))
+    added = np.concatenate([np.eye(21)[0], c[21:]])
+    written, entry = (direct_form(x[:, None], shaped.controller.dt_s) for x in (c, added))
     variance = np.array([loop.sums_nm2(c, 1.0)])
     left = _rounding_left(shaped.hardware, written, entry, variance, 1.0)
     assert loop.rounding_nm(c)[0] == pytest.approx(np.sqrt(left[0]), rel=2e-3)

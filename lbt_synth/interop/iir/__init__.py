@@ -1,1 +1,0 @@
-"""Export of a controller as transfer functions for SPECULA's IirFilter."""
