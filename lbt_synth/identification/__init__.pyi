@@ -53,11 +53,5 @@ from .records.record import LoopRecord as LoopRecord
 from .records.record_length import require_length as require_length
 from .records.spectrum import SpectrumRecord as SpectrumRecord
 from .stretches import split_halves as split_halves
-from .tracking.evidence import Evidence as Evidence
-from .tracking.identifiers import LineFollower as LineFollower
-from .tracking.identifiers import LoopIdentifier as LoopIdentifier
-from .tracking.switching import SwitchedController as SwitchedController
-from .tracking.switching import SwitchReport as SwitchReport
-from .tracking.tracker import Identifier as Identifier
-from .tracking.tracker import TrackingController as TrackingController
-from .tracking.tracker import TrackingUpdate as TrackingUpdate
+from .tracking import TrackingController as TrackingController
+from .tracking import TrackingUpdate as TrackingUpdate

@@ -13,5 +13,4 @@ from .sensor_failures import sensor_failure_figure as sensor_failure_figure
 from .sigma import sigma_figure as sigma_figure
 from .simulation import simulation_figure as simulation_figure
 from .step import step_figure as step_figure
-from .tracking import tracking_figure as tracking_figure
 from .tradeoff import tradeoff_figure as tradeoff_figure

@@ -1,1 +1,0 @@
-"""Tracking: identification and redesign while the loop runs."""

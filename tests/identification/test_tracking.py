@@ -1,0 +1,233 @@
+"""The tracking controller in the loop: change-overs without a bump, a drift, failures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.loop.simulation.run import step_loop
+from lbt_synth.models.plant.tip_tilt import with_vibrations
+
+AIR = lbt.models.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
+SHELL = lbt.models.PositionLoop.from_bandwidth(
+    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300
+)
+
+
+def line(frequency_hz, damping=0.02):
+    return lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=300, direction=(1,))
+
+
+def axis(frequency_hz, **changes):
+    settings = {"frame_rate_hz": 800, "turbulence": AIR, "noise_nm": 15.5, "modes": 1}
+    return lbt.tip_tilt_plant(**(settings | changes), vibrations=[line(frequency_hz)])
+
+
+def two_axes():
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        turbulence=AIR,
+        noise_nm=15.5,
+        delay_frames=2.4,
+        vibrations=[replace(line(20), direction=(1, 0.5))],
+        sensor_matrix=np.diag([0.8, 1.1]),
+        influence_matrix=[[1, 0.2], [0, 0.9]],
+    )
+
+
+def disturbed(plant, *, frames, hz=20, seed=0):
+    """Total phase and noise, (1, frames, n) each; the vibration is on the first axis."""
+    along = tuple(np.eye(plant.hardware.modes)[0])
+    shake = lbt.models.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=along)
+    truth = lbt.Truth(turbulence=AIR, vibrations=(shake,), noise_nm=15.5)
+    size = {"frames": frames, "cases": 1, "rng": np.random.default_rng(seed)}
+    return (draw(truth, plant.hardware, **size) for draw in (draw_disturbance, draw_noise))
+
+
+class Watched:
+    """A controller, what it measured and what it commanded."""
+
+    def __init__(self, controller):
+        self.controller = controller
+        self.reset()
+
+    def reset(self):
+        self.controller.reset()
+        self.measured, self.commands = [], []
+
+    def step(self, y):
+        self.measured.append(np.array(y))
+        self.commands.append(self.controller.step(y))
+        return self.commands[-1]
+
+
+def run(controller, plant, series):
+    """Residual and commands, (frames, n + m)."""
+    return step_loop(controller, 1.0, plant.hardware, *series)[0]
+
+
+PLANTS = {
+    "delay 1": axis(20, delay_frames=1),
+    "delay 2": axis(20),
+    "delay 3": axis(20, delay_frames=3),
+    "a slow mirror": axis(20, mirror=SHELL),
+    "two axes": two_axes(),
+}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_each_filter_is_as_if_it_had_always_run(name):
+    """Its commands are those of its estimator, run beside the loop from the first frame on."""
+    plant, made = PLANTS[name], []
+
+    def design(problem):
+        made.append(lbt.kalman(problem))
+        return made[-1]
+
+    tracker = lbt.identification.TrackingController(
+        plant, window_s=1.0, update_s=0.75, design=design
+    )
+    watched = Watched(tracker)
+    run(watched, plant, disturbed(plant, frames=1600, hz=22))
+    assert [update.reason for update in tracker.history] == [""] * 2
+    assert len({design.gain_predictor.tobytes() for design in made}) == 3
+    commands, scale = np.array(watched.commands), np.max(np.abs(watched.commands))
+    before = np.zeros_like(commands[0])
+    starts = [0, 800, 1400, 1600]  # a filter runs from the frame after its update on
+    for number, filter_design in enumerate(made):
+        beside, cold = filter_design.estimator.start(), filter_design.controller.start()
+        begun = []
+        for k, y in enumerate(watched.measured):
+            last = commands[k - 1] if k else before
+            expected = filter_design.hardware.projector @ beside.step(np.concatenate([y, last]))
+            if starts[number] <= k < starts[number + 1]:
+                assert commands[k] == pytest.approx(expected, rel=0, abs=1e-9 * scale)
+                begun.append(np.max(np.abs(cold.step(y) - commands[k])))
+        if number:  # one that began here, from zero, would be far off
+            assert max(begun[:20]) > 0.02 * scale
+
+
+def test_a_line_that_moves_is_followed_and_a_fixed_filter_does_not():
+    plant = axis(18)
+    drift = lbt.models.DriftingVibration(
+        start_hz=18, end_hz=22, duration_s=8, rms_nm=300, direction=(1,)
+    )
+    truth = lbt.Truth(turbulence=AIR, vibrations=(drift,), noise_nm=15.5)
+    tracker = lbt.identification.TrackingController(plant, window_s=2, update_s=0.5)
+
+    def left(controller):
+        settings = {"hardware": plant.hardware, "frames": 7200, "settle_frames": 1600, "seed": 2}
+        return lbt.simulate(controller, truth, **settings).residual_nm[0, :, 0]
+
+    followed = left(tracker)
+    assert all(update.reason == "" for update in tracker.history)
+    for update in tracker.history:
+        true = drift.frequency_hz_at(update.time_s - 2 - 1)  # of the middle of the window
+        assert min(abs(hz - true) for hz in update.frequencies_hz) < 0.3
+    again = left(tracker)
+    assert np.array_equal(again, followed)  # the same again after a reset
+    last = slice(5600, None)
+    fixed, knowing = (left(lbt.kalman(p).controller) for p in (plant, axis(22)))
+    rms = [np.sqrt(np.mean(series[last] ** 2)) for series in (followed, fixed, knowing)]
+    assert rms[0] < 1.1 * rms[2]
+    assert rms[0] < 0.7 * rms[1]
+    assert np.max(np.abs(followed)) < 2 * np.max(np.abs(fixed))  # nor is there a bump
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lbt.errors.CertificateError("not today"), "CertificateError: not today"),
+        (np.linalg.LinAlgError("no inverse today"), "LinAlgError: no inverse today"),
+        (axis(20, sensor_gain=0.1), "the loop must be stable with the new filter"),
+        (lbt.LoopHardware(frame_rate_hz=800, modes=1), "only filters of a TipTiltPlant"),
+    ],
+)
+def test_a_filter_that_fails_never_runs(wrong, words):
+    plant, calls = axis(18), []
+
+    def design(problem):
+        calls.append(problem)
+        if len(calls) == 1:
+            return lbt.kalman(problem)
+        if isinstance(wrong, Exception):
+            raise wrong
+        if isinstance(wrong, lbt.LoopHardware):
+            return lbt.integrator(wrong, gain=0.3)
+        return lbt.kalman(wrong)
+
+    tracker = lbt.identification.TrackingController(
+        plant, window_s=0.75, update_s=0.25, design=design
+    )
+    total, noise = disturbed(plant, frames=1200)
+    found = run(tracker, plant, (total, noise))
+    own = run(lbt.kalman(plant).controller.start(), plant, (total, noise))
+    assert np.allclose(found, own, rtol=0, atol=1e-10 * np.max(np.abs(own)))
+    assert len(tracker.history) == 4
+    for update in tracker.history:
+        assert words in update.reason
+        assert update.frequencies_hz == (18.0,)
+        assert update.rms_nm == (300.0,)
+        assert update.noise_nm == (pytest.approx(15.5),)
+
+
+def test_measurements_that_are_not_numbers_hold_the_command_and_spoil_a_window():
+    plant = axis(20)
+    tracker = lbt.identification.TrackingController(plant, window_s=1.0, update_s=0.5)
+    total, noise = disturbed(plant, frames=2400)
+    clean = run(tracker, plant, (total, noise))
+    noise[0, [500, 501, 700], 0] = [np.nan, np.inf, -np.inf]
+    out = run(tracker, plant, (total, noise))
+    assert out[500, 1] == out[501, 1] == out[499, 1]
+    assert out[700, 1] == out[699, 1]
+    assert np.array_equal(out[:500], clean[:500])
+    assert [update.reason for update in tracker.history] == [""] * 5
+    noise[0, 1300:1320] = np.nan
+    run(tracker, plant, (total, noise))
+    reasons = [update.reason for update in tracker.history]
+    assert [bool(reason) for reason in reasons] == [False, False, True, True, False]
+    assert "got 2.5 %" in reasons[2]
+
+
+def test_a_new_line_on_the_other_axis_is_found():
+    plant = two_axes()
+    truth = with_vibrations(
+        plant, [*plant.vibrations, replace(line(41, damping=0.01), direction=(0, 1))]
+    )
+    tracker = lbt.identification.TrackingController(plant, window_s=4.0, update_s=4.0)
+    shaken = lbt.Truth(turbulence=AIR, vibrations=truth.vibrations, noise_nm=15.5)
+    lbt.simulate(tracker, shaken, hardware=plant.hardware, frames=3200, settle_frames=0, seed=3)
+    (update,) = tracker.history
+    assert min(abs(hz - 41) for hz in update.frequencies_hz) < 0.5
+
+
+def test_what_cannot_be_tracked_is_refused():
+    plant = axis(20)
+    tracked = lbt.identification.TrackingController
+    for options, words in (
+        ({"window_s": 0.5}, "window_s must be at least 0.64"),
+        ({"update_s": 0}, "update_s must be at least"),
+        ({"design": lambda p: lbt.integrator(p.hardware, gain=0.3)}, "only filters of"),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            tracked(plant, **options)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+        tracked(plant.hardware)
+    coupled = axis(20, sensor_matrix=[[1.0], [0.5]])
+    with pytest.raises(lbt.errors.ProblemError, match="each measurement must be of one axis"):
+        tracked(coupled)
+    tracker = tracked(plant)
+    with pytest.raises(lbt.errors.DimensionError, match=r"y must have shape \(1,\)"):
+        tracker.step([0.0, 0.0])
+    for wrong, words in (
+        (["a"], "y must be an array of numbers; got list"),
+        ([1j], "y must be real; got complex numbers"),
+        ([[1.0], [1.0, 2.0]], "y must be a rectangular array"),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            tracker.step(wrong)
+    assert np.array_equal(tracker.step([0]), [0.0])  # nothing was taken in
