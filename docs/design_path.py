@@ -13,7 +13,7 @@ STEPS = (
     ("plant", "turbulence, vibrations,\nsensor, delay, mirror", "models"),
     ("gain", "Riccati, LMI or SDP", "linear"),
     ("certificate", "by other means\nthan the solver", "design"),
-    ("gain file", "FITS, NPZ, JSON", "files"),
+    ("gain file", "FITS, NPZ", "files"),
     ("loop", "residual, margins,\nStrehl in the truth", "loop"),
 )
 WIDTH, HEIGHT, GAP = 1.75, 1.15, 0.45

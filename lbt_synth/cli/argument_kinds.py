@@ -6,7 +6,7 @@ from argparse import Action, ArgumentError, ArgumentParser, Namespace, _ActionsC
 from collections.abc import Sequence
 from typing import Any
 
-GAIN_FILE = "gain file (.fits, .npz or .json)"
+GAIN_FILE = "gain file (.fits or .npz)"
 FIGURE = "figure (.png, .pdf or .svg)"
 
 

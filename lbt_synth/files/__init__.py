@@ -1,6 +1,6 @@
 """Gain files and telemetry files.
 
-Gain files are FITS, NPZ or JSON, and SPECULA loads the FITS ones as they are.
+Gain files are FITS or NPZ, and SPECULA loads the FITS ones as they are.
 Telemetry is read and written in our own layout and in the AOT standard.
 What is loaded has been checked, and what is written is written whole.
 """

@@ -14,11 +14,8 @@ from lbt_synth.storage.array_file import digest, error_reason
 from lbt_synth.validation import FloatArray
 
 
-def unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object; refuse a name that stands twice, as readers differ in which they take.
-
-    For ``json.loads(text, object_pairs_hook=unique_names)``.
-    """
+def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object; refuse a name that stands twice."""
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError("a name stands twice in one object of its JSON")
@@ -45,7 +42,7 @@ class FileKind:
         """Return the arrays and the metadata, of a layout that is known and with their digest."""
         try:
             arrays, text = read(content)
-            meta = json.loads(text, object_pairs_hook=unique_names)
+            meta = json.loads(text, object_pairs_hook=_unique_names)
             found = digest(arrays, meta) if isinstance(meta, dict) else ""
         except Exception as error:  # foreign bytes: the decoders raise whatever they like
             why = f"{source} is no {self.name}, or it is damaged: {error_reason(error)}."

@@ -45,7 +45,7 @@ def test_a_page_of_text(capsys, night):
 
 
 def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
-    gain = lbt.save_gain(tmp_path / "mine.json", given_design())
+    gain = lbt.save_gain(tmp_path / "mine.npz", given_design())
     page = tmp_path / "page.html"
     status, text, error = run(capsys, "diagnose", night, gain, *FACTS, "-o", page, "--json")
     assert (status, error) == (0, "")

@@ -55,7 +55,7 @@ def test_show_says_what_is_only_the_files_word(tmp_path, capsys):
     config = lbt.load_config(LBT_YAML)
     bare = lbt.integrator(config.hardware, gain=0.4)
     for design, more in ((bare, ""), (config.design("integrator", gain=0.4), "; configuration")):
-        path = lbt.save_gain(tmp_path / "i.json", design)
+        path = lbt.save_gain(tmp_path / "i.npz", design)
         status, text, _ = run(capsys, "show", path)
         assert status == 0
         assert f"not proved, the file's word: route and status of the solver{more}" in text

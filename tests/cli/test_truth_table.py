@@ -53,7 +53,7 @@ def test_design_and_show_give_the_residual_in_the_truth(tmp_path, capsys, config
 def test_the_wavelength_is_that_of_the_file(tmp_path, capsys):
     path = tmp_path / "k_band.yaml"
     path.write_text(LBT_YAML.read_text().replace("wavelength_um: 2.2", "wavelength_um: 1.65"))
-    gain = tmp_path / "g.json"
+    gain = tmp_path / "g.npz"
     status, text, _ = run(capsys, "design", path, "--method", "integrator", "-o", gain)
     assert (status, "In the truth of k_band.yaml; Strehl ratio at 1.65 um" in text) == (0, True)
     assert "at 1.65 um" in run(capsys, "show", gain)[1]

@@ -229,7 +229,7 @@ def test_the_demand_is_kept_and_checked(tmp_path, plant):
     design = lbt.mixed(plant, rms=140.0, taps=4)
     assert design.rms_requested == 140.0
     assert design.gamma_requested is None
-    loaded = lbt.load_gain(lbt.save_gain(tmp_path / "m.json", design))
+    loaded = lbt.load_gain(lbt.save_gain(tmp_path / "m.npz", design))
     assert loaded.rms_requested == 140.0
     assert loaded.recertify().passed
     forged = dataclasses.replace(loaded, rms_requested=139.0)

@@ -13,7 +13,6 @@ from lbt_synth.storage.input_files import read_bytes, read_json
 READERS = {
     ".fits": [lbt.load_gain, lbt.files.load_telemetry, lbt.load_record],
     ".npz": [lbt.load_gain, lbt.files.load_telemetry, lbt.load_record],
-    ".json": [lbt.load_gain],
     ".csv": [lbt.load_record],
     ".yaml": [lbt.load_config, lbt.studies.load_study],
 }

@@ -167,7 +167,7 @@ def formats(folder: Path) -> list[Format]:
 
     hardware = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     designs = [lbt.integrator(hardware, gain=gain) for gain in (0.4, 0.5)]
-    for ending in (".fits", ".npz", ".json"):
+    for ending in (".fits", ".npz"):
         seeds = _contents(folder, ending, lbt.save_gain, *designs)
         add(f"gain file {ending}", ending, seeds, lbt.load_gain, covered=True)
     nights = [full(random=0), full(random=1, frames=8)]

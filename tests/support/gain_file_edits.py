@@ -24,7 +24,7 @@ from lbt_synth.models.fusion.plant import fused_plant
 from lbt_synth.models.fusion.sensors import Accelerometer, Motion, SensorSuite, WavefrontSensor
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes
 
-ENDINGS = ("fits", "npz", "json")
+ENDINGS = ("fits", "npz")
 COMMANDS = ("verify", "show", "simulate", "export")
 # What a design does not depend on: words, what its solver said, values of checks (rounding).
 NOTES = ("solver", "assumptions", "library_version", "bound_programme", "long_objective_nm")
@@ -139,13 +139,6 @@ class GainFile:
     def write(self, path):
         """Write the file; what its format cannot hold raises an exception."""
         arrays, meta = self.parts["arrays"], self.parts["meta"]
-        if self.ending == "json":
-            lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arrays.items()}
-            with contextlib.suppress(Exception):  # what has no digest is refused without one
-                numbers = {k: np.array(v, dtype=np.float64) for k, v in lists.items()}
-                meta["digest"] = digest(numbers, meta)
-            path.write_text(json.dumps({"meta": meta, "arrays": lists}))
-            return path
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             meta["digest"] = digest(arrays, meta)
@@ -288,7 +281,7 @@ def facts_of_original(name):
     from pathlib import Path
 
     with tempfile.TemporaryDirectory() as folder:
-        path = lbt.save_gain(Path(folder) / "g.json", original(name))
+        path = lbt.save_gain(Path(folder) / "g.npz", original(name))
         return facts(run_quietly(command("show", path))[1])
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 
-ENDINGS = ("fits", "npz", "json")
+ENDINGS = ("fits", "npz")
 
 
 def every_design():
@@ -22,3 +26,15 @@ def every_design():
 
 
 DESIGNS = every_design()
+
+
+def edited_file(path, design, change, *, digest_again=True):
+    """The NPZ gain file of a design after a change of its ``arrays`` (as lists) and ``meta``."""
+    arrays, text = read_npz(lbt.save_gain(path, design).read_bytes())
+    document = {"arrays": {k: v.tolist() for k, v in arrays.items()}, "meta": json.loads(text)}
+    change(document)
+    arrays = {k: np.array(v, dtype=float) for k, v in document["arrays"].items()}
+    if digest_again:
+        document["meta"]["digest"] = digest(arrays, document["meta"])
+    path.write_bytes(npz_bytes(arrays, json.dumps(document["meta"])))
+    return path

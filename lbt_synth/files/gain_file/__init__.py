@@ -1,1 +1,1 @@
-"""Gain files: FITS (loaded as it is by SPECULA's state-space filter), NPZ and JSON."""
+"""Gain files: FITS (loaded as it is by SPECULA's state-space filter) and NPZ."""

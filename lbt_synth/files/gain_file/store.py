@@ -1,10 +1,9 @@
-"""Gain files: a design as named arrays and metadata, saved as FITS, NPZ or JSON, and loaded."""
+"""Gain files: a design as named arrays and metadata, saved as FITS or NPZ, and loaded."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import lbt_synth
 from lbt_synth.design import Design, EstimatorDesign
 from lbt_synth.design.record import DesignRecord, Meta, record_common
 from lbt_synth.errors import CertificateError, GainFileError, OutputError, SchemaVersionError
-from lbt_synth.files.file_checks import FileKind, unique_names
+from lbt_synth.files.file_checks import FileKind
 from lbt_synth.files.gain_file.agreement import require_agreement, require_certificate, require_same
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.storage.array_file import (
@@ -28,7 +27,7 @@ from lbt_synth.storage.array_file import (
 )
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import FloatArray, float_array, frozen_copy, real_array, text
+from lbt_synth.validation import frozen_copy, real_array, text
 
 SCHEMA = "lbt_synth gain file"
 SCHEMA_VERSION = 1
@@ -63,22 +62,7 @@ def write_cards(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
     return cards
 
 
-def write_json(arrays: Mapping[str, FloatArray], words: str) -> bytes:
-    """Write one JSON object; numbers keep all their digits."""
-    document = {"meta": json.loads(words), "arrays": {k: v.tolist() for k, v in arrays.items()}}
-    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-
-
-def read_json(content: bytes) -> tuple[dict[str, FloatArray], str]:
-    """Read the arrays and the text of :func:`write_json`; other bytes raise some exception."""
-    document = json.loads(content.decode(), object_pairs_hook=unique_names)
-    if not isinstance(document, dict):
-        raise ValueError("the JSON is not an object")  # noqa: TRY004 - one kind of refusal
-    arrays = {k: float_array(v, k) for k, v in document["arrays"].items()}
-    return arrays, json.dumps(document["meta"])
-
-
-_READERS = {".fits": read_fits, ".npz": read_npz, ".json": read_json}
+_READERS = {".fits": read_fits, ".npz": read_npz}
 _KIND = FileKind(
     name="gain file",
     schema=SCHEMA,
@@ -103,7 +87,7 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     Parameters
     ----------
     path : path-like
-        File to write; the ending chooses the format: ``.fits``, ``.npz`` or ``.json``.
+        File to write; the ending chooses the format: ``.fits`` or ``.npz``.
     design : Design
         The design.
 
@@ -115,7 +99,7 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     Raises
     ------
     OutputError
-        If the ending is none of these, or the file cannot be written.
+        If the ending is neither, or the file cannot be written.
 
     Examples
     --------
@@ -136,12 +120,12 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
         raise OutputError(f"the design contradicts itself: {error}", path=target) from error
     arrays, meta = record.arrays, record.meta
     meta["digest"] = digest(arrays, meta)
-    words, ending = json.dumps(meta, allow_nan=False), target.suffix.lower()
-    if ending == ".fits":
+    words = json.dumps(meta, allow_nan=False)
+    if target.suffix.lower() == ".fits":
         # A, B, C and D come first, as SPECULA's SsrFilterData loads them
         content = fits_bytes(write_cards(design, meta), arrays, words)
     else:
-        content = npz_bytes(arrays, words) if ending == ".npz" else write_json(arrays, words)
+        content = npz_bytes(arrays, words)
     return write_atomically(target, content)
 
 

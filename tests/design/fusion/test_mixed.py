@@ -31,7 +31,7 @@ def test_a_bound_below_the_least(fused_config):
 
 def test_a_configuration_and_its_gain_file(fused_config, tmp_path):
     design = fused_config.design("mixed", gamma_ratio=1.05)
-    again = lbt.load_gain(lbt.save_gain(tmp_path / "mixed.json", design))
+    again = lbt.load_gain(lbt.save_gain(tmp_path / "mixed.npz", design))
     assert (again.method, again.gamma_central) == ("fused mixed", design.gamma_central)
     with pytest.raises(ProblemError, match="rms must be left out with several sensors"):
         fused_config.design("mixed", rms=50.0)

@@ -31,7 +31,7 @@ def refused_commands(name, ending, folder, commands):
 
 
 def test_a_sample_of_edits(tmp_path):
-    for name, ending in zip(QUICK, ENDINGS, strict=True):
+    for name, ending in zip(QUICK, (*ENDINGS, "npz"), strict=True):
         assert not refused_commands(name, ending, tmp_path, ("verify",))
     verdicts = [judge(edit, tmp_path, ("verify",)) for edit in random_edits(40, 1, QUICK)]
     assert set(verdicts) <= set(HARMLESS), verdicts
@@ -66,10 +66,10 @@ def test_no_edit_is_taken_for_a_certified_design(tmp_path, capsys):
 def test_another_claim_that_holds_has_another_digest(tmp_path):
     """The band's worst frequency is at its other end: from 9.09 Hz on it promises no less."""
     place = ("meta", "shaped", "specifications", 0, "objective", "terms", 1, "low_hz")
-    edit = Edit("shaped", "json", place, "times 1.01", 9.09)
+    edit = Edit("shaped", "npz", place, "times 1.01", 9.09)
     assert judge(edit, tmp_path, ("verify",)) == "another claim that holds"
-    contents = (saved("shaped", "json"), saved("shaped", "json").changed(edit))
-    digests = [load_with_digest(each.write(tmp_path / "g.json"))[1] for each in contents]
+    contents = (saved("shaped", "npz"), saved("shaped", "npz").changed(edit))
+    digests = [load_with_digest(each.write(tmp_path / "g.npz"))[1] for each in contents]
     assert digests[0] != digests[1]
     wider = replace(edit, place=(*place[:-1], "high_hz"), value=12.0)  # it leaves more there
     assert judge(wider, tmp_path, ("verify",)) == "refused"
@@ -77,6 +77,6 @@ def test_another_claim_that_holds_has_another_digest(tmp_path):
 
 def test_a_demand_that_is_there_twice_is_refused(tmp_path):
     place = ("meta", "shaped", "specifications", 0, "demands")
-    demands = saved("shaped", "json").parts["meta"]["shaped"]["specifications"][0]["demands"]
-    edit = Edit("shaped", "json", place, "longer", [*demands, *demands])
+    demands = saved("shaped", "npz").parts["meta"]["shaped"]["specifications"][0]["demands"]
+    edit = Edit("shaped", "npz", place, "longer", [*demands, *demands])
     assert judge(edit, tmp_path, ("verify",)) == "refused"
