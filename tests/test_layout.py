@@ -12,7 +12,6 @@ WITHOUT_A_ROOM = {
     "test_documentation.py",
     "test_layout.py",
     "test_no_skips.py",
-    "test_old_files.py",
     "test_public.py",
     "test_size.py",
     "test_validation.py",

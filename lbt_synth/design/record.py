@@ -55,7 +55,7 @@ class DesignRecord:
 
     def common(self) -> dict[str, Any]:
         """Return what every design has, as arguments of its class; it is not certified yet."""
-        solver, assumptions = self.meta["solver"], self.meta.get("assumptions", [])
+        solver = self.meta["solver"]
         return {
             "method": self.meta["method"],
             "certificate": UNCERTIFIED,
@@ -65,9 +65,9 @@ class DesignRecord:
                 iterations=integer(solver["iterations"], "iterations", at_least=0),
             ),
             "assumptions": tuple(
-                text(a, "assumptions") for a in sequence(assumptions, "assumptions")
+                text(a, "assumptions") for a in sequence(self.meta["assumptions"], "assumptions")
             ),
-            "configuration": text(self.meta.get("configuration", ""), "configuration"),
+            "configuration": text(self.meta["configuration"], "configuration"),
         }
 
     def hardware(self) -> LoopHardware:
@@ -131,11 +131,9 @@ def record_common(design: Design) -> DesignRecord:
         "solver": asdict(design.solver),
         "certificate": _pack_certificate(design.certificate),
         "units": {"commands": "1", "measurements": "1", "phase": "1"},
+        "assumptions": list(design.assumptions),
+        "configuration": design.configuration,
     }
-    if design.assumptions:
-        meta["assumptions"] = list(design.assumptions)
-    if design.configuration:
-        meta["configuration"] = design.configuration
     record = DesignRecord(arrays, meta)
     return record if design.hardware is None else record | record_hardware(design.hardware)
 

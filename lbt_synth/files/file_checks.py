@@ -31,7 +31,7 @@ class FileKind:
     version: int  # of the layout
     error: type[FileError]
     version_error: type[FileError]
-    advice: str = ""  # what to do about a damaged file
+    again: str  # how such a file is made: a sentence
 
     def decode(
         self,
@@ -46,19 +46,19 @@ class FileKind:
             found = digest(arrays, meta) if isinstance(meta, dict) else ""
         except Exception as error:  # foreign bytes: the decoders raise whatever they like
             why = f"{source} is no {self.name}, or it is damaged: {error_reason(error)}."
-            raise self.error(why + self.advice, path=source) from error
+            raise self.error(f"{why} {self.again}", path=source) from error
         if not isinstance(meta, dict) or meta.get("schema") != self.schema:
             raise self.error(f"{source} is not a {self.name} of lbt_synth.", path=source)
         version = meta.get("schema_version")
         if version != self.version:
             raise self.version_error(
-                f"{source} has layout version {version!r}; this lbt_synth reads {self.version}. "
-                "Read it with the version that wrote it.",
+                f"{source} has layout version {version!r}, of lbt_synth "
+                f"{meta.get('library_version')}; this version reads {self.version}. {self.again}",
                 path=source,
             )
         if meta.get("digest") != found:
             raise self.error(
-                f"{source} is damaged: its content does not match its digest.{self.advice}",
+                f"{source} is damaged: its content does not match its digest. {self.again}",
                 path=source,
             )
         return arrays, meta
@@ -81,5 +81,5 @@ class FileKind:
             MemoryError,
         ) as error:
             raise self.error(
-                f"{source} is inconsistent: {error_reason(error)}.{self.advice}", path=source
+                f"{source} is inconsistent: {error_reason(error)}. {self.again}", path=source
             ) from error

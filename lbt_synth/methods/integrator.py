@@ -72,9 +72,8 @@ def _build(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign
 def _pack(design: IntegratorDesign) -> DesignRecord:
     from lbt_synth.design.record import DesignRecord
 
-    changes = design.law.changes()
     return DesignRecord(
-        meta={"integrator_gain": design.gain} | ({"integrator_law": changes} if changes else {})
+        meta={"integrator_gain": design.gain, "integrator_law": design.law.changes()}
     )
 
 
@@ -85,7 +84,7 @@ def _unpack(record: DesignRecord) -> IntegratorDesign:
         **record.common(),
         loop_hardware=record.hardware(),
         gain=number(record.meta["integrator_gain"], "integrator_gain", above=0),
-        law=_law(record.meta.get("integrator_law", {})),
+        law=_law(record.meta["integrator_law"]),
     )
 
 

@@ -127,8 +127,6 @@ def test_a_gain_file_keeps_the_law_and_its_claim(tmp_path):
     bold = dataclasses.replace(design, law=dataclasses.replace(law, modulus_margin=0.6))
     with pytest.raises(lbt.errors.GainFileError, match="modulus margin demanded over achieved"):
         lbt.load_gain(lbt.save_gain(tmp_path / "bold.npz", bold))
-    pure = lbt.save_gain(tmp_path / "pure.npz", lbt.integrator(PATH, gain=0.3))
-    assert b"integrator_law" not in pure.read_bytes()  # as files of earlier versions
 
 
 def test_a_configuration_gives_the_law_of_its_baseline(tmp_path):

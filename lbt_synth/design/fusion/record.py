@@ -61,7 +61,7 @@ def rebuild_fused(record: DesignRecord) -> FusedFilter:
     if len(stack) != len(missing):
         raise ValueError(f"FALLBACKS must be {len(missing)} filters; got {len(stack)}")
     claims: dict[str, Any] = {
-        k: number(meta[k], k, above=0) for k in _CLAIMS if meta.get(k) is not None
+        k: number(meta[k], k, above=0) for k in _CLAIMS if meta[k] is not None
     }
     if meta["method"] != fused_name(claims):
         raise ValueError("the method must be that of its bound, or of none")

@@ -6,43 +6,16 @@ there for other readers. Nothing of it is believed: it is computed again, and co
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.design.record import DesignRecord
-from lbt_synth.design.result import ORIGIN
 from lbt_synth.validation import agree, number
 
 _ARRAYS = 1e-9  # relative, of an entry; and a thousandth of that, of the largest
 _NUMBERS = 1e-6  # relative
-_LATER = frozenset({"mean_delay_frames", "gamma_infeasible", "rms_requested"})  # than 0.1
-_LATER_CHECKS = {  # than 0.2
-    "predictor gain against the filter gain",
-    ORIGIN,
-    "least norm of any filter, error",
-    "level proved over the infeasible level, less 1",
-    "objective claimed over the one found, less 1",
-    "norm of the estimation error over its bound, less 1",
-    "standard deviation of the estimation error over its bound, less 1",
-    "bound recomputed over the one stated, less 1",
-    "objective found over the one claimed, less 1",
-    "rms of the command stroke over its bound",
-    "rms of the command step over its bound",
-}
-_RETIRED_CHECKS = {  # since 0.2
-    "controller against its gains",
-    "controller against its parameters",
-    "controller, against the one made of the filter",
-    "norm of the estimation error",
-    "standard deviation of the estimation error",
-    "bound over the interval, recomputed",
-    "root of the objective, against the one claimed [nm]",
-    "command stroke [nm rms]",
-    "command step [nm rms]",
-}
 
 
 def require_agreement(found: DesignRecord, expected: DesignRecord) -> None:
@@ -62,7 +35,7 @@ def require_agreement(found: DesignRecord, expected: DesignRecord) -> None:
                 "largest entry"
             )
     for key, value in expected.meta.items():
-        if key != "certificate" and (key in found.meta or key not in _LATER):
+        if key != "certificate":
             require_same(found.meta[key], value, key)
 
 
@@ -74,11 +47,11 @@ def require_certificate(found: Mapping[str, Any], expected: Mapping[str, Any]) -
     for key in ("gamma", "rms_per_output"):
         require_same(found[key], expected[key], f"certificate.{key}")
     checks, own = ({c["name"]: c for c in cert["checks"]} for cert in (found, expected))
-    if lost := _kinds(checks) - _kinds(own) - _RETIRED_CHECKS:
-        raise ValueError(f"the design does not claim what was checked: {min(lost)}")
-    if more := _kinds(own) - _kinds(checks) - _LATER_CHECKS:
-        raise ValueError(f"the certificate lacks a check of the design: {min(more)}")
-    for name in checks.keys() & own.keys():
+    if unclaimed := checks.keys() - own.keys():
+        raise ValueError(f"the design does not claim what was checked: {min(unclaimed)}")
+    if missing := own.keys() - checks.keys():
+        raise ValueError(f"the certificate lacks a check of the design: {min(missing)}")
+    for name in checks:
         require_same(checks[name]["limit"], own[name]["limit"], f"the limit of '{name}'")
         number(checks[name]["value"], f"the value of '{name}'")
 
@@ -89,10 +62,9 @@ def require_same(found: Any, expected: Any, name: str) -> None:
         for key in expected.keys() | found.keys():
             if key not in expected:
                 raise ValueError(f"{name}.{key} is not known")
-            if key in found:
-                require_same(found[key], expected[key], f"{name}.{key}")
-            elif expected[key]:  # an older version may have no word for none
+            if key not in found:
                 raise ValueError(f"{name}.{key} is missing")
+            require_same(found[key], expected[key], f"{name}.{key}")
         return
     if isinstance(expected, list) and isinstance(found, list) and len(expected) == len(found):
         for i, (one, other) in enumerate(zip(found, expected, strict=True)):
@@ -106,11 +78,6 @@ def require_same(found: Any, expected: Any, name: str) -> None:
     )
     if not same:
         raise ValueError(f"{name} must be {_brief(expected)} for this design; got {_brief(found)}")
-
-
-def _kinds(names: Iterable[str]) -> set[str]:
-    """Names of checks without their modes; 0.2 listed equal modes once."""
-    return {re.sub(r"^mode \d+: ", "", name) for name in names}
 
 
 def _brief(value: Any) -> str:

@@ -30,7 +30,7 @@ from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import frozen_copy, real_array, text
 
 SCHEMA = "lbt_synth gain file"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 CONVENTION = (
     "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
     "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1), or the "
@@ -69,7 +69,7 @@ _KIND = FileKind(
     version=SCHEMA_VERSION,
     error=GainFileError,
     version_error=SchemaVersionError,
-    advice=" Write it again with lbt-synth design.",
+    again="Design it again with lbt-synth design CONFIG --method METHOD -o FILE.",
 )
 
 

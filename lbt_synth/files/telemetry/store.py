@@ -43,6 +43,7 @@ _KIND = FileKind(
     version=1,
     error=TelemetryError,
     version_error=TelemetryError,
+    again="Try another copy, or write it again with lbt.files.save_telemetry.",
 )
 
 

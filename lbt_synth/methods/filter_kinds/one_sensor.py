@@ -35,7 +35,7 @@ def _unpack(record: DesignRecord) -> FilterDesign:
     """Rebuild a filter."""
     problem, arrays = record.problem(), record.arrays
     rows_cols = (problem.A.shape[0], problem.C.shape[0])
-    said = {name: record.meta.get(name) for name in _CLAIMS}  # files of 0.1 have fewer
+    said = {name: record.meta[name] for name in _CLAIMS}
     claims: dict[str, Any] = {k: number(v, k, above=0) for k, v in said.items() if v is not None}
     for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
         if arrays[name].shape != rows_cols:

@@ -256,11 +256,17 @@ def test_an_edited_gain_does_not_match_its_digest(tmp_path):
         lbt.load_gain(edited(tmp_path, change, digest_again=False))
 
 
-def test_a_later_layout_is_refused_by_its_number(tmp_path):
-    with pytest.raises(
-        lbt.errors.SchemaVersionError, match="layout version 99; this lbt_synth reads 1"
-    ):
-        lbt.load_gain(edited(tmp_path, lambda d: d["meta"].update(schema_version=99)))
+@pytest.mark.parametrize("version", [1, 99])
+def test_another_layout_is_refused_with_the_way_to_make_the_file_again(tmp_path, version):
+    def change(document):
+        document["meta"].update(schema_version=version, library_version="0.2.0")
+
+    said = (
+        f"layout version {version}, of lbt_synth 0.2.0; this version reads 2. Design it again "
+        "with lbt-synth design CONFIG --method METHOD -o FILE."
+    )
+    with pytest.raises(lbt.errors.SchemaVersionError, match=said):
+        lbt.load_gain(edited(tmp_path, change))
 
 
 @pytest.mark.parametrize(

@@ -216,7 +216,11 @@ def edited(tmp_path, change, *, resign=True):
     ("change", "resign", "text"),
     [
         (lambda a, m: m.update(schema="recipes"), True, "is not a telemetry file of lbt_synth"),
-        (lambda a, m: m.update(schema_version=9), True, "layout version 9; this lbt_synth reads 1"),
+        (
+            lambda a, m: m.update(schema_version=9),
+            True,
+            "layout version 9, of lbt_synth .*; this version reads 1. Try another copy",
+        ),
         (lambda a, m: a["COMMANDS"].__setitem__(0, 3.0), False, "does not match its digest"),
         (lambda a, m: m.update(seed=8), False, "does not match its digest"),
         (lambda a, m: a.pop("COMMANDS"), True, "inconsistent: COMMANDS is missing"),
