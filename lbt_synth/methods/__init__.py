@@ -1,7 +1,6 @@
 """The methods of synthesis, one module each; nothing else knows their names.
 
-A module of this folder with a ``METHOD`` is a method. A package of its own adds one under the
-entry point ``lbt_synth.methods``, and a script by :func:`~lbt_synth.methods.register`.
+A module of this folder with a ``METHOD`` is a method.
 """
 
 import lazy_loader

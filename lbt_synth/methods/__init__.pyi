@@ -4,5 +4,3 @@ from .method import Method as Method
 from .method import RowTable as RowTable
 from .method import Section as Section
 from .registry import method_named as method_named
-from .registry import register as register
-from .registry import unregister as unregister

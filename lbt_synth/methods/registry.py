@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import pkgutil
 from functools import cache
-from importlib import import_module, metadata
+from importlib import import_module
 
 from lbt_synth import methods as folder
 from lbt_synth.errors import ProblemError
@@ -13,16 +13,13 @@ from lbt_synth.methods.method import Method
 
 
 @cache
-def _registered() -> dict[str, Method]:
-    found = {}
-    for module in pkgutil.iter_modules(folder.__path__):
-        method = getattr(import_module(f"{folder.__name__}.{module.name}"), "METHOD", None)
-        if method is not None:
-            found[method.name] = method
-    for entry in metadata.entry_points(group="lbt_synth.methods"):
-        method = entry.load()
-        found[method.name] = method
-    return found
+def _methods_of_folder() -> dict[str, Method]:
+    modules = [
+        import_module(f"{folder.__name__}.{module.name}")
+        for module in pkgutil.iter_modules(folder.__path__)
+    ]
+    methods = [module.METHOD for module in modules if hasattr(module, "METHOD")]
+    return {method.name: method for method in sorted(methods, key=lambda method: method.name)}
 
 
 def all_methods() -> dict[str, Method]:
@@ -39,58 +36,7 @@ def all_methods() -> dict[str, Method]:
     >>> ", ".join(all_methods())
     'hinf, integrator, kalman, lqg, mixed, robust'
     """
-    return dict(sorted(_registered().items()))
-
-
-def register(method: Method) -> Method:
-    """Add a method of synthesis, or replace the one of its name.
-
-    Parameters
-    ----------
-    method : Method
-        The method; command line, studies and gain files know it from now on.
-
-    Returns
-    -------
-    Method
-        The same.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods import method_named, register
-    >>> register(method_named("kalman")).label  # replaces itself
-    'Kalman'
-    """
-    _registered()[method.name] = method
-    return method
-
-
-def unregister(name: str) -> Method:
-    """Remove a method of synthesis.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-
-    Returns
-    -------
-    Method
-        The method that was removed.
-
-    Raises
-    ------
-    ProblemError
-        If there is no such method.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods import register, unregister
-    >>> register(unregister("mixed")).label
-    'mixed'
-    """
-    method_named(name)
-    return _registered().pop(name)
+    return dict(_methods_of_folder())
 
 
 def method_named(name: str) -> Method:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,7 +16,8 @@ from support.design_reports import SMALL
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
-from lbt_synth.methods import method_named, register, unregister
+from lbt_synth import methods
+from lbt_synth.methods import method_named, registry
 from lbt_synth.methods.registry import (
     all_methods,
     design_label,
@@ -30,15 +30,19 @@ BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "robust")
 
 
 @pytest.fixture
-def leaky():
-    register(leaky_method.METHOD)
-    yield leaky_method.METHOD
-    unregister("leaky")
+def leaky(tmp_path, monkeypatch):
+    """The method of a file that is put into the folder of methods."""
+    shutil.copy(leaky_method.__file__, tmp_path / "leaky.py")
+    monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(tmp_path)])
+    registry._methods_of_folder.cache_clear()
+    yield method_named("leaky")
+    registry._methods_of_folder.cache_clear()
+    del sys.modules["lbt_synth.methods.leaky"]
 
 
 def test_methods_by_name(leaky):
     assert tuple(name for name in all_methods() if name != "leaky") == BUILT_IN
-    assert method_named("leaky") is leaky
+    assert leaky.title == leaky_method.METHOD.title
     assert method_of_design("shaped") is method_named("robust")
     assert [m.name for m in reference_methods()] == ["integrator", "kalman", "hinf"]
     assert [m.name for m in reference_methods(estimators_only=True)] == ["kalman", "hinf"]
@@ -60,7 +64,7 @@ def config():
     return lbt.load_config(CONFIG)
 
 
-def test_every_command_takes_a_method_that_is_registered(leaky, tmp_path, capsys, monkeypatch):
+def test_every_command_takes_a_method_of_the_folder(leaky, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("small.yaml").write_text(SMALL)
     gain, small = "leaky.fits", "small.yaml"
@@ -106,7 +110,7 @@ parameters:
 """
 
 
-def test_a_study_takes_a_method_that_is_registered(leaky, tmp_path, capsys):
+def test_a_study_takes_a_method_of_the_folder(leaky, tmp_path, capsys):
     study = tmp_path / "study.yaml"
     study.write_text(STUDY.format(config=CONFIG, leak=5.0))
     status, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
@@ -118,22 +122,6 @@ def test_a_study_takes_a_method_that_is_registered(leaky, tmp_path, capsys):
     status, _, error = run(capsys, "study", study, "-o", tmp_path / "out2")
     assert status == 2
     assert "controllers.own.leak_per_s must be above 0; got -1." in error
-
-
-def test_a_package_adds_a_method_by_its_entry_point(tmp_path):
-    shutil.copy(leaky_method.__file__, tmp_path / "leaky_method.py")
-    facts = tmp_path / "leaky-1.0.dist-info"
-    facts.mkdir()
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: leaky\nVersion: 1.0\n")
-    (facts / "entry_points.txt").write_text("[lbt_synth.methods]\nleaky = leaky_method:METHOD\n")
-    code = (
-        f"import sys; sys.path[:0] = [{str(tmp_path)!r}]; "
-        "from lbt_synth.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", code, "design", CONFIG, "--method", "leaky"]
-    options = ["--leak-per-s", "5", "-o", str(tmp_path / "k.npz"), "--json"]
-    done = subprocess.run([*command, *options], capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout)["method"] == "leaky"
 
 
 def test_no_other_file_names_a_method():
