@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-from lbt_synth.cli.streams import discard, print_error, reopen_closed
+from lbt_synth.cli.streams import discard, print_error
 from lbt_synth.errors import LbtSynthError, SynthesisError
 from lbt_synth.storage.thread_limits import limit_threads
 
@@ -98,7 +98,8 @@ def _terminate(*_: object) -> None:
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
     gc.set_threshold(200_000, 50, 50)  # what imports and charts make stays until the end
-    reopen_closed()
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         try:
             with limit_threads():  # numpy is loaded by the commands

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import os
-import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.constructor import ConstructorError, SafeConstructor
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from lbt_synth.config.plant_and_truth import (
     build_atmosphere,
@@ -46,7 +41,6 @@ Checked = TypeVar("Checked", bound=BaseModel)
 _LARGEST_BYTES = 2**17  # of a file; ruamel.yaml may read no more than 30 kB per second
 _MOST_ERROR_HZ, _USUAL_ERROR = 3.5, 0.175  # of frequencies, unless the file says
 _ERROR_STEPS = [step / 7 for step in range(-7, 8)]
-_MOST_NODES, _DEEPEST, _MOST_DIGITS = 2**16, 40, 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -253,7 +247,7 @@ def read_mapping(source: Path) -> dict[str, Any]:
         where = f"{error.reason} at byte {error.start}"
         raise ConfigError(f"{source} is not UTF-8 text: {where}.") from error
     try:
-        raw = _load_yaml(text)
+        raw = YAML(typ="safe", pure=True).load(text)
     except Exception as error:  # the parsers of YAML raise whatever they like
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
@@ -263,47 +257,6 @@ def read_mapping(source: Path) -> dict[str, Any]:
         got = "nothing" if raw is None else f"a {type(raw).__name__}"
         raise ConfigError(f"{source} must hold sections, each with its keys; got {got}.")
     return raw
-
-
-class _Constructor(SafeConstructor):
-    """Makes values of YAML, and names those that are not of their type."""
-
-    def construct_non_recursive_object(self, node: Node, tag: str | None = None) -> Any:
-        """Return the value of a node; its constructor raises whatever it likes."""
-        try:
-            return super().construct_non_recursive_object(node, tag)
-        except YAMLError:
-            raise
-        except Exception as error:
-            kind, got = str(node.tag).rpartition(":")[2], reprlib.repr(node.value)
-            problem = f"expected a value of type {kind}; got {got}"
-            raise ConstructorError(None, None, problem, node.start_mark) from error
-
-
-def _load_yaml(text: str) -> Any:
-    """Return what a text holds; refuse one that is deep, or grows by its aliases."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.Constructor = _Constructor
-    node = yaml.compose(text)
-    if node is None:
-        return None
-    if _count_nodes(node, {}, _DEEPEST) > _MOST_NODES:
-        raise ValueError(f"its aliases and merges make more than {_MOST_NODES} values of it")
-    return yaml.constructor.construct_document(node)
-
-
-def _count_nodes(node: Node, known: dict[int, int], depth: int) -> int:
-    """Return how many values a node holds, those of its aliases counted each time."""
-    if depth == 0:
-        raise ValueError(f"it is nested deeper than {_DEEPEST} levels, or in itself")
-    if isinstance(node, ScalarNode):
-        if str(node.tag).endswith(":int") and len(node.value) > _MOST_DIGITS:
-            raise ValueError(f"an integer may have {_MOST_DIGITS} digits; got {len(node.value)}")
-        return 1
-    if id(node) not in known:
-        parts = node.value if isinstance(node, SequenceNode) else chain.from_iterable(node.value)
-        known[id(node)] = 1 + sum(_count_nodes(part, known, depth - 1) for part in parts)
-    return known[id(node)]
 
 
 def build_config(settings: FileSection, source: Path) -> Config:

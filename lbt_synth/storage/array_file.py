@@ -1,7 +1,7 @@
 """Arrays with a text of metadata in one file, FITS or NPZ, and a digest of both.
 
-Each ``read_*`` raises ``ValueError``, ``KeyError`` or ``OSError`` on bytes of another format;
-the caller turns that into an error of its own.
+What reads bytes of another format raises ``ValueError`` or ``KeyError``; the caller turns that into
+an error of its own.
 """
 
 from __future__ import annotations
@@ -9,21 +9,21 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, BinaryIO
 from zipfile import ZipFile
 
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.storage.fits_structure import CARD, check_fits
-from lbt_synth.storage.fits_writer import image_unit, primary_unit
 from lbt_synth.storage.input_files import LARGEST_BYTES
+from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 Cards = Mapping[str, tuple[Any, str]]
 TEXT = "META"
-LONGEST_HEADER = 2880 * 36  # that is looked through
+_CHECKSUM_NOTE = "of this unit"  # in place of the time, so that equal contents give equal files
 
 
 def digest(arrays: Mapping[str, npt.NDArray[Any]], meta: Mapping[str, Any]) -> str:
@@ -58,35 +58,89 @@ def fits_bytes(
     ...     units["A"].data.tolist()
     [[1.0, 2.0]]
     """
-    arrays = arrays if text is None else _with_text(arrays, text)
-    units = [
-        image_unit(name, np.asarray(array), (headers or {}).get(name, {}))
-        for name, array in arrays.items()
-    ]
-    return b"".join([primary_unit(cards, comments), *units])
+    from astropy.io import fits
+
+    primary = fits.PrimaryHDU()
+    primary.header.update(cards)
+    for line in comments:
+        primary.header.add_comment(line)
+    units = fits.HDUList([primary])
+    for name, array in (arrays if text is None else _with_text(arrays, text)).items():
+        units.append(fits.ImageHDU(np.array(array, order="C"), name=name))
+        units[-1].header.update((headers or {}).get(name, {}))
+    for unit in units:
+        unit.add_checksum(when=_CHECKSUM_NOTE)
+    buffer = io.BytesIO()
+    units.writeto(buffer, output_verify="exception")
+    return buffer.getvalue()
+
+
+@contextmanager
+def open_fits(content: bytes, **options: Any) -> Iterator[Any]:
+    """Open FITS content with astropy; content that is cut or belies a checksum raises ValueError.
+
+    Examples
+    --------
+    >>> from lbt_synth.storage.array_file import fits_bytes, open_fits
+    >>> content = fits_bytes({}, {"A": [1.0, 2.0]})
+    >>> with open_fits(content[:-1] + b"!"):
+    ...     pass
+    Traceback (most recent call last):
+        ...
+    ValueError: the checksum of its HDU 1 is wrong
+    """
+    from astropy.io import fits
+
+    if not content.startswith(b"SIMPLE  ="):  # astropy would unpack other formats
+        raise ValueError("it does not begin as FITS files do")
+    with ignore_warnings():  # foreign headers deviate in many small ways
+        try:
+            units = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, **options)
+            sums = [_is_whole(unit, content) for unit in units]
+            rest = units[-1].fileinfo()
+        except Exception as error:  # astropy raises many kinds on damaged files
+            raise ValueError("its FITS structure is broken") from error
+        if not all(sums):
+            raise ValueError(f"the checksum of its HDU {sums.index(False)} is wrong")
+        if content[rest["datLoc"] + rest["datSpan"] :].strip(b"\0 "):
+            raise ValueError(f"what follows its HDU {len(units) - 1} is no FITS")
+        with units:
+            yield units
+
+
+def _is_whole(unit: Any, content: bytes) -> bool:
+    """Whether an HDU is within the content, and has the checksums of its header."""
+    place = unit.fileinfo()
+    if place["datLoc"] + place["datSpan"] > len(content):
+        raise ValueError("it is truncated")
+    return "DATASUM" not in unit.header or bool(unit.verify_datasum() and unit.verify_checksum())
+
+
+def check_fits(content: bytes) -> None:
+    """Refuse FITS content as :func:`open_fits` does."""
+    with open_fits(content):
+        pass
 
 
 def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
     """Read the arrays and the text of :func:`fits_bytes`."""
-    from astropy.io import fits
-
-    check_fits(content)
-    try:
-        with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False) as units:
-            pairs = [(unit.name, np.array(unit.data)) for unit in units[1:]]
-    except Exception as error:  # astropy raises many kinds on damaged files
-        raise ValueError("its FITS structure is broken") from error
+    with open_fits(content) as units:
+        pairs = [(unit.name, np.array(unit.data)) for unit in units[1:]]
     if len(dict(pairs)) != len(pairs):  # readers differ in which of two they take
         raise ValueError("two of its HDUs have one name")
     return _split_text(dict(pairs))
 
 
-def read_cards(content: bytes, names: Iterable[str]) -> dict[str, Any]:
+def read_cards(stream: BinaryIO, names: Iterable[str]) -> dict[str, Any]:
     """Read cards of the primary header of a FITS file, those that are there."""
     from astropy.io import fits
 
-    header = fits.Header.fromfile(io.BytesIO(content))
-    return {name: header[name] for name in names if name in header}
+    with ignore_warnings():
+        try:
+            header = fits.Header.fromfile(stream)
+            return {name: header[name] for name in names if name in header}
+        except Exception as error:  # astropy raises many kinds on damaged files
+            raise ValueError("its FITS header is broken") from error
 
 
 def npz_bytes(arrays: Mapping[str, npt.NDArray[Any]], text: str) -> bytes:
@@ -141,18 +195,6 @@ def _split_text(data: dict[str, npt.NDArray[Any]]) -> tuple[dict[str, FloatArray
         if array.dtype.kind not in "fiub":
             raise ValueError(f"{name} holds no real numbers")
     return {name: array.astype(np.float64) for name, array in data.items()}, text
-
-
-def has_card(content: bytes, keyword: str) -> bool:
-    """Whether the first header of a FITS file has a card of that keyword."""
-    mark = keyword.ljust(8).encode() + b"="
-    for start in range(0, min(len(content), LONGEST_HEADER), CARD):
-        card = content[start : start + CARD]
-        if card.startswith(mark):
-            return True
-        if card.startswith(b"END "):
-            return False
-    return False
 
 
 def error_reason(error: Exception) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import hashlib
 import os
+import secrets
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,11 +12,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from lbt_synth.errors import FileError, OutputError
-from lbt_synth.storage.file_locks import CAN_LOCK, lock_file
-from lbt_synth.storage.input_files import error_text, open_regular
+from lbt_synth.storage.input_files import error_text
 
-_UNFINISHED = ".lbt_synth.{}.{}.tmp"  # beside a target: digest of its name, and a number
-_MOST_UNFINISHED = 100  # of one target, by as many processes at once
+try:
+    import fcntl
+except ImportError:  # on Windows a second process goes unnoticed
+    fcntl = None  # type: ignore[assignment]
+
+UNFINISHED = ".lbt_synth.*.tmp"  # beside what is being written
 
 
 def require_ending(
@@ -63,8 +65,8 @@ def require_writable(
         target = Path(path)
         if not os.path.isdir(target.parent):  # noqa: PTH112 - False for a name that is too long
             raise OutputError(f"cannot write {target}: no directory {target.parent}.", path=target)
-        _mode_of(target)
         try:
+            _require_file(target)
             with tempfile.TemporaryFile(dir=target.parent):
                 pass
         except (OSError, ValueError) as error:
@@ -98,22 +100,16 @@ def refuse_replacing(
                 )
 
 
-def _mode_of(target: Path) -> int | None:
-    """Return the permissions of a file that would be replaced, None if there is none."""
+def _require_file(target: Path) -> None:
+    """Refuse to replace what is no regular file."""
     try:
-        found = target.lstat()
+        mode = target.lstat().st_mode
     except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        raise _output_error(target, error) from error
-    if stat.S_ISREG(found.st_mode):
-        return stat.S_IMODE(found.st_mode)
-    kind = "a device or a pipe"
-    if stat.S_ISDIR(found.st_mode):
-        kind = "a directory"
-    elif stat.S_ISLNK(found.st_mode):
-        kind = f"a link to {target.readlink()}"
-    raise OutputError(f"{target} is {kind}; expected the name of a file.", path=target)
+        return
+    if not stat.S_ISREG(mode):
+        kinds = {stat.S_IFDIR: "a directory", stat.S_IFLNK: "a link"}
+        kind = kinds.get(stat.S_IFMT(mode), "a device or a pipe")
+        raise OutputError(f"{target} is {kind}; expected the name of a file.", path=target)
 
 
 def _is_same(one: Path, other: Path) -> bool:
@@ -138,9 +134,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
 
 
 def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Path, ...]:
-    """Write files that belong together: all of them, or none.
-
-    Every file is written in full under a temporary name before the first is renamed.
+    """Write files that belong together: each is on the disk before the first gets its name.
 
     Examples
     --------
@@ -151,102 +145,12 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
     ...     [p.name for p in write_together({at / "a.c": b"code", at / "a.h": b"names"})]
     ['a.c', 'a.h']
     """
-    targets = {Path(path): content for path, content in contents.items()}
-    staged: dict[Path, Path] = {}
-    target = next(iter(targets))
-    with contextlib.ExitStack() as temporaries, contextlib.ExitStack() as undo:
-        try:
-            for target, content in targets.items():
-                stream, staged[target] = temporaries.enter_context(_temporary_file(target))
-                stream.write(content)
-                _finish(stream)
-            for target, temporary in staged.items():
-                # kept to undo the change if a later file fails; a single file needs no undoing
-                older = target.read_bytes() if len(targets) > 1 and target.exists() else None
-                temporary.replace(target)
-                undo.callback(_restore, target, older)
-        except (OSError, ValueError) as error:  # ValueError: a null character in the name
-            raise _output_error(target, error) from error
-        undo.pop_all()
-    return tuple(targets)
-
-
-def _restore(target: Path, older: bytes | None) -> None:
-    """Give a file its older content again, or delete it."""
-    with contextlib.suppress(OSError, OutputError):
-        if older is None:
-            target.unlink()
-        else:
-            write_atomically(target, older)
-
-
-@contextlib.contextmanager
-def _temporary_file(target: Path) -> Iterator[tuple[BinaryIO, Path]]:
-    """Open a temporary file beside a target; after the block there is none under its name.
-
-    It is locked to the end of the block, so that another process knows it for unfinished.
-    """
-    mode = _mode_of(target)
-    handle, temporary = _create_temporary(target)
-    lock = os.dup(handle) if CAN_LOCK else None
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            if mode is not None:
-                temporary.chmod(mode)
-            yield stream, temporary
-    finally:
-        if lock is None or _is_open(lock, temporary):
-            _restore(temporary, None)
-        if lock is not None:
-            os.close(lock)
-
-
-def _finish(stream: BinaryIO) -> None:
-    """Bring a whole file to the disk."""
-    stream.flush()
-    os.fsync(stream.fileno())
-    stream.close()
-
-
-def _create_temporary(target: Path) -> tuple[int, Path]:
-    """Create a temporary file and lock it; one that a killed run left is removed."""
-    digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:16]
-    for number in range(_MOST_UNFINISHED):
-        path = target.with_name(_UNFINISHED.format(digest, number))
-        _remove_unlocked(path)
-        with contextlib.suppress(FileExistsError):
-            handle = open_regular(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
-            lock_file(handle)
-            if _is_open(handle, path):  # else it was removed before the lock
-                return handle, path
-            os.close(handle)
-    raise OSError(errno.EEXIST, f"{_MOST_UNFINISHED} files {path.name} are in the way")
-
-
-def remove_unfinished_files(folder: Path) -> None:
-    """Remove the temporary files in a directory that no process is writing."""
-    for path in folder.glob(_UNFINISHED.format("*", "*")):
-        _remove_unlocked(path)
-
-
-def _remove_unlocked(path: Path) -> None:
-    """Remove a temporary file whose process is dead."""
-    with contextlib.suppress(OSError):
-        if stat.S_ISREG(path.lstat().st_mode):
-            handle = open_regular(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
-            try:
-                if lock_file(handle) and _is_open(handle, path):
-                    path.unlink()
-            finally:
-                os.close(handle)
-
-
-def _is_open(handle: int, path: Path) -> bool:
-    """Whether a file is still under the name by which it was opened."""
-    try:
-        return os.path.samestat(os.fstat(handle), path.lstat())
-    except FileNotFoundError:
-        return False
+    with contextlib.ExitStack() as streams:
+        opened = [streams.enter_context(open_atomically(path)) for path in contents]
+        for stream, content in zip(opened, contents.values(), strict=True):
+            stream.write(content)
+            _synchronise(stream)
+    return tuple(map(Path, contents))
 
 
 @contextlib.contextmanager
@@ -264,13 +168,23 @@ def open_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     b'part by part'
     """
     target = Path(path)
+    temporary = target.with_name(UNFINISHED.replace("*", secrets.token_hex(8)))
     try:
-        with _temporary_file(target) as (stream, temporary):
+        _require_file(target)
+        stream = temporary.open("xb")
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise _output_error(target, error) from error
+    try:
+        with stream:
             yield stream
-            _finish(stream)
-            temporary.replace(target)
+            _synchronise(stream)
+        if target.exists():
+            temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+        temporary.replace(target)
     except OSError as error:
         raise _output_error(target, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def _output_error(target: Path, error: Exception) -> OutputError:
@@ -278,3 +192,34 @@ def _output_error(target: Path, error: Exception) -> OutputError:
         f"cannot write {target}: {error_text(error)}. Check the directory and its free space.",
         path=target,
     )
+
+
+def _synchronise(stream: BinaryIO) -> None:
+    """Bring what was written to the disk."""
+    stream.flush()
+    os.fsync(stream.fileno())
+
+
+@contextlib.contextmanager
+def exclusive_lock(folder: Path, what: str) -> Iterator[None]:
+    """Hold a lock on a directory, which the system releases when the process ends in any way."""
+    path = folder / ".lock"
+    try:
+        stream = path.open("ab")
+    except OSError as error:
+        why = f"cannot write into {folder}: {path.name}: {error_text(error)}."
+        raise OutputError(why, path=path) from error
+    with stream:
+        try:
+            if fcntl is not None:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise OutputError(
+                f"another {what} is running in {folder}. Wait for it, or name another directory.",
+                path=folder,
+            ) from error
+        try:
+            yield
+        finally:
+            if fcntl is not None:  # at once: a process that is being started holds a copy
+                fcntl.flock(stream, fcntl.LOCK_UN)

@@ -1,4 +1,4 @@
-"""What may be opened: regular files up to a size, never followed into a device or a pipe."""
+"""What is read: regular files up to a size."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import errno
 import hashlib
 import json
 import os
-import stat
 from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
@@ -19,39 +18,18 @@ LARGEST_BYTES = 2**30  # of a file that is read whole
 LARGEST_TEXT_BYTES = 2**24  # of a file that people write, or of one result
 
 
-def open_regular(path: str | os.PathLike[str], flags: int) -> int:
-    """Open a regular file, and return its descriptor; OSError for a device, pipe or directory.
-
-    With ``os.O_CREAT``, a link is refused, too: what is written goes into the named file.
-    """
-    if flags & os.O_CREAT:
-        flags |= getattr(os, "O_NOFOLLOW", 0)
-    # opening a pipe that nobody writes to would wait
-    flags |= getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    try:
-        handle = os.open(path, flags, 0o666)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise OSError(errno.ELOOP, "it is a link") from error
-        raise
-    mode = os.fstat(handle).st_mode
-    if stat.S_ISREG(mode):
-        return handle
-    os.close(handle)
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    raise OSError(errno.EINVAL, "it is not a regular file")
-
-
 @contextlib.contextmanager
 def open_input(path: str | os.PathLike[str], error: type[FileError]) -> Iterator[BufferedReader]:
     """Open a regular file; where it cannot be read, raise an error of a kind."""
+    source = Path(path)
     try:
-        with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as stream:
+        if source.exists() and not source.is_file() and not source.is_dir():
+            raise OSError(errno.EINVAL, "it is not a regular file")  # noqa: TRY301 - as open says
+        with source.open("rb") as stream:
             yield stream
     except (OSError, ValueError) as why:  # ValueError: a null character in the name
         shown = path if isinstance(why, OSError) else repr(str(path))
-        raise error(f"cannot read {shown}: {error_text(why)}.", path=Path(path)) from why
+        raise error(f"cannot read {shown}: {error_text(why)}.", path=source) from why
 
 
 def read_bytes(
@@ -69,9 +47,9 @@ def read_bytes(
     lbt_synth.errors.FileError: cannot read /dev/zero: it is not a regular file.
     """
     with open_input(path, error) as stream:
-        size = os.fstat(stream.fileno()).st_size
-        content = b"" if size > most else stream.read(most + 1)  # it may grow meanwhile
-    if max(size, len(content)) > most:
+        fits = os.fstat(stream.fileno()).st_size <= most
+        content = stream.read() if fits else b""
+    if not fits:
         limit = f"{most >> 20} MB" if most >> 20 else f"{most >> 10} kB"
         raise error(f"cannot read {path}: it is larger than {limit}.", path=Path(path))
     return content

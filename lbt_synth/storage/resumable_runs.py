@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
-from lbt_synth.storage.atomic_files import write_atomically
-from lbt_synth.storage.file_locks import exclusive_lock
+from lbt_synth.storage.atomic_files import exclusive_lock, write_atomically
 from lbt_synth.storage.input_files import read_json
 from lbt_synth.storage.thread_limits import limit_threads
 from lbt_synth.storage.worker_processes import WorkerPool

@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import io
 import json
+import random
 import struct
 import zipfile
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from support.record_files import image
 
 import lbt_synth as lbt
-from lbt_synth.storage.array_file import digest, npz_bytes, read_fits, read_npz, read_numpy
+from lbt_synth.storage.array_file import (
+    digest,
+    fits_bytes,
+    npz_bytes,
+    open_fits,
+    read_fits,
+    read_npz,
+    read_numpy,
+)
 
 
 def test_complex_arrays_do_not_lose_their_imaginary_part(tmp_path):
@@ -57,3 +68,82 @@ def test_other_bytes(read):
     for content in (b"", b"\x93NUMPY", b"PK\x03\x04", b"SIMPLE"):
         with pytest.raises((ValueError, KeyError)):
             read(content)
+
+
+def table_file(*, sums=True):
+    """A table and an image by astropy alone, as bytes."""
+    rows = fits.BinTableHDU.from_columns(
+        [fits.Column(name, "D", array=np.arange(50.0)) for name in ("y_tip", "y_tilt")], name="R"
+    )
+    units = fits.HDUList([fits.PrimaryHDU(), rows, image("Y", np.arange(9.0))])
+    stream = io.BytesIO()
+    units.writeto(stream, checksum=sums)
+    return stream.getvalue()
+
+
+def values(content):
+    """All cards and data of FITS content."""
+    with open_fits(content) as units:
+        return [(repr(u.header), None if u.data is None else u.data.tobytes()) for u in units]
+
+
+def test_files_of_other_programs_are_read_with_and_without_checksums():
+    names = ["PRIMARY", "R", "Y"]
+    for content in (table_file(), table_file(sums=False), table_file() + bytes(2880)):
+        with open_fits(content) as units:
+            assert [unit.name for unit in units] == names
+
+
+def test_every_flipped_bit_of_an_hdu_with_a_checksum_is_found_or_changes_nothing():
+    content, draw, refused = table_file(), random.Random(1), 0
+    whole = values(content)
+    for _ in range(300):
+        at = draw.randrange(len(content))
+        damaged = bytearray(content)
+        damaged[at] ^= 1 << draw.randrange(8)
+        card = bytes(content[at - at % 80 :][:80])
+        if card.startswith((b"CHECKSUM", b"DATASUM")):  # without these there is nothing to check
+            continue
+        try:
+            assert values(bytes(damaged)) == whole  # behind END
+        except ValueError:
+            refused += 1
+    assert refused > 150
+
+
+@pytest.mark.parametrize("length", [0, 100, 3000, 5000, -2880, -1000])
+@pytest.mark.parametrize("sums", [True, False])
+def test_fits_content_that_is_cut_is_refused(length, sums):
+    with pytest.raises(ValueError, match="FITS"), open_fits(table_file(sums=sums)[:length]):
+        pass
+
+
+def test_what_follows_the_last_hdu_is_refused():
+    with pytest.raises(ValueError, match="FITS"), open_fits(table_file() + b"x" * 2880):
+        pass
+
+
+@pytest.mark.parametrize("value", ["p" * 200, "several words, " * 12 + "end"])
+def test_long_strings_go_on_in_further_cards(value):
+    header = fits.Header.fromstring(fits_bytes({"LONG": value, "NEXT": 1}, {}).decode())
+    assert (header["LONG"], header["NEXT"]) == (value, 1)
+
+
+def test_the_same_content_gives_the_same_bytes():
+    cards, arrays = {"VERSION": (1, "layout")}, {"A": np.eye(2), "B": np.ones(3, dtype="f4")}
+    one = fits_bytes(cards, arrays, "text", headers={"A": {"BUNIT": "nm"}}, comments=["note"])
+    assert one == fits_bytes(
+        cards, arrays, "text", headers={"A": {"BUNIT": "nm"}}, comments=["note"]
+    )
+    with open_fits(one) as units:
+        assert units[0].header["COMMENT"][0] == "note"
+        assert units["A"].header["BUNIT"] == "nm"
+        assert units["B"].data.dtype == ">f4"
+    read, text = read_fits(one)
+    assert (set(read), text) == ({"A", "B"}, "text")
+
+
+@pytest.mark.parametrize("text", ["Čerenkov", "two\nlines"])
+def test_cards_that_fits_cannot_hold_are_refused(text):
+    with pytest.raises(ValueError, match="ASCII|printable"):
+        fits_bytes({"NAME": text}, {})

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import os
-import signal
 import stat
-import subprocess
-import sys
-import textwrap
 from pathlib import Path
 
 import pytest
 
-from lbt_synth.errors import OutputError
+from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import (
+    exclusive_lock,
     open_atomically,
     refuse_replacing,
-    remove_unfinished_files,
     require_writable,
     write_atomically,
     write_together,
@@ -89,57 +85,39 @@ def test_permissions_stay(tmp_path, write):
     assert stat.S_IMODE(new.stat().st_mode) == 0o640
 
 
-KILLED = """
-    import os, signal, sys
-    from lbt_synth.storage.atomic_files import open_atomically
-    with open_atomically(sys.argv[1]) as stream:
-        stream.write(b"half")
-        stream.flush()
-        if sys.argv[2] == "waits":
-            print(flush=True)
-            input()
-        os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def start_writer(path, how):
-    lines = textwrap.dedent(KILLED)
-    return subprocess.Popen(
-        [sys.executable, "-c", lines, str(path), how], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-
-
-def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
+@pytest.mark.parametrize("write", [write_atomically, write_streamed, write_two])
+def test_a_full_disk_leaves_the_older_file_and_nothing_else(tmp_path, monkeypatch, write):
     path = tmp_path / "out"
-    with start_writer(path, "dies") as other:
-        assert other.wait() == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    assert left.read_bytes() == b"half"
-    write_atomically(path, b"whole")
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+    path.write_bytes(b"old")
+
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OutputError, match="cannot write .*No space left on device"):
+        write(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["out"]
 
 
-def test_what_another_process_writes_stays(tmp_path):
-    path = tmp_path / "out"
-    with start_writer(path, "waits") as other:
-        other.stdout.readline()
-        write_atomically(path, b"whole")
-        remove_unfinished_files(tmp_path)
-        assert path.read_bytes() == b"whole"
-        assert sorted(p.read_bytes() for p in tmp_path.iterdir()) == [b"half", b"whole"]
-        other.kill()
-        other.stdout.close()
-    remove_unfinished_files(tmp_path)
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+def test_an_error_while_writing_is_not_taken_for_one_of_the_file(tmp_path):
+    with pytest.raises(ProblemError, match="one of the content"), open_atomically(tmp_path / "out"):
+        raise ProblemError("one of the content")
+    assert os.listdir(tmp_path) == []
 
 
-def test_a_link_under_the_temporary_name_is_not_followed(tmp_path):
-    path, mine = tmp_path / "out", tmp_path / "mine"
-    with start_writer(path, "dies") as other:
-        other.wait()
-    (left,) = tmp_path.iterdir()
-    left.unlink()
-    mine.write_text("mine")
-    left.symlink_to(mine)
-    write_atomically(path, b"whole")
-    assert (mine.read_text(), path.read_bytes()) == ("mine", b"whole")
+def test_one_at_a_time_holds_a_directory(tmp_path):
+    with exclusive_lock(tmp_path, "run"):  # noqa: SIM117 - the second is refused
+        with (
+            pytest.raises(OutputError, match="another run is running"),
+            exclusive_lock(tmp_path, "run"),
+        ):
+            pass
+    with exclusive_lock(tmp_path, "run"):
+        pass
+
+
+def test_a_directory_that_takes_no_lock(tmp_path):
+    (tmp_path / ".lock").mkdir()
+    with pytest.raises(OutputError, match=r"\.lock: Is a dir"), exclusive_lock(tmp_path, "run"):
+        pass

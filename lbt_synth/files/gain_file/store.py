@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from dataclasses import replace
@@ -213,5 +214,5 @@ def read_design(path: str | os.PathLike[str]) -> tuple[Design, str]:
             require_certificate(meta["certificate"], own)
             if ending == ".fits":
                 cards = {key: value for key, (value, _) in write_cards(design, meta).items()}
-                require_same(read_cards(content, cards), cards, "header")
+                require_same(read_cards(io.BytesIO(content), cards), cards, "header")
     return design, str(meta["digest"])

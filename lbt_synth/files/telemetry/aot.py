@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import json
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -21,11 +22,11 @@ from lbt_synth.errors import FileError, OutputError, TelemetryError
 from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
 from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.array_file import error_reason, has_card
-from lbt_synth.storage.fits_structure import check_fits
+from lbt_synth.storage.array_file import check_fits, error_reason, read_cards
 from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
+_VERSION_CARD = "AOT-VERS"
 _OWN_CARD = "LBTSYNTH"  # one card with what the standard has no field for, JSON
 _OWN_FIELDS = (
     *("seed", "name", "controller_name", "controller_digest", "metadata"),
@@ -43,8 +44,10 @@ _INSTALL = 'it needs aotpy: pip install "lbt-synth[aot]"'
 
 
 def is_aot(content: bytes) -> bool:
-    """Whether the first header of a FITS file says that it is of the standard."""
-    return has_card(content, "AOT-VERS")
+    """Whether the first header of FITS content says that it is of the standard."""
+    with suppress(ValueError):
+        return bool(read_cards(io.BytesIO(content), [_VERSION_CARD]))
+    return False
 
 
 def lost_fields(telemetry: Telemetry) -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -15,11 +14,9 @@ import numpy.typing as npt
 
 from lbt_synth.errors import FileError, LbtSynthError, ProblemError, TelemetryError
 from lbt_synth.identification.records.columns import Column, parse_column, recognise_fact
-from lbt_synth.storage.array_file import error_reason, read_numpy
+from lbt_synth.storage.array_file import error_reason, open_fits, read_numpy
 from lbt_synth.storage.atomic_files import require_ending
-from lbt_synth.storage.fits_structure import check_fits
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 FITS = (".fits", ".fit", ".fts")
@@ -122,9 +119,7 @@ def parse_contents(path: Path, content: bytes) -> Contents:
 def _read_fits(out: Contents, content: bytes) -> None:
     from astropy.io import fits
 
-    check_fits(content)
-    # foreign headers deviate in many small ways; without uint, gaps of shifted integers become NaN
-    with ignore_warnings(), fits.open(io.BytesIO(content), memmap=False, uint=False) as units:
+    with open_fits(content, uint=False) as units:  # gaps of shifted integers become NaN
         for place, unit in enumerate(units):
             name = unit.name if unit.name and unit.name != "PRIMARY" else ""
             for card in unit.header.cards:

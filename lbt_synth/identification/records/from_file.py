@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,11 +26,12 @@ from lbt_synth.identification.records.from_series import build_record, join_comm
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.array_file import LONGEST_HEADER, has_card
+from lbt_synth.storage.array_file import read_cards
 from lbt_synth.storage.input_files import open_input
 from lbt_synth.validation import FloatArray, choice, require_instance
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
+_LONGEST_HEADER = 2880 * 36  # bytes, of telemetry
 _TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
 
 
@@ -146,13 +148,13 @@ def is_telemetry(path: Path) -> bool:
     try:
         if path.suffix.lower() in FITS:
             with open_input(path, TelemetryError) as stream:
-                header = stream.read(LONGEST_HEADER)
-            return any(has_card(header, card) for card in _TELEMETRY_CARDS)
+                header = io.BytesIO(stream.read(_LONGEST_HEADER))
+            return bool(read_cards(header, _TELEMETRY_CARDS))
         if path.suffix.lower() != ".npz":
             return False
         with open_input(path, TelemetryError) as stream:
             names = ZipFile(stream).namelist()
-    except Exception:  # of zipfile, many kinds; read_contents reports the error
+    except Exception:  # zipfile raises many kinds; read_contents reports the error
         return False
     return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
 

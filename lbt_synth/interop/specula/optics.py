@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import io
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ import numpy.typing as npt
 
 from lbt_synth.errors import FileError, MissingExtraError, OutputError, ProblemError
 from lbt_synth.interop.specula.system import EndToEndSystem
-from lbt_synth.storage.fits_structure import check_fits
+from lbt_synth.storage.array_file import open_fits
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray
 
@@ -123,13 +122,9 @@ def _make_pupil(system: EndToEndSystem, parameters: Any) -> Any:
 
 def _discard_damaged(files: Iterable[Path]) -> None:
     """Delete truncated phase screens, so that they are computed again."""
-    from astropy.io import fits
-
     for file in files:
         try:
-            content = read_bytes(file, FileError)
-            check_fits(content)
-            with fits.open(io.BytesIO(content)) as units:
+            with open_fits(read_bytes(file, FileError)) as units:
                 _ = units[0].data.shape
         except Exception:  # astropy has no common class for what damage makes it raise
             file.unlink()

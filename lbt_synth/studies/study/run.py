@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
-from lbt_synth.storage.file_locks import exclusive_lock
+from lbt_synth.storage.atomic_files import exclusive_lock, make_directory, refuse_replacing
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.thread_limits import limit_threads
 from lbt_synth.storage.worker_processes import WorkerPool

@@ -23,8 +23,8 @@ from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import (
+    UNFINISHED,
     open_atomically,
-    remove_unfinished_files,
     write_atomically,
 )
 from lbt_synth.storage.input_files import file_sha256, open_input, read_bytes, read_json
@@ -231,8 +231,8 @@ def read_part(part: Part, study: Study) -> tuple[FloatArray, tuple[Failure, ...]
 
 def remove_unfinished(folder: Path) -> None:
     """Remove what a killed process left unfinished."""
-    for place in (folder, folder / PARTS):
-        remove_unfinished_files(place)
+    for path in [*folder.glob(UNFINISHED), *(folder / PARTS).glob(UNFINISHED)]:
+        path.unlink()
 
 
 def require_unchanged(folder: Path, manifest: Manifest) -> None:
