@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from lbt_synth.design.certificate import Certificate, certify_loop
 from lbt_synth.design.facts import IntegratorFacts
@@ -13,7 +14,6 @@ from lbt_synth.design.integrator_law import PURE, IntegratorLaw
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller
-from lbt_synth.linear.scalar_search import find_least
 from lbt_synth.loop import LoopEnsemble, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import noise_covariance
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
@@ -388,11 +388,19 @@ def _least_residual(
     walls = np.concatenate([[np.inf], left(trials), [np.inf]])
     low = np.flatnonzero((walls[1:-1] < walls[:-2]) & (walls[1:-1] <= walls[2:])).tolist()
     pairs = [[max(i - 1, 0), min(i + 1, trials.size - 1)] for i in low]
-    refined = [find_least(left, *trials[pair].tolist(), width=1e-7) for pair in pairs]
-    best = int(np.argmin([least for _, least in refined]))
+    with np.errstate(invalid="ignore"):  # beside an unstable gain its parabola has no vertex
+        refined = [
+            minimize_scalar(
+                lambda log_gain: float(left(np.array([log_gain]))[0]),
+                bounds=trials[pair].tolist(),
+                options={"xatol": 1e-7},
+            )
+            for pair in pairs
+        ]
+    best = int(np.argmin([result.fun for result in refined]))
     limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
     ends = {trials.size - 1: f"limited by {limit}"}
     if not law.demands:
         ends[0] = "limited by the least gain tried: a loop that hardly acts leaves least"
-    gain, status = float(np.exp(refined[best][0])), ends.get(low[best], "least residual")
+    gain, status = float(np.exp(refined[best].x)), ends.get(low[best], "least residual")
     return _design_with_gain(hardware, gain, law, route="search", status=status)

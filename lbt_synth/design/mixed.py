@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from scipy.optimize import brentq
 
 from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
@@ -25,7 +26,6 @@ from lbt_synth.linear import (
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
-from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 if TYPE_CHECKING:
@@ -323,6 +323,6 @@ class CentralFilters:
             return gains[0.0]
         if value(_DECADES) <= 0:
             return self.start
-        find_root(value, 0.0, _DECADES, width=1e-9)
+        brentq(value, 0.0, _DECADES, xtol=1e-9)
         # the closest on the side of smaller norms
         return gains[max(decades for decades, size in found.items() if size <= 0)]

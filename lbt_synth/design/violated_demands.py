@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.design.loop_shaping import ShapedDesign
 from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.linear import Controller
-from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
@@ -43,7 +43,7 @@ def _controller_of_mode(
     n, modes = len(A), len(D)
     whole = np.zeros((n + modes, n + modes))  # which state or mode acts on which
     whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:] = map(_entries, (A, B, C, D))
-    label = connected_parts(whole)
+    _, label = connected_components(whole)
     if np.count_nonzero(label[n:] == label[n + mode]) > 1:
         return None
     own = label[:n] == label[n + mode]

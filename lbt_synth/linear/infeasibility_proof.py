@@ -20,8 +20,8 @@ from functools import reduce
 
 import numpy as np
 from scipy.linalg import eigh, null_space
+from scipy.sparse.csgraph import connected_components
 
-from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.estimation_problem import (
     EstimationProblem,
     decorrelate,
@@ -136,7 +136,7 @@ def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArra
     """
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     spread = np.where(spread > 0, spread, 1.0)
-    label = connected_parts(covariance)
+    _, label = connected_components(covariance != 0)
     sizes: list[FloatArray] = []
     directions: list[FloatArray] = []
     for part in range(np.max(label) + 1):

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import NumericalError, UnstableLoopError
-from lbt_synth.linear.connected_parts import system_parts
 from lbt_synth.linear.state_space import StateSpace, pointwise_response, schur_response
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 _TOLERANCE = 2e-11
 _CAREFUL = 8
@@ -106,6 +106,19 @@ def independent_parts(G: StateSpace) -> list[StateSpace]:
             key = tuple(matrix.tobytes() for matrix in (A, B, C, D))
             parts[key] = replace(G, A=A, B=B, C=C, D=D)
     return list(parts.values()) or [G]
+
+
+def system_parts(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the numbers of the parts of a system's states (n,), inputs (m,) and outputs (p,)."""
+    (n, m), p = B.shape, len(C)
+    links = np.zeros((n + m + p, n + m + p), dtype=np.bool_)
+    links[:n, : n + m] = np.hstack([A, B]) != 0
+    links[n + m :, : n + m] = np.hstack([C, D]) != 0
+    _, parts = connected_components(links)
+    label = parts.astype(np.int64)
+    return label[:n], label[n : n + m], label[n + m :]
 
 
 def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:

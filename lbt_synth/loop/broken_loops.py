@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from lbt_synth.linear.panel_edges import distinct_edges, pole_edges
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only
@@ -199,7 +199,7 @@ def _examine(
             ends = float(grid[i]), float(grid[i + 1])
             sizes = [value(at(f)) for f in ends]
             if sizes[0] * sizes[1] < 0:
-                f = find_root(lambda f: value(at(f)), *ends, width=1e-12)
+                f = brentq(lambda f: value(at(f)), *ends, xtol=1e-12)
             else:  # only rounding had changed its sign
                 f = ends[int(abs(sizes[1]) < abs(sizes[0]))]
             found.append(MarginPoint(frequency_hz=f, response=at(f)))

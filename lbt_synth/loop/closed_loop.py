@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
-from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models import LoopHardware
@@ -188,8 +188,9 @@ def affine_radii(A0: FloatArray, A1: FloatArray) -> Callable[[FloatArray], Float
     The loop's transition at phase t is ``A0[t] + gain A1[t]``, (N, n, n). The eigenvalues are those
     of the parts whose states act on one another; equal parts count once.
     """
-    label = connected_parts(np.any((A0 != 0) | (A1 != 0), axis=0), both_ways=True)
-    parts = (np.ix_(range(len(A0)), label == i, label == i) for i in range(np.max(label) + 1))
+    links = np.any((A0 != 0) | (A1 != 0), axis=0)
+    count, label = connected_components(links, connection="strong")
+    parts = (np.ix_(range(len(A0)), label == i, label == i) for i in range(count))
     different = {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}
 
     def radii(sensor_gains: FloatArray) -> FloatArray:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import brentq
 
 from lbt_synth.design.fusion.fused_filter import FusedFilter, make_design
 from lbt_synth.design.fusion.levels import central_filter, error_norm, find_level
-from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.models.fusion.plant import FusedPlant
 
 _DECADES = 4.0  # of gamma, over which a central filter is searched
@@ -63,7 +63,7 @@ def fused_mixed(
 
     decades = 0.0
     if excess(0.0) < 0 < excess(_DECADES):
-        decades = find_root(excess, 0.0, _DECADES, width=1e-9)
+        decades = brentq(excess, 0.0, _DECADES, xtol=1e-9)
     central = level.bound * 10**decades
     return make_design(
         plant,

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.signal import welch
 
 from lbt_synth.design.modal.gains import LoopInputs, ModalGains, find_gains
 from lbt_synth.design.modal.plants import number_per_mode
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear.power_spectrum import welch_spectrum
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import FloatArray, integer, real_array
@@ -124,7 +124,7 @@ def modal_gains_from_telemetry(
         )
     open_loop = y[:, first:] / gain[:, None] + past_corrections(taps, u.T)[first:].T
     steps = np.diff(open_loop, axis=1)
-    frequency, power = welch_spectrum(steps, rate, segment)
+    frequency, power = welch(steps, rate, nperseg=segment, detrend=False)
     power[:, 0] *= 2  # one-sided as the others
     if segment % 2 == 0:
         power[:, -1] *= 2

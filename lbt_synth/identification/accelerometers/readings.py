@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
 from lbt_synth.identification.accelerometers.units import M_S2
@@ -17,7 +18,6 @@ from lbt_synth.identification.records.column_selection import CLOCKS
 from lbt_synth.identification.records.columns import Column, seconds_per
 from lbt_synth.identification.records.contents import Contents, read_contents
 from lbt_synth.identification.records.faults import fill, find_outliers, find_stuck, mark, runs
-from lbt_synth.linear.cubic_spline import cubic_spline
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
@@ -178,7 +178,7 @@ def at_places(values: FloatArray, place: FloatArray) -> FloatArray:
             continue
         filled = np.interp(rows, rows[good], series[good])
         sure = good[below] & good[below + 1]
-        out[:, c] = np.where(sure, cubic_spline(rows, filled)(place), np.nan)
+        out[:, c] = np.where(sure, CubicSpline(rows, filled)(place), np.nan)
     return out
 
 

@@ -14,9 +14,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from lbt_synth.identification.fit.periodogram import tukey
-from lbt_synth.linear.cubic_spline import cubic_spline
 from lbt_synth.validation import FloatArray
 
 WIDE = 30.0  # half width above which a line is not smeared
@@ -59,8 +59,8 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     blend = np.clip((grid - _LOBES / 2) / (_LOBES / 2), 0, 1)
     k = np.maximum(at * (1 - blend) + mean * blend, 1e-14)
     knots = np.log(widths)
-    value = cubic_spline(knots, np.log(k)).coefficients  # (4, w, d)
-    slope = np.gradient(value, axis=2)
+    value = CubicSpline(knots, np.log(k)).c  # (4, w, d)
+    slope = np.asarray(np.gradient(value, axis=2))
     rise, (m0, m1) = np.diff(value, axis=2), (slope[..., :-1], slope[..., 1:])
     powers = [value[..., :-1], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise]
     return knots, grid, np.stack(powers, axis=1)

@@ -22,7 +22,6 @@ from scipy import sparse
 from scipy.linalg import block_diag, null_space
 
 from lbt_synth.errors import InfeasibleError, NumericalError
-from lbt_synth.linear.connected_parts import system_parts
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.linear.lmi.conic_data import (
@@ -32,6 +31,7 @@ from lbt_synth.linear.lmi.conic_data import (
     require_optimum,
 )
 from lbt_synth.linear.matrix_functions import semidefinite_root
+from lbt_synth.linear.norms import system_parts
 from lbt_synth.validation import FloatArray, IntArray, frozen_copy
 
 

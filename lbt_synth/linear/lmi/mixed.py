@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.linalg import solve_triangular
+from scipy.sparse.csgraph import connected_components
 
-from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.lmi.conic_data import ConicProgramme, require_optimum
 from lbt_synth.linear.lyapunov import stationary_covariance
@@ -142,7 +142,7 @@ def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int
     stacked = np.concatenate([N, E], axis=1)
     size = np.linalg.norm(stacked, axis=(0, 2))
     products = np.abs(stacked @ stacked.conj().swapaxes(1, 2)).sum(axis=0)
-    labels = connected_parts(products > _APART * size[:, None] * size)
+    _, labels = connected_components(products > _APART * size[:, None] * size)
     q = N.shape[1]
     groups = []
     for label in np.unique(labels[q:]):

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from lbt_synth.errors import NonFiniteError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
@@ -24,7 +25,6 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     last_step,
     steady_oscillation,
 )
-from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import FloatArray
 
@@ -103,7 +103,7 @@ class TwoRiccati:
             )
         upper = min(found)
         if lower < upper and slack(lower) <= 0:
-            find_root(slack, lower, upper, width=_TOLERANCE * upper)
+            brentq(slack, lower, upper, xtol=2 * _TOLERANCE * upper)  # its steps are half of it
         return found[min(found)]
 
     def _frequency_text(self, angle: float) -> str:

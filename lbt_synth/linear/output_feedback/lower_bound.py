@@ -24,6 +24,7 @@ from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import eigh, null_space
+from scipy.optimize import minimize_scalar
 
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
@@ -37,7 +38,6 @@ from lbt_synth.linear.output_feedback.full_information import (
     estimation_side,
 )
 from lbt_synth.linear.riccati.dare import solve_dare
-from lbt_synth.linear.scalar_search import find_least
 from lbt_synth.validation import FloatArray
 
 _STEPS = 64  # of the recursion that bounds the storage matrix
@@ -123,7 +123,7 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
     """Level that both sides prove together, at the best relative weight of the two."""
     shared = float(np.linalg.norm(one.root.T @ two.root, "nuc"))
 
-    def levels(weights: FloatArray) -> FloatArray:
+    def levels(weights: FloatArray | float) -> FloatArray:
         t = np.exp(weights)
         spent = t * one.spent + two.spent / t
         gained = t * one.gained + two.gained / t
@@ -132,8 +132,10 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
 
     grid = np.linspace(-_WIDEST, _WIDEST, 97)
     best, step = float(grid[np.argmax(levels(grid))]), float(grid[1] - grid[0])
-    refined, _ = find_least(lambda w: -levels(w), best - step, best + step, width=1e-9)
-    return float(np.max(levels(np.array([best, refined]))))
+    refined = minimize_scalar(
+        lambda w: -float(levels(w)), bounds=(best - step, best + step), options={"xatol": 1e-9}
+    )
+    return float(np.max(levels(np.array([best, refined.x]))))
 
 
 def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> _Moments:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.optimize import brentq
 
 from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import (
@@ -23,7 +24,6 @@ from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
-from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.validation import FloatArray, frozen_copy
 
 
@@ -317,13 +317,15 @@ def least_gamma(
     root = lower
     below = slack(lower) if lower < upper else 1.0
     if below <= 0:
-        whole, ends = upper, ((upper / lower) ** 2, 1.0)  # the slack is almost linear in gamma^-2
-        root = whole * find_root(
-            lambda s: slack(whole * s**-0.5),
-            *ends,
-            width=2 * _GAMMA_TOLERANCE,
-            values=(below, above),
-        ) ** (-0.5)
+        start_level = upper  # the slack is almost linear in s = (start_level / gamma)^2
+        slack_at = {(upper / lower) ** 2: below, 1.0: above}
+        s_root = brentq(
+            lambda s: slack_at[s] if s in slack_at else slack(start_level * s**-0.5),
+            (upper / lower) ** 2,
+            1.0,
+            xtol=2 * _GAMMA_TOLERANCE,
+        )
+        root = start_level * s_root**-0.5
     upper, width = min(met), _GAMMA_TOLERANCE
     for _ in range(100):  # the search leaves one end of its bracket far away: bring it in
         if upper - lower <= 2.5 * _GAMMA_TOLERANCE * upper:

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.connected_parts import connected_parts
 from lbt_synth.linear.state_space import schur_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
 from lbt_synth.loop.ensemble.loop_poles import loop_poles
@@ -102,7 +102,7 @@ def split_into_subloops(
     controller = (x, x, A), (x, y, B), (u, x, C), (u, y, D)
     for rows, columns, entries in (*controller, (y, r, sensor[None]), (r, u, influence[None])):
         links[np.ix_(rows, columns)] = _nonzero_entries(entries)
-    label = connected_parts(links)
+    _, label = connected_components(links)
     subloops, rest = [], []
     for each in np.unique(label):
         own = label == each

@@ -16,11 +16,11 @@ from typing import Annotated, Any
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.linear.scalar_search import find_root
 from lbt_synth.validation import (
     Count,
     FloatArray,
@@ -283,7 +283,7 @@ class PositionLoop:
             return float("nan") if below.size else float(grid[-1])
         low, high = grid[below[0] - 1 : below[0] + 1].tolist()
         level = np.sqrt(0.5)
-        return find_root(lambda f: float(amplitude(f)[0]) - level, low, high, width=1e-9 * low)
+        return brentq(lambda f: float(amplitude(f)[0]) - level, low, high, xtol=1e-9 * low)
 
     def _law(self) -> FloatArray:
         """Acceleration [positions per sample^2] that the loop computes, over states and command."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.quadrature import gauss_panels
@@ -159,8 +160,6 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     >>> [round(float(a), 4) for a in model.coefficients]
     [1.9975, -0.9976]
     """
-    from scipy.optimize import minimize  # slow to import
-
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     noise = number(noise_nm, "noise_nm", above=0)
     crossing_hz, rms = atmosphere.wind_speed_m_s / atmosphere.diameter_m, atmosphere.tilt_rms_nm

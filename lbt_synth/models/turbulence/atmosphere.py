@@ -15,10 +15,10 @@ from math import factorial
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline, PPoly
 from scipy.special import j0, j1
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.cubic_spline import CubicSpline, cubic_spline
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.validation import FloatArray, Obstruction, Positive, check_fields, real_array
 
@@ -173,11 +173,11 @@ class LogSpline:
     It is constant below its first knot, and the power law f^(-17/3) of tilt beyond the last.
     """
 
-    spline: CubicSpline
+    spline: PPoly
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return the logarithms of the spectrum at logarithms of frequencies."""
-        first, last = self.spline.knots[[0, -1]]
+        first, last = self.spline.x[[0, -1]]
         values = self.spline(np.clip(x, first, last))
         return np.asarray(values - 17 / 3 * np.maximum(x - last, 0))
 
@@ -197,4 +197,4 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
             spectrum = _filtered_spectrum(scale_ratio, obstruction, np.hypot(f[:, None], fy))
             density.append(4 * spectrum @ wy)
     knots = np.log(np.concatenate([slow, fast]))
-    return LogSpline(spline=cubic_spline(knots, np.log(np.concatenate(density))))
+    return LogSpline(spline=CubicSpline(knots, np.log(np.concatenate(density))))

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
+from scipy.interpolate import PPoly
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear.cubic_spline import CubicSpline
 from lbt_synth.models.turbulence.atmosphere import (
     Atmosphere,
     LogSpline,
@@ -157,7 +157,7 @@ def _interpolate_over_scales(
         rows = np.flatnonzero(octave == each)
         place = 2 * (np.log2(scale_ratio[rows]) - each) - 1
         for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
-            spline = CubicSpline(knots=knots, coefficients=coefficients @ terms)
+            spline = PPoly(coefficients @ terms, knots)
             values[row] = LogSpline(spline=spline)(x[row])
 
 
@@ -171,5 +171,5 @@ def _octave_splines(octave: int, obstruction: float) -> tuple[FloatArray, FloatA
     ratios = 2.0 ** (octave + (nodes + 1) / 2)
     splines = [tilt_spline(float(ratio), obstruction).spline for ratio in ratios]
     inverse = np.linalg.inv(chebyshev.chebvander(nodes, _TERMS - 1))
-    stacked = np.stack([spline.coefficients for spline in splines], axis=-1)
-    return splines[0].knots, stacked @ inverse.T
+    stacked = np.stack([spline.c for spline in splines], axis=-1)
+    return splines[0].x, stacked @ inverse.T

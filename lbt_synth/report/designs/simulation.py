@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import welch
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.linear.power_spectrum import welch_spectrum
 from lbt_synth.loop import ClosedLoop, close_loop, simulate, step_response
 from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
@@ -59,8 +59,8 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
     rate, length = hardware.frame_rate_hz, min(frames, _SEGMENT)
     spectra = []
     for series in (run.total_nm, run.residual_nm):
-        frequency, density = welch_spectrum(np.swapaxes(series, 1, 2), rate, length)
-        spectra.append(density.mean(axis=0).sum(axis=0))
+        frequency, density = welch(series, rate, nperseg=length, detrend=False, axis=1)
+        spectra.append(density.mean(axis=0).sum(axis=-1))
     strehls = run.strehl(config.imaging)
     shown = min(frames, _EXCERPT)
     step = step_response(loop)

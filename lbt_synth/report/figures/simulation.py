@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import welch
 
-from lbt_synth.linear.power_spectrum import welch_spectrum
 from lbt_synth.loop import Simulation
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
@@ -60,7 +60,7 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
         # the residual is solid, what there was before it is dotted
         for data, word, dash in ((run.total_nm, "open loop", 3), (run.residual_nm, "residual", 0)):
             length = min(frames, 2048)
-            f, s = welch_spectrum(data[:, :, i], run.frame_rate_hz, length, remove_mean=True)
+            f, s = welch(data[:, :, i], run.frame_rate_hz, nperseg=length)
             name, mean = f"{names[i]}, {word}", s.mean(axis=0)[1:]
             spectra.append(Curve(name=name, x=f[1:], y=mean, look=i, width=1.0, dash=dash))
     panels = (series_panel(series), spectra_panel(spectra))
