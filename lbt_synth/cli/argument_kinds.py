@@ -107,11 +107,23 @@ class TargetChoice(Action):
     ) -> None:
         """Store the name, or print the targets."""
         if values is None:
-            from lbt_synth.cli.export import list_targets
-
-            list_targets()
+            _list_targets()
             parser.exit()
         setattr(namespace, self.dest, values)
+
+
+def _list_targets() -> None:
+    """Print how each target computes."""
+    from lbt_synth.cli.output import Report  # needs what makes help slow
+    from lbt_synth.interop import target_named
+    from lbt_synth.interop.target import target_names
+    from lbt_synth.storage.rows import fact_table
+
+    report = Report()
+    for name in target_names():
+        target = target_named(name)
+        report.tables.append(fact_table(f"{name}: {target.file}", target.arithmetic))
+    report.print(as_json=False)
 
 
 def add_faults(parser: ArgumentParser) -> None:

@@ -79,15 +79,6 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def list_targets() -> None:
-    """Print how each target computes."""
-    report = Report()
-    for name in target_names():
-        target = target_named(name)
-        report.tables.append(fact_table(f"{name}: {target.file}", target.arithmetic))
-    report.print(as_json=False)
-
-
 def _precision_notes(arguments: Namespace, written: Exported) -> list[str]:
     if written.made_again:
         return [

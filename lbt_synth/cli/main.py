@@ -13,9 +13,8 @@ import signal
 import sys
 import threading
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from types import FrameType
 
 from lbt_synth.cli.streams import discard, print_error
 from lbt_synth.errors import LbtSynthError, SynthesisError
@@ -36,16 +35,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     from lbt_synth.cli.parser import build_parser
 
     arguments = build_parser(named).parse_args(words)
-    from lbt_synth.report.provenance import creation_time  # slow to import for --help
     from lbt_synth.storage.display_unit import own_display_unit
 
     try:
-        creation_time()  # refuses a wrong SOURCE_DATE_EPOCH before the libraries read it
-    except LbtSynthError as error:
-        return _fail(error, str(error), arguments)
-    try:
         command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
-        with _interruptible(), own_display_unit():
+        with _terminable(), own_display_unit():
             report = command.run(arguments)
     except LbtSynthError as error:
         from lbt_synth.cli.surface import say_error  # after what it says may have failed
@@ -73,22 +67,16 @@ def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let signals raise exceptions where they would end the process at once."""
-    handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
-    interruption = signal.getsignal(signal.SIGINT)
-    if interruption is signal.SIG_DFL:  # by the console script
-        handlers[signal.SIGINT] = signal.default_int_handler
-    # shells and nohup ignore SIGINT of what runs in the background, where SIGTERM ends it
-    alone = threading.current_thread() is threading.main_thread()
-    if interruption in (signal.SIG_DFL, signal.SIG_IGN) and alone:
-        handlers[signal.SIGTERM] = _terminate
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM raise an exception where it would end the process at once."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may set handlers
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        signal.signal(signal.SIGTERM, before)
 
 
 def _terminate(*_: object) -> None:
@@ -98,7 +86,7 @@ def _terminate(*_: object) -> None:
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
     gc.set_threshold(200_000, 50, 50)  # what imports and charts make stays until the end
-    for stream in (sys.stdout, sys.stderr):
+    for stream in (sys.stdout, sys.stderr):  # no character that an encoding lacks ends a command
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from typing import Any, NoReturn, cast
 
 import lbt_synth
@@ -35,41 +34,17 @@ COMMANDS = {
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line: what is wrong, what was meant, and where help is."""
 
-    _words: Sequence[str] = ()  # that it was given
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Keep the words, so that an error can name one that is wrong."""
-        self._words = args or ()
-        return super().parse_known_args(args, namespace)
-
     def error(self, message: str) -> NoReturn:
         """Print what is wrong with the words, without control characters; exit with status 2."""
         strange = message.removeprefix("unrecognized arguments: ")
         if strange != message and (known := _option_strings(self)):
-            message += f"; {_suggest_option(strange.split()[0], known)}"
-        elif message.startswith("the following arguments are required") and (
-            mistyped := self._find_mistyped()
-        ):
-            message = f"unrecognized arguments: {mistyped}"
+            message += f"; {suggest_word(strange.split()[0].partition('=')[0], known)}"
         self.exit(2, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
-
-    def _find_mistyped(self) -> str:
-        """Return the first option that does not exist, and which was meant; else nothing."""
-        known = _option_strings(self)
-        for word in self._words:
-            name = word.partition("=")[0]
-            if name.startswith("--") and not any(each.startswith(name) for each in known):
-                return f"{name}; {_suggest_option(name, known)}"
-        return ""
 
     def _check_value(self, action: argparse.Action, value: object) -> None:
         if action.choices is not None and value not in action.choices:
             hint = suggest_word(str(value), map(str, action.choices))
             raise argparse.ArgumentError(action, f"invalid choice {value!r}; {hint}")
-
-
-def _suggest_option(word: str, known: Sequence[str]) -> str:
-    return suggest_word(word.partition("=")[0], known)
 
 
 def _option_strings(parser: argparse.ArgumentParser) -> list[str]:

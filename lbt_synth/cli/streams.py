@@ -1,16 +1,10 @@
-"""Standard output and standard error, which may be full, or a terminal that obeys."""
+"""Standard output and standard error, which may be full or a terminal that obeys."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import re
 import sys
-
-# control characters, of writing directions too, and halves of letters in names of files
-_UNPRINTABLE = re.compile(
-    "[\0-\x08\n-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
-)
 
 
 def printable(text: str) -> str:
@@ -22,7 +16,9 @@ def printable(text: str) -> str:
     >>> print(printable("\33[31mred\n café"))
     \x1b[31mred\n café
     """
-    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return "".join(
+        c if c.isprintable() or c == "\t" else c.encode("unicode_escape").decode() for c in text
+    )
 
 
 def print_error(text: str) -> None:

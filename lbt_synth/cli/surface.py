@@ -1,23 +1,18 @@
-"""Errors in the words of the terminal: options and keys for arguments, and what a file is.
+"""Errors in the words of the terminal: options for arguments, and what a file is.
 
 Messages name the arguments of functions in three forms: ``name=value``, a name before "must" or
-after "give", and names of several words. The options of the command and the keys of its
-configuration that have such a name are said instead.
+after "give", and names of several words. The option of the command that has such a name is said
+instead.
 """
 
 from __future__ import annotations
 
 import re
 from argparse import Namespace
-from collections import Counter
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-
-from pydantic import BaseModel
 
 from lbt_synth.cli.parser import command_options
 from lbt_synth.config.load import read_mapping
-from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, LbtSynthError, OutputError
 from lbt_synth.files import load_gain
 from lbt_synth.identification.records.from_file import is_telemetry
@@ -52,42 +47,21 @@ def say_error(error: LbtSynthError, arguments: Namespace) -> str:
 
 
 def _say_names(message: str, arguments: Namespace) -> str:
-    """Name options and keys where a message names arguments of functions."""
-    options = command_options(arguments.command)
-    given = {name for name, (_, usual) in options.items() if getattr(arguments, name) != usual}
-    keys = _unique_keys() if "config" in arguments else {}
+    """Name options where a message names arguments of functions."""
+    options = {name: said for name, (said, _) in command_options(arguments.command).items()}
 
     def name(found: re.Match[str]) -> str:
-        word = found[0]
-        if word in options and (word in given or word not in keys):
-            return options[word][0]
-        return keys.get(word, word)
+        return options.get(found[0], found[0])
 
     def setting(found: re.Match[str]) -> str:
         word, value = found.groups()
-        if word in options:
-            pairs = re.findall(r"'(\w+)': ([^,}]+)", value)
-            words = [f"{key}={entry}" for key, entry in pairs] or [value.strip("'\"")]
-            return " ".join([options[word][0], *words])
-        return f"{keys[word]}: {value}" if word in keys else found[0]
+        if word not in options:
+            return found[0]
+        pairs = re.findall(r"'(\w+)': ([^,}]+)", value)
+        words = [f"{key}={entry}" for key, entry in pairs] or [value.strip("'\"")]
+        return " ".join([options[word], *words])
 
     return _NAME.sub(name, _SETTING.sub(setting, message))
-
-
-def _unique_keys() -> Mapping[str, str]:
-    """Return the paths of keys outside lists by their last names, where only one has it."""
-    paths = list(_key_paths(FileSection))
-    counts = Counter(path.rpartition(".")[2] for path in paths)
-    last = {path: path.rpartition(".")[2] for path in paths}
-    return {name: path for path, name in last.items() if counts[name] == 1}
-
-
-def _key_paths(section: type[BaseModel], place: str = "") -> Iterator[str]:
-    for name, field in section.model_fields.items():
-        yield f"{place}{name}"
-        for kind in (field.annotation, *getattr(field.annotation, "__args__", ())):
-            if isinstance(kind, type) and issubclass(kind, BaseModel):
-                yield from _key_paths(kind, f"{place}{name}.")
 
 
 def _misplaced_files(arguments: Namespace) -> str:

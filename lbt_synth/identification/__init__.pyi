@@ -25,7 +25,7 @@ from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
 from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identified_model import IdentifiedTurbulence as IdentifiedTurbulence
-from .fit.identified_model import Whiteness as Whiteness
+from .fit.periodogram import Whiteness as Whiteness
 from .method_choice import MethodChoice as MethodChoice
 from .method_choice import MethodRow as MethodRow
 from .prediction.comparison import PredictionRow as PredictionRow

@@ -1,7 +1,6 @@
 from .broken_loops import BrokenLoop as BrokenLoop
 from .broken_loops import MarginPoint as MarginPoint
 from .broken_loops import broken_loops as broken_loops
-from .budget import ResidualBudget as ResidualBudget
 from .budget import model_budget as model_budget
 from .budget import residual_budget as residual_budget
 from .budget import settling_error as settling_error
@@ -25,6 +24,7 @@ from .margins import loop_margins as loop_margins
 from .margins import stable_sensor_gains as stable_sensor_gains
 from .moving_gain import MovingGain as MovingGain
 from .moving_gain import moving_gain as moving_gain
+from .residual import ResidualBudget as ResidualBudget
 from .simulation.run import Simulation as Simulation
 from .simulation.run import filter_series as filter_series
 from .simulation.run import simulate as simulate

@@ -19,7 +19,7 @@ from scipy.special import j0, j1
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.quadrature import compress_rule, gauss_panels
-from lbt_synth.loop.budget import ResidualBudget
+from lbt_synth.loop.residual import ResidualBudget
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,

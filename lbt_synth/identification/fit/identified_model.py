@@ -1,14 +1,14 @@
-"""The identified model of a loop: its axes, turbulence and lines, with standard errors."""
+"""The identified model of a loop, with standard errors, and its tables."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from lbt_synth.identification.fit.model_tables import model_tables
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
 from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.models import (
     ARModel,
@@ -19,8 +19,10 @@ from lbt_synth.models import (
     Vibration,
     tip_tilt_plant,
 )
-from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.display_unit import nm_text, shown_format, shown_unit
+from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
+from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
@@ -96,15 +98,7 @@ class IdentifiedLine:
     def vibration(self, direction: tuple[float, ...] | None = None) -> Vibration:
         """Return the resonance as a part of a plant.
 
-        Parameters
-        ----------
-        direction : tuple of float, optional
-            Direction over the modes; by default the line's own, and tip for one without.
-
-        Returns
-        -------
-        Vibration
-            With its frequency, damping and rms.
+        Its direction over the modes is by default the line's own, and tip for one without.
         """
         return Vibration(
             frequency_hz=self.frequency_hz,
@@ -139,44 +133,6 @@ class IdentifiedTurbulence:
     corner_error_hz: float | None
     rms_nm: float
     rms_error_nm: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Whiteness:
-    """Tests of the innovations, the prediction errors of the fitted model.
-
-    Their spectrum is the ratio of periodogram to model.
-
-    Attributes
-    ----------
-    deviation : float
-        Largest distance of the cumulative periodogram of the innovations from the diagonal, as
-        a part of their power.
-    p_value : float
-        Probability of a larger one if the innovations were white (M. S. Bartlett, An
-        Introduction to Stochastic Processes, 1955; Kolmogorov's distribution).
-    autocorrelation : (lags,) ndarray
-        From lag 1.
-    correlation_p_value : float
-        Of Box and Pierce's sum of squares over these lags (doi:10.1080/01621459.1970.10481180).
-    frequency_hz, cumulative : (f,) ndarray
-        The cumulative periodogram, from 0 to 1.
-    effective : float
-        Number of independent values.
-    """
-
-    deviation: float
-    p_value: float
-    autocorrelation: FloatArray
-    correlation_p_value: float
-    frequency_hz: FloatArray
-    cumulative: FloatArray
-    effective: float
-
-    @property
-    def white(self) -> bool:
-        """Whether neither test refuses whiteness at 1 %."""
-        return self.p_value > 0.01 and self.correlation_p_value > 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -329,13 +285,7 @@ class IdentifiedModel(Summarised):
         return (*own, *self.shared)
 
     def plant(self) -> TipTiltPlant:
-        """Return the plant of a design.
-
-        Returns
-        -------
-        TipTiltPlant
-            Turbulence and resonances, independent of each other; those of both axes once.
-        """
+        """Return the plant of a design: independent processes, those of both axes once."""
         return tip_tilt_plant(
             frame_rate_hz=self.frame_rate_hz,
             delay_frames=self.delay_frames,
@@ -347,15 +297,90 @@ class IdentifiedModel(Summarised):
         )
 
     def truth(self) -> Truth:
-        """Return the same as the truth of an analysis, for :attr:`hardware`.
-
-        Returns
-        -------
-        Truth
-            Turbulence, resonances and noise of each axis.
-        """
+        """Return the same as the truth of an analysis, for :attr:`hardware`."""
         return Truth(
             turbulence=tuple(axis.turbulence for axis in self.axes),
             vibrations=tuple(part.vibration() for part in self.parts),
             noise_nm=np.array([axis.noise_nm for axis in self.axes]),
         )
+
+
+@table_row
+class VibrationRow:
+    """A vibration on one axis, or along a direction over both."""
+
+    axis: str = column("axis")  # or the direction
+    frequency_hz: float = column("f", unit="Hz", format=".3f")
+    frequency_error_hz: float = column("+-", unit="Hz", format=".2g")
+    frequency_error_if_several_hz: float | None = column("if several", unit="Hz", format=".2g")
+    damping: str = column("damping")  # one that is not resolved has a bound, and no error
+    damping_error: float | None = column("+-", format=".2g")
+    rms_nm: float = nm_column("rms", format=".2f")
+    rms_error_nm: float = column("+-", unit="nm", format=".2g")
+    prominence: float = column("over the rest", format=".3g")
+    origin: str = column("origin")
+
+
+def axis_names(count: int) -> list[str]:
+    """Return what tables call each axis."""
+    return ["tip", "tilt"] if count == 2 else ["-"] * count
+
+
+def model_tables(model: IdentifiedModel) -> list[Table]:
+    """Return turbulence, noise and sensor of each axis, and the vibrations if there are any."""
+    names = axis_names(len(model.axes))
+    background = Table(
+        caption="Turbulence, noise and sensor",
+        headings=("quantity", "axis", "value", "error", "unit"),
+        rows=tuple(
+            (quantity, name, *_shown_cells(value, digits, error, unit))
+            for name, axis in zip(names, model.axes, strict=True)
+            for quantity, value, digits, error, unit in _background(axis)
+            if value is not None
+        ),
+        words=(4,),
+    )
+    lines = [
+        fill_row(
+            VibrationRow,
+            line,
+            axis=_direction_text(line, names),
+            damping=f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
+            damping_error=line.damping_error if line.resolved else None,
+            origin=line.kind + ", announced" * line.announced,
+        )
+        for line in model.parts
+    ]
+    return [background, *([row_table("Vibrations", lines)] if lines else [])]
+
+
+def _shown_cells(value: float, digits: str, error: float | None, unit: str) -> tuple[str, str, str]:
+    """Return the cells of a value, its error and its unit."""
+    name, factor = shown_unit(unit)
+    size = None if error is None else factor * error
+    return cell_text(factor * value, shown_format(digits, factor)), cell_text(size, ".2g"), name
+
+
+def _direction_text(line: IdentifiedLine, names: Sequence[str]) -> str:
+    """Return the axis of a line, or the direction of one that both axes share."""
+    assert line.direction is not None  # of the parts of a model
+    if np.count_nonzero(line.direction) == 1:
+        return names[int(np.argmax(line.direction))]
+    error = line.direction_error_deg
+    return f"{line.direction_deg:.4g}{'' if error is None else f' +- {error:.1g}'} deg"
+
+
+def _background(
+    axis: IdentifiedAxis,
+) -> tuple[tuple[str, float | None, str, float | None, str], ...]:
+    """Return each quantity, its value, how it is written, its standard error and its unit."""
+    slow, correlation = axis.turbulence_fit, axis.noise_correlation or None
+    return (
+        ("turbulence, rms", slow.rms_nm, ".1f", slow.rms_error_nm, "nm"),
+        ("turbulence, frequency", slow.frequency_hz, ".4g", slow.frequency_error_hz, "Hz"),
+        ("turbulence, damping", slow.damping, ".3g", slow.damping_error, ""),
+        ("turbulence, roll-off", slow.corner_hz, ".3g", slow.corner_error_hz, "Hz"),
+        ("noise per frame", axis.noise_nm, ".3f", axis.noise_error_nm, "nm"),
+        ("noise, correlation", correlation, ".3f", axis.noise_correlation_error, ""),
+        ("sensor gain", axis.sensor_gain, ".4f", axis.sensor_gain_error, ""),
+    )

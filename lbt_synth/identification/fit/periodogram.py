@@ -95,6 +95,44 @@ class LoopPeriodogram:
         return replace(self, **values)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Whiteness:
+    """Tests of the innovations, the prediction errors of the fitted model.
+
+    Their spectrum is the ratio of periodogram to model.
+
+    Attributes
+    ----------
+    deviation : float
+        Largest distance of the cumulative periodogram of the innovations from the diagonal, as
+        a part of their power.
+    p_value : float
+        Probability of a larger one if the innovations were white (M. S. Bartlett, An
+        Introduction to Stochastic Processes, 1955; Kolmogorov's distribution).
+    autocorrelation : (lags,) ndarray
+        From lag 1.
+    correlation_p_value : float
+        Of Box and Pierce's sum of squares over these lags (doi:10.1080/01621459.1970.10481180).
+    frequency_hz, cumulative : (f,) ndarray
+        The cumulative periodogram, from 0 to 1.
+    effective : float
+        Number of independent values.
+    """
+
+    deviation: float
+    p_value: float
+    autocorrelation: FloatArray
+    correlation_p_value: float
+    frequency_hz: FloatArray
+    cumulative: FloatArray
+    effective: float
+
+    @property
+    def white(self) -> bool:
+        """Whether neither test refuses whiteness at 1 %."""
+        return self.p_value > 0.01 and self.correlation_p_value > 0.01
+
+
 def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:
     """Return ``4 sin^2(pi f / f_s)``, the power of the difference of two frames."""
     return np.asarray(4 * np.sin(np.pi * frequency_hz / frame_rate_hz) ** 2)

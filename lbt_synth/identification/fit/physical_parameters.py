@@ -14,9 +14,8 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedLine,
     IdentifiedTurbulence,
     Kind,
-    Whiteness,
 )
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
 from lbt_synth.identification.fit.spectrum_model import GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
     FittedModel,

@@ -13,13 +13,13 @@ from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear.panel_edges import panel_edges
 from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
 from lbt_synth.linear.quadrature import adaptive_integral
-from lbt_synth.loop.budget import ResidualBudget, require_true_gain
 from lbt_synth.loop.closed_loop import (
     STABILITY_MARGIN,
     ClosedLoop,
     affine_radii,
     require_loop_rate,
 )
+from lbt_synth.loop.residual import ResidualBudget, require_true_gain
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, Truth, Vibration
 from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
 from lbt_synth.models.fusion.plant import FusedPlant

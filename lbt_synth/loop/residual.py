@@ -1,0 +1,97 @@
+"""What a loop leaves of the disturbances and of the noise, by origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.models import Truth
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import fact_table, fill_row, nm_column, table_row
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
+
+
+@table_row
+class BudgetFacts:
+    """The residual by origin."""
+
+    rms_nm: float = nm_column("residual", unit="nm rms")
+    turbulence_nm: float = nm_column("  turbulence", unit="nm rms")
+    vibration_nm: float = nm_column("  vibrations", unit="nm rms")
+    noise_nm: float = nm_column("  noise", unit="nm rms")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualBudget(Summarised):
+    """Stationary residual of a loop, by origin.
+
+    Attributes
+    ----------
+    turbulence_nm2, noise_nm2, random_vibration_nm2 : (n, n) ndarray
+        Covariances over the modes [nm^2].
+    line_amplitudes_nm : (s, n) complex ndarray
+        Complex amplitude that each sinusoid leaves on each mode [nm].
+    """
+
+    turbulence_nm2: FloatArray
+    noise_nm2: FloatArray
+    random_vibration_nm2: FloatArray
+    line_amplitudes_nm: ComplexArray
+
+    def _brief(self) -> str:
+        return f"{nm_text(self.rms_nm, '.4g')} rms, {len(self.noise_nm2)} modes"
+
+    def _summarise(self) -> Summary:
+        return Summary(tables=[fact_table("Residual", fill_row(BudgetFacts, self))])
+
+    @property
+    def gaussian_nm2(self) -> FloatArray:
+        """Covariance of all that is Gaussian [nm^2]."""
+        return frozen_copy(self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2)
+
+    @property
+    def vibration_nm2(self) -> FloatArray:
+        """Covariance of all vibrations, the sinusoids by their mean power [nm^2]."""
+        a = self.line_amplitudes_nm
+        return frozen_copy(self.random_vibration_nm2 + np.real(a.T @ a.conj()) / 2)
+
+    @property
+    def total_nm2(self) -> FloatArray:
+        """Covariance of the residual [nm^2]."""
+        return frozen_copy(self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2)
+
+    @property
+    def rms_nm(self) -> float:
+        """Residual over all modes [nm rms]."""
+        return _rms(self.total_nm2)
+
+    @property
+    def turbulence_nm(self) -> float:
+        """Residual turbulence over all modes [nm rms]."""
+        return _rms(self.turbulence_nm2)
+
+    @property
+    def vibration_nm(self) -> float:
+        """Residual vibration over all modes [nm rms]."""
+        return _rms(self.vibration_nm2)
+
+    @property
+    def noise_nm(self) -> float:
+        """Propagated noise over all modes [nm rms]."""
+        return _rms(self.noise_nm2)
+
+
+def _rms(covariance: FloatArray) -> float:
+    return float(np.sqrt(np.trace(covariance)))
+
+
+def require_true_gain(sensor_gain: float, truth: Truth) -> None:
+    """Refuse a loop that is closed with another sensor gain than that of the truth."""
+    if sensor_gain != truth.sensor_gain:
+        raise ProblemError(
+            f"the loop must be closed with the truth's sensor gain {truth.sensor_gain:.6g}; "
+            f"got {sensor_gain:.6g}."
+        )
