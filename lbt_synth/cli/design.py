@@ -1,21 +1,30 @@
-"""The command design: a controller from a configuration, as a gain file."""
+"""The command design: a controller from a configuration, as a gain file, and what it prints."""
 
 from __future__ import annotations
 
 from argparse import Namespace
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
 
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.design_description import describe_design
 from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config import load_config
+from lbt_synth.design import Design
+from lbt_synth.design.facts import DesignFacts, without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
+from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import method_of_design, option_names
 from lbt_synth.methods.request import Wording, design_request
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.loop_hardware import LoopFacts
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.rows import fact_table, json_record
 
 _WORDING = Wording(method="--method {}", option="--{}")
 
@@ -40,3 +49,93 @@ def run(arguments: Namespace) -> Report:
         )
     report.note_written(path)
     return report
+
+
+_SMALL_MODULUS = 0.3
+
+
+def describe_design(design: Design, *, matrices: bool = False) -> Report:
+    """Describe a design: what it is, its loop, its certificate, and its matrices if asked for."""
+    described = method_of_design(design.method).describe(design)
+    said = DesignFacts(
+        method=design.method,
+        route=f"{design.solver.route} ({design.solver.status})",
+        n_states=design.controller.n_states,
+    )
+    report = Report(
+        data={
+            "solver": asdict(design.solver),
+            "poles": [complex(p) for p in design.poles],
+            "controller_spectral_radius": design.controller.to_statespace().spectral_radius,
+        }
+    )
+    facts: list[Any] = [said, described.facts]
+    margins = None
+    if design.hardware is not None:
+        facts.append(_loop_facts(report, design.hardware))
+        margins = loop_margins(close_loop(design.hardware, design))
+        report.data["margins"] = json_record(margins)
+        report.notes += _loop_notes(design, design.hardware, report.data)
+    report.add_records(*facts)
+    printed = fact_table("Design", *facts, *([] if margins is None else [margins]))
+    report.tables.append(printed if margins or design.several_sensors else without_units(printed))
+    report.notes += described.notes
+    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
+    report.data["assumptions"] = design.assumptions
+    for table in described.tables:
+        report.add_rows(table.key, table.title, table.rows)
+    report.add_rows("checks", "Certificate", design.certificate.checks)
+    if matrices:
+        named = {name: getattr(design.controller, name) for name in "ABCD"}
+        named |= described.matrices
+        report.data["matrices"] = named
+        with np.printoptions(precision=8, linewidth=160, suppress=False):
+            for name, value in named.items():
+                report.notes += [f"{name} =", *str(value).splitlines()]
+    return report
+
+
+def add_moving_gain(report: Report, design: Design) -> None:
+    """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
+    from lbt_synth.loop import moving_gain
+
+    if design.hardware is None:
+        return
+    loop = close_loop(design.hardware, design)
+    if loop.is_stable:
+        report.add_facts("Sensor gain that moves", moving_gain(loop), key="moving_gain")
+
+
+def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
+    """Return the facts of a loop; the data get its mirror, if that has dynamics."""
+    facts = hardware.facts()
+    if hardware.mirror is not None:
+        settling_s = hardware.mirror.step_response().settling_s
+        report.data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
+    return facts
+
+
+def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:
+    notes = []
+    modulus, alone = data["margins"]["modulus"], data["controller_spectral_radius"]
+    if hardware.mirror is not None and not design.knows_mirror:
+        notes.append(
+            "note: this filter commands its estimate as if the mirror settled at once, so that its "
+            "estimation error is not the residual; --method lqg commands for the mirror's dynamics."
+        )
+    if modulus < _SMALL_MODULUS:
+        notes.append(
+            f"note: the modulus margin {modulus:.3g} is small; a loop is usually asked for "
+            f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
+        )
+    if not np.array_equal(hardware.sensor, np.eye(len(hardware.sensor))):
+        notes.append(
+            "note: sensor gains here are factors on the gain that the design assumes, which is in "
+            "its sensor matrix."
+        )
+    if alone > 1:
+        notes.append(
+            f"note: the controller alone has a pole of modulus {alone:.4g}; with the loop open its "
+            "commands grow. Reset it whenever the loop opens."
+        )
+    return notes

@@ -1,4 +1,4 @@
-"""The command init: a configuration to begin with, and its schema for editors beside it."""
+"""The commands init and schema: a configuration to begin with, and its schema for editors."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from lbt_synth.storage.atomic_files import (
     make_directory,
     require_ending,
     require_writable,
+    write_atomically,
     write_together,
 )
 
@@ -114,3 +115,15 @@ def _unknown_sections(record: LoopRecord, source: str, telescope: str) -> str:
 
 def _section(name: str, template: str) -> re.Match[str] | None:
     return re.search(rf"^{name}:.*\n(?:  .*\n)+", template, re.MULTILINE)
+
+
+def run_schema(arguments: Namespace) -> Report:
+    """Print the schema of a configuration, or write it."""
+    schema = config_schema()
+    text = json.dumps(schema, indent=1)
+    if arguments.output is None:
+        return Report(data=schema, opening=text.splitlines())
+    report, output = Report(), require_ending(arguments.output, "a schema", (".json",))
+    require_writable(output)
+    report.note_written(write_atomically(output, f"{text}\n".encode()))
+    return report

@@ -13,14 +13,24 @@ import signal
 import sys
 import threading
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from lbt_synth.cli.streams import discard, print_error
 from lbt_synth.errors import LbtSynthError, SynthesisError
 from lbt_synth.storage.thread_limits import limit_threads
 
+if TYPE_CHECKING:  # slow to import for --help
+    from lbt_synth.cli.output import Report
+
 DONE, FAILED, WRONG = 0, 1, 2
+_SHARED_MODULES = dict.fromkeys(("bode", "nyquist", "nichols", "sigma", "step"), "loop_views") | {
+    "completion": "help",
+    "end-to-end-table": "end_to_end",
+    "schema": "init",
+    "verify": "show",
+}
 INTERRUPTED, BROKEN_PIPE, TERMINATED = 130, 141, 143  # as shells count signals
 
 
@@ -38,9 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     from lbt_synth.storage.display_unit import own_display_unit
 
     try:
-        command = importlib.import_module(f"lbt_synth.cli.{arguments.command.replace('-', '_')}")
+        run = _find_command(arguments.command)
         with _terminable(), own_display_unit():
-            report = command.run(arguments)
+            report = run(arguments)
     except LbtSynthError as error:
         from lbt_synth.cli.surface import say_error  # after what it says may have failed
 
@@ -56,6 +66,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     report.print(as_json=arguments.json)
     return DONE if report.passed else FAILED
+
+
+def _find_command(command: str) -> Callable[[Namespace], Report]:
+    """Return what runs a command, from its module or from one that it shares."""
+    name = command.replace("-", "_")
+    module = importlib.import_module(f"lbt_synth.cli.{_SHARED_MODULES.get(command, name)}")
+    run: Callable[[Namespace], Report] = getattr(module, f"run_{name}", None) or module.run
+    return run
 
 
 def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:

@@ -1,17 +1,17 @@
-"""The command show: what is in a gain file."""
+"""The commands show and verify: what is in a gain file, and its certificate computed again."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from pathlib import Path
 
-from lbt_synth.cli.design_description import add_moving_gain, describe_design
+from lbt_synth.cli.design import add_moving_gain, describe_design
 from lbt_synth.cli.display import choose_design_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config.load import config_from_text
-from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.files.gain_file.store import load_with_digest, read_design
 from lbt_synth.interop import frame_cost
 from lbt_synth.storage.rows import fact_table, json_record
 
@@ -38,4 +38,26 @@ def run(arguments: Namespace) -> Report:
     if design.configuration:
         with show_spinner("comparing in the truth", quiet=arguments.json):
             add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
+    return report
+
+
+def run_verify(arguments: Namespace) -> Report:
+    """Recompute the certificate of a gain file."""
+    design, digest = read_design(arguments.gain)
+    certificate = design.certificate
+    report = Report(
+        data={
+            "file": arguments.gain,
+            "digest": digest,
+            "method": design.method,
+            "passed": certificate.passed,
+        },
+        notes=[
+            f"{arguments.gain}: {'verified' if certificate.passed else 'NOT VERIFIED'}",
+            f"digest {digest}",
+        ],
+        passed=certificate.passed,
+    )
+    report.add_rows("checks", "Certificate", certificate.checks)
+    add_moving_gain(report, design)
     return report

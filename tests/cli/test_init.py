@@ -1,4 +1,4 @@
-"""The command init: a configuration to begin with."""
+"""The commands init and schema."""
 
 from __future__ import annotations
 
@@ -76,3 +76,15 @@ def test_records_that_know_too_little_are_refused(here, capsys):
     assert status == 2
     assert "Try lbt-synth identify, which takes what is missing." in error
     assert sorted(file.name for file in here.iterdir()) == ["a.csv"]
+
+
+def test_the_schema_is_printed_and_written(tmp_path, capsys):
+    schema = lbt.config.config_schema()
+    for words in ((), ("--json",)):
+        status, out, error = run(capsys, "schema", *words)
+        assert (status, error) == (0, "")
+        assert json.loads(out) == schema
+    file = tmp_path / "s.json"
+    assert run(capsys, "schema", "-o", file)[0] == 0
+    assert json.loads(file.read_text()) == schema
+    assert run(capsys, "schema", "-o", tmp_path / "s.yaml")[0] == 2

@@ -56,3 +56,17 @@ def test_without_a_stable_loop_there_is_nothing_to_draw(tmp_path, capsys, gains)
     status, _, error = run(capsys, "bode", gains["integrator"], "--sensor-gain", 3, "-o", out)
     assert (status, out.exists()) == (1, False)
     assert "no loop is stable at sensor gain 3" in error
+
+
+def test_sigma(tmp_path, capsys, gains):
+    out = tmp_path / "sigma.pdf"
+    status, text, _ = run(capsys, "sigma", *gains.values(), "-o", out)
+    assert status == 0
+    assert out.read_bytes().startswith(b"%PDF")
+    lines = {words[0]: words[1:] for words in map(str.split, text.splitlines()) if words}
+    assert lines["quantity"] == ["kalman", "hinf", "integrator", "unit"]
+    assert lines["norm"][-1] == "nm"
+    assert "phase margin" in text
+    data = json.loads(run(capsys, "sigma", gains["hinf"], "-o", out, "--json")[1])
+    assert data["designs"]["hinf"]["stable"] is True
+    assert data["units"]["phase_deg"] == "deg"

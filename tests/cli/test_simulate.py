@@ -1,4 +1,4 @@
-"""The command simulate."""
+"""The command simulate, with one sensor and with several that may fail."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import pytest
 from support.commands import run
 from support.drifting import drift_file
 from support.plants import LBT_YAML
+from support.several_sensors import CONFIG as SEVERAL_SENSORS
+from support.several_sensors import write_config
 
 from lbt_synth.cli.main import main
+from lbt_synth.cli.simulate import parse_drop
 
 CONFIG = str(LBT_YAML)
 
@@ -84,3 +87,169 @@ def test_the_commands_simulate_it_or_refuse(tmp_path, capsys):
     ):
         assert main(refused) == 2
         assert "drifts from 17 to 23 Hz" in " ".join(capsys.readouterr().err.split())
+
+
+_OTHER_SENSORS = "runs with the sensors of the gain file beside the loop's own"
+
+
+@pytest.fixture
+def config_file(tmp_path):
+    return write_config(tmp_path)
+
+
+def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, fused_file):
+    figure = tmp_path / "drops.png"
+    status, text, _ = run(
+        capsys,
+        *("simulate", config_file, fused_file, "--drop", "m2@0.5s", "-o", figure),
+        *("--drop", "wavefront@1s..1.2s", "--frames", 2000),
+    )
+    assert status == 0
+    assert "m2, wavefront" in text
+    assert figure.stat().st_size > 10_000
+
+
+def test_the_run_reaches_beyond_the_last_event(capsys, config_file, fused_file):
+    arguments = ("simulate", config_file, fused_file, "--drop", "m2@0.5s", "--cases", 1, "--json")
+    data = json.loads(run(capsys, *arguments)[1])
+    assert data["frames"] == 5500
+    assert [row["sensors"] for row in data["segments"]] == ["none", "m2"]
+    assert " in the loop: 1 run; " in run(capsys, *arguments[:-1])[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--drop", "m3@1s"), "must be one of wavefront, slow, m1, m2"),
+        (("--drop", "m2"), "--drop takes SENSOR@START..END"),
+        (("--drop", "m2@1.2.3s"), "times in seconds"),
+        (("--drop", "m2@5s", "--frames", 1000), "--frames must reach beyond"),
+        (("--stroke", 100), "--stroke goes with"),
+        (("--telemetry", "t.fits"), "--telemetry goes with"),
+        (("--form", "estimator"), "--form goes with"),
+        (("--sensor-gain", 30), "must be stable"),
+    ],
+)
+def test_what_it_refuses(capsys, config_file, fused_file, arguments, said):
+    status, out, error = run(capsys, "simulate", config_file, fused_file, *arguments)
+    assert status != 0
+    assert out == ""
+    assert said in error
+
+
+def test_a_design_of_one_sensor_has_nothing_to_drop(capsys, config_file, gains):
+    status, _, error = run(capsys, "simulate", config_file, gains["kalman"], "--drop", "m2@1s")
+    assert status == 2
+    assert "--drop goes with a design of several sensors" in error
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("sigma",),
+        ("bode",),
+        ("step",),
+        ("rehearse", "--for", "c"),
+    ],
+)
+def test_commands_for_one_sensor_say_so(capsys, fused_file, command):
+    status, out, error = run(capsys, command[0], fused_file, *command[1:])
+    assert (status, out) == (2, "")
+    assert "is a design of several sensors" in error
+
+
+def test_the_table_of_the_paper_has_no_channels(capsys, fused_file, tmp_path):
+    out = tmp_path / "table"
+    status, _, error = run(capsys, "end-to-end-table", LBT_YAML, fused_file, "-o", out)
+    assert status == 2
+    assert "is a design of several sensors" in error
+    assert not out.exists()
+
+
+def test_show_prints_what_failures_do(capsys, fused_file):
+    status, text, _ = run(capsys, "show", fused_file)
+    assert status == 0
+    assert "When sensors fail" in text
+    assert "wavefront + slow + m1 + m2" in text
+    assert "of the loop's own sensor in the truth" in text
+
+
+def test_verify_and_limits_take_it(tmp_path, capsys, fused_file):
+    assert "verified" in run(capsys, "verify", fused_file)[1]
+    few = write_config(tmp_path, SEVERAL_SENSORS + "robustness: {errors_hz: [0]}\n")
+    status, text, _ = run(capsys, "limits", few, fused_file)
+    assert status == 0
+    assert "fused" in text
+    assert _OTHER_SENSORS not in text
+
+
+@pytest.mark.parametrize("command", ["limits", "simulate", "report"])
+def test_other_sensors_than_those_of_the_configuration_are_named(
+    tmp_path, capsys, fused_file, command
+):
+    noisy = SEVERAL_SENSORS.replace("noise_m_s2: 2.0e-4", "noise_m_s2: 2.0e-2")
+    few = write_config(tmp_path, noisy + "robustness: {errors_hz: [0]}\n")
+    output = ("-o", tmp_path / "a.html") if command == "report" else ()
+    status, text, _ = run(capsys, command, few, fused_file, *output)
+    assert status == 0
+    assert _OTHER_SENSORS in text
+
+
+def test_commands_that_read_the_own_sensor_alone_say_so(capsys, config_file):
+    for command in (("robustness", config_file), ("tradeoff", config_file, "--points", 2)):
+        status, text, _ = run(capsys, *command)
+        assert status == 0
+        assert "note: the loop's own sensor is read alone, without slow, m1, m2." in text
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("kalman", ("--horizon", 2)),
+        ("kalman", ("--route", "sdp")),
+        ("hinf", ("--route", "lmi")),
+        ("mixed", ("--taps", 8)),
+        ("mixed", ("--rms", 60)),
+    ],
+)
+def test_options_that_several_sensors_do_not_have(tmp_path, capsys, config_file, method, options):
+    gain = tmp_path / "q.fits"
+    status, _, error = run(capsys, "design", config_file, "--method", method, *options, "-o", gain)
+    assert status == 2
+    assert f"{options[0]} must be left out with several sensors" in error
+    assert not gain.exists()
+
+
+def test_a_design_has_units(tmp_path, capsys, fused_file):
+    text = run(capsys, "show", fused_file)[1]
+    (line,) = (row for row in text.splitlines() if row.lstrip().startswith("estimation error, rms"))
+    assert line.split()[-1] == "nm"
+
+
+def test_what_a_drop_says():
+    drop = parse_drop("wavefront@20s..20.2s:frozen")
+    assert (drop.unit, drop.start_s, drop.end_s) == ("wavefront", 20, 20.2)
+    assert drop.reading == "frozen"
+
+
+def test_it_is_exported_to_c(tmp_path, capsys, fused_file):
+    out = tmp_path / "k.c"
+    status, text, error = run(capsys, "export", fused_file, "--for", "c", "-o", out)
+    assert (status, error) == (0, "")
+    assert "spectral radius with any sensors missing" in text
+    data = json.loads(run(capsys, "export", fused_file, "--for", "c", "-o", out, "--json")[1])
+    assert (data["measurements"], data["commands"]) == (6, 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--for", "c", "--form", "plain", "-o", "k.c"), "in estimator form alone"),
+        (("--for", "dao", "-o", "k.npy"), "reads several sensors (wavefront, slow, m1, m2)"),
+    ],
+)
+def test_exports_that_cannot_hold_it(tmp_path, capsys, fused_file, options, said):
+    status, out, error = run(capsys, "export", fused_file, *options[:-1], tmp_path / options[-1])
+    assert (status, out) == (2, "")
+    assert said in error
+    assert not list(tmp_path.iterdir())
