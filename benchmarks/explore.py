@@ -20,8 +20,14 @@ from statistics import median, quantiles
 
 import lbt_synth as lbt
 from lbt_synth.report.explore.evaluation import loop_curves
-from lbt_synth.report.explore.exploration import explore, judge, quick_view, whole_view
-from lbt_synth.report.explore.wish import Wish, fulfil
+from lbt_synth.report.explore.exploration import (
+    Wish,
+    explore,
+    fulfil,
+    judge,
+    quick_view,
+    whole_view,
+)
 
 sys.path.insert(0, "tests")  # what opens the page is what the tests use
 

@@ -42,7 +42,7 @@ from lbt_synth.models import (
     tip_tilt_plant,
 )
 from lbt_synth.models.plant.frequency_prior import line_frequencies, spread_lines
-from lbt_synth.models.vibration.in_a_loop import TrueVibration
+from lbt_synth.models.vibration import TrueVibration
 from lbt_synth.validation import FloatArray, frozen_copy
 
 WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # keys of FrozenFlows

@@ -366,3 +366,25 @@ class FileSection(Section):
     def true_turbulence(self) -> str:
         """Turbulence that the real loop meets: frozen_flow, model or none."""
         return self.truth.turbulence or self.usual_turbulence
+
+
+def config_schema() -> dict[str, Any]:
+    """Return the JSON schema of a configuration file.
+
+    Every key has its description, with its unit. Rules over several keys, such as one of
+    ``rms_nm`` and ``rms_mas``, are known to :func:`load_config` alone.
+
+    Returns
+    -------
+    dict
+        Schema of draft 2020-12, ready for :func:`json.dumps`.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> schema = lbt.config.config_schema()
+    >>> schema["$defs"]["LoopSection"]["properties"]["frame_rate_hz"]["description"]
+    'frame rate [Hz]'
+    """
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, **FileSection.model_json_schema(), "title": "lbt-synth"}

@@ -19,7 +19,7 @@ from lbt_synth.loop.budget import noise_covariance
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
-from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
+from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance, set_fields
 
 TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as fractions of the limit

@@ -22,7 +22,7 @@ from lbt_synth.loop.fusion.fused_loop import AnyLoop, FusedLoop, fused_budget
 from lbt_synth.loop.residual import ResidualBudget, require_true_gain
 from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density
-from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 

@@ -29,6 +29,6 @@ from .turbulence.frozen_flows import FrozenFlows as FrozenFlows
 from .turbulence.modal import ModalTurbulence as ModalTurbulence
 from .turbulence.modal import modal_turbulence as modal_turbulence
 from .turbulence.zernike import noll_orders as noll_orders
-from .vibration.drifting import DriftingVibration as DriftingVibration
-from .vibration.resonance import Vibration as Vibration
-from .vibration.sinusoid import SinusoidalVibration as SinusoidalVibration
+from .vibration import DriftingVibration as DriftingVibration
+from .vibration import SinusoidalVibration as SinusoidalVibration
+from .vibration import Vibration as Vibration

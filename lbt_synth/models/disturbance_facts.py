@@ -8,8 +8,7 @@ import numpy as np
 
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.spectra import Spectrum
-from lbt_synth.models.vibration.drifting import DriftingVibration
-from lbt_synth.models.vibration.in_a_loop import TrueVibration
+from lbt_synth.models.vibration import DriftingVibration, TrueVibration
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import FloatArray

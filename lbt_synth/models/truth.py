@@ -12,8 +12,7 @@ from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.fusion.sensors import Motions
 from lbt_synth.models.spectra import Spectrum, spectrum_key
-from lbt_synth.models.vibration.drifting import DriftingVibration
-from lbt_synth.models.vibration.in_a_loop import TrueVibration, stationary_vibrations
+from lbt_synth.models.vibration import DriftingVibration, TrueVibration, stationary_vibrations
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
 from lbt_synth.storage.words import count_text

@@ -12,7 +12,7 @@ from lbt_synth.design.fusion.failures import failure_rows
 from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.loop.fusion.simulation import Drop
 from lbt_synth.report.charts.description import Chart
-from lbt_synth.report.figures.sensor_failures import sensor_failure_panels
+from lbt_synth.report.figures.simulation import sensor_failure_panels
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.page.source_section import source_section

@@ -22,7 +22,7 @@ from lbt_synth.loop import (
 )
 from lbt_synth.loop.broken_loops import phase_margin_deg
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
-from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
+from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, number
 

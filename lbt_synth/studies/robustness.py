@@ -26,7 +26,7 @@ from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth, retuned_plant
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
-from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
 from lbt_synth.validation import (
     BoolArray,

@@ -13,7 +13,7 @@ from lbt_synth.design.shaping.frequencies import spectrum_edges
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop import ClosedLoop, residual_budget
 from lbt_synth.models import SinusoidalVibration, Spectrum, Truth, Vibration
-from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, IntArray

@@ -26,7 +26,7 @@ from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
-from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_BOXES = 120  # halved

@@ -13,7 +13,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.batched import transpose
 from lbt_synth.models import ARModel, ModalTurbulence, Vibration
 from lbt_synth.models.mirror.frame_rate_system import Response
-from lbt_synth.models.vibration.resonance import sampled_lines
+from lbt_synth.models.vibration import sampled_lines
 from lbt_synth.validation import FloatArray, frozen_copy, integer, real_array
 
 Lines: TypeAlias = tuple[tuple[Vibration, ...], ...]

@@ -11,7 +11,7 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.budget import ar_covariance
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.models.vibration.in_a_loop import checked_direction
+from lbt_synth.models.vibration import checked_direction
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray
 

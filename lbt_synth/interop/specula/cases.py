@@ -20,7 +20,7 @@ from lbt_synth.models import (
     SinusoidalVibration,
     Vibration,
 )
-from lbt_synth.models.vibration.in_a_loop import TrueVibration
+from lbt_synth.models.vibration import TrueVibration
 
 
 def make_case(

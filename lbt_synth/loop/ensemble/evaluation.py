@@ -27,7 +27,7 @@ from lbt_synth.loop.ensemble.process_covariances import Process, add_process
 from lbt_synth.loop.ensemble.spectral_covariances import spectral_covariances
 from lbt_synth.loop.strehl import Imaging, jitter_spread_nm, jitter_strehls, widest_jitter_nm
 from lbt_synth.models import LoopHardware, ModalTurbulence
-from lbt_synth.models.vibration.resonance import sampled_lines
+from lbt_synth.models.vibration import sampled_lines
 from lbt_synth.validation import (
     BoolArray,
     ComplexArray,

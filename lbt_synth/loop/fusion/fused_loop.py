@@ -30,7 +30,7 @@ from lbt_synth.models.fusion.sensors import (
     checked_motions,
 )
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number
 
 

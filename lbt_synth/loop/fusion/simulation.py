@@ -19,8 +19,7 @@ from lbt_synth.models.fusion.sensors import (
     SensorSuite,
     checked_motions,
 )
-from lbt_synth.models.vibration.drifting import DriftingVibration
-from lbt_synth.models.vibration.in_a_loop import TrueVibration, checked_direction
+from lbt_synth.models.vibration import DriftingVibration, TrueVibration, checked_direction
 from lbt_synth.validation import FloatArray, choice, integer, number
 
 READINGS = ("missing", "zero", "frozen")

@@ -22,7 +22,7 @@ from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum
 from lbt_synth.loop.least_residuals.prediction import Prediction
 from lbt_synth.loop.least_residuals.residual_limit import mode_limit, truth_modes
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
-from lbt_synth.models.vibration.in_a_loop import checked_direction
+from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _PANELS = 128  # at least so many over the band

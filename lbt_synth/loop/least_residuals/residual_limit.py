@@ -22,7 +22,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.fusion.memory import suite_exposures
 from lbt_synth.models.fusion.sensors import SensorSuite
-from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 

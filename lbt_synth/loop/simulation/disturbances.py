@@ -9,7 +9,7 @@ from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, DriftingVibration, LoopHardware, Spectrum, Truth, Vibration
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.models.vibration.in_a_loop import checked_direction
+from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray
 
 # A spectrum is drawn over this many times the wanted frames, which hides the series' period.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.plant.tip_tilt import TipTiltPlant, with_vibrations
-from lbt_synth.models.vibration.resonance import Vibration
+from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, integer, number, real_array
 
 _MOST_LINES = 64

@@ -10,8 +10,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.loop_hardware import LoopHardware
-from lbt_synth.models.vibration.in_a_loop import checked_direction
-from lbt_synth.models.vibration.resonance import Vibration
+from lbt_synth.models.vibration import Vibration, checked_direction
 from lbt_synth.validation import FloatArray, definite, frozen_copy, one_or_each
 
 

@@ -30,7 +30,7 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.full_state import FullStatePlant
 from lbt_synth.models.plant.parts import PlantParts, held_frames, noise_factor
-from lbt_synth.models.vibration.resonance import Vibration
+from lbt_synth.models.vibration import Vibration
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text

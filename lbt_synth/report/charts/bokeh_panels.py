@@ -9,6 +9,9 @@ import numpy as np
 
 from lbt_synth.report.charts import scales
 from lbt_synth.report.charts.description import (
+    GREY,
+    PALE,
+    SHADE,
     Area,
     Bars,
     Curve,
@@ -18,8 +21,10 @@ from lbt_synth.report.charts.description import (
     Panel,
     Rule,
     Span,
+    colour,
+    dashes,
+    marker_name,
 )
-from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
 from lbt_synth.validation import FloatArray
 
 _FONT = "system-ui, sans-serif"

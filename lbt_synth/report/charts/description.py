@@ -13,9 +13,45 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.report.charts.line_styles import MARKERS
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.validation import FloatArray, choice, float_array, frozen_copy, set_fields
+
+# Okabe and Ito's palette, in an order that also darkens and lightens in grey
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+GREY = "#404040"
+SHADE = 0.2  # opacity of shaded areas
+PALE = "#d9d9d9"
+# Lengths of strokes and gaps, in widths of the line
+_DASHES: tuple[tuple[float, ...], ...] = (
+    (),
+    (4, 2),
+    (6, 2, 1, 2),
+    (1.2, 1.6),
+    (6, 1.5, 1, 1.5, 1, 1.5),
+    (2.5, 1.5),
+)
+MARKERS = ("circle", "square", "triangle", "diamond", "plus", "cross")
+
+
+def colour(look: int | None) -> str:
+    """Colour of a look, as #rrggbb; None is grey."""
+    return GREY if look is None else _COLOURS[look % len(_COLOURS)]
+
+
+def dashes(look: int | None) -> tuple[float, ...]:
+    """Strokes and gaps of a look [widths of the line]; () is solid."""
+    return () if look is None else _DASHES[_turned(look)]
+
+
+def marker_name(marker: str, look: int | None) -> str:
+    """Name of a marker; "own" stands for that of the look."""
+    return marker if marker != "own" else MARKERS[0 if look is None else _turned(look)]
+
+
+def _turned(look: int) -> int:
+    """Return the number of dashes or marker; where the colours repeat, it differs."""
+    return (look + look // len(_COLOURS)) % len(_DASHES)
+
 
 _KEY = re.compile(r"[a-z][a-z0-9-]*")
 

@@ -14,6 +14,9 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.charts import paper_layout, scales
 from lbt_synth.report.charts.description import (
+    GREY,
+    PALE,
+    SHADE,
     Area,
     Bars,
     Chart,
@@ -24,8 +27,10 @@ from lbt_synth.report.charts.description import (
     Panel,
     Rule,
     Span,
+    colour,
+    dashes,
+    marker_name,
 )
-from lbt_synth.report.charts.line_styles import GREY, PALE, SHADE, colour, dashes, marker_name
 from lbt_synth.report.figures.style import house_style
 from lbt_synth.storage.warning_filters import ignore_warnings
 

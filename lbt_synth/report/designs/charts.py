@@ -13,7 +13,6 @@ from lbt_synth.report.charts.description import Axis, Chart, Curve, Panel, Rule
 from lbt_synth.report.charts.scales import count_columns
 from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.simulation import STEP_NM
-from lbt_synth.report.figures.limits import limits_panel
 from lbt_synth.report.figures.loop import (
     frequency_panel,
     loop_panels,
@@ -23,6 +22,7 @@ from lbt_synth.report.figures.loop import (
 from lbt_synth.report.figures.open_loops import bode_panels, break_loop
 from lbt_synth.report.figures.robustness import FREQUENCY_ERROR, map_panels, strehl_panel
 from lbt_synth.report.figures.simulation import series_panel, spectra_panel
+from lbt_synth.report.figures.studies import limits_panel
 from lbt_synth.report.number_text import fixed_text, number_text, signed_text
 from lbt_synth.report.page.words import chart
 from lbt_synth.storage.display_unit import nm_text, shown_unit

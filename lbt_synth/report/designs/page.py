@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import SinusoidalVibration
-from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
+from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.charts import (
     pole_and_step_charts,
     robustness_charts,
@@ -17,8 +17,7 @@ from lbt_synth.report.designs.charts import (
     transfer_charts,
 )
 from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table
-from lbt_synth.report.designs.verdict import verdict
+from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table, verdict
 from lbt_synth.report.number_text import number_text
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
 from lbt_synth.report.page.page_files import require_page_names, write_page

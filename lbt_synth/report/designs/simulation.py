@@ -11,7 +11,7 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.loop import ClosedLoop, close_loop, simulate, step_response
 from lbt_synth.models import Truth, Vibration
-from lbt_synth.models.vibration.in_a_loop import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy
 
 STEP_NM = 100.0

@@ -1,7 +1,8 @@
-"""Tables of a report of designs."""
+"""The verdict on designs and the tables of a report."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -9,21 +10,177 @@ import numpy as np
 
 from lbt_synth.loop import BandLimit, ResidualLimit
 from lbt_synth.report.designs.assessment import DesignAssessment
-from lbt_synth.report.designs.assessment_row import AssessmentRow, assessment_row
 from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.designs.verdict import good_range
 from lbt_synth.report.number_text import (
     DASH,
     MINUS,
+    NO_BREAK,
     fixed_text,
     interval_text,
     number_text,
     signed_text,
 )
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import Column, columns, row_table
+from lbt_synth.storage.rows import (
+    Column,
+    column,
+    columns,
+    fill_row,
+    nm_column,
+    percent_column,
+    row_table,
+    table_row,
+)
 from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.storage.words import count_text
+from lbt_synth.storage.words import count_text, listing_text
+from lbt_synth.studies import LimitRow
+
+
+@table_row
+class AssessmentRow:
+    """One design in the loop of the configuration; the page prints each column's help."""
+
+    design: str = column("design", help="design")
+    method: str = column("method", help="method")
+    route: str = column(help="computed by")
+    n_states: int = column(help="states of the controller")
+    multiplications: int = column(help="multiplications per frame")
+    gamma: float = column(
+        unit="nm",
+        format=".5g",
+        help="achieved gamma, norm of the error in its own model",
+    )
+    estimation_rms: float = nm_column("", unit="nm rms", help="error in its own model")
+    stable: bool = column("stable", help="closed loop")
+    certified: bool = column("certified", help="certificate, recomputed")
+    spectral_radius: float = column(format=".6g", help="largest modulus of its poles")
+    residual_nm: float = nm_column("residual", unit="nm rms", help="residual, exact")
+    turbulence_nm: float | None = nm_column(
+        "", unit="nm rms", help="of that turbulence", default=None
+    )
+    vibration_nm: float | None = nm_column(
+        "", unit="nm rms", help="of that vibration", default=None
+    )
+    noise_nm: float | None = nm_column("", unit="nm rms", help="of that noise", default=None)
+    strehl: float = percent_column("Strehl", help="Strehl ratio, exact")
+    strehl_simulated: float | None = percent_column("", help="Strehl ratio, simulated")
+    worst_strehl: float = percent_column("worst Strehl", help="worst Strehl ratio")
+    worst_nm: float = nm_column("", unit="nm rms", help="worst residual")
+    above_limit_percent: float = column(unit="%", format=".0f")
+    above_band_limit_percent: float = column(unit="%", format=".0f")
+    modulus: float | None = column(
+        "modulus margin", format=".3f", help="modulus margin", default=None
+    )
+    phase_deg: float | None = column(unit="deg", format=".3g", help="phase margin", default=None)
+    delay_frames: float | None = column(
+        unit="frames", format=".3g", help="delay margin", default=None
+    )
+    crossover_hz: float | None = column(
+        unit="Hz", format=".3g", help="highest crossover", default=None
+    )
+
+
+def assessment_row(report: DesignReport, one: DesignAssessment, limits: LimitRow) -> AssessmentRow:
+    """Return the row of a design; numbers that an unstable loop lacks are None or nan."""
+    simulation = report.simulations.get(one.name)
+    return fill_row(
+        AssessmentRow,
+        *(one, one.budget, one.margins, one.cost, limits, one.design, one.design.solver),
+        design=one.name,
+        n_states=one.design.controller.n_states,
+        strehl_simulated=None if simulation is None else simulation.strehl,
+        worst_strehl=float(one.curve.strehl.min()) if one.stable else float("nan"),
+    )
+
+
+KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
+
+
+def good_range(one: DesignAssessment) -> tuple[float, float] | None:
+    """Return between which frequency errors [Hz] a design keeps 90 % of its best Strehl ratio.
+
+    None where it is unstable.
+    """
+    if not one.stable:
+        return None
+    errors, strehls = one.curve.errors_hz, one.curve.strehl[0, 0]
+    best = int(np.argmax(strehls))
+    poor = np.flatnonzero(strehls < KEPT * np.max(strehls))
+    first = int(np.max(poor[poor < best], initial=-1)) + 1
+    last = int(np.min(poor[poor > best], initial=errors.size)) - 1
+    return float(errors[first]), float(errors[last])
+
+
+def verdict(report: DesignReport) -> str:
+    """Return at most three sentences: which design leaves least, which is robust, what is proved.
+
+    The table of the report has the numbers of all designs.
+    """
+    sentences = [_certificate_sentence(report)]
+    if report.stable and report.errors_hz.size > 1:
+        sentences.insert(0, _error_sentence(report))
+    if report.stable:
+        sentences.insert(0, _least_sentence(report))
+    # a number stays in one line with its unit
+    return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", NO_BREAK, " ".join(sentences))
+
+
+def _least_sentence(report: DesignReport) -> str:
+    stable = report.stable
+    best = min(stable, key=lambda one: one.residual_nm)
+    shown = {one.name: nm_text(one.residual_nm, ".1f", unit="nm rms") for one in stable}
+    least = shown[best.name]
+    # designs that show the same number as the best are as good
+    equal = [name for name, text in shown.items() if text == least]
+    verb = "leave" if len(equal) > 1 else "leaves"
+    several = len(stable) > 1
+    where = ", if the vibrations are where the configuration has them"
+    return (
+        f"{f'Of {len(stable)} stable designs, ' if several else ''}{listing_text(equal)} "
+        f"{verb} {'the least, ' if several else ''}{least} (Strehl ratio "
+        f"{fixed_text(100 * best.strehl, 1)} %){where if report.config.truth.vibrations else ''}."
+    )
+
+
+def _error_sentence(report: DesignReport) -> str:
+    """Say which design keeps most of its Strehl ratio over all frequency errors."""
+    first, last = (signed_text(float(report.errors_hz[i])) for i in (0, -1))
+    worst = {
+        one.name: fixed_text(100 * float(np.min(one.curve.strehl)), 1) for one in report.stable
+    }
+    most = max(worst.values(), key=float)
+    tough = [name for name, percent in worst.items() if percent == most]
+    if len(worst) == 1:
+        who = "the"
+    elif len(tough) == len(worst):
+        who = "all do equally well: the"
+    else:
+        who = f"{listing_text(tough)} {'does' if len(tough) == 1 else 'do'} best: the"
+    return (
+        f"If their frequencies are wrong by {first} to {last} Hz, {who} Strehl ratio is still "
+        f"{most} % at worst."
+    )
+
+
+def _certificate_sentence(report: DesignReport) -> str:
+    """Say which designs are unstable, and whether all certificates hold."""
+    unstable = [one.name for one in report.assessments if not one.stable]
+    failed = [one.name for one in report.assessments if not one.certified]
+    checks = sum(len(one.checks) for one in report.assessments)
+    parts = []
+    if unstable:
+        verb = "is" if len(unstable) == 1 else "are"
+        parts.append(f"{listing_text(unstable)} {verb} UNSTABLE in this loop")
+    if failed:
+        parts.append(f"the certificate of {listing_text(failed)} does NOT hold")
+    elif unstable:  # a proof about another loop must not be taken for one about this loop
+        about = "they are about the loops that the designs were made for, not about this one"
+        parts.append(f"all {checks} checks of the certificates passed, but {about}")
+    else:
+        parts.append(f"all {checks} checks of the certificates were recomputed and passed")
+    sentence = "; ".join(parts)
+    return f"{sentence if unstable else sentence[0].upper() + sentence[1:]}."
+
 
 # titles of what is an interval, not a column of the row
 _GOOD = "within 10 % of its best Strehl ratio [Hz]"

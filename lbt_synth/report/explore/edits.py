@@ -9,7 +9,7 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.methods.method import Method
 from lbt_synth.models import Vibration
-from lbt_synth.models.vibration.in_a_loop import stationary_vibrations
+from lbt_synth.models.vibration import stationary_vibrations
 
 Content: TypeAlias = dict[str, Any]
 _MOST_DAMPING = 0.99

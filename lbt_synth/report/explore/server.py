@@ -8,33 +8,119 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextvars import copy_context
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.resources import files
+from itertools import count
 from pathlib import Path
+from threading import Condition, Thread
 from typing import Any
 
 from bokeh.core.properties import String
 from bokeh.model import DataModel
 from bokeh.server.server import Server
 
+from lbt_synth.config.write import config_text
 from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.files import save_gain
 from lbt_synth.methods.registry import all_methods
-from lbt_synth.report.charts.bokeh_live import LivePanel
-from lbt_synth.report.charts.line_styles import colour, dashes
+from lbt_synth.report.charts.bokeh_charts import LivePanel
+from lbt_synth.report.charts.description import colour, dashes
 from lbt_synth.report.explore.exploration import (
     Exploration,
     View,
+    Wish,
     describe_moves,
     judge,
     quick_view,
     whole_view,
 )
-from lbt_synth.report.explore.lane import Lane
 from lbt_synth.report.explore.panels import Shown, explore_charts
-from lbt_synth.report.explore.save import save_view
-from lbt_synth.report.explore.wish import Wish
+from lbt_synth.report.provenance import creator_name
+from lbt_synth.storage.atomic_files import write_together
 from lbt_synth.storage.rows import row_table
+
+
+class Lane:
+    """Runs one piece of work after another in a thread; newer work replaces what still waits.
+
+    The thread shows wavefronts in the unit of its maker, and ends with the program, even in the
+    middle of its work.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: Callable[[], None] | None = None
+        self._open, self._changed = True, Condition()
+        self._thread = Thread(target=copy_context().run, args=(self._run,), daemon=True)
+        self._thread.start()
+
+    def submit(self, work: Callable[[], None]) -> None:
+        """Run a piece of work, instead of any that waits."""
+        with self._changed:
+            self._waiting = work
+            self._changed.notify()
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether newer work waits for the one that runs."""
+        return self._waiting is not None
+
+    def close(self) -> None:
+        """Drop what waits, and end after what runs."""
+        with self._changed:
+            self._waiting, self._open = None, False
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting is not None or not self._open)
+                work, self._waiting = self._waiting, None
+            if work is None:
+                return
+            work()
+
+
+_ENDINGS = (".yaml", ".fits", ".sh")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Saved:
+    """What was written."""
+
+    files: tuple[Path, ...]
+    commands: tuple[str, ...]
+
+
+def save_view(exploration: Exploration, view: View, folder: Path) -> Saved:
+    """Write a view into a folder under names that are free; OutputError if that fails."""
+    stem = next(
+        stem
+        for stem in (f"explored-{number}" for number in count(1))
+        if not any((folder / (stem + ending)).exists() for ending in _ENDINGS)
+    )
+    config, gain, script = (folder / (stem + ending) for ending in _ENDINGS)
+    commands = list_commands(view, stem)
+    moves = describe_moves(exploration, view.wish) or "nothing moved"
+    head = f"{exploration.config.source.name!a} with {moves}; {creator_name()}"
+    lines = ["#!/bin/sh", f"# {head}", "set -e", 'cd "$(dirname "$0")"', *commands, ""]
+    text = config_text(view.config.settings, {"": "\n".join((head, *commands))})
+    write_together({config: text.encode(), script: "\n".join(lines).encode()})
+    save_gain(gain, view.design)
+    return Saved(files=(config, gain, script), commands=commands)
+
+
+def list_commands(view: View, stem: str) -> tuple[str, ...]:
+    """Return the commands that make the files of a name, and a report of them."""
+    request = view.request
+    options = [f"--{name.replace('_', '-')} {value}" for name, value in request.given.items()]
+    design = ["lbt-synth design", f"{stem}.yaml --method {request.method.name}", *options]
+    return (
+        " ".join((*design, f"-o {stem}.fits")),
+        f"lbt-synth report {stem}.yaml {stem}.fits -o {stem}.html",
+    )
+
 
 _QUICK_S = 0.3  # a design that takes longer is made when a slider is released, in its own lane
 _MOST_KEPT = 5

@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 from lbt_synth.report.charts.bokeh_charts import bokeh_script, embed_charts
-from lbt_synth.report.charts.line_styles import PALE, SHADE, colour, dashes, marker_name
+from lbt_synth.report.charts.description import PALE, SHADE, colour, dashes, marker_name
 from lbt_synth.report.charts.matplotlib_charts import chart_svg
 from lbt_synth.report.charts.scales import legend_entries
 from lbt_synth.report.number_text import print_text, unbroken_text

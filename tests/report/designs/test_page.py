@@ -14,7 +14,7 @@ from support.pages import Reader
 import lbt_synth as lbt
 from lbt_synth.report.charts.description import Curve
 from lbt_synth.report.designs.page import design_page
-from lbt_synth.report.designs.verdict import verdict
+from lbt_synth.report.designs.tables import verdict
 from lbt_synth.report.number_text import fixed_text
 from lbt_synth.storage.tables import Table
 

@@ -6,8 +6,8 @@ from support.configs import AR, change_key, write_config
 from support.explore import five_lines
 
 import lbt_synth as lbt
+from lbt_synth.report.explore.exploration import Wish, fulfil
 from lbt_synth.report.explore.knobs import list_knobs
-from lbt_synth.report.explore.wish import Wish, fulfil
 
 
 def moved(config, method="kalman", **values):

@@ -8,8 +8,8 @@ from lbt_synth.linear import largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.report.designs.simulation import exact_spectrum
 from lbt_synth.report.explore.evaluation import loop_curves, performance
+from lbt_synth.report.explore.exploration import Wish, fulfil
 from lbt_synth.report.explore.knobs import list_knobs
-from lbt_synth.report.explore.wish import Wish, fulfil
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ from support.explore import five_lines
 from support.plants import ROOT
 
 import lbt_synth as lbt
+from lbt_synth.report.explore.exploration import Wish, fulfil
 from lbt_synth.report.explore.knobs import list_knobs, shift_range_hz
-from lbt_synth.report.explore.wish import Wish, fulfil
 
 
 def test_the_knobs_of_a_configuration(tmp_path):

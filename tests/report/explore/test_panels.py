@@ -6,9 +6,8 @@ import pytest
 import lbt_synth as lbt
 from lbt_synth.report.charts.description import Curve, Rule
 from lbt_synth.report.charts.scales import legend_entries
-from lbt_synth.report.explore.exploration import explore, first_wish, quick_view, whole_view
+from lbt_synth.report.explore.exploration import Wish, explore, first_wish, quick_view, whole_view
 from lbt_synth.report.explore.panels import explore_charts
-from lbt_synth.report.explore.wish import Wish
 
 
 @pytest.fixture(scope="module")

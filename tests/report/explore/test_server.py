@@ -8,18 +8,22 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from queue import Queue
+from threading import Event
 
+import numpy as np
 import pytest
 from bokeh.document import Document
 from support.browser import DESK, PHONE, chain, chromium
+from support.commands import run
 from support.configs import write_config
 from support.explore import asked, await_state, choose, five_lines, move, reset, select, served
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.report.explore import server
-from lbt_synth.report.explore.exploration import explore, first_wish, quick_view, whole_view
-from lbt_synth.report.explore.server import Session, Site
+from lbt_synth.report.explore.exploration import Wish, explore, first_wish, quick_view, whole_view
+from lbt_synth.report.explore.server import Lane, Session, Site, save_view
+from lbt_synth.storage.display_unit import DisplayUnit, nm_text, own_display_unit, show_in
 
 # numbers of all sources, by the chart that draws them
 CURVES = """
@@ -339,3 +343,100 @@ def test_another_origin_is_refused(driver, address):
     )
     assert driver.execute_async_script(script, address.replace("http", "ws") + "ws") == "refused"
     driver.get_log("browser")
+
+
+def test_newer_work_replaces_what_waits():
+    lane, began, go_on, ended = Lane(), Event(), Event(), Event()
+    done = []
+
+    def first():
+        began.set()
+        assert go_on.wait(10)
+        done.append((1, lane.is_waiting))
+
+    lane.submit(first)
+    assert began.wait(10)
+    assert not lane.is_waiting
+    lane.submit(lambda: done.append((2, None)))
+    lane.submit(lambda: (done.append((3, lane.is_waiting)), ended.set()))
+    go_on.set()
+    assert ended.wait(10)
+    assert done == [(1, True), (3, False)]
+    lane.close()
+
+
+def test_a_closed_lane_drops_what_waits():
+    lane, began, go_on = Lane(), Event(), Event()
+    lane.submit(lambda: (began.set(), go_on.wait(10)))
+    assert began.wait(10)
+    lane.submit(lambda: began.clear())
+    lane.close()
+    go_on.set()
+    lane._thread.join(10)
+    assert not lane._thread.is_alive()
+    assert began.is_set()
+
+
+def test_work_is_shown_in_the_unit_of_the_page():
+    shown, ended = [], Event()
+    with own_display_unit():
+        show_in(DisplayUnit(name="mas", nm=10.0))
+        lane = Lane()
+    lane.submit(lambda: (shown.append(nm_text(20.0)), ended.set()))
+    assert ended.wait(10)
+    assert shown == ["2 mas"]
+    lane.close()
+
+
+@pytest.fixture(scope="module")
+def exploration():
+    return explore(lbt.load_config("examples/lbt.yaml"), {})
+
+
+@pytest.mark.parametrize("method", ["kalman", "hinf"])
+def test_the_commands_make_the_files(exploration, tmp_path, monkeypatch, capsys, method):
+    wish = Wish(method=method, values={"delay": 2.5, "shift": 0.7, f"{method}-gamma_ratio": 1.4})
+    view = quick_view(exploration, wish)
+    saved = save_view(exploration, view, tmp_path)
+    config, gain, script = saved.files
+    assert lbt.load_config(config).text == view.config.text
+    kept = lbt.load_gain(gain)
+    np.testing.assert_array_equal(kept.gain_predictor, view.design.gain_predictor)
+    gain.unlink()
+    monkeypatch.chdir(tmp_path)
+    words = saved.commands[0].split()
+    assert words[0] == "lbt-synth"
+    assert saved.commands[0] in script.read_text().splitlines()
+    status, _, error = run(capsys, *words[1:])
+    assert (status, error) == (0, "")
+    made = lbt.load_gain(gain)
+    np.testing.assert_allclose(made.gain_predictor, kept.gain_predictor, rtol=1e-9, atol=1e-12)
+
+
+def test_nothing_is_overwritten(exploration, tmp_path):
+    view = quick_view(exploration, Wish(method="kalman"))
+    first = save_view(exploration, view, tmp_path)
+    (tmp_path / "explored-2.sh").write_text("mine")
+    third = save_view(exploration, view, tmp_path)
+    assert [path.name for path in first.files] == [
+        f"explored-1.{e}" for e in ("yaml", "fits", "sh")
+    ]
+    assert [path.name for path in third.files] == [
+        f"explored-3.{e}" for e in ("yaml", "fits", "sh")
+    ]
+    assert (tmp_path / "explored-2.sh").read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 7
+
+
+def test_the_head_says_what_was_moved(exploration, tmp_path):
+    view = quick_view(exploration, Wish(method="kalman", values={"gain": 0.5}))
+    config = save_view(exploration, view, tmp_path).files[0]
+    head = config.read_text().splitlines()[:2]
+    assert head[0].startswith("# 'lbt.yaml' with real sensor gain 0.5; lbt_synth ")
+    assert head[1] == "# lbt-synth design explored-1.yaml --method kalman -o explored-1.fits"
+
+
+def test_a_folder_that_takes_nothing_is_said(exploration, tmp_path):
+    view = quick_view(exploration, Wish(method="kalman"))
+    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
+        save_view(exploration, view, tmp_path / "nowhere")

@@ -7,8 +7,7 @@ import re
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.report.designs.tables import summary_table
-from lbt_synth.report.designs.verdict import good_range, verdict
+from lbt_synth.report.designs.tables import good_range, summary_table, verdict
 from lbt_synth.report.number_text import signed_text
 
 

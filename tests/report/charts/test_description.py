@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lbt_synth.report.charts.line_styles import colour, dashes, marker_name
+from lbt_synth.report.charts.description import colour, dashes, marker_name
 
 
 def test_different_looks_differ():

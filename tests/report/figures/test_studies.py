@@ -1,4 +1,4 @@
-"""The figure of modal control."""
+"""The figures of studies: of a set of modes."""
 
 from __future__ import annotations
 

@@ -1,0 +1,345 @@
+"""Vibrations: damped resonances, sinusoids, what drifts, and whether they fit a loop.
+
+G. Agapito et al., 2008, equation 4, with the errata 1 and 7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.ar_model import ARModel, variance_ratios
+from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.models.resonance_spectrum import coefficient_rows
+from lbt_synth.validation import FloatArray, Positive, check_fields, choice, number, real_array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vibration:
+    """A narrow line: a damped resonance driven by white noise.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Natural frequency [Hz].
+    damping : float
+        Damping ratio, in (0, 1).
+    rms_nm : float
+        Standard deviation of the displacement along its direction [nm rms wavefront].
+    direction : tuple of float, optional
+        Direction over the modes, made a unit vector; ``(1, 0)`` shakes tip.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
+    >>> [round(float(a), 6) for a in line.ar_model(800).coefficients]
+    [1.972279, -0.996863]
+    """
+
+    frequency_hz: Positive
+    damping: Annotated[float, ("above", 0), ("below", 1)]
+    rms_nm: Positive
+    direction: tuple[float, ...] = (1.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_fields(self, direction=unit_direction(self.direction))
+
+    def ar_model(self, frame_rate_hz: float) -> ARModel:
+        """Return the AR2 process of this rms, sampled at a frame rate [Hz].
+
+        A line that is not below the Nyquist frequency raises a ProblemError.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
+        >>> round(line.ar_model(800).rms_nm, 6)
+        100.0
+        """
+        rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+        a, driving = sampled_lines(
+            np.array(self.frequency_hz), np.array(self.damping), self.rms_nm, rate
+        )
+        return ARModel(coefficients=a, driving_rms_nm=float(driving), frame_rate_hz=rate)
+
+    def retuned(self, frequency_hz: float, *, frame_rate_hz: float, hold: str = "rms") -> Vibration:
+        """Return this vibration at another frequency [Hz], for a loop of a frame rate [Hz].
+
+        ``hold`` says what stays: the rms of the vibration, "rms", or that of its driving noise,
+        "driving". A value out of its range raises a ProblemError.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
+        >>> round(line.retuned(18, frame_rate_hz=800, hold="driving").rms_nm, 2)
+        117.01
+        """
+        choice(hold, "hold", ("rms", "driving"))
+        moved = replace(self, frequency_hz=frequency_hz)
+        if hold == "rms":
+            return moved
+        drive = self.ar_model(frame_rate_hz).driving_rms_nm
+        ratio = drive / moved.ar_model(frame_rate_hz).driving_rms_nm
+        return replace(moved, rms_nm=self.rms_nm * ratio)
+
+    def at_frequency(self, frequency_hz: float) -> Vibration:
+        """Return this vibration at another frequency [Hz], with the same rms and the same decay.
+
+        The decay rate is damping times frequency, so the coefficient a2 of the AR2 process stays
+        the same. A frequency that is not above the decay rate raises a ProblemError: nothing
+        oscillates.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
+        >>> line.at_frequency(25).damping
+        0.008
+        """
+        rate = self.damping * self.frequency_hz
+        frequency = number(frequency_hz, "frequency_hz")
+        if not frequency > rate:
+            raise ProblemError(
+                f"a vibration that decays at {rate:.6g} Hz (damping times frequency) must have a "
+                f"frequency above that; got {frequency:.6g} Hz. Try a narrower range."
+            )
+        return replace(self, frequency_hz=frequency, damping=rate / frequency)
+
+
+def unit_direction(direction: Any) -> tuple[float, ...]:
+    """Return a direction over the modes as a vector of length one."""
+    vector = np.atleast_1d(real_array(direction, "direction"))
+    length = float(np.linalg.norm(vector))
+    if vector.ndim != 1 or length == 0:
+        raise ProblemError(
+            f"direction must be a vector over the modes, not zero; got {direction!r}."
+        )
+    return tuple(float(v) for v in vector / length)
+
+
+def require_below_nyquist(frequency_hz: float, frame_rate_hz: float) -> None:
+    """Refuse a vibration that a frame rate does not sample."""
+    if not frequency_hz < frame_rate_hz / 2:
+        raise ProblemError(
+            f"a vibration must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "
+            f"got {frequency_hz:.6g} Hz. Give the frequency it is aliased to."
+        )
+
+
+def sampled_lines(
+    frequency_hz: FloatArray, damping: FloatArray, rms_nm: FloatArray | float, frame_rate_hz: float
+) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (p, 2) and driving noise (p,) [nm] of p vibrations at a frame rate."""
+    require_below_nyquist(float(np.max(frequency_hz, initial=0.0)), frame_rate_hz)
+    a = coefficient_rows(2 * np.pi * frequency_hz / frame_rate_hz, damping)
+    # by the rounded coefficients, so that the process has exactly this rms
+    return a, np.asarray(rms_nm / np.sqrt(variance_ratios(a)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SinusoidalVibration:
+    """A vibration that is a pure sinusoid.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Frequency [Hz].
+    rms_nm : float
+        Standard deviation, amplitude / sqrt(2), along its direction [nm rms wavefront].
+    direction : tuple of float, optional
+        Direction over the modes, made a unit vector.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> round(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797).amplitude_nm, 1)
+    1127.1
+    """
+
+    frequency_hz: Positive
+    rms_nm: Positive
+    direction: tuple[float, ...] = (1.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_fields(self, direction=unit_direction(self.direction))
+
+    @property
+    def amplitude_nm(self) -> float:
+        """Peak displacement [nm rms wavefront]."""
+        return float(np.sqrt(2) * self.rms_nm)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriftingVibration:
+    """A vibration whose frequency moves linearly in time, and stays where it arrived.
+
+    Without a damping it is a sinusoid whose phase is the integral of its frequency. With one it
+    is a resonance with a constant decay rate, damping times frequency, and a constant rms: an
+    AR2 process whose coefficient a1 follows the frequency, with a driving noise that keeps
+    the variance exactly constant. Only simulations accept it; whatever needs a stationary
+    truth refuses it.
+
+    Parameters
+    ----------
+    start_hz, end_hz : float
+        Frequency up to time 0, and from ``duration_s`` on [Hz].
+    duration_s : float
+        Duration of the drift [s].
+    rms_nm : float
+        Standard deviation of the displacement along its direction [nm rms wavefront].
+    damping : float, optional
+        Damping ratio at ``start_hz``, in (0, 1); None for a sinusoid.
+    direction : tuple of float, optional
+        Direction over the modes, made a unit vector; ``(1, 0)`` shakes tip.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not finite or out of its range, or a resonance arrives at a frequency
+        that is not above its decay rate.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.models.DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    >>> line.frequency_hz_at([-5, 0, 30, 60, 100]).tolist()
+    [17.0, 17.0, 20.0, 23.0, 23.0]
+    """
+
+    start_hz: Positive
+    end_hz: Positive
+    duration_s: Positive
+    rms_nm: Positive
+    damping: Annotated[float, ("above", 0), ("below", 1)] | None = None
+    direction: tuple[float, ...] = (1.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_fields(self, direction=unit_direction(self.direction))
+        if self.damping is not None:
+            start = Vibration(frequency_hz=self.start_hz, damping=self.damping, rms_nm=self.rms_nm)
+            start.at_frequency(self.end_hz)
+
+    @property
+    def highest_hz(self) -> float:
+        """The highest frequency that it passes [Hz]."""
+        return max(self.start_hz, self.end_hz)
+
+    @property
+    def amplitude_nm(self) -> float:
+        """Peak displacement of the sinusoid [nm rms wavefront]."""
+        return float(np.sqrt(2) * self.rms_nm)
+
+    def frequency_hz_at(self, time_s: ArrayLike) -> FloatArray:
+        """Return the frequency [Hz] at finite times [s]; the drift begins at time 0."""
+        moved = np.clip(real_array(time_s, "time_s") / self.duration_s, 0.0, 1.0)
+        return np.asarray(self.start_hz + (self.end_hz - self.start_hz) * moved)
+
+    def turns_at(self, time_s: ArrayLike) -> FloatArray:
+        """Return the phase over 2 pi at finite times [s]: the frequency's integral from time 0."""
+        t = real_array(time_s, "time_s")
+        inside = np.clip(t, 0.0, self.duration_s)
+        rise = (self.end_hz - self.start_hz) / self.duration_s
+        arrived = np.maximum(t - self.duration_s, 0.0)
+        before = self.start_hz * (t - arrived)
+        return np.asarray(before + rise * inside**2 / 2 + self.end_hz * arrived)
+
+    def ar_process(
+        self, time_s: FloatArray, frame_rate_hz: float
+    ) -> tuple[FloatArray, float, FloatArray]:
+        """Return the AR2 process of the resonance: ``x(k) = a1(k) x(k-1) + a2 x(k-2) + s(k) v(k)``.
+
+        With unit white noise v and a process that was stationary at the first frame's frequency,
+        the variance is ``rms_nm^2`` in every frame: s follows from the recursion of
+        ``E x(k) x(k-1)``.
+
+        Parameters
+        ----------
+        time_s : (frames,) ndarray
+            Times of the frames [s], one frame period apart.
+        frame_rate_hz : float
+            Frame rate [Hz].
+
+        Returns
+        -------
+        a1, a2, driving_rms_nm : (frames,) ndarray, float, (frames,) ndarray
+            Coefficients, and the standard deviation s of the driving noise [nm], in each frame.
+
+        Raises
+        ------
+        ProblemError
+            If this is a sinusoid, or the frequency falls faster than the decay lets the
+            variance follow.
+        """
+        from scipy.signal import lfilter  # slow to import
+
+        if self.damping is None:
+            raise ProblemError("a sinusoid has no AR2 process; got one that drifts.")
+        decay = 2 * np.pi * self.damping * self.start_hz / frame_rate_hz  # per frame
+        natural = 2 * np.pi * self.frequency_hz_at(time_s) / frame_rate_hz
+        a1 = 2 * np.exp(-decay) * np.cos(np.sqrt(natural**2 - decay**2))
+        a2 = -float(np.exp(-2 * decay))
+        # E x(k-1) x(k-2) over the variance, less its value at a constant a1, a1 / (1 - a2)
+        step = np.diff(a1, prepend=a1[:1]) / (1 - a2)
+        late = lfilter([-a2], [1.0, -a2], step)
+        behind = np.concatenate([[0.0], late[:-1]]) - step
+        still = 1 / variance_ratios(np.stack([a1, np.full_like(a1, a2)], axis=-1))
+        variance = still - 2 * a1 * a2 * behind
+        if np.any(variance < 0):
+            raise ProblemError(
+                "the frequency of a resonance must move slowly beside its decay, or its rms cannot "
+                f"be held; got {self.start_hz:.6g} to {self.end_hz:.6g} Hz in "
+                f"{self.duration_s:.6g} s at a damping of {self.damping:.6g}. Try a longer drift, "
+                "more damping, or a sinusoid (no damping)."
+            )
+        return a1, a2, np.asarray(self.rms_nm * np.sqrt(variance))
+
+
+TrueVibration: TypeAlias = Vibration | SinusoidalVibration | DriftingVibration
+
+
+def checked_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
+    """Return the direction (n,) of a vibration, which must fit the loop."""
+    if isinstance(vibration, DriftingVibration):
+        frequency_hz = vibration.highest_hz
+    else:
+        frequency_hz = vibration.frequency_hz
+    if len(vibration.direction) != hardware.modes:
+        raise DimensionError(
+            f"the direction of a vibration must have {hardware.modes} components, one per mode; "
+            f"got {len(vibration.direction)} at {frequency_hz:.6g} Hz."
+        )
+    require_below_nyquist(frequency_hz, hardware.frame_rate_hz)
+    return np.array(vibration.direction)
+
+
+def stationary_vibrations(
+    vibrations: Iterable[TrueVibration],
+) -> tuple[Vibration | SinusoidalVibration, ...]:
+    """Return the vibrations; refuse one that drifts."""
+    still = []
+    for vibration in vibrations:
+        if isinstance(vibration, DriftingVibration):
+            raise ProblemError(
+                "this needs a truth that is stationary; got a vibration that drifts from "
+                f"{vibration.start_hz:.6g} to {vibration.end_hz:.6g} Hz. Simulate it, or take "
+                "vibrations that stay, at the frequencies in question."
+            )
+        still.append(vibration)
+    return tuple(still)

@@ -1,1 +1,0 @@
-"""Vibrations, with one module for each kind."""
