@@ -248,8 +248,6 @@ def _add_simulator(parser: ArgumentParser) -> None:
 def identify(parser: ArgumentParser) -> None:
     """Identify turbulence, vibrations, noise and sensor gain from a record."""
     add_record(parser)
-    text = "earlier configuration with the same accelerometers, to find exchanged channels"
-    add_option(parser, "--earlier-model", str, text)
     add_output(parser, "configuration to write (.yaml)")
 
 

@@ -15,13 +15,11 @@ from lbt_synth.identification import (
     accelerometer_transfers,
     identify,
 )
-from lbt_synth.identification.accelerometers.replayed_channels import drop_harmful
 
 
 def run(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
     places = loop_records.find_places(arguments, arguments.output)
-    earlier = loop_records.earlier_lines(arguments)
     record = loop_records.read_record(arguments)
     choose_unit(arguments, record.diameter_m)
     options = loop_records.identification_options(arguments, record)
@@ -38,14 +36,7 @@ def run(arguments: Namespace) -> Report:
     found: AccelerometerTransfers | None = None
     if arguments.accelerometers is not None and isinstance(record, LoopRecord):
         readings = loop_records.read_accelerations(arguments, record)
-        found = accelerometer_transfers(
-            model,
-            record,
-            readings.values,
-            channels=readings.channels,
-            earlier=earlier,
-        )
-        found = drop_harmful(found, model, record, readings.values)
+        found = accelerometer_transfers(model, record, readings.values, channels=readings.channels)
         loop_records.add_accelerometers(report, found)
         report.notes += [f"note: {note}." for note in readings.notes]
     report.notes += [loop_records.marked_note(note) for note in notes]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
-import math
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -13,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.output import Report
-from lbt_synth.config import identified_config, load_config
+from lbt_synth.config import identified_config
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
@@ -34,7 +32,6 @@ from lbt_synth.identification.accelerometers.readings import (
     fill_missing,
     load_readings,
 )
-from lbt_synth.identification.accelerometers.swapped import EarlierLine
 from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.fit.identified_model import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS
@@ -189,31 +186,6 @@ def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
     )
 
 
-def earlier_lines(arguments: Namespace) -> list[EarlierLine]:
-    """Return how channels moved with each line of an earlier configuration, if there is one."""
-    path = arguments.earlier_model
-    if path is None:
-        return []
-    if arguments.accelerometers is None:
-        raise ProblemError("--earlier-model goes with --accelerometers.")
-    vibrations = load_config(path).settings.model.vibrations or []
-    if not any(line.accelerometers for line in vibrations):
-        raise ProblemError(
-            f"{path} must say how accelerometers move, for --earlier-model; no vibration of its "
-            "model does. Try what identify --accelerometers wrote."
-        )
-    return [
-        (
-            line.frequency_hz,
-            {
-                name: cmath.rect(each.motion_nm_per_nm, math.radians(each.phase_deg))
-                for name, each in (line.accelerometers or {}).items()
-            },
-        )
-        for line in vibrations
-    ]
-
-
 def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
     """Add how the channels of accelerometers move with the lines, and what each is worth."""
     if found.transfers:
@@ -236,7 +208,7 @@ def find_places(arguments: Namespace, model: str | Path | None, **others: Path) 
         places["figure"] = require_figure_name(figure)
     elif arguments.figure is not None:
         raise ProblemError("give one of --figure and --no-figure, not both.")
-    read = ("file", "commands", "lines_file", "accelerometers", "earlier_model")
+    read = ("file", "commands", "lines_file", "accelerometers")
     given = given_options(arguments, *(name for name in read if name in arguments))
     require_writable(*places.values(), inputs=given.values())
     return places

@@ -160,8 +160,6 @@ def _accelerometer_section(
     if age != found.age_frames:
         apart = found.age_frames - 1
         comments[path] = f"not known: the clocks were {apart} frames apart; give the real delay"
-    elif found.clock_ppm:
-        comments[path] += f" in the middle; the clocks drift by {found.clock_ppm:.3g} ppm"
     return {
         "kind": "accelerometer",
         "rate_hz": float(found.rate_hz),

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.night import GAIN, LINE_HZ
-from support.plants import LBT_YAML
 from support.recorded_loops import RATE, open_record
 
 import lbt_synth as lbt
@@ -197,27 +196,6 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     assert "at least once a frame, 1000 Hz; got 500 Hz" in error
 
 
-def test_exchanged_channels_are_named_against_an_earlier_model(
-    tmp_path, capsys, recorded_loop, tip_night
-):
-    run_, _, _ = recorded_loop
-    shake = np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0])  # mm/s^2 at 1 kHz
-    noise = 0.05 * np.std(shake) * np.random.default_rng(4).standard_normal((shake.size, 2))
-    table = shake[:, None] * [2.0, -0.5] + noise
-    base = ("identify", tip_night, *FACTS, "--no-figure", "--acceleration-unit", "mm/s2", "--json")
-    names = (("m1", "m2"), ("m2", "m1"))
-    for before, after in [(None, 0), (0, 0), (0, 1)]:
-        file, model = tmp_path / f"{after}.csv", tmp_path / f"{before}-{after}.yaml"
-        np.savetxt(file, table, delimiter=",", header=",".join(names[after]), comments="")
-        earlier = () if before is None else ("--earlier-model", tmp_path / "None-0.yaml")
-        status, text, error = run(capsys, *base, "-o", model, "--accelerometers", file, *earlier)
-        assert (status, error) == (0, "")
-        verdicts = {row["channel"]: row["verdict"] for row in json.loads(text)["accelerometers"]}
-        swapped = {name: "swapped with" in verdict for name, verdict in verdicts.items()}
-        assert swapped == dict.fromkeys(names[after], after == 1)
-    assert verdicts["m1"].startswith("swapped with m2; used for")
-
-
 def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
     run_, _, _ = recorded_loop
     y, u = run_.measurements[0].copy(), run_.commands[0]
@@ -251,16 +229,7 @@ def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
         (("-o", "m.yaml", "--lines-hz", "20", "--lines-error-hz", "-1"), "must be at least 0"),
         (("-o", "m.yaml", "--lines-file", "none.txt"), "cannot read"),
         (("-o", "m.yaml", "--accelerometers", "none.npy"), "cannot read"),
-        (("-o", "m.yaml", "--earlier-model", LBT_YAML), "goes with --accelerometers"),
         (("-o", "m.yaml", "--acceleration-unit", "g"), "goes with --accelerometers"),
-        (
-            ("-o", "m.yaml", "--accelerometers", "none.npy", "--earlier-model", "none.yaml"),
-            "cannot read none.yaml",
-        ),
-        (
-            ("-o", "m.yaml", "--accelerometers", "none.npy", "--earlier-model", LBT_YAML),
-            "must say how accelerometers move",
-        ),
         (("-o", "m.yaml", "--most-lines", "-1"), "--most-lines must be"),
         (("-o", "m.yaml", "--wavelength-um", "0"), "--wavelength-um must be above 0"),
         (("-o", "m.yaml", "--kind", "spectrum"), "kind"),
@@ -273,19 +242,6 @@ def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, brief_night, op
     assert words in error
     assert "Traceback" not in error
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_earlier_model_is_not_overwritten(tmp_path, capsys, brief_night):
-    earlier = tmp_path / "m.yaml"
-    earlier.write_bytes(LBT_YAML.read_bytes())
-    status, _, error = run(
-        capsys,
-        *("identify", brief_night, "--accelerometers", "none.npy", "--no-figure"),
-        *("--earlier-model", earlier, "-o", earlier),
-    )
-    assert status == 2
-    assert "must not replace the input" in error
-    assert earlier.read_bytes() == LBT_YAML.read_bytes()
 
 
 def test_a_short_record_is_refused_with_the_length_it_needs(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""Readings of accelerometers laid beside the wavefront, by time and rate, and fitted there."""
+"""Readings of accelerometers laid beside the wavefront, and fitted there."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.accelerometers.band_fit import fit_band
-from lbt_synth.identification.accelerometers.clock_rate import clock_rate
 from lbt_synth.identification.accelerometers.clock_shift import (
     ClockShift,
     Pair,
@@ -17,7 +16,6 @@ from lbt_synth.identification.accelerometers.clock_shift import (
     likeliest_lag,
 )
 from lbt_synth.identification.accelerometers.line_bands import LineBand, line_bands
-from lbt_synth.identification.accelerometers.readings import at_places
 from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
@@ -25,8 +23,6 @@ from lbt_synth.identification.stretches import Stretches
 from lbt_synth.validation import BoolArray, FloatArray
 
 _SHORTEST = 256  # frames side by side
-_ERRORS = 5.0  # between the shifts of two channels that differ
-_LEAST_SHIFT = 0.2  # frames, that are worth a word
 _PASSES = 3
 _NEAR_S = 1.0  # within which a shift is refined
 _ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
@@ -34,13 +30,11 @@ _ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Laid:
-    """Readings beside the wavefront: by how many frames late, how much faster, and fits."""
+    """Readings beside the wavefront: by how many frames late, and fits."""
 
     lag: int
-    faster: float
     fits: list[Pair]
     shift: ClockShift  # beyond the whole frames
-    odd: dict[int, float]  # channels with another shift, against the others
 
 
 def lay_and_fit(
@@ -52,11 +46,12 @@ def lay_and_fit(
     largest: int,
     limit: float,
 ) -> Laid:
-    """Lay readings beside the wavefront, in time and rate, and fit them there."""
-    gains, lag, faster = np.array(model.sensor_gains), 0, 0.0
+    """Lay readings beside the wavefront, and fit them there."""
+    gains, lag = np.array(model.sensor_gains), 0
     errors = np.array([axis.sensor_gain_error or 0.0 for axis in model.axes])
     series = record.pseudo_open_loop(gains)
     moved = record.pseudo_open_loop(gains + errors) - series
+    near = round(_NEAR_S * model.frame_rate_hz)
 
     def bands(stretches: Stretches) -> list[LineBand]:
         laid = readings[np.clip(np.arange(record.frames) + lag, 0, len(readings) - 1)]
@@ -75,32 +70,14 @@ def lay_and_fit(
         return found
 
     lag = likeliest_lag(bands(side_by_side()), largest)
-    if faster := clock_rate(bands, side_by_side()):
-        readings, good = at_loop_rate(readings, good, faster, lag + record.frames / 2)
-        lag += likeliest_lag(bands(side_by_side()), _near(model))
     for step in range(_PASSES):
         fits = fit_pairs(bands(side_by_side()))
-        shift, odd = channel_shifts([fit for fit in fits if chance(fit) < limit], _near(model))
+        shift = clock_shift([fit for fit in fits if chance(fit) < limit], near)
         sure = shift.by_phases or abs(shift.frames) > 3 * shift.error_frames
         if step == _PASSES - 1 or not sure or not round(shift.frames):
             break
         lag += round(shift.frames)
-    return Laid(lag=lag, faster=faster, fits=fits, shift=shift, odd=odd)
-
-
-def _near(model: IdentifiedModel) -> int:
-    """Return the frames within which a shift is refined."""
-    return round(_NEAR_S * model.frame_rate_hz)
-
-
-def at_loop_rate(
-    readings: FloatArray, good: BoolArray, faster: float, middle: float
-) -> tuple[FloatArray, BoolArray]:
-    """Return readings as a clock of the loop's rate gives them, the same in the middle."""
-    rows = np.arange(float(len(readings)))
-    moved = at_places(np.where(good[:, None], readings, np.nan), rows + faster * (rows - middle))
-    known: BoolArray = np.asarray(np.isfinite(moved).all(axis=1))
-    return np.where(known[:, None], moved, 0.0), known
+    return Laid(lag=lag, fits=fits, shift=shift)
 
 
 def fit_pairs(bands: Sequence[LineBand]) -> list[Pair]:
@@ -123,23 +100,3 @@ def fit_pairs(bands: Sequence[LineBand]) -> list[Pair]:
 def chance(pair: Pair) -> float:
     """Return the probability that a channel without the line shows as much."""
     return float(pair[1].chances[pair[2]])
-
-
-def channel_shifts(pairs: Sequence[Pair], largest: int) -> tuple[ClockShift, dict[int, float]]:
-    """Return the shift of the channels, and of those that have another, against the first."""
-    own = {
-        channel: clock_shift([pair for pair in pairs if pair[3] == channel], largest)
-        for channel in sorted({pair[3] for pair in pairs})
-    }
-    known = {channel: shift for channel, shift in own.items() if shift.by_phases}
-    if not known:
-        return clock_shift(pairs, largest), {}
-    middle = sorted(known.values(), key=lambda shift: shift.frames)
-    common = min(middle[(len(middle) - 1) // 2 : len(middle) // 2 + 1], key=lambda s: abs(s.frames))
-    odd = {
-        channel: shift.frames - common.frames
-        for channel, shift in known.items()
-        if abs(shift.frames - common.frames)
-        > max(_ERRORS * np.hypot(shift.error_frames, common.error_frames), _LEAST_SHIFT)
-    }
-    return clock_shift([pair for pair in pairs if pair[3] not in odd], largest), odd

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design.fusion.failures import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.channel_faults import channel_fault
 from lbt_synth.identification.accelerometers.clock_shift import (
     ClockShift,
     Pair,
@@ -20,24 +19,23 @@ from lbt_synth.identification.accelerometers.clock_shift import (
 from lbt_synth.identification.accelerometers.laying import chance, lay_and_fit
 from lbt_synth.identification.accelerometers.line_bands import NM
 from lbt_synth.identification.accelerometers.readings import as_columns, fill_missing
-from lbt_synth.identification.accelerometers.swapped import Factor, swapped_channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.records.faults import find_saturated
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.fusion.sensors import LONGEST_DELAY
 from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import Table
-from lbt_synth.validation import number
+from lbt_synth.validation import FloatArray, number
 
-_SHORTEST = 256  # frames side by side
-_ERRORS = 5.0  # between the shifts of two channels that differ
-_LEAST_SHIFT = 0.2  # frames, that are worth a word
-_PASSES = 3
-_NEAR_S = 1.0
-_ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
 _TINY = 1e-300
-_USED = "used for"
 _EXTRA = f"left out, because others show more and a design takes {MOST_UNITS - 1} channels"
-LEFT_OUT = ("dead", "saturated")
+_LEFT_OUT = ("dead", "saturated")
+_FEWEST_VALUES = 4  # a series of no more different numbers is rounding
+_ROUNDING = 1e-12  # of the largest number
+_LEAST_M_S2 = 1e-6  # far below what any accelerometer resolves
+_CLIPPED = 10  # frames at the ends, at least
+_DRIFT = 100.0  # power at low frequencies over the median
+_SLOW_HZ = 1.0
 
 
 @table_row
@@ -104,9 +102,6 @@ class AccelerometerTransfers:
         measurement of the same frame.
     rate_hz : float
         Readings per second, after averaging [Hz].
-    clock_ppm : float
-        By how much the clock of the readings runs faster than the loop's [1e-6]; 0 where the
-        record shows no difference. Motions and phases are those without it.
     """
 
     transfers: tuple[TransferRow, ...]
@@ -114,7 +109,6 @@ class AccelerometerTransfers:
     shift: ClockShift
     age_frames: int
     rate_hz: float
-    clock_ppm: float = 0.0
 
     @property
     def used(self) -> tuple[ChannelRow, ...]:
@@ -127,27 +121,6 @@ class AccelerometerTransfers:
         known = self.age_frames >= 0 and 0 < self.age_frames + delay_frames - 1 <= LONGEST_DELAY
         return self.age_frames if known else 1
 
-    def noisier(self, factor: float) -> AccelerometerTransfers:
-        """Return the same with so many times the noise."""
-        rows = (replace(row, noise_m_s2=factor * row.noise_m_s2) for row in self.channels)
-        return replace(self, channels=tuple(rows))
-
-    def without(self, channels: Sequence[str], why: str) -> AccelerometerTransfers:
-        """Return the same with some channels not used, for a reason."""
-        return replace(
-            self,
-            transfers=tuple(
-                replace(row, useful=row.useful and row.channel not in channels)
-                for row in self.transfers
-            ),
-            channels=tuple(
-                replace(row, verdict=f"{why}; {row.verdict.replace(_USED, 'shows')}")
-                if row.channel in channels
-                else row
-                for row in self.channels
-            ),
-        )
-
     @property
     def shift_text(self) -> str:
         """The shift of the clocks in words."""
@@ -157,22 +130,12 @@ class AccelerometerTransfers:
                 "check the rate of the readings, and when they began (accelerometer_rate_hz)."
             )
         size = f"{self.shift.frames:.3g} +- {self.shift.error_frames:.2g} frames"
-        rate = ""
-        if self.clock_ppm:
-            way = "faster" if self.clock_ppm > 0 else "slower"
-            rate = (
-                f" Their clock runs {abs(self.clock_ppm):.3g} ppm {way} than the loop's: motions "
-                "and phases hold for readings that do not drift against the frames."
-            )
         if self.shift.by_phases:
-            return (
-                f"the accelerometers lag behind the wavefront by {size}, by the phases of lines."
-                f"{rate}"
-            )
+            return f"the accelerometers lag behind the wavefront by {size}, by the phases of lines."
         return (
             f"the phases of the lines do not tell the shift of the clocks from motions out of "
             f"phase; the slope within the lines says {size}. Phases hold for a shift of "
-            f"{self.age_frames - 1}.{rate}"
+            f"{self.age_frames - 1}."
         )
 
     def tables(self) -> list[Table]:
@@ -191,7 +154,6 @@ def accelerometer_transfers(
     channels: Sequence[str] | None = None,
     false_alarm: float = 1e-3,
     largest_shift_s: float = 10.0,
-    earlier: Sequence[tuple[float, Mapping[str, complex]]] = (),
 ) -> AccelerometerTransfers:
     r"""Find how the channels of accelerometers move with the lines of an identified model.
 
@@ -221,9 +183,6 @@ def accelerometer_transfers(
         Probability that any line shows in any of these channels without being there.
     largest_shift_s : float, optional
         Largest shift between the clocks that is looked for [s].
-    earlier : sequence of (float, mapping of str to complex), optional
-        Lines of an earlier model: frequency [Hz] and the factors of channels by name. Without
-        them, exchanged channels cannot be found.
 
     Returns
     -------
@@ -261,15 +220,15 @@ def accelerometer_transfers(
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
     largest = int(number(largest_shift_s, "largest_shift_s", at_least=0) * model.frame_rate_hz)
     faults = [
-        channel_fault(raw, model.frame_rate_hz) if filled.any() else "dead"
+        _channel_fault(raw, model.frame_rate_hz) if filled.any() else "dead"
         for raw, filled in zip(given.T, readings.T, strict=True)
     ]
-    live = [c for c, fault in enumerate(faults) if fault not in LEFT_OUT]
+    live = [c for c, fault in enumerate(faults) if fault not in _LEFT_OUT]
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
     if not live or not places:
         return AccelerometerTransfers(
             transfers=(),
-            channels=_channel_rows(names, (), {}, [(fault,) for fault in faults]),
+            channels=_channel_rows(names, (), {}, faults),
             shift=clock_shift((), largest),
             age_frames=1,
             rate_hz=model.frame_rate_hz,
@@ -279,43 +238,57 @@ def accelerometer_transfers(
     tried = len(live) * len(lines) * (1 + np.ceil(4 * widest * largest / model.frame_rate_hz))
     limit = alarm / tried
     laid = lay_and_fit(model, record, readings[:, live], good, lines, largest, limit)
-    lag, fits, shift, odd = laid.lag, laid.fits, laid.shift, laid.odd
+    fits = laid.fits
     rows = [_row(fit, names[live[fit[3]]], places, model, limit) for fit in fits]
     rows.sort(key=lambda row: (names.index(row.channel), row.frequency_hz))
     noises = {live[c]: _noise(fits, c, model.frame_rate_hz, limit) for c in range(len(live))}
     shown = [row for row in rows if row.useful]
     best = _best_channels(shown, {names[c]: noise for c, noise in noises.items()}, model)
-    extra = {row.channel for row in shown if row.channel not in best}
-    swapped = swapped_channels(_factors(rows), earlier) if earlier else {}
-    wrong = {live[c]: f"shifted by {frames:.3g} frames against others" for c, frames in odd.items()}
-    troubles = [
-        (fault, wrong.get(c, ""), _swap_text(swapped.get(names[c])))
-        for c, fault in enumerate(faults)
-    ]
-    found = AccelerometerTransfers(
-        transfers=tuple(rows),
-        channels=_channel_rows(names, rows, noises, troubles),
-        shift=replace(shift, frames=shift.frames + lag),
-        age_frames=lag + 1,
+    return AccelerometerTransfers(
+        transfers=tuple(replace(row, useful=row.useful and row.channel in best) for row in rows),
+        channels=_channel_rows(names, rows, noises, faults, best),
+        shift=replace(laid.shift, frames=laid.shift.frames + laid.lag),
+        age_frames=laid.lag + 1,
         rate_hz=model.frame_rate_hz,
-        clock_ppm=1e6 * laid.faster,
     )
-    return found.without(sorted(extra), _EXTRA) if extra else found
+
+
+def _channel_fault(readings: FloatArray, rate_hz: float) -> str:
+    """Return dead, saturated, drifting, or an empty text, for the readings (frames,) of one."""
+    readings = readings[np.isfinite(readings)]
+    values = np.unique(readings)
+    rounding = _ROUNDING * max(float(np.max(np.abs(values), initial=0.0)), _LEAST_M_S2)
+    if values.size <= _FEWEST_VALUES or np.ptp(values) <= rounding:
+        return "dead"
+    if np.sum(find_saturated(readings, np.ones(readings.size, dtype=np.bool_))) >= _CLIPPED:
+        return "saturated"
+    return "drifting" if _drifts(readings, rate_hz) else ""
+
+
+def _drifts(readings: FloatArray, rate_hz: float) -> bool:
+    from scipy.signal import periodogram
+
+    frequency, power = periodogram(readings, rate_hz, window="cosine")
+    slow = (frequency > 0) & (frequency < _SLOW_HZ)
+    if not slow.any():
+        return False
+    return bool(np.mean(power[slow]) > _DRIFT * np.median(power[1:]))
 
 
 def _channel_rows(
     names: Sequence[str],
     rows: Sequence[TransferRow],
     noises: Mapping[int, float],
-    troubles: Sequence[Sequence[str]],
+    faults: Sequence[str],
+    best: Sequence[str] = (),
 ) -> tuple[ChannelRow, ...]:
     return tuple(
         ChannelRow(
             channel=name,
             noise_m_s2=noises.get(c, float("nan")),
-            verdict=_verdict(name, rows, *own),
+            verdict=_verdict(name, rows, fault, name in best),
         )
-        for c, (name, own) in enumerate(zip(names, troubles, strict=True))
+        for c, (name, fault) in enumerate(zip(names, faults, strict=True))
     )
 
 
@@ -379,22 +352,9 @@ def _best_channels(
     return best
 
 
-def _factors(rows: Sequence[TransferRow]) -> dict[str, list[Factor]]:
-    """Return frequency, complex factor and standard error of each line, by channel."""
-    out: dict[str, list[Factor]] = {}
-    for row in rows:
-        factor = complex(row.motion_nm_per_nm * np.exp(1j * np.radians(row.phase_deg)))
-        own = (row.frequency_hz, factor, row.motion_error_nm_per_nm)
-        out.setdefault(row.channel, []).append(own)
-    return out
-
-
-def _swap_text(other: str | None) -> str:
-    return f"swapped with {other}" if other else ""
-
-
-def _verdict(name: str, rows: Sequence[TransferRow], *wrong: str) -> str:
+def _verdict(name: str, rows: Sequence[TransferRow], fault: str, best: bool) -> str:
     """Return what a channel is used for, and what is wrong with it, in words."""
     lines = [f"{row.frequency_hz:.3g}" for row in rows if row.channel == name and row.useful]
-    use = f"{_USED} {', '.join(lines)} Hz" if lines else "adds nothing"
-    return "; ".join([*(text for text in wrong if text), use])
+    use = f"{'used for' if best else 'shows'} {', '.join(lines)} Hz" if lines else "adds nothing"
+    extra = _EXTRA if lines and not best else ""
+    return "; ".join(text for text in (extra, fault, use) if text)
