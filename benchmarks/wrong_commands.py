@@ -33,13 +33,12 @@ FAULTS = {  # and the beginning of what repairs it
     "none": "",
     "sign": "--command-sign -1",
     "swap": "--swap-axes",
-    "rotation": "--command-rotation-deg",
+    "rotation": "--command-matrix",
     "scale 1000": "--command-scale 0.001",
     "scale 0.5": "--command-scale 2",
     "shift": "--command-shift-frames",
     "increments": "--command-increments",
     "other night": "",
-    "clipped": "--command-limit-nm",
     "axis late": "",
 }
 PART_SIZE = FAULTS["scale 0.5"]  # also named in a warning beside a design
@@ -116,22 +115,6 @@ def run(loop: Loop, night: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return made.measurements[0][SETTLE:], made.commands[0][SETTLE:]
 
 
-def run_clipped(loop: Loop, limit_nm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Run a leaky integrator whose requests beyond a stroke are recorded, not applied."""
-    idle = lbt.Controller(
-        A=np.zeros((2, 2)), B=np.zeros((2, 2)), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
-    )
-    made = lbt.simulate(idle, loop.truth, hardware=loop.path, frames=loop.frames, seed=loop.seed)
-    phase, noise = made.total_nm[0], made.measurements[0]
-    sensor = loop.truth.sensor_gain
-    y, u = np.zeros((2, loop.frames, 2))
-    for k in range(DELAY, loop.frames):  # the idle loop's measurement has phase and noise
-        y[k] = noise[k] - sensor * np.clip(u[k - DELAY], -limit_nm, limit_nm)
-        u[k] = 0.995 * u[k - 1] + loop.gain * y[k]
-    assert phase.shape == y.shape
-    return y[SETTLE:], u[SETTLE:]
-
-
 def spoil(loop: Loop, fault: str) -> tuple[np.ndarray, np.ndarray]:
     """Return measurements and commands with a fault."""
     y, u = run(loop)
@@ -143,9 +126,6 @@ def spoil(loop: Loop, fault: str) -> tuple[np.ndarray, np.ndarray]:
         return y[5:-5], np.roll(u, (-2, -1, 1, 2)[loop.seed % 4], axis=0)[5:-5]
     if fault == "axis late":
         return y[1:], np.column_stack([u[1:, 0], u[:-1, 1]])
-    if fault == "clipped":
-        part = (0.7, 0.9, 0.97)[loop.seed % 3]
-        return run_clipped(loop, np.quantile(abs(u), part, axis=0))
     wrong = {
         "none": u,
         "sign": -u,

@@ -22,10 +22,8 @@ def given_repair(arguments: Namespace) -> CommandRepair:
     return CommandRepair(
         increments=arguments.command_increments,
         shift_frames=arguments.command_shift_frames,
-        limit_nm=tuple(arguments.command_limit_nm or ()),
         swap_axes=arguments.swap_axes,
         sign=tuple(arguments.command_sign or ()),
-        rotation_deg=arguments.command_rotation_deg,
         matrix=tuple(arguments.command_matrix or ()),
         scale=arguments.command_scale or 1.0,
     )

@@ -35,12 +35,8 @@ def add_repairs(parser: ArgumentParser) -> None:
     add_switch(needs, "--command-increments", "they are increments: add them up")
     text = "frames by which they move to later frames, or to earlier ones below 0"
     add_option(needs, "--command-shift-frames", int, text, 0)
-    text = "largest command that was applied [nm], of both axes or of each"
-    add_option(needs, "--command-limit-nm", float, text, nargs="+", metavar="NM")
     add_switch(needs, "--swap-axes", "exchange those of the two axes")
     add_option(needs, "--command-sign", int, "1 or -1, of both axes or of each", nargs="+")
-    text = "turn them, from the first axis to the second [deg]"
-    add_option(needs, "--command-rotation-deg", float, text, 0.0)
     text = "matrix from them to the axes of the measurements, row after row"
     add_option(needs, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
     text = "factor, of both axes or of each; 1 says that they were recorded as large as applied"

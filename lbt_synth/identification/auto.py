@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.identification.commands.fitted_gains import judge_fitted_gains
-from lbt_synth.identification.commands.verdict import explain_commands
+from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
 from lbt_synth.identification.design_for_gains import design_for_gains, is_stable_at_gains
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.likeliest_gain import identify_likeliest, identify_with_gains
@@ -180,7 +179,7 @@ def design_from_record(
     fit_model = partial(identify_likeliest, record, allowed=allowed, **options)
     design = partial(_design, defaults=defaults)
     if allowed is not None:
-        assumptions += _judge_gains(record, half, accept_record)
+        assumptions += _judge_gains(half, accept_record)
     found = None
     if method is None:
         found = choose_method(
@@ -313,11 +312,11 @@ def _judge_commands(
     return list(verdict.notes), [*verdict.overruled, *given]
 
 
-def _judge_gains(record: LoopRecord, model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
+def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
     """Return what is assumed of fitted gains; refuse those of commands in another unit."""
     errors = [axis.sensor_gain_error for axis in model.axes]
     known = np.array([np.inf if error is None else error for error in errors])
-    verdict = judge_fitted_gains(record, np.array(model.sensor_gains), known)
+    verdict = judge_fitted_gains(np.array(model.sensor_gains), known)
     if not accept:
         verdict.require_accepted()
     return verdict.overruled

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.identification.commands.coarse_steps import is_stepped
+from lbt_synth.identification.commands.doubts import STEPPED, rounding_share
 from lbt_synth.identification.commands.gain_interval import POSSIBLE_GAINS, allowed_gains
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, Search
@@ -41,7 +41,8 @@ def identify_with_gains(
     if agrees(model, allowed):
         return model, allowed
     best, excluded = _compare(record, model, allowed, options)
-    excluded = excluded and not is_stepped(record) and _is_plausible(best)
+    stepped = np.max(rounding_share(record)) > STEPPED
+    excluded = excluded and not stepped and _is_plausible(best)
     own = np.repeat(np.array(best.sensor_gains)[:, None], 2, axis=1)
     return best, own if excluded else allowed
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
-from support.control_laws import PATH, TRUTH, ordinary_loop
+from support.control_laws import ordinary_loop
 from support.recorded_loops import RATE
 
 import lbt_synth as lbt
@@ -13,14 +11,13 @@ from lbt_synth.identification.commands.repair import CommandRepair
 
 TURN = np.deg2rad(30)
 ROTATION = np.array([[np.cos(TURN), -np.sin(TURN)], [np.sin(TURN), np.cos(TURN)]])
-LIMIT_NM = 250.0
 
 # fault: (measurements and commands of the wrong record, the options that repair it)
 FAULTS = {
     "turned": (lambda y, u: (y, -u), "--command-sign -1"),
     "one turned": (lambda y, u: (y, u * [1, -1]), "--command-sign 1 -1"),
     "exchanged": (lambda y, u: (y, u[:, ::-1]), "--swap-axes"),
-    "rotated": (lambda y, u: (y, u @ ROTATION), "--command-rotation-deg 30"),
+    "rotated": (lambda y, u: (y, u @ ROTATION), "--command-matrix 0.866025 -0.5 0.5 0.866025"),
     "1000 times": (lambda y, u: (y, 1000 * u), "--command-scale 0.001"),
     "a tenth": (lambda y, u: (y, 0.1 * u), "--command-scale 10"),
     "late": (lambda y, u: (y[1:], u[:-1]), "--command-shift-frames -1"),
@@ -45,33 +42,13 @@ def wrong_record(fault: str, seed: int = 1) -> lbt.identification.LoopRecord:
     return record(*spoil(*ordinary_loop(seed)))
 
 
-@cache
-def requested_loop(frames: int = 10_000):
-    """Measurements and requests of an integrator whose mirror has a small stroke."""
-    idle = lbt.Controller(
-        A=np.zeros((2, 2)),
-        B=np.zeros((2, 2)),
-        C=np.zeros((2, 2)),
-        D=np.zeros((2, 2)),
-        dt_s=1 / RATE,
-    )
-    phase = lbt.simulate(idle, TRUTH, hardware=PATH, frames=frames, seed=3).total_nm[0]
-    noise = 8.0 * np.random.default_rng(4).standard_normal((frames, 2))
-    y, u = np.zeros((2, frames, 2))
-    for k in range(2, frames):
-        correction = np.clip(u[k - 2], -LIMIT_NM, LIMIT_NM)
-        y[k] = 0.7 * (phase[k - 1] - correction) + noise[k]
-        u[k] = 0.99 * u[k - 1] + 0.4 * y[k]
-    return y, u
-
-
 def repair_of(fault: str) -> CommandRepair:
     """The repair of a fault."""
     return {
         "turned": CommandRepair(sign=(-1,)),
         "one turned": CommandRepair(sign=(1, -1)),
         "exchanged": CommandRepair(swap_axes=True),
-        "rotated": CommandRepair(rotation_deg=30.0),
+        "rotated": CommandRepair(matrix=tuple(ROTATION.ravel())),
         "1000 times": CommandRepair(scale=0.001),
         "a tenth": CommandRepair(scale=10.0),
         "late": CommandRepair(shift_frames=-1),

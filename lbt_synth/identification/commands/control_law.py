@@ -14,11 +14,12 @@ from lbt_synth.identification.commands.law_search import (
     LAGS,
     LawCoefficients,
     LawShape,
+    LoopSeries,
     Regression,
+    prepare_series,
     simplest_law,
     simplest_short_law,
 )
-from lbt_synth.identification.commands.loop_series import LoopSeries, prepare_series
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, matrix, read_only
 
@@ -65,9 +66,6 @@ class ControlLaw:
     lag_frames : int
         Lag of the first measurement: 0 if u(k) follows from measurements up to y(k), 2 if two
         frames later than that; negative if commands know measurements of the future.
-    mean_lag_frames : float
-        Mean lag of the measurements, weighted by their share of the gain: not whole after a
-        fractional shift. Nan of a law of order 2 and more.
     gain : (axes, axes) ndarray
         Increment of u per unit of y at low frequencies: the gain of an integrator. Of a law
         without memory, u per unit of y; of a double integrator, the second increment. Sign and
@@ -77,8 +75,8 @@ class ControlLaw:
         Standard errors of the gain.
     axis_matrix : AxisMatrix
         Signs and structure of the gain.
-    leak, leak_error : (axes,) ndarray
-        Pole nearest 1, and its standard error; nan of a law without memory.
+    leak : (axes,) ndarray
+        Pole nearest 1; nan of a law without memory.
     poles : (axes, order) complex ndarray
         Poles of the law of each axis.
     order : int
@@ -94,20 +92,16 @@ class ControlLaw:
         of a deterministic law, 0 of the commands of another night; the mean of the axes.
     axis_coherence : (axes,) ndarray
         The same of each axis; there is a law if any of them is not 0.
-    frames : int
-        Frames of the fit.
     odd_frames : int
         Frames that do not follow the law of the others, and were left out.
     """
 
     kind: LawKind
     lag_frames: int
-    mean_lag_frames: float
     gain: FloatArray
     gain_error: FloatArray
     axis_matrix: AxisMatrix
     leak: FloatArray
-    leak_error: FloatArray
     poles: ComplexArray
     order: int
     past: FloatArray
@@ -115,7 +109,6 @@ class ControlLaw:
     residual: float
     coherence: float
     axis_coherence: FloatArray
-    frames: int
     odd_frames: int
 
     @property
@@ -127,11 +120,6 @@ class ControlLaw:
     def is_sure(self) -> bool:
         """Whether it explains so much that its lag counts."""
         return self.kind != "none" and self.residual < _SURE
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether it is sure, and each axis follows it."""
-        return self.is_sure and bool(np.all(self.axis_coherence > FOLLOWED))
 
     @property
     def is_ordinary(self) -> bool:
@@ -309,12 +297,10 @@ def _describe(regression: Regression, shape: LawShape) -> ControlLaw:
     return ControlLaw(
         kind=kind,
         lag_frames=shape.first,
-        mean_lag_frames=_mean_lag(found.taps, shape),
         gain=read_only(gain),
         gain_error=read_only(error),
         axis_matrix=classify_matrix(gain, error),
         leak=read_only(_leak(poles)),
-        leak_error=read_only(found.past_error),
         poles=read_only(poles),
         order=shape.order,
         past=read_only(found.past),
@@ -322,7 +308,6 @@ def _describe(regression: Regression, shape: LawShape) -> ControlLaw:
         residual=unexplained,
         coherence=float(np.mean(coherence)),
         axis_coherence=read_only(coherence),
-        frames=regression.rows,
         odd_frames=0,
     )
 
@@ -340,12 +325,6 @@ def _leak(poles: ComplexArray) -> FloatArray:
         return np.full(len(poles), np.nan)
     nearest = poles[:, 0]
     return np.where(abs(nearest.imag) > 0, abs(nearest), nearest.real)
-
-
-def _mean_lag(taps: FloatArray, shape: LawShape) -> float:
-    """Return the mean lag of the measurements [frames], weighted by their share of the gain."""
-    shares = np.einsum("ilj,ij->l", taps, np.sum(taps, axis=1))
-    return float(shares @ np.array(shape.lags) / shares.sum()) if shape.order < 2 else np.nan
 
 
 def _gain(found: LawCoefficients, others: ComplexArray) -> tuple[FloatArray, FloatArray]:
@@ -382,12 +361,10 @@ def _no_law(
     return ControlLaw(
         kind="none",
         lag_frames=0,
-        mean_lag_frames=0.0,
         gain=read_only(zeros),
         gain_error=read_only(zeros.copy()),
         axis_matrix=classify_matrix(zeros),
         leak=read_only(np.full(axes, np.nan)),
-        leak_error=read_only(np.full(axes, np.nan)),
         poles=read_only(np.zeros((axes, 0), dtype=np.complex128)),
         order=0,
         past=read_only(np.zeros((axes, 0))),
@@ -395,6 +372,5 @@ def _no_law(
         residual=residual,
         coherence=float(np.mean(known)),
         axis_coherence=read_only(known),
-        frames=regression.rows,
         odd_frames=0,
     )

@@ -9,8 +9,8 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.commands.coarse_steps import gain_dilution
 from lbt_synth.identification.commands.control_law import record_control_law
+from lbt_synth.identification.commands.doubts import gain_dilution
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
 from lbt_synth.identification.commands.plausibility import could_have_run
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
@@ -76,7 +76,7 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel | None = None) -> F
     allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
     low, high = np.array(ends, dtype=np.float64).T
-    high = high * gain_dilution(coarse) ** 2  # in the steps of commands, a gain looks smaller
+    high = high * gain_dilution(coarse) ** 2  # in steps, a gain looks smaller
     intervals: FloatArray = np.clip(np.column_stack([low, high]), _LEAST, _MOST)
     running = far[_has_run(record, far)]
     if not running.size:

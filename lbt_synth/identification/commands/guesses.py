@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, TypeAlias, TypeVar
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -18,23 +17,18 @@ from lbt_synth.identification.commands.coarse_spectrum import (
     fit_profile,
     segment_transforms,
 )
-from lbt_synth.identification.commands.repair import MIRROR, rotation
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import ComplexArray, FloatArray
 
-GuessKind: TypeAlias = Literal["as given", "matrix", "shift", "increments", "clipped"]
-_Series = TypeVar("_Series", FloatArray, ComplexArray)
-SHIFTS = tuple(float(shift) for shift in np.arange(-3, 3.1, 0.5) if shift)
-_ROTATIONS_DEG = (-150.0, -120.0, -90.0, -60.0, -30.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
-_MIRRORS_DEG = (-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0)
-_LEVELS = (0.99, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.12, 0.06, 0.03)  # of the largest command
+GuessKind: TypeAlias = Literal["as given", "matrix", "shift", "increments"]
+SHIFTS = (-3, -2, -1, 1, 2, 3)  # frames
+_SIGNS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
 _MARGIN = 5  # frames of a stretch, on either side, that no shift leaves
 _SHORTEST = 512
 _NATURAL_GAINS = np.array([0.2, 0.7, 2.0])  # starts, of the natural gain
 _NATURAL = 0.4
 _STEADY = 1e-24  # of the measured power
-_ORTHOGONAL = 1e-6
 _ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 
 
@@ -44,31 +38,20 @@ class Guess:
 
     kind: GuessKind
     matrix: FloatArray | None = None  # from commands to the axes of the measurements, (axes, axes)
-    shift_frames: float = 0.0  # by which the delay is longer than given
-    limit_nm: FloatArray | None = None  # stroke beyond which requests were not applied, (axes,)
+    shift_frames: int = 0  # by which the delay is longer than given
 
     @property
     def is_simple(self) -> bool:
-        """Whether the matrix, if there is one, is a rotation, with a mirror or without."""
-        return self.matrix is None or is_orthogonal(self.matrix)
+        """Whether the matrix, if there is one, has only signs and exchanged axes."""
+        return self.matrix is None or bool(np.all(np.isin(np.abs(self.matrix), (0, 1))))
 
-    def unturned_corrections(self, record: LoopRecord, shift: int = 0) -> FloatArray:
-        """Return the corrections in the measurements, but for the matrix, (frames, axes) [nm].
-
-        A shift that is not whole mixes those of two whole ones, ``shift`` is one of them.
-        """
+    def unturned_corrections(self, record: LoopRecord) -> FloatArray:
+        """Return the corrections in the measurements, but for the matrix, (frames, axes) [nm]."""
         assert record.commands is not None
         u = record.commands
         if self.kind == "increments":
             u = np.cumsum(u, axis=0)
-        if self.limit_nm is not None:
-            u = np.clip(u, -self.limit_nm, self.limit_nm)
-        return np.roll(past_corrections(record.mirror_taps, u), shift, axis=0)
-
-
-def is_orthogonal(matrix: FloatArray) -> bool:
-    """Return whether a matrix is a rotation, with a mirror or without."""
-    return bool(np.max(abs(matrix @ matrix.T - np.eye(len(matrix)))) < _ORTHOGONAL)
+        return np.roll(past_corrections(record.mirror_taps, u), self.shift_frames, axis=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,16 +68,6 @@ class Comparison:
         """Return the factor by which a misfit of guess i raises what decides, at least 1."""
         return max(1.0, float(self.misfit[i]) / _ENOUGH)
 
-    def join(self, other: Comparison) -> Comparison:
-        """Return the guesses of both."""
-        return Comparison(
-            guesses=self.guesses + other.guesses,
-            contrast=np.append(self.contrast, other.contrast),
-            axis_contrast=np.hstack([self.axis_contrast, other.axis_contrast]),
-            gain=np.hstack([self.gain, other.gain]),
-            misfit=np.append(self.misfit, other.misfit),
-        )
-
 
 def list_guesses(record: LoopRecord, *, earliest_frames: float) -> list[Guess]:
     """Return the guesses for a record, the first as given.
@@ -102,33 +75,21 @@ def list_guesses(record: LoopRecord, *, earliest_frames: float) -> list[Guess]:
     ``earliest_frames`` is the least total delay at which a correction still follows from the
     past of the measurements.
     """
-    assert record.commands is not None
     assert record.delay_frames is not None
     out = [Guess(kind="as given")]
     out += [Guess(kind="matrix", matrix=matrix) for matrix in _matrices(record.axes)]
     least = earliest_frames - record.delay_frames
     out += [Guess(kind="shift", shift_frames=shift) for shift in SHIFTS if shift >= least]
     out.append(Guess(kind="increments"))
-    largest = np.max(abs(record.commands[record.usable]), axis=0)
-    if np.all(largest > 0):
-        out += [Guess(kind="clipped", limit_nm=level * largest) for level in _LEVELS]
     return out
 
 
-def _matrices(axes: int) -> Iterator[FloatArray]:
-    """Yield matrices from commands to the axes of the measurements."""
+def _matrices(axes: int) -> list[FloatArray]:
+    """Return the signs and exchanges from commands to the axes of the measurements."""
     if axes == 1:
-        yield -np.eye(1)
-        return
-    yield from map(rotation, _ROTATIONS_DEG)
-    yield from (rotation(angle) @ MIRROR for angle in _MIRRORS_DEG)
-
-
-def _mix_shifts(shift_frames: float, at: Callable[[int], _Series]) -> _Series:
-    """Return what a shift gives, mixed from what two whole ones do."""
-    whole = int(np.floor(shift_frames))
-    part = shift_frames - whole
-    return (1 - part) * at(whole) + part * at(whole + 1) if part else at(whole)
+        return [-np.eye(1)]
+    plain = [np.diag(np.array(signs, dtype=float)) for signs in _SIGNS]
+    return [*plain[1:], *(signs[:, ::-1] for signs in plain)]
 
 
 class CoarseRecord:
@@ -147,7 +108,7 @@ class CoarseRecord:
         self.resonances = [()] * record.axes if resonances is None else resonances
         trimmed = [(a + _MARGIN, b - _MARGIN) for a, b in record.stretches()]
         self.stretches = [(a, b) for a, b in trimmed if b - a >= _SHORTEST]
-        self._known: dict[tuple[object, ...], ComplexArray] = {}
+        self._known: dict[tuple[bool, int], ComplexArray] = {}
         if self.stretches:
             every = self._transform(record.measurements)
             self.frequency_hz, self.measured, self.independent = every
@@ -155,22 +116,17 @@ class CoarseRecord:
     def _transform(self, series: FloatArray) -> tuple[FloatArray, ComplexArray, float]:
         return segment_transforms(series, self.stretches, self.record.frame_rate_hz)
 
-    def _shifted(self, guess: Guess, shift: int) -> ComplexArray:
-        """Return the transforms of a guess without its matrix, at a whole shift."""
-        limit = None if guess.limit_nm is None else tuple(guess.limit_nm.tolist())
-        key = (guess.kind == "increments", limit, shift)
-        if key not in self._known:
-            self._known[key] = self._transform(guess.unturned_corrections(self.record, shift))[1]
-        return self._known[key]
-
     def transform(self, guess: Guess) -> ComplexArray:
         """Return the transforms of the corrections of a guess, (axes, segments, f)."""
-        out = _mix_shifts(guess.shift_frames, partial(self._shifted, guess))
+        key = (guess.kind == "increments", guess.shift_frames)
+        if key not in self._known:
+            self._known[key] = self._transform(guess.unturned_corrections(self.record))[1]
+        out = self._known[key]
         return out if guess.matrix is None else np.tensordot(guess.matrix, out, 1)
 
     def corrections(self, guess: Guess) -> FloatArray:
         """Return the corrections of a guess as series, (frames, axes) [nm]."""
-        out = _mix_shifts(guess.shift_frames, partial(guess.unturned_corrections, self.record))
+        out = guess.unturned_corrections(self.record)
         return out if guess.matrix is None else out @ guess.matrix.T
 
     def compare(self, guesses: Sequence[Guess]) -> Comparison:

@@ -91,8 +91,9 @@ def score_guesses(
     possible = _possible_guesses(compared, record, law)
     surprising = unusual | ~possible
     best = int(np.argmin(compared.contrast))
-    if law is not None and not law.exact and surprising[best] and not surprising.all():
-        saved = np.min(compared.contrast[~surprising]) - compared.contrast[best]
+    if law is not None and not law.exact and surprising[best]:
+        expected = compared.contrast[:1] if surprising.all() else compared.contrast[~surprising]
+        saved = np.min(expected) - compared.contrast[best]
         if saved > _CONTRADICTED * compared.dispersion(best):
             return score_guesses(compared, record, None, 0)  # it is not what computed the commands
     assert record.delay_frames is not None
@@ -139,7 +140,7 @@ def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
         return guess.shift_frames != 0
     if guess.kind == "shift":
         return guess.shift_frames != -lag or lag == 0
-    if guess.kind in ("as given", "clipped") and lag:
+    if guess.kind == "as given" and lag:
         return True
     if (guess.kind == "increments") == already_integrates(law):
         return True
@@ -151,20 +152,14 @@ def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
     return turned.kind != "diagonal" and law.order <= _SHORT
 
 
-def finer_saving(coarse: CoarseRecord, guess: Guess, *, clear: float, decides: bool) -> float:
+def finer_saving(coarse: CoarseRecord, guess: Guess, clear: float) -> float:
     """Return how much likelier a guess is than the record as given, by the model of the fit.
 
     Both have the lines and the wide resonances that they need, at the price of the criterion: the
-    coarse spectrum has few. A guess that does not decide must first be likelier with the clear
-    ones of the record as given. Before a saving is clear, that is fitted from other gains as well.
+    coarse spectrum has few. Before a saving is clear, the record as given is fitted from other
+    gains as well.
     """
     as_given = Guess(kind="as given")
-    if not decides:
-        likely = np.clip(coarse.compare([as_given]).gain[:, 0], *PLAUSIBLE_GAINS)
-        begun = _fit_axes(coarse, as_given, rounds=0, begin_at=likely)
-        saving = _cost(begun) - _cost(_fit_axes(coarse, guess, starts=begun, rounds=0))
-        if saving < 0:
-            return saving
     other = _cost(_fit_axes(coarse, guess))
     saving = _cost(_fit_axes(coarse, as_given)) - other
     if saving < clear:
@@ -206,8 +201,6 @@ def _fit_axes(
     guess: Guess,
     gain: float | None = None,
     *,
-    starts: Sequence[_Fit] = (),
-    rounds: int = _ROUNDS,
     other_gains: bool = False,
     begin_at: FloatArray | None = None,
 ) -> list[_Fit]:
@@ -223,18 +216,15 @@ def _fit_axes(
         for a, b in coarse.stretches
         for start in range(a, max(b - length, a) + 1, length)
     ]
-    begins = [model.spectrum if model else None for _, model in starts] or [None] * record.axes
     out: list[_Fit] = []
-    for i, (y, c, begin) in enumerate(
-        zip(record.measurements.T, corrections.T, begins, strict=True)
-    ):
+    for i, (y, c) in enumerate(zip(record.measurements.T, corrections.T, strict=True)):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         search = Search(data=data, gain=gain, most_lines=_LINES)
         if begin_at is not None:
             search = replace(search, starting_gains=(float(begin_at[i]),))
         found: FittedModel | None = None
         with suppress(NumericalError):
-            found = find_components(search, begin, rounds=rounds)
+            found = find_components(search, None, rounds=_ROUNDS)
             if other_gains:
                 found, _ = try_other_gains(search, found)
         out.append((search, found))

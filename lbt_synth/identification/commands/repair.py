@@ -12,7 +12,6 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import FloatArray, integer, number, read_only, real_array, set_fields
 
 _SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
-MIRROR = np.diag([1.0, -1.0])
 _MOST_SHIFT = 100
 
 
@@ -26,14 +25,10 @@ class CommandRepair:
         The record has increments: they are added up.
     shift_frames : int, optional
         Frames by which the commands move to later frames; negative to earlier ones.
-    limit_nm : tuple of float, optional
-        Stroke of each axis, or of both: what was requested beyond was not applied [nm].
     swap_axes : bool, optional
         The commands of the two axes change places.
     sign : tuple of int, optional
         1 or -1 for each axis, or for both.
-    rotation_deg : float, optional
-        Angle by which the commands turn, from the first axis to the second [deg].
     matrix : tuple of float, optional
         Matrix from commands to the axes of the measurements, in rows.
     scale : float or sequence of float, optional
@@ -54,10 +49,8 @@ class CommandRepair:
 
     increments: bool = False
     shift_frames: int = 0
-    limit_nm: tuple[float, ...] = ()
     swap_axes: bool = False
     sign: tuple[int, ...] = ()
-    rotation_deg: float = 0.0
     matrix: tuple[float, ...] = ()
     scale: float | tuple[float, ...] = 1.0
 
@@ -67,11 +60,8 @@ class CommandRepair:
         set_fields(self, scale=scales[0] if len(set(scales)) == 1 else scales)
         shift = integer(self.shift_frames, "command_shift_frames", at_least=-_MOST_SHIFT)
         number(shift, "command_shift_frames", at_most=_MOST_SHIFT)
-        for limit in self.limit_nm:
-            number(limit, "command_limit_nm", above=0)
         if any(sign not in (-1, 1) for sign in self.sign):
             raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
-        number(self.rotation_deg, "command_rotation_deg", at_least=-180, at_most=180)
         real_array(self.matrix, "command_matrix")
 
     @property
@@ -84,10 +74,8 @@ class CommandRepair:
         words = [
             "--command-increments" if self.increments else "",
             f"--command-shift-frames {self.shift_frames}" if self.shift_frames else "",
-            f"--command-limit-nm {values(self.limit_nm)}" if self.limit_nm else "",
             "--swap-axes" if self.swap_axes else "",
             f"--command-sign {values(self.sign)}" if self.sign else "",
-            f"--command-rotation-deg {self.rotation_deg:g}" if self.rotation_deg else "",
             f"--command-matrix {values(self.matrix)}" if self.matrix else "",
             f"--command-scale {values(self._scales)}" if self.scale != 1 else "",
         ]
@@ -98,10 +86,10 @@ class CommandRepair:
         return self.scale if isinstance(self.scale, tuple) else (self.scale,)
 
     def turn(self, axes: int) -> FloatArray:
-        """Return the matrix that swap, sign, rotation, matrix and scale are together."""
-        if axes != 2 and (self.swap_axes or self.rotation_deg):
+        """Return the matrix that swap, sign, matrix and scale are together."""
+        if axes != 2 and self.swap_axes:
             raise ProblemError(
-                "swapped or rotated commands need two axes; the record has one. Leave "
+                "swapped commands need two axes; the record has one. Leave "
                 f"{self.options} out, or choose two columns."
             )
         if len(self._scales) not in (1, axes):
@@ -116,8 +104,6 @@ class CommandRepair:
                     f"got {len(self.matrix)}."
                 )
             out = out @ np.reshape(self.matrix, (axes, axes))
-        if self.rotation_deg:
-            out = out @ rotation(self.rotation_deg)
         if self.sign:
             if len(self.sign) not in (1, axes):
                 raise ProblemError(
@@ -125,12 +111,6 @@ class CommandRepair:
                 )
             out = out @ np.diag(np.broadcast_to(np.array(self.sign, dtype=float), axes))
         return out @ _SWAP if self.swap_axes else out
-
-
-def rotation(angle_deg: float) -> FloatArray:
-    """Return the matrix of a rotation, (2, 2)."""
-    angle = np.deg2rad(angle_deg)
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
@@ -181,14 +161,6 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
         late = repair.shift_frames > 0
         unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
         commands[unknown], good[unknown] = 0.0, False
-    if repair.limit_nm:
-        if len(repair.limit_nm) not in (1, record.axes):
-            raise ProblemError(
-                f"command_limit_nm must be one number, or {record.axes}; got "
-                f"{list(repair.limit_nm)}."
-            )
-        limit = np.broadcast_to(np.array(repair.limit_nm), record.axes)
-        commands = np.clip(commands, -limit, limit)
     commands = commands @ repair.turn(record.axes).T
     repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
     return repaired if record.delay_frames is None else repaired.with_delay(record.delay_frames)

@@ -9,33 +9,19 @@ from functools import partial
 import numpy as np
 
 from lbt_synth.errors import ProblemError, RecordError
-from lbt_synth.identification.commands.coarse_steps import doubt_steps, gain_dilution, note_steps
 from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
-from lbt_synth.identification.commands.explanations import (
-    invert_axes,
-    recorded_early,
-    refine_guess,
-    repair_guess,
-    wrong_scale,
-)
-from lbt_synth.identification.commands.guesses import (
-    SHIFTS,
-    CoarseRecord,
-    Comparison,
-    Guess,
-    list_guesses,
-)
-from lbt_synth.identification.commands.held_commands import held_while_moving
-from lbt_synth.identification.commands.law_doubts import (
+from lbt_synth.identification.commands.doubts import (
     doubt_axes,
     doubt_law,
     doubt_running,
-    find_slip,
+    doubt_steps,
+    held_while_moving,
     moving_axes,
 )
+from lbt_synth.identification.commands.guesses import SHIFTS, CoarseRecord, Guess, list_guesses
 from lbt_synth.identification.commands.plausibility import finer_saving, score_guesses
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
-from lbt_synth.identification.commands.scale_search import find_scale
+from lbt_synth.identification.commands.scale import find_scale, likely_factors, wrong_scale
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.storage.words import count_text
@@ -43,13 +29,14 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_ins
 
 AS_GIVEN = "as given"
 _CLEAR = 20.0  # nats that decide
-_CLEAR_FINER = 8.0  # the same by the criterion of the fit, where a shift is of whole frames
-_PART = 0.5  # frame, which the dynamics of a mirror may imitate: only a warning
+_CLEAR_FINER = 8.0  # the same by the criterion of the fit
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _NO_UNIT = 1e12  # scale that no two units of a length or an angle have
 _NOT_SHOWN = 3.0  # factor beyond plausible gains
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
+_FIT_ERRORS = 4.0  # of a fitted gain from a plausible one that refute the unit
+_WORST_CONDITION = 100.0  # of the gain of a law that is inverted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,9 +115,9 @@ def explain_commands(
 
     Each explanation gives another pseudo-open-loop series, and only the right one has the simple
     spectrum of turbulence, lines and noise: Whittle's likelihood on a coarse model decides between
-    the commands as given, turned, exchanged or rotated ones, other delays, increments, requests
-    beyond the stroke, other units, and commands that have nothing to do with the measurements.
-    The control law that computed the commands tells a shifted record from a wrong delay.
+    the commands as given, with other signs, exchanged or shifted, increments, other units, and
+    commands that have nothing to do with the measurements. The control law that computed the
+    commands says which of these are likely, and tells a shifted record from a wrong delay.
 
     Parameters
     ----------
@@ -189,8 +176,7 @@ def explain_commands(
         return CommandVerdict(
             explanation=AS_GIVEN, accepted=True, gain=nothing, law=law, notes=(note,)
         )
-    dilution = gain_dilution(coarse)
-    steps = doubt_steps(coarse, dilution) if sensor_gain is None else None
+    steps = doubt_steps(coarse) if sensor_gain is None else None
     if law is not None and (doubt := _doubt_commands(coarse, law, steps)):
         return refuse(explanation=doubt)
     found = _find_best(coarse, law, max(lag, 0))
@@ -205,14 +191,14 @@ def explain_commands(
         )
     if found.guess.kind == "as given" and (doubt := doubt_running(record, law, found.gain)):
         return refuse(explanation=doubt)
-    words = [] if not early else [recorded_early(early)]
+    late = f"{count_text(early, 'frame')} early, before their measurements"
+    words = [f"they are recorded {late}"] if early else []
     repair, other_delay, why = repair_guess(found.guess, delay, max(lag, 0))
     words += why
     if np.any(scale != 1):
         words.append(wrong_scale(scale, found.gain))
     if steps and not words:
         words.append(steps)
-    rounded = note_steps(coarse, dilution) if sensor_gain is None else ()
     repair = replace(repair, shift_frames=repair.shift_frames or early, scale=tuple(scale))
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
@@ -222,7 +208,7 @@ def explain_commands(
         nats=max(found.nats, 0.0),
         gain=_shown_gain(found.gain / scale, plausible),
         law=law,
-        notes=() if words else (*_notes(found, delay, lag), *rounded),
+        notes=() if words else _note_lag(delay, lag),
     )
 
 
@@ -258,9 +244,7 @@ def _doubt_series(record: LoopRecord, law: ControlLaw | None) -> str | None:
     """Return what is wrong with the series of a record whatever the sensor sees, in words."""
     if held := held_while_moving(record):
         return held
-    if law is not None and law.is_sure and (doubt := doubt_law(law)):
-        return doubt
-    return None if law is not None and law.is_whole else find_slip(record)
+    return doubt_law(law) if law is not None and law.is_sure else None
 
 
 def _doubt_commands(coarse: CoarseRecord, law: ControlLaw, steps: str | None) -> str | None:
@@ -287,8 +271,6 @@ class _Best:
     own_contrast: float  # of the axes, without their coherence
     gain: FloatArray  # (axes,)
     clear: float  # nats that decide
-    rival: Guess | None = None  # a likelier one that is not clearly so
-    rival_nats: float = 0.0
 
     def scale(
         self, coarse: CoarseRecord, law: ControlLaw | None, plausible: tuple[float, float]
@@ -303,81 +285,113 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     record = coarse.record
     guesses = list_guesses(record, earliest_frames=1.0 - lag)
     if lag > SHIFTS[-1]:
-        guesses.append(Guess(kind="shift", shift_frames=-float(lag)))
-    if law is not None and law.axis_matrix.kind not in ("diagonal", "swapped", "zero"):
-        inverse = invert_axes(law.gain)
-        guesses += [] if inverse is None else [Guess(kind="matrix", matrix=inverse)]
+        guesses.append(Guess(kind="shift", shift_frames=-lag))
+    if law is not None and law.axis_matrix.kind == "general":
+        guesses += [Guess(kind="matrix", matrix=each) for each in _unmix_axes(law.gain)]
     compared = coarse.compare(guesses)
-    if any(guess.kind == "clipped" for guess in guesses):
-        guesses.append(_best_limits(compared))
-        compared = compared.join(coarse.compare(guesses[-1:]))
     score, surprising = score_guesses(compared, record, law, lag)
     best = int(np.argmin(score))
     # what the law asks for, which the coarse spectrum may miss
     expected = np.flatnonzero(~surprising)
     if surprising[[0, best]].all() and expected.size:
         other = int(expected[np.argmin(score[expected])])
-        saving = finer_saving(coarse, guesses[other], clear=_CLEAR_FINER, decides=True)
-        if saving >= _CLEAR_FINER:
+        if finer_saving(coarse, guesses[other], _CLEAR_FINER) >= _CLEAR_FINER:
             best, score[0] = other, np.inf
     clear = _CLEAR * compared.dispersion(best)
     no_law = law is None or law.kind == "none"
     saved = coarse.unrelated() - np.min(compared.contrast) if no_law else np.inf
     if saved < _RELATED * compared.dispersion(best):
         return None
-    given = _Best(
-        guess=guesses[0],
-        nats=0.0,
-        own_contrast=float(np.sum(compared.axis_contrast[:, 0])),
-        gain=compared.gain[:, 0],
-        clear=clear,
-    )
-    if best == 0:
-        return given
     nats = float(compared.contrast[0] - compared.contrast[best])
-    part_of_a_frame = abs(guesses[best].shift_frames) == _PART
-    guess = refine_guess(coarse, guesses[best], law)
-    shown = nats >= clear / 2 or np.isinf(score[0])
-    finer = 0.0
-    if not surprising[0] or surprising[best]:  # the law does not ask for it
-        least = _CLEAR_FINER if guess.shift_frames % 1 == 0 else _CLEAR
-        if nats >= clear:
-            finer = finer_saving(coarse, guess, clear=least, decides=not part_of_a_frame)
-        shown = finer >= least and not part_of_a_frame
+    if surprising[0] and not surprising[best]:  # the law asks for it
+        shown = nats >= clear / 2 or np.isinf(score[0])
+    else:
+        finer = finer_saving(coarse, guesses[best], _CLEAR_FINER) if nats >= clear else 0.0
+        shown = finer >= _CLEAR_FINER
     if not shown:
-        return replace(given, rival=guesses[best], rival_nats=finer)
-    fine = coarse.compare([guess])
+        best, nats = 0, 0.0
     return _Best(
-        guess=guess,
+        guess=guesses[best],
         nats=nats,
-        own_contrast=float(np.sum(fine.axis_contrast[:, 0])),
-        gain=fine.gain[:, 0],
+        own_contrast=float(np.sum(compared.axis_contrast[:, best])),
+        gain=compared.gain[:, best],
         clear=clear,
     )
 
 
-def _best_limits(compared: Comparison) -> Guess:
-    """Return the guess of clipped commands with the best limit of each axis."""
-    places = [i for i, guess in enumerate(compared.guesses) if guess.limit_nm is not None]
-    limits = np.array([compared.guesses[i].limit_nm for i in places])
-    best = np.argmin(compared.axis_contrast[:, places], axis=1)
-    return Guess(kind="clipped", limit_nm=limits[best, np.arange(best.size)])
+def _unmix_axes(gain: FloatArray) -> list[FloatArray]:
+    """Return matrices of commands that undo a law's gain: a turn, and all of it."""
+    if np.linalg.cond(gain) > _WORST_CONDITION:
+        return []
+    one, _, other = np.linalg.svd(gain)
+    inverse = np.linalg.inv(gain)
+    return [(one @ other).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))]
 
 
-def _notes(found: _Best, delay_frames: float, lag: int) -> tuple[str, ...]:
-    """Return what to look at although the record is accepted."""
-    out = []
-    if lag > 0:
-        out.append(
-            f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If "
-            "the real-time computer takes that long, the total delay of a new design is "
-            f"{delay_frames + lag:g} frames"
-        )
-    rival = found.rival if found.rival_nats > 0.5 * _CLEAR_FINER else None
-    if rival is not None and rival.kind == "shift":
-        fitting = delay_frames + rival.shift_frames
-        out.append(
-            f"warning: a delay of {fitting:g} frames fits better than {delay_frames:g} (by "
-            f"{found.rival_nats:.0f} in the logarithm of the likelihood). Check the delay"
-        )
-    return tuple(out)
+def repair_guess(
+    guess: Guess, delay_frames: float, lag: int
+) -> tuple[CommandRepair, float | None, list[str]]:
+    """Return the repair that a guess asks for, the delay if it is another, and the words."""
+    if guess.matrix is not None:
+        repair, why = _repair_matrix(guess.matrix)
+        return repair, None, [why]
+    if guess.kind == "increments":
+        return CommandRepair(increments=True), None, ["they are increments, not positions"]
+    if guess.shift_frames == 0:
+        return CommandRepair(), None, []
+    words = []
+    if lag:
+        words = [f"they are recorded {count_text(lag, 'frame')} late"]
+    total = delay_frames + guess.shift_frames + lag
+    other = total if total != delay_frames else None
+    if other is not None:
+        words.append(f"the total delay is {other:g} frames, not {delay_frames:g}")
+    return CommandRepair(shift_frames=-lag), other, words
+
+
+def _repair_matrix(matrix: FloatArray) -> tuple[CommandRepair, str]:
+    """Return the repair of a matrix from commands to axes of the measurements, and its words."""
+    if len(matrix) == 1:
+        return CommandRepair(sign=(-1,)), "they have the opposite sign"
+    if not np.isin(np.abs(matrix), (0, 1)).all():
+        values = tuple(float(f"{value:.6g}") for value in matrix.ravel())
+        rows = ", ".join(f"{value:.4g}" for value in values)
+        why = f"between them and the axes of the measurements lies a matrix ({rows})"
+        return CommandRepair(matrix=values), why
+    swapped = bool(matrix[0, 0] == 0)
+    one, other = matrix[:, ::-1].diagonal() if swapped else matrix.diagonal()
+    signs = int(one), int(other)
+    words = ["those of the two axes are exchanged"] if swapped else []
+    if signs == (-1, -1):
+        words.append("they have the opposite sign")
+    elif min(signs) < 0:
+        words.append(f"axis {signs.index(-1)} has the opposite sign")
+    sign = () if signs == (1, 1) else (-1,) if signs == (-1, -1) else signs
+    return CommandRepair(swap_axes=swapped, sign=sign), " and ".join(words)
+
+
+def _note_lag(delay_frames: float, lag: int) -> tuple[str, ...]:
+    """Return what to look at in an accepted record whose law has a lag."""
+    if lag <= 0:
+        return ()
+    return (
+        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If "
+        "the real-time computer takes that long, the total delay of a new design is "
+        f"{delay_frames + lag:g} frames",
+    )
+
+
+def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
+    """Judge the commands by the sensor gains (axes,) of a fit, with their standard errors.
+
+    The fit shows gains beyond the plausible ones where the coarse model leaves them open.
+    """
+    accepted = not np.all(gains - _FIT_ERRORS * errors > PLAUSIBLE_GAINS[1])
+    scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
+    return CommandVerdict(
+        explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
+        accepted=accepted,
+        repair=None if accepted else CommandRepair(scale=tuple(scale)),
+        gain=frozen_copy(gains / scale),
+        law=None,
+    )

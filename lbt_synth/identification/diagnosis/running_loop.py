@@ -65,16 +65,13 @@ def law_row(law: ControlLaw) -> LawRow:
             coherence=law.coherence,
         )
     matrix = law.axis_matrix
-    words: str = matrix.kind
-    if matrix.kind == "rotated":
-        words = f"rotated by {matrix.angle_deg:.0f} deg"
     gains = law.gain
     flat = np.diag(gains) if matrix.kind == "diagonal" else gains.ravel()
     return LawRow(
         law=law.kind,
         order=law.order,
         gain=", ".join(_distinct(f"{value:.4g}" for value in flat + 0.0)),
-        axes="" if len(gains) == 1 else words,
+        axes="" if len(gains) == 1 else matrix.kind,
         leak=", ".join(_distinct(f"{value:.5g}" for value in law.leak if np.isfinite(value))),
         lag_frames=law.lag_frames,
         residual=0.0 if law.exact else law.residual,

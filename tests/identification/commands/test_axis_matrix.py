@@ -4,29 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.control_laws import rotation
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.axis_matrix import classify_matrix
 
-MIRROR = np.diag([1.0, -1.0])
-
-
-@pytest.mark.parametrize("angle", [-150, -60, -20, 10, 45, 100, 170])
-@pytest.mark.parametrize("gains", [(0.4, 0.4), (0.5, 0.3)])
-def test_rotations(angle, gains):
-    for matrix in (rotation(angle) @ np.diag(gains), np.diag(gains) @ rotation(angle)):
-        found = classify_matrix(matrix, 1e-3)
-        assert found.kind == "rotated"
-        assert found.angle_deg == pytest.approx(angle)
-        assert classify_matrix(MIRROR @ matrix, 1e-3).kind == "mirrored"
-
 
 def test_diagonals():
     found = classify_matrix(np.diag([-0.3, -0.5]))
-    assert (found.kind, found.signs, found.angle_deg) == ("diagonal", (-1, -1), 180.0)
-    np.testing.assert_allclose(found.gains, [0.3, 0.5])
-    assert np.isnan(classify_matrix(np.diag([0.3, -0.5])).angle_deg)
+    assert (found.kind, found.signs) == ("diagonal", (-1, -1))
     found = classify_matrix([[0.0, -0.3], [0.5, 0.0]])
     assert (found.kind, found.signs) == ("swapped", (-1, 1))
     assert classify_matrix([[-2.0]]).signs == (-1,)
@@ -34,7 +19,7 @@ def test_diagonals():
 
 def test_errors_and_tolerance_count_as_zero():
     near = [[0.4, 0.03], [-0.03, 0.4]]
-    assert classify_matrix(near).kind == "rotated"
+    assert classify_matrix(near).kind == "general"
     assert classify_matrix(near, 0.01).kind == "diagonal"
     assert classify_matrix(near, tolerance=0.1).kind == "diagonal"
     assert classify_matrix(near, 0.2).kind == "zero"

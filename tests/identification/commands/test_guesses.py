@@ -33,12 +33,6 @@ def test_one_axis_may_only_be_turned() -> None:
     assert [m.tolist() for m in matrices] == [[[-1.0]]]
 
 
-def test_half_a_frame_is_the_mean_of_two(coarse) -> None:
-    whole = [coarse.transform(Guess(kind="shift", shift_frames=s)) for s in (0.0, 1.0)]
-    half = coarse.transform(Guess(kind="shift", shift_frames=0.5))
-    np.testing.assert_allclose(half, np.mean(whole, axis=0))
-
-
 def test_a_matrix_mixes_the_axes(coarse) -> None:
     plain = coarse.transform(Guess(kind="as given"))
     mixed = coarse.transform(Guess(kind="matrix", matrix=np.array([[0.0, 1.0], [2.0, 1.0]])))
@@ -49,9 +43,7 @@ def test_a_matrix_mixes_the_axes(coarse) -> None:
 def test_the_record_as_given_is_the_likeliest(coarse) -> None:
     guesses = list_guesses(coarse.record, earliest_frames=1.0)
     found = coarse.compare(guesses)
-    others = [i for i, g in enumerate(guesses) if g.kind not in ("as given", "clipped")]
-    assert np.all(found.contrast[others] > found.contrast[0] + 5)
-    assert np.all(found.contrast > found.contrast[0] - 5)  # hardly any command beyond 99 %
+    assert np.all(found.contrast[1:] > found.contrast[0] + 5)
     np.testing.assert_allclose(found.gain[:, 0], 0.7, rtol=0.1)
     assert found.misfit[0] < 2
 
@@ -65,11 +57,3 @@ def test_other_gains_are_less_likely(coarse) -> None:
     own = coarse.profile(given, best.gain) - best.axis_contrast
     np.testing.assert_allclose(own, 0, atol=0.02)  # what fits end within
     assert coarse.unrelated() > np.sum(best.axis_contrast) + 100
-
-
-def test_comparisons_are_joined(coarse) -> None:
-    one, other = (coarse.compare([Guess(kind=kind)]) for kind in ("as given", "increments"))
-    joined = one.join(other)
-    assert joined.contrast.tolist() == [*one.contrast, *other.contrast]
-    assert joined.gain.tolist() == np.hstack([one.gain, other.gain]).tolist()
-    assert [guess.kind for guess in joined.guesses] == ["as given", "increments"]

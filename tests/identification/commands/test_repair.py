@@ -8,7 +8,7 @@ from support.control_laws import ordinary_loop
 from support.wrong_commands import FAULTS, record, repair_of, wrong_record
 
 import lbt_synth as lbt
-from lbt_synth.identification.commands.repair import CommandRepair, repair_commands, rotation
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -40,20 +40,13 @@ def test_frames_whose_command_is_not_known_are_not_usable() -> None:
     assert not summed.usable[5002:].any()  # every later position depends on the lost increment
 
 
-def test_requests_are_clipped() -> None:
-    y, u = ordinary_loop()
-    limits = (100.0, 50.0)
-    clipped = repair_commands(record(y, u), CommandRepair(limit_nm=limits))
-    assert np.max(abs(clipped.commands), axis=0).tolist() == list(limits)
-
-
 def test_the_matrix_of_a_repair_is_applied_in_the_order_of_its_fields() -> None:
-    both = CommandRepair(swap_axes=True, sign=(1, -1), rotation_deg=30.0, scale=2.0)
+    both = CommandRepair(swap_axes=True, sign=(1, -1), matrix=(1.0, 2.0, 3.0, 4.0), scale=2.0)
     swap, sign = np.array([[0, 1], [1, 0]]), np.diag([1, -1])
-    np.testing.assert_allclose(both.turn(2), 2 * rotation(30.0) @ sign @ swap)
+    np.testing.assert_allclose(both.turn(2), 2 * np.array([[1, 2], [3, 4]]) @ sign @ swap)
     assert CommandRepair(matrix=(1.0, 2.0, 3.0, 4.0)).turn(2).tolist() == [[1, 2], [3, 4]]
     assert both.options == (
-        "--swap-axes --command-sign 1 -1 --command-rotation-deg 30 --command-scale 2"
+        "--swap-axes --command-sign 1 -1 --command-matrix 1 2 3 4 --command-scale 2"
     )
 
 
@@ -63,9 +56,7 @@ def test_the_matrix_of_a_repair_is_applied_in_the_order_of_its_fields() -> None:
         ({"sign": (2,)}, "command_sign must be 1 or -1"),
         ({"scale": 0.0}, "command_scale must be above 0"),
         ({"scale": (1.0, -2.0)}, "command_scale must be above 0"),
-        ({"limit_nm": (-1.0,)}, "command_limit_nm must be above 0"),
         ({"shift_frames": 101}, "command_shift_frames must be at most 100"),
-        ({"rotation_deg": 181.0}, "command_rotation_deg must be at most 180"),
         ({"matrix": (1.0, np.nan, 0.0, 1.0)}, "command_matrix"),
     ],
 )
@@ -78,10 +69,8 @@ def test_values_out_of_range(fields, why) -> None:
     ("fields", "why"),
     [
         ({"swap_axes": True}, "need two axes"),
-        ({"rotation_deg": 10.0}, "need two axes"),
         ({"sign": (1, -1)}, "must be one sign, or 1"),
         ({"matrix": (1.0, 0.0, 0.0, 1.0)}, "must have 1 numbers"),
-        ({"limit_nm": (1.0, 1.0)}, "must be one number, or 1"),
     ],
 )
 def test_a_repair_must_fit_the_axes(fields, why) -> None:

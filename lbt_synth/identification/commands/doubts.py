@@ -1,0 +1,220 @@
+"""What speaks against the commands of a record although no option repairs it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lbt_synth.identification.commands.control_law import FOLLOWED, ControlLaw
+from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
+from lbt_synth.identification.commands.plausibility import could_have_run
+from lbt_synth.identification.records.faults import equal_runs, mark, runs
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.models.loop_hardware import past_corrections
+from lbt_synth.storage.words import count_text
+from lbt_synth.validation import BoolArray, FloatArray, IntArray, read_only
+
+_SAME_ROWS = 0.05  # sine of the angle between the rows of a gain that are one
+_NO_STEADY_GAIN = 1e-3  # of the size of the taps, in their sum
+_SHORT = 3  # order of a law whose loop can be judged
+_PARTS_OF_GAIN, _TRIED = np.array([1.0, 0.3, 0.1]), np.geomspace(1.0, 1e-6, 19)
+_RELATED = 30.0  # nats by which the commands of an axis must be likelier than none
+_FUZZ = 1e-6  # of the range of values, within which two are the same
+STEPPED = 1e-6  # of the variance of increments, in rounding that may move a gain
+_DROWNED = 1.15  # factor by which rounding makes a gain too small to be used
+_SEGMENT = 256  # frames whose spectrum is taken
+_LEAST_SEGMENTS = 4
+_BANDS = 20
+_CLEAR = 20.0  # nats that decide
+
+
+def doubt_law(law: ControlLaw) -> str | None:
+    """Return what is wrong with the axes of a sure law, in words; None if nothing is."""
+    followed = law.axis_coherence > FOLLOWED
+    lags = law.axis_lags
+    if np.any(followed) and np.ptp(lags[followed]):  # no real-time computer does that
+        return _axes_apart(lags)
+    steady = np.linalg.norm(np.sum(law.taps, axis=1), axis=1)
+    largest = np.sum(np.linalg.norm(law.taps, axis=2), axis=1)
+    if law.order <= 1 and np.all(steady < _NO_STEADY_GAIN * largest):
+        return "they follow from the changes of the measurements, as if both had been exchanged"
+    size = np.linalg.norm(law.gain, axis=1, keepdims=True)
+    if size.size > 1 and np.all(followed) and np.all(size > 0):
+        rows = law.gain / size
+        if abs(np.linalg.det(rows)) < _SAME_ROWS:
+            return "those of both axes follow the same measurements: one axis was recorded twice"
+    return None
+
+
+def _axes_apart(lags: IntArray) -> str:
+    """Return the words for commands of two axes that follow their measurements differently."""
+    late = int(np.argmax(lags))
+    frames = int(np.ptp(lags))
+    return (
+        f"those of axis {late} follow their measurements {count_text(frames, 'frame')} later "
+        f"than those of axis {1 - late}; move one of them"
+    )
+
+
+def doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray) -> str | None:
+    """Return that no loop has run with the law of these commands at any gain, in words.
+
+    ``gains`` (axes,) are the likeliest ones.
+    """
+    if law is None or not law.exact or law.order > _SHORT:
+        return None
+    tried = np.vstack([gains * _PARTS_OF_GAIN[:, None], _TRIED[:, None] * np.ones(record.axes)])
+    if could_have_run(Guess(kind="as given"), tried, record, law):
+        return None
+    return (
+        "a loop with the law that they follow is unstable at any sensor gain. Check what the "
+        "series are"
+    )
+
+
+def doubt_axes(coarse: CoarseRecord, law: ControlLaw) -> str | None:
+    """Return which axis has commands that follow no law and do not reach it, in words.
+
+    Commands that stand still are of an open loop.
+    """
+    alone = (law.axis_coherence < FOLLOWED) & moving_axes(coarse.record)
+    if law.kind == "none" or not np.any(alone):
+        return None
+    given = Guess(kind="as given")
+    best = coarse.compare([given])
+    nothing = coarse.profile(given, np.zeros((alone.size, 1)))
+    saved = (nothing - best.axis_contrast)[:, 0]
+    unrelated = np.flatnonzero(alone & (saved < _RELATED * best.dispersion(0)))
+    if not unrelated.size:
+        return None
+    return f"those of axis {unrelated[0]} have nothing to do with its measurements"
+
+
+def moving_axes(record: LoopRecord) -> BoolArray:
+    """Return the axes whose commands move, (axes,)."""
+    assert record.commands is not None
+    used: FloatArray = record.commands[record.usable]
+    return np.asarray(np.ptp(used, axis=0) > 0) if used.size else np.ones(record.axes, dtype=bool)
+
+
+def rounding_share(record: LoopRecord) -> FloatArray:
+    """Return which part of the increments' variance is rounding to steps, (axes,)."""
+    assert record.commands is not None
+    changes = np.var(np.diff(record.commands, axis=0), axis=0)
+    return np.asarray(_steps(record) ** 2 / 12 / np.maximum(changes, np.finfo(float).tiny))
+
+
+def _steps(record: LoopRecord) -> FloatArray:
+    """Return the step of which the commands of each axis are multiples, (axes,); 0 if none."""
+    assert record.commands is not None
+    steps = np.zeros(record.axes)
+    for axis, column in enumerate(record.commands[record.usable].T):
+        values = np.unique(column)
+        gaps = np.diff(values)
+        gaps = gaps[gaps > _FUZZ * np.ptp(values)] if gaps.size else gaps
+        if gaps.size:
+            away = (values - values[0]) / np.min(gaps)
+            whole = np.max(np.abs(away - np.round(away))) < 0.1
+            steps[axis] = np.min(gaps) if whole else 0.0
+    return steps
+
+
+def gain_dilution(coarse: CoarseRecord) -> FloatArray:
+    """Return by how much sensor gains are too small for the steps of commands, (axes,), about.
+
+    What rounding takes from a gain, as much rounding again takes once more (J. R. Cook, L. A.
+    Stefanski, J. Am. Stat. Assoc. 89, 1314 (1994), doi:10.2307/2290994).
+    """
+    record = coarse.record
+    matters = rounding_share(record) > STEPPED
+    if not np.any(matters):
+        return np.ones(record.axes)
+    assert record.commands is not None
+    rounding = np.random.default_rng(0).uniform(-0.5, 0.5, record.commands.shape) * _steps(record)
+    worse = CoarseRecord(replace(record, commands=read_only(record.commands + rounding)))
+    given = [Guess(kind="as given")]
+    own, moved = (each.compare(given).gain[:, 0] for each in (coarse, worse))
+    return np.where(matters, np.maximum(own / moved, 1.0), 1.0)
+
+
+def doubt_steps(coarse: CoarseRecord) -> str | None:
+    """Return that a sensor gain drowns in the steps of the recorded commands, in words."""
+    dilution = gain_dilution(coarse)
+    worst = int(np.argmax(dilution))
+    if dilution[worst] < _DROWNED:
+        return None
+    return (
+        f"those of axis {worst} are recorded in steps of {_steps(coarse.record)[worst]:.3g} nm, in "
+        "which the sensor gain drowns. Record more digits, or give the sensor gain"
+    )
+
+
+def held_while_moving(record: LoopRecord) -> str:
+    """Say in how many frames the commands stand still while the mirror moved; empty if in none.
+
+    A mirror that stands still leaves the measurements of an open loop, whose spectrum is that of
+    the pseudo-open loop in the other frames. If those of the closed loop explain them better, the
+    record of the commands stopped, not the mirror.
+    """
+    assert record.commands is not None
+    corrections = past_corrections(record.mirror_taps, record.commands)
+    still = np.array([_still(column, record.usable) for column in corrections.T])
+    if not np.any(still):
+        return ""
+    moving = CoarseRecord(replace(record, usable=record.usable & ~np.any(still, axis=0)))
+    if not moving.stretches:
+        return ""
+    gains = moving.compare([Guess(kind="as given")]).gain[:, 0]
+    opened = record.measurements + gains * corrections
+    nats = sum(
+        _excess(*axis)
+        for axis in zip(record.measurements.T, opened.T, still, still ^ record.usable, strict=True)
+    )
+    if nats < _CLEAR:
+        return ""
+    share = 100 * float(np.max(np.mean(still, axis=1)))
+    return (
+        f"they stand still in {share:.0f} % of the frames, where the "
+        "measurements are those of a loop that runs. Cut these frames off, or record them again"
+    )
+
+
+def _still(correction: FloatArray, usable: BoolArray) -> BoolArray:
+    """Return the frames of long stretches in which a correction does not move."""
+    each = equal_runs(correction, usable)
+    return mark(each[each[:, 1] - each[:, 0] >= _SEGMENT], len(correction))
+
+
+def _excess(closed: FloatArray, opened: FloatArray, still: BoolArray, moving: BoolArray) -> float:
+    """Return by how many nats the closed loop explains the measurements of held frames better."""
+    held, free = _segments(still), _segments(moving)
+    if min(len(held), len(free)) < _LEAST_SEGMENTS:
+        return 0.0
+    seen = _spectrum(closed[held])
+    if not np.all(seen > 0):  # nothing is measured there
+        return 0.0
+    own, other = (
+        len(held) * np.sum(np.log(S) + seen / S)
+        for S in (_spectrum(closed[free]), _spectrum(opened[free]))
+    )
+    return float(other - own)
+
+
+def _segments(frames: BoolArray) -> IntArray:
+    """Return the frames of each whole segment of stretches, (segments, frames)."""
+    starts = [
+        first
+        for start, stop in runs(frames)
+        for first in range(start, stop - _SEGMENT + 1, _SEGMENT)
+    ]
+    return np.array(starts, dtype=np.int64)[:, None] + np.arange(_SEGMENT)
+
+
+def _spectrum(segments: FloatArray) -> FloatArray:
+    """Return the mean power in each of some bands, but for the mean, (bands,)."""
+    window = np.hanning(_SEGMENT + 1)[:-1]
+    transforms = np.fft.rfft((segments - segments.mean(axis=1, keepdims=True)) * window)
+    power = np.mean(np.abs(transforms[:, 2:]) ** 2, axis=0)
+    edges = np.unique(np.geomspace(1, power.size, _BANDS).astype(np.int64)) - 1
+    return np.asarray(np.add.reduceat(power, edges) / np.diff(edges, append=power.size))
