@@ -12,8 +12,7 @@ from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, RecordedDesign, design_from_record
 from lbt_synth.identification.auto import LEAST_SECONDS
 from lbt_synth.identification.method_choice import MethodChoice
-from lbt_synth.identification.prediction.comparison import RAN
-from lbt_synth.identification.prediction.residual_row import ResidualRow
+from lbt_synth.identification.prediction.comparison import RAN, ResidualRow
 from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fill_row

@@ -35,7 +35,7 @@ from lbt_synth.identification.accelerometers.readings import (
 from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.fit.identified_model import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS
-from lbt_synth.identification.records.record_length import LEAST_SECONDS
+from lbt_synth.identification.records.record import LEAST_SECONDS
 from lbt_synth.loop import Imaging
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.style import require_figure_name, save_figure

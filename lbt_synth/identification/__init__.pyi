@@ -50,7 +50,7 @@ from .records.line_priors import LinePrior as LinePrior
 from .records.line_priors import accelerometer_lines as accelerometer_lines
 from .records.line_priors import load_lines as load_lines
 from .records.record import LoopRecord as LoopRecord
-from .records.record_length import require_length as require_length
+from .records.record import require_length as require_length
 from .records.spectrum import SpectrumRecord as SpectrumRecord
 from .stretches import split_halves as split_halves
 from .tracking import TrackingController as TrackingController

@@ -21,19 +21,19 @@ from lbt_synth.identification.prediction.comparison import (
     PredictionTable,
     prediction_against_data,
 )
-from lbt_synth.identification.record_drift import note_drift
 from lbt_synth.identification.records.line_priors import LinePrior
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.record_length import require_length
+from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop
 from lbt_synth.methods.registry import gain_robust_method, method_named, record_methods
 from lbt_synth.methods.request import PlantInputs, design_request, option_owners
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import choice, require_instance
+from lbt_synth.validation import FloatArray, choice, require_instance
 
 _APART = 3.0  # standard errors between gains that disagree
+_DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 8.0  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 
@@ -332,4 +332,24 @@ def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[st
             yield (
                 f"warning: axis {i} has a sensor gain of {first.sensor_gain:.3f} in the first half "
                 f"of the record, and of {whole.sensor_gain:.3f} in all of it"
+            )
+
+
+def note_drift(record: LoopRecord, loop: ClosedLoop, residual_nm: FloatArray) -> Iterator[str]:
+    """Yield a note on each axis whose offset and drift leave much beside its residual (n,).
+
+    The fit sees a drift in its lowest frequencies only, and an offset not at all. The filter sees
+    both, and what it does not reject at zero frequency stays in the residual for ever.
+    """
+    series = record.pseudo_open_loop(np.diag(loop.hardware.sensor))[record.usable]
+    seconds = np.flatnonzero(record.usable) / record.frame_rate_hz
+    speed, mean = np.polyfit(seconds - np.mean(seconds), series, 1)
+    away = np.abs(mean) + np.abs(speed) * np.ptp(seconds) / 2
+    rejected = loop.rejection().frequency_response([0.0])[0].real
+    for i, left in enumerate(np.abs(rejected) @ away):
+        if left > _DRIFT_SHARE * residual_nm[i]:
+            yield (
+                f"axis {i} of the record stands {nm_text(mean[i])} off zero and drifts by "
+                f"{nm_text(speed[i])}/s. The filter sees that, and leaves up to "
+                f"{nm_text(left, '.2g')} of it. Offload it to the telescope"
             )

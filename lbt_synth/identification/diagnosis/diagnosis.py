@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
-from lbt_synth.design import Design
+from lbt_synth.design import Design, model_integrator
 from lbt_synth.design.model_limits import limit_or_nan
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
-from lbt_synth.identification.diagnosis.candidates import candidate_designs, stable_designs
 from lbt_synth.identification.diagnosis.channels import ChannelRow, judge_channels
-from lbt_synth.identification.diagnosis.command_doubt import doubt_commands
 from lbt_synth.identification.diagnosis.costs import CostRow, disturbance_costs
 from lbt_synth.identification.diagnosis.given_design import (
     GivenDesignRow,
@@ -24,6 +23,7 @@ from lbt_synth.identification.diagnosis.given_design import (
 from lbt_synth.identification.diagnosis.line_origins import LineOrigin, line_origins
 from lbt_synth.identification.diagnosis.running_loop import (
     LoopRow,
+    doubt_commands,
     loop_row,
     running_controller,
 )
@@ -33,15 +33,17 @@ from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
     PredictionRow,
     PredictionTable,
+    ResidualRow,
     prediction_against_data,
 )
-from lbt_synth.identification.prediction.residual_row import ResidualRow
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.record_length import require_length
+from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.methods.registry import all_methods, reference_methods
+from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import fill_row
 from lbt_synth.validation import require_instance
 
@@ -226,7 +228,7 @@ def _examine_loop(
         notes,
     )
     comparison, best = compared if compared is not None else (None, "")
-    build = candidate_designs(model).get(best)
+    build = _candidate_designs(model).get(best)
     best_design = None if build is None else _attempt(build, best, notes)
     costs = _attempt(
         lambda: disturbance_costs(
@@ -278,9 +280,9 @@ def _compare(
     step(1)
     plant = half.plant()
     series = record.pseudo_open_loop(half.sensor_gains)
-    builders = candidate_designs(half)
+    builders = _candidate_designs(half)
     builders.pop(INTEGRATOR)  # the comparison has it
-    designs, missing = stable_designs(builders, plant)
+    designs, missing = _stable_designs(builders, plant)
     notes += missing
     stable = {}
     for name, controller in given.items():
@@ -310,6 +312,36 @@ def _compare(
         if entry.replayed is not None and entry.name in (INTEGRATOR, *designs)
     }
     return table, min(left, key=lambda name: left[name])
+
+
+def _candidate_designs(model: IdentifiedModel) -> dict[str, Callable[[], Design]]:
+    """Return what builds each candidate for a model, by the name of its row."""
+    plant = model.plant()
+    inputs = PlantInputs(plant=plant)
+    with_bands = [each for each in all_methods().values() if each.plant_section is not None]
+    builders: dict[str, Callable[[], Design]] = {
+        method.title: partial(design_request(method.name, {}).build, inputs)
+        for method in (*reference_methods(estimators_only=True), *with_bands)
+    }
+    return builders | {INTEGRATOR: partial(model_integrator, plant)}
+
+
+def _stable_designs(
+    builders: Mapping[str, Callable[[], Design]], plant: TipTiltPlant
+) -> tuple[dict[str, Design], list[str]]:
+    """Return the designs that can be built and hold a plant's loop, and why others are missing."""
+    found, notes = {}, []
+    for name, build in builders.items():
+        try:
+            design = build()
+        except LbtSynthError as error:
+            notes.append(f"no {name}: {error}")
+            continue
+        if close_loop(plant.hardware, design.controller).is_stable:
+            found[name] = design
+        else:
+            notes.append(f"no {name}: its loop is not stable at the identified sensor gain")
+    return found, notes
 
 
 def _attempt(compute: Callable[[], Any], what: str, notes: list[str]) -> Any:

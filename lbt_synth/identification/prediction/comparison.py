@@ -32,6 +32,7 @@ from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 RAN = "what ran"
@@ -50,6 +51,23 @@ _COLUMNS = {  # attribute of a row by heading
     "strehl": "strehl",
     "model_strehl": "model_strehl",
 }
+
+
+@table_row
+class ResidualRow:
+    """One controller on frames that nothing was fitted to, beside what the model promises."""
+
+    name: str = column("controller", help="What it is")
+    replayed_nm: float = nm_column(
+        "data", format=".2f", key="data_nm", help="Residual on the data, all axes"
+    )
+    replayed_error_nm: float = nm_column(
+        "+-", format=".2f", key="data_error_nm", help="Its standard error"
+    )
+    model_nm: float = nm_column("model", format=".2f", help="Residual that the model promises")
+    ratio: float = column("data/model", format=".3f", help="Residual on the data over that")
+    strehl: float = column("Strehl, data", format=".3f", help="Strehl ratio on the data")
+    model_strehl: float = column("Strehl, model", format=".3f", help="Strehl ratio by the model")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.prediction.mean_products import mean_covariance
 from lbt_synth.identification.prediction.replay import (
     Replay,
     ReplayFrames,
     choose_warm_up,
+    mean_covariance,
     replay,
     replay_frames,
 )

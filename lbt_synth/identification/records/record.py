@@ -32,6 +32,10 @@ _BRIDGED_FRACTION = 0.01
 NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 
+_LEAST_FRAMES = 4096  # that show a model
+LEAST_SECONDS = 4.0
+_SHORTEST_STRETCH = 256  # frames of a stretch that counts
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopRecord:
@@ -334,3 +338,56 @@ def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: i
     powers = np.vander(known - start, increasing=True)
     inside = np.vander(np.arange(stop - start), known.size, increasing=True)
     return np.asarray(inside @ np.linalg.solve(powers, series[known]))
+
+
+def require_length(
+    record: LoopRecord, *, frames: int = _LEAST_FRAMES, seconds: float = LEAST_SECONDS
+) -> int:
+    """Refuse a record that is too short for a model to be found.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record.
+    frames : int, optional
+        Usable frames that are needed, in stretches of at least 256. Those at the start of a record,
+        whose commands came before it, count.
+    seconds : float, optional
+        The same as a time [s].
+
+    Returns
+    -------
+    int
+        Usable frames in stretches of at least 256.
+
+    Raises
+    ------
+    ProblemError
+        If there are too few frames; it says how many there are and are needed, and which faults
+        were found.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> brief = lbt.identification.loop_record([[1.0], [2.5], [2.0]], frame_rate_hz=800, unit="nm")
+    >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s at 800 Hz) ...
+    """
+    rate = record.frame_rate_hz
+    needed = integer(frames, "frames", at_least=1)
+    needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
+    known = record.commands is None or record.delay_frames is None
+    before = 0 if known else len(record.hardware.mirror_taps)  # commands that no record knows
+    lengths = [stop - (start if start > before else 0) for start, stop in record.stretches()]
+    count = sum(length for length in lengths if length >= _SHORTEST_STRETCH)
+    longest = max(lengths, default=0)
+    if count < needed:
+        raise ProblemError(
+            f"the record needs {needed} usable frames ({needed / rate:.3g} s at {rate:.6g} Hz) in "
+            f"stretches of at least {_SHORTEST_STRETCH}; got {count} ({count / rate:.3g} s), the "
+            f"longest stretch {longest}. {record.health.summary()} Record for longer, or lose "
+            "fewer frames."
+        )
+    return count

@@ -13,8 +13,7 @@ import numpy as np
 from lbt_synth.design import Design
 from lbt_synth.identification import Diagnosis, diagnosis_verdict
 from lbt_synth.identification.diagnosis.channels import AXES
-from lbt_synth.identification.diagnosis.command_doubt import command_row
-from lbt_synth.identification.diagnosis.running_loop import law_row
+from lbt_synth.identification.diagnosis.running_loop import command_row, law_row
 from lbt_synth.identification.diagnosis.verdict import NARROW
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN

@@ -8,7 +8,7 @@ from support.control_laws import ordinary_loop
 from support.wrong_commands import record
 
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.diagnosis.command_doubt import command_row, doubt_commands
+from lbt_synth.identification.diagnosis.running_loop import command_row, doubt_commands
 
 
 @pytest.mark.parametrize(
