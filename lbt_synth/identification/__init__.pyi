@@ -1,4 +1,4 @@
-from .accelerometers.clock_shift import ClockShift as ClockShift
+from .accelerometers.laying import ClockShift as ClockShift
 from .accelerometers.transfers import AccelerometerTransfers as AccelerometerTransfers
 from .accelerometers.transfers import ChannelRow as ChannelRow
 from .accelerometers.transfers import TransferRow as TransferRow
@@ -10,7 +10,7 @@ from .commands.control_law import ControlLaw as ControlLaw
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.control_law import record_control_law as record_control_law
 from .commands.gain_interval import allowed_gains as allowed_gains
-from .commands.law_controller import law_controller as law_controller
+from .commands.plausibility import law_controller as law_controller
 from .commands.repair import CommandRepair as CommandRepair
 from .commands.repair import repair_commands as repair_commands
 from .commands.verdict import CommandVerdict as CommandVerdict

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design.fusion.failures import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.clock_shift import (
+from lbt_synth.identification.accelerometers.laying import (
     ClockShift,
     Pair,
+    chance,
     clock_shift,
+    lay_and_fit,
 )
-from lbt_synth.identification.accelerometers.laying import chance, lay_and_fit
 from lbt_synth.identification.accelerometers.line_bands import NM
 from lbt_synth.identification.accelerometers.readings import as_columns, fill_missing
 from lbt_synth.identification.fit.identified_model import IdentifiedModel

@@ -1,4 +1,4 @@
-"""What a guess about commands must pass beside the coarse likelihood."""
+"""What a guess about commands must pass beside the coarse likelihood: its loop and its fit."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lbt_synth.errors import NumericalError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.identification.commands.axis_matrix import classify_matrix
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.guesses import CoarseRecord, Comparison, Guess
-from lbt_synth.identification.commands.law_controller import law_controller
 from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
 from lbt_synth.identification.fit.order_search import find_components, try_other_gains
 from lbt_synth.identification.fit.periodogram import loop_periodogram
@@ -22,7 +21,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import BoolArray, FloatArray
+from lbt_synth.validation import BoolArray, FloatArray, number
 
 _NEAR_ONE = 0.2  # distance from 1 of the pole of a law that adds up
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
@@ -44,6 +43,67 @@ _Fit: TypeAlias = tuple[Search, FittedModel | None]
 def already_integrates(law: ControlLaw) -> bool:
     """Return whether a law adds up measurements, as positions do and increments do not."""
     return bool(law.order > 0 and np.all(abs(law.poles[:, 0] - 1) < _NEAR_ONE))
+
+
+def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
+    """Return a control law as a controller.
+
+    Parameters
+    ----------
+    law : ControlLaw
+        The law.
+    frame_rate_hz : float
+        Frame rate [Hz].
+
+    Returns
+    -------
+    Controller
+        Its state holds past commands and measurements.
+
+    Raises
+    ------
+    ProblemError
+        If there is no law, or it knows measurements of the future.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.identification.commands.control_law import fit_control_law
+    >>> y = np.random.default_rng(1).standard_normal((2000, 1))
+    >>> again = law_controller(fit_control_law(y, 0.3 * np.cumsum(y, axis=0)), 500).start()
+    >>> [round(float(again.step([1.0])[0]), 6) for _ in range(3)]
+    [0.3, 0.6, 0.9]
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    if law.kind == "none" or law.lag_frames < 0:
+        why = (
+            "the commands do not follow from the measurements"
+            if law.kind == "none"
+            else f"its commands know measurements of {-law.lag_frames} frames later"
+        )
+        raise ProblemError(f"a controller needs a law that can run; got one where {why}.")
+    axes, lags = len(law.gain), law.taps.shape[1]
+    last = law.lag_frames + lags - 1
+    slots = max(law.order, 1)  # of u(k-1), u(k-2), ...; then last of y(k-1), y(k-2), ...
+    size = axes * (slots + last)
+    A, B = np.zeros((size, size)), np.zeros((size, axes))
+    each = np.arange(axes)
+    for j in range(law.order):
+        A[each, axes * j + each] = law.past[:, j]
+    for index in range(lags):
+        lag = law.lag_frames + index
+        if lag:
+            column = axes * (slots + lag - 1)
+            A[:axes, column : column + axes] += law.taps[:, index]
+        else:
+            B[:axes] += law.taps[:, index]
+    for slot in range(1, slots):
+        A[axes * slot + each, axes * (slot - 1) + each] = 1.0
+    if last:
+        B[axes * slots + each, each] = 1.0
+    for slot in range(slots + 1, slots + last):
+        A[axes * slot + each, axes * (slot - 1) + each] = 1.0
+    return Controller(A=A, B=B, C=np.eye(axes, size), D=np.zeros((axes, axes)), dt_s=1 / rate)
 
 
 def could_have_run(guess: Guess, gains: FloatArray, record: LoopRecord, law: ControlLaw) -> bool:

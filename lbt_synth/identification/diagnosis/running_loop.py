@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.commands.law_controller import law_controller
+from lbt_synth.identification.commands.plausibility import law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.linear import Controller

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support.line_bands import make_bands
 
-from lbt_synth.identification.accelerometers.clock_shift import clock_shift
-from lbt_synth.identification.accelerometers.laying import fit_pairs
+from lbt_synth.identification.accelerometers.laying import clock_shift, fit_pairs
 
 
 def test_a_sensor_gain_whose_error_looks_like_a_shift_is_its_error():
