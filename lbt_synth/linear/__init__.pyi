@@ -3,10 +3,10 @@ from .estimator_form import EstimatorForm as EstimatorForm
 from .estimator_form import RunningEstimator as RunningEstimator
 from .estimator_form import estimator_form as estimator_form
 from .generalized_plant import GeneralizedPlant as GeneralizedPlant
+from .generalized_plant import mixed_sensitivity as mixed_sensitivity
 from .infeasibility_proof import Witness as Witness
 from .infeasibility_proof import infeasible_level as infeasible_level
 from .lyapunov import stationary_covariance as stationary_covariance
-from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .norms import HinfNorm as HinfNorm
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values

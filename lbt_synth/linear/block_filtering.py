@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.batched import transpose
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.validation import FloatArray, real_array
 
 _BLOCK = 8

@@ -7,9 +7,13 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from lbt_synth.linear.batched import frobenius_norms, symmetrise, transpose
-from lbt_synth.linear.matrix_functions import semidefinite_root
-from lbt_synth.linear.schur_form import complex_schur
+from lbt_synth.linear.matrix_functions import (
+    complex_schur,
+    frobenius_norms,
+    semidefinite_root,
+    symmetrise,
+    transpose,
+)
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _SOLVED = 1e-14  # relative residual of an equation solved to rounding

@@ -1,11 +1,50 @@
-"""Small questions about one matrix that several solvers ask."""
+"""Functions of a matrix, and of stacks of matrices (N, n, m), that numpy and scipy have not."""
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
+from scipy.linalg import LinAlgError, rsf2csf, schur
 
-from lbt_synth.linear.batched import symmetrise
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import ComplexArray, Entry, FloatArray
+
+
+def transpose(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
+    """Transpose each matrix of a stack."""
+    return stack.swapaxes(-1, -2)
+
+
+def symmetrise(stack: FloatArray) -> FloatArray:
+    """Symmetric part of each matrix of a stack."""
+    return np.asarray((stack + transpose(stack)) / 2, dtype=np.float64)
+
+
+def frobenius_norms(stack: npt.NDArray[Entry]) -> FloatArray:
+    """Frobenius norm of each matrix of a stack, (N,)."""
+    squares = np.einsum("...ij,...ij->...", stack, stack.conj())  # type: ignore[arg-type]
+    return np.asarray(np.sqrt(squares.real), dtype=np.float64)
+
+
+def solve_stack(matrices: npt.NDArray[Entry], right: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
+    """Solve each system of a stack, (N, n, n) and (N, n, m); a singular one gives nan.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.matrix_functions import solve_stack
+    >>> solve_stack(np.array([[[2.0]], [[0.0]]]), np.ones((2, 1, 1))).ravel().tolist()
+    [0.5, nan]
+    """
+    try:
+        return np.asarray(np.linalg.solve(matrices, right))  # type: ignore[arg-type]
+    except np.linalg.LinAlgError:
+        out = np.full_like(right, np.nan)
+        for i in range(len(matrices)):
+            try:
+                out[i] = np.linalg.solve(matrices[i], right[i])
+            except np.linalg.LinAlgError:
+                continue
+        return out
 
 
 def is_stable(A: FloatArray) -> bool:
@@ -43,3 +82,23 @@ def semidefinite_root(M: FloatArray) -> FloatArray:
     """
     values, vectors = np.linalg.eigh(symmetrise(M))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+
+
+def complex_schur(A: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return T and U with ``A = U T U*``, T upper triangular and U unitary, (n, n).
+
+    On some companion matrices of long filters the complex iteration fails and the real one ends.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lbt_synth.linear.matrix_functions import complex_schur
+    >>> T, U = complex_schur(np.array([[0.0, -1.0], [1.0, 0.0]]))
+    >>> bool(np.allclose(U @ T @ U.conj().T, [[0, -1], [1, 0]]))
+    True
+    """
+    try:
+        T, U = schur(A.astype(np.complex128), output="complex")
+    except LinAlgError:
+        T, U = rsf2csf(*schur(A, output="real"))
+    return T, U

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.linear.batched import solve_stack
+from lbt_synth.linear.matrix_functions import complex_schur, solve_stack
 from lbt_synth.linear.other_systems import control_system, system_parts
-from lbt_synth.linear.schur_form import complex_schur
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
 from lbt_synth.storage.warning_filters import ignore_warnings

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from lbt_synth.linear.panel_edges import distinct_edges, pole_edges
-from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only

@@ -15,8 +15,7 @@ from scipy.linalg import block_diag
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.lyapunov import stationary_root
-from lbt_synth.linear.panel_edges import panel_edges
-from lbt_synth.linear.quadrature import adaptive_integral
+from lbt_synth.linear.quadrature import adaptive_integral, panel_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.loop.fusion.fused_loop import AnyLoop, FusedLoop, fused_budget
 from lbt_synth.loop.residual import ResidualBudget, require_true_gain

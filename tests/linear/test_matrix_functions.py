@@ -1,10 +1,12 @@
-"""Roots of semidefinite matrices, and stability."""
+"""Roots of semidefinite matrices, stability, and the Schur form."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 
+from lbt_synth.linear import matrix_functions
 from lbt_synth.linear.matrix_functions import is_stable, semidefinite_root
 
 
@@ -20,3 +22,20 @@ def test_root_of_a_matrix_of_rank_one():
 def test_rotation_is_stable_inside_the_circle(radius, stable):
     turn = np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
     assert is_stable(radius * turn) is stable
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_schur_form_gives_back_the_matrix(monkeypatch, fails):
+    def stubborn(A, output):
+        if output == "complex" and fails:
+            raise scipy.linalg.LinAlgError("Schur form not found.")
+        return scipy.linalg.schur(A, output=output)
+
+    monkeypatch.setattr(matrix_functions, "schur", stubborn)
+    rng = np.random.default_rng(0)
+    shift = np.eye(6, k=-1)
+    for A in (rng.standard_normal((7, 7)), shift, shift + np.eye(6, k=5)):
+        T, U = matrix_functions.complex_schur(A)
+        assert U @ T @ U.conj().T == pytest.approx(A, abs=1e-12)
+        assert U @ U.conj().T == pytest.approx(np.eye(len(A)), abs=1e-12)
+        assert not np.tril(T, -1).any()

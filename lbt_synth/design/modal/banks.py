@@ -15,9 +15,9 @@ import numpy as np
 
 from lbt_synth.design.modal.plants import ModalModels
 from lbt_synth.errors import DimensionError
-from lbt_synth.linear.batched import transpose
 from lbt_synth.linear.block_filtering import BatchedSystems
 from lbt_synth.linear.lyapunov import stationary_covariances
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop.closed_loop import loop_matrices
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.validation import FloatArray, float_array

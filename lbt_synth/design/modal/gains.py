@@ -20,8 +20,7 @@ from scipy.special import comb
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
 from lbt_synth.design.modal.plants import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.linear.panel_edges import distinct_edges, pole_edges
-from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Spectrum
 from lbt_synth.models.spectra import breakpoints_below

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear.batched import transpose
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.models import ARModel, ModalTurbulence, Vibration
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.models.vibration import sampled_lines

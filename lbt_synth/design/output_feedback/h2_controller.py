@@ -11,8 +11,8 @@ from lbt_synth.design.output_feedback.result import (
     first_certified,
 )
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.scaled_plant import scaled_plant
+from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
 
 
 def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:

@@ -14,9 +14,8 @@ from lbt_synth.design.output_feedback.result import (
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.norms import hinf_norm
-from lbt_synth.linear.output_feedback.free_parameter import free_parameter
-from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
+from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati, free_parameter
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import integer, number
 
@@ -103,7 +102,7 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
     bracket.require(gamma)
     loop = free_parameter(equations)
     frequency_hz = np.linspace(0, 0.5 / loop.T11.dt_s, _POINTS)
-    from lbt_synth.linear.lmi.mixed_control import least_variance_below
+    from lbt_synth.linear.lmi.output_feedback import least_variance_below
 
     for _ in range(_ROUNDS):
         try:

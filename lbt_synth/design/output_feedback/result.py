@@ -23,9 +23,9 @@ from lbt_synth.errors import (
     SynthesisError,
 )
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.output_feedback.least_level import TwoRiccati
 from lbt_synth.linear.output_feedback.lower_bound import ControlWitness, infeasible_control_level
 from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant
+from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
 from lbt_synth.linear.state_space import StateSpace, sigma_sparkline
 from lbt_synth.storage.rows import column, fact_table, row_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary

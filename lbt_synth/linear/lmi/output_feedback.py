@@ -1,8 +1,8 @@
-"""The least gamma of a controller by linear matrix inequalities, without its matrices.
+"""Controllers by linear matrix inequalities: the least gamma, and the least variance below one.
 
-P. Gahinet, P. Apkarian, Int. J. Robust Nonlinear Control 4, 421 (1994),
-doi:10.1002/rnc.4590040403, theorem 4.2 in discrete time. It asks nothing of D12 and D21. The dual
-solution proves that no controller reaches less.
+The least gamma comes without the matrices of its controller: P. Gahinet, P. Apkarian, Int. J.
+Robust Nonlinear Control 4, 421 (1994), doi:10.1002/rnc.4590040403, theorem 4.2 in discrete time. It
+asks nothing of D12 and D21. The dual solution proves that no controller reaches less.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from scipy.linalg import null_space
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lmi.conic_data import require_optimum
-from lbt_synth.linear.lmi.solver import solve, symmetrise
+from lbt_synth.linear.lmi.conic_data import ATTEMPTS, SETTINGS, require_optimum, solver_error
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import Side, control_side, estimation_side
 from lbt_synth.linear.output_feedback.lower_bound import (
@@ -25,6 +24,8 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     storage_coordinates,
     storage_root,
 )
+from lbt_synth.linear.output_feedback.two_riccati import FreeParameter
+from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 _RANK = 1e-7  # share of the largest root of a cost that counts as none for the solver
@@ -80,3 +81,70 @@ class _Storage:
         count = self.hidden.shape[1]
         found = self.hidden @ semidefinite_root(dual[:count, :count])
         return Witness(states=self.basis @ found[: self.size], disturbances=found[self.size :])
+
+
+def least_variance_below(
+    loop: FreeParameter, gamma: float, taps: int, frequency_hz: FloatArray
+) -> FloatArray:
+    """Return the taps (T, m2, p2) of the least ``|Q|`` with the loop below gamma at frequencies.
+
+    T12 is inner and T21 co-inner: with their orthogonal complements the loop is
+    ``[[E11 + Q, E12], [E21, E22]]``, of which Q moves the first block alone.
+    """
+    m2, p2 = loop.T12.B.shape[1], len(loop.T21.C)
+    Q = cp.Variable((m2, p2 * taps))
+    z = np.exp(2j * np.pi * frequency_hz * loop.T11.dt_s)
+    parts = (s.frequency_response(frequency_hz) for s in (loop.T11, loop.T12, loop.T21))
+    constraints = []
+    for point, T11, T12, T21 in zip(z, *parts, strict=True):
+        left, right = _completed(T12), _completed(T21.conj().T)
+        fixed = left.conj().T @ T11 @ right / gamma
+        powers = np.kron((point ** -np.arange(taps))[:, None], np.eye(p2))  # (T p2, p2)
+        place = np.eye(len(fixed), m2)
+        wide = np.eye(p2, fixed.shape[1])
+        real = fixed.real + place @ (Q @ powers.real) @ wide / gamma
+        imaginary = fixed.imag + place @ (Q @ powers.imag) @ wide / gamma
+        block = cp.bmat([[real, -imaginary], [imaginary, real]])
+        rows, columns = (2 * size for size in fixed.shape)
+        whole = cp.bmat([[np.eye(rows), block], [block.T, np.eye(columns)]])
+        constraints.append(symmetrise(whole) >> 0)
+    run = solve(cp.Minimize(cp.norm(Q, "fro")), constraints)
+    require_optimum(
+        run, "the programme of the mixed controller", "Try a larger gamma, or more taps."
+    )
+    return np.moveaxis(np.asarray(Q.value).reshape(m2, taps, p2), 1, 0)
+
+
+def _completed(columns: FloatArray) -> FloatArray:
+    """Return a unitary matrix that begins with orthonormal columns."""
+    full = np.linalg.qr(columns, mode="complete")[0]
+    full[:, : columns.shape[1]] = columns
+    return np.asarray(full)
+
+
+def symmetrise(expression: Any) -> Any:
+    """Return ``(M + M') / 2``, because cvxpy refuses a matrix that rounding made asymmetric."""
+    return (expression + expression.T) / 2
+
+
+def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
+    """Solve with Clarabel; return the status and the iteration count."""
+    programme = cp.Problem(objective, constraints)
+    for attempt, settings in enumerate(ATTEMPTS):
+        try:
+            # the certificate judges an inaccurate solution, not a warning
+            with ignore_warnings(message="Solution may be inaccurate"):
+                programme.solve(solver=cp.CLARABEL, **SETTINGS, **settings)
+            break
+        except cp.error.SolverError as error:
+            if attempt == len(ATTEMPTS) - 1:
+                raise solver_error("the solver lost its accuracy on the way.") from error
+        except ValueError as error:  # raised by cvxpy on data that are not finite
+            raise solver_error("its numbers are not finite.") from error
+        except BaseException as error:
+            # on numbers out of range the compiled solver raises something other than an Exception
+            if type(error).__name__ != "PanicException":
+                raise
+            raise solver_error("the solver gave up on numbers out of its range.") from error
+    iterations = programme.solver_stats.num_iters if programme.solver_stats else 0
+    return str(programme.status), int(iterations or 0)

@@ -13,10 +13,9 @@ from functools import reduce
 import numpy as np
 
 from lbt_synth.errors import InfeasibleError, NumericalError
-from lbt_synth.linear.batched import symmetrise
 from lbt_synth.linear.estimation_problem import EstimationProblem, error_units, scale_states
 from lbt_synth.linear.infeasibility_proof import infeasible_periodic_level, worst_invisible_bursts
-from lbt_synth.linear.matrix_functions import is_stable, relative_distance
+from lbt_synth.linear.matrix_functions import is_stable, relative_distance, symmetrise
 from lbt_synth.linear.periodic.problem import PeriodicProblem
 from lbt_synth.linear.riccati.filtering import require_detectable
 from lbt_synth.linear.riccati.routes import doubling

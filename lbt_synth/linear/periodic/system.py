@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.linear.schur_form import complex_schur
+from lbt_synth.linear.matrix_functions import complex_schur
 from lbt_synth.linear.state_space import Controller, StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray, number, real_array, set_fields
 

@@ -6,9 +6,14 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from lbt_synth.linear.batched import frobenius_norms, solve_stack, symmetrise, transpose
 from lbt_synth.linear.lyapunov import smith_sum
-from lbt_synth.linear.matrix_functions import nearest_powers_of_two
+from lbt_synth.linear.matrix_functions import (
+    frobenius_norms,
+    nearest_powers_of_two,
+    solve_stack,
+    symmetrise,
+    transpose,
+)
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 # Where the platform has it, the residual is formed with 64 bits of mantissa instead of 53:

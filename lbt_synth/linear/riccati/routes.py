@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from lbt_synth.linear.batched import frobenius_norms, solve_stack, symmetrise, transpose
+from lbt_synth.linear.matrix_functions import frobenius_norms, solve_stack, symmetrise, transpose
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 

@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.batched import transpose
 from lbt_synth.linear.lyapunov import stationary_covariances
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop.ensemble.closed_loops import LoopGroup
 from lbt_synth.models import ARModel, ModalTurbulence
 from lbt_synth.validation import FloatArray, IntArray

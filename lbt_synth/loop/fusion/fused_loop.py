@@ -10,9 +10,8 @@ from typing import TypeAlias
 import numpy as np
 
 from lbt_synth.errors import ProblemError, UnstableLoopError
-from lbt_synth.linear.panel_edges import panel_edges
 from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
-from lbt_synth.linear.quadrature import adaptive_integral
+from lbt_synth.linear.quadrature import adaptive_integral, panel_edges
 from lbt_synth.loop.closed_loop import (
     STABILITY_MARGIN,
     ClosedLoop,

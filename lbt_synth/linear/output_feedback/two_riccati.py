@@ -1,0 +1,334 @@
+"""The controllers of a plant, by the Riccati equations of both sides, at any level of gamma.
+
+The central controller: the disturbance is replaced by its distance from the worst one, and the
+control by its distance from the best one; what is left is to estimate the best control from the
+measurements. M. Green, D. J. N. Limebeer, "Linear Robust Control", Prentice-Hall (1995),
+appendix B. With an infinite level it is the controller of least variance.
+
+All stabilising controllers: with ``u = u_least + R^(-1/2) q`` and
+``q = Q S^(-1/2) innovation``, R and S the weights of control and innovation, every stable Q gives
+one. From w to z the loop is ``T11 + T12 Q T21``, affine in Q, with T12 inner and T21 co-inner, and
+its variance is the least one plus ``|Q|^2`` (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans.
+Autom. Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223).
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from lbt_synth.errors import NonFiniteError, NumericalError
+from lbt_synth.linear.generalized_plant import GeneralizedPlant, invert_well_posed
+from lbt_synth.linear.matrix_functions import semidefinite_root
+from lbt_synth.linear.norms import hinf_norm
+from lbt_synth.linear.output_feedback.full_information import (
+    FullInformation,
+    WorstCase,
+    control_side,
+    estimation_side,
+)
+from lbt_synth.linear.output_feedback.lower_bound import (
+    ControlWitness,
+    coupled_bursts,
+    last_step,
+    steady_oscillation,
+)
+from lbt_synth.linear.state_space import StateSpace
+from lbt_synth.validation import FloatArray
+
+_TOLERANCE = 1e-11
+_NOTHING = 1e-6  # part of the level of the least variance that counts as none
+_SLOW = 0.99  # a pole of the worst case beyond this may belong to a steady oscillation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LevelSolution:
+    """Solutions of both sides at a level."""
+
+    gamma: float
+    X: FloatArray
+    Y: FloatArray
+
+
+class TwoRiccati:
+    """The two equations of a plant, at any level."""
+
+    def __init__(self, plant: GeneralizedPlant) -> None:
+        self.plant = plant
+        self.control = FullInformation(control_side(plant))
+        self.estimation = FullInformation(estimation_side(plant))
+
+    def least_variance(self) -> StateSpace:
+        """Return the controller of least variance."""
+        return central_controller(self.plant, self.control.least, self.estimation.least)
+
+    def controller(self, solution: LevelSolution) -> StateSpace:
+        """Return the central controller of a solution."""
+        X = self.control.refine(solution.X, solution.gamma)
+        Y = self.estimation.refine(solution.Y, solution.gamma)
+        return central_controller(self.plant, X, Y, solution.gamma)
+
+    def solve(self, gamma: float) -> tuple[float, LevelSolution | None]:
+        """Return the least slack of the three conditions, and the solutions where it is above 0."""
+        try:
+            slack, X = self.control.solve(gamma)
+            other, Y = (-1.0, None) if X is None else self.estimation.solve(gamma)
+            if X is None or Y is None:
+                return -1.0, None
+            root = semidefinite_root(X)
+            coupling = 1 - float(np.linalg.eigvalsh(root.T @ Y @ root)[-1]) / gamma**2
+        except np.linalg.LinAlgError:  # singular to working accuracy, as next to a level of zero
+            return -1.0, None
+        least = min(slack, other, coupling)
+        return least, LevelSolution(gamma=gamma, X=X, Y=Y) if least > 0 else None
+
+    def least_level(self) -> LevelSolution:
+        """Return the solution at the least level, to a relative 1e-11.
+
+        Raises a NumericalError if not even the level of the least variance has one.
+        """
+        found: dict[float, LevelSolution] = {}
+
+        def slack(gamma: float) -> float:
+            value, solution = self.solve(gamma)
+            if solution is None:
+                return min(value, -_TOLERANCE)  # at a slack of 0 there is no controller
+            found[gamma] = solution
+            return value
+
+        loop = self.plant.closed_loop(self.least_variance())
+        upper = hinf_norm(loop).upper if loop.spectral_radius < 1 else np.inf
+        floors = self.control.floor(), self.estimation.floor()
+        lower = max(*floors, _NOTHING * upper) * (1 - 1e-12) if np.isfinite(upper) else 0.0
+        for growth in np.geomspace(1e-9, 1e9, 19):  # next to nothing rounding is larger
+            if not np.isfinite(upper) or slack(upper * (1 + growth)) > 0:
+                break
+        if not found:
+            raise NumericalError(
+                "the Riccati equations have no solution at the level of the least variance. "
+                "Scale states and signals to similar sizes.",
+                status="search",
+            )
+        upper = min(found)
+        if lower < upper and slack(lower) <= 0:
+            brentq(slack, lower, upper, xtol=2 * _TOLERANCE * upper)  # its steps are half of it
+        return found[min(found)]
+
+    def _frequency_text(self, angle: float) -> str:
+        """Return the frequency of an angle on the unit circle."""
+        return f"{angle / (2 * np.pi * self.plant.dt_s):.6g} Hz"
+
+    def proofs(self, solution: LevelSolution, plant: GeneralizedPlant) -> list[ControlWitness]:
+        """Return what may prove of a plant, this or the one next to it, that no level is lower.
+
+        Bursts belong to this plant alone. Steady oscillations have frequency zero, the highest one,
+        and those of the slow poles of the worst cases. At levels next to zero there may be none.
+        """
+        out: list[ControlWitness] = []
+        with suppress(np.linalg.LinAlgError):
+            control = self.control.worst_case(solution.X, solution.gamma)
+            estimation = self.estimation.worst_case(solution.Y, solution.gamma)
+            if plant is self.plant:
+                with suppress(NonFiniteError):  # of a worst case that rounding makes unstable
+                    unmoved = last_step(control, solution.X)
+                    out.append(ControlWitness(unseen=None, unmoved=unmoved, reason=_CONTROL))
+                with suppress(NonFiniteError):
+                    unseen = last_step(estimation, solution.Y)
+                    out.append(ControlWitness(unseen=unseen, unmoved=None, reason=_ESTIMATION))
+                with suppress(NonFiniteError):
+                    unseen, unmoved = coupled_bursts(control, solution.X, estimation, solution.Y)
+                    out.append(ControlWitness(unseen=unseen, unmoved=unmoved, reason=_COUPLED))
+            for angle in _slow_angles(control):
+                pairs = steady_oscillation(control_side(plant), angle)
+                words = f"{_CONTROL_AT} {self._frequency_text(angle)}"
+                out.append(ControlWitness(unseen=None, unmoved=pairs, reason=words))
+            for angle in _slow_angles(estimation):
+                pairs = steady_oscillation(estimation_side(plant), angle)
+                words = f"{_ESTIMATION_AT} {self._frequency_text(angle)}"
+                out.append(ControlWitness(unseen=pairs, unmoved=None, reason=words))
+        return out
+
+
+def _slow_angles(worst: WorstCase) -> list[float]:
+    """Angles of the slow poles of a worst case, the slowest few, and both ends."""
+    poles = np.linalg.eigvals(worst.A)
+    slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
+    return [*(float(np.angle(pole)) for pole in slow[np.argsort(-np.abs(slow))][:4]), 0.0, np.pi]
+
+
+_COUPLED = "what is not seen in time cannot be made good in time"
+_CONTROL = "even a controller that knows the state and the disturbance leaves as much"
+_ESTIMATION = "even a control that reaches every state leaves as much, as the disturbance is unseen"
+_CONTROL_AT = "even a controller that knows the disturbance leaves as much at"
+_ESTIMATION_AT = "even a control that reaches every state leaves as much, unseen, at"
+
+
+def central_controller(
+    plant: GeneralizedPlant, X: FloatArray, Y: FloatArray, gamma: float = np.inf
+) -> StateSpace:
+    """Return the central controller, from y to u, of a level above the least one.
+
+    X and Y (n, n) are the stabilising solutions of control and of estimation at the level; an
+    infinite level is that of the least variance. NumericalError if it is not above the least one.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.linear.output_feedback.two_riccati import central_controller
+    >>> P = lbt.linear.GeneralizedPlant(
+    ...     A=1.0,
+    ...     B1=[[1.0, 0.0]],
+    ...     B2=1.0,
+    ...     C1=[[1.0], [0.0]],
+    ...     C2=1.0,
+    ...     D12=[[0.0], [1.0]],
+    ...     D21=[[0.0, 1.0]],
+    ... )
+    >>> golden = [[(1 + 5**0.5) / 2]]
+    >>> round(float(central_controller(P, golden, golden).D[0, 0]), 6)  # -1 / golden^2
+    -0.381966
+    """
+    X, Y = np.asarray(X), np.asarray(Y)
+    try:
+        best = _best_control(plant, X, Y, gamma)
+        injection = _injection(*best)
+    except np.linalg.LinAlgError as error:
+        raise NumericalError(
+            f"the level {gamma:.9g} has no controller to working accuracy: {error}. Try a larger "
+            "gamma.",
+            status="central controller",
+        ) from error
+    A, _, C2, _, F, _, _ = best
+    n = len(A)
+    state, control = injection[:n], injection[n:]
+    C, D = control @ C2 - F, -control
+    observer = StateSpace(
+        A=A - state @ C2 + plant.B2 @ C, B=state + plant.B2 @ D, C=C, D=D, dt_s=plant.dt_s
+    )
+    return with_seen_controls(observer, plant.D22)
+
+
+def _best_control(
+    plant: GeneralizedPlant, X: FloatArray, Y: FloatArray, gamma: float
+) -> tuple[FloatArray, ...]:
+    """Return A, B1, C2, D21 about the worst disturbance, the law (F, F0), and Z."""
+    scale = gamma if np.isfinite(gamma) else 1.0
+    B1, D11, D21, m = plant.B1 / scale, plant.D11 / scale, plant.D21 / scale, plant.sizes[0]
+    A, B2, C1, D12, n = plant.A, plant.B2, plant.C1, plant.D12, len(plant.A)
+    R3, R2 = D12.T @ D12 + B2.T @ X @ B2, D12.T @ D11 + B2.T @ X @ B1
+    L2, L1 = B2.T @ X @ A + D12.T @ C1, B1.T @ X @ A + D11.T @ C1
+    worst, unit, Z = np.zeros((m, n)), np.eye(m), Y
+    if np.isfinite(gamma):
+        least = D11.T @ D11 + B1.T @ X @ B1 - R2.T @ _solve(R3, R2) - np.eye(m)
+        worst = -_solve(least, L1 - R2.T @ _solve(R3, L2))
+        root = np.asarray(np.linalg.cholesky(-(least + least.T) / 2), dtype=np.float64)
+        unit = _solve(root.T, unit)
+        Z = _solve((np.eye(n) - X @ Y / scale**2).T, Y.T).T / scale**2
+    law = _solve(R3, np.hstack([L2 + R2 @ worst, R2 @ unit]))
+    return (
+        *(A + B1 @ worst, B1 @ unit, plant.C2 + D21 @ worst, D21 @ unit),
+        *(law[:, :n], law[:, n:], (Z + Z.T) / 2),
+    )
+
+
+def _injection(
+    A: FloatArray,
+    B1: FloatArray,
+    C2: FloatArray,
+    D21: FloatArray,
+    F: FloatArray,
+    F0: FloatArray,
+    Z: FloatArray,
+) -> FloatArray:
+    """Gains of the innovation into the state (n, p2) and into the best control (m2, p2)."""
+    innovation = D21 @ D21.T + C2 @ Z @ C2.T
+    seen = np.vstack([A, F]) @ Z @ C2.T + np.vstack([B1, F0]) @ D21.T
+    return _solve(innovation, seen.T).T
+
+
+def with_seen_controls(controller: StateSpace, D22: FloatArray) -> StateSpace:
+    """Return the controller for measurements that see the control at once, by D22."""
+    if not np.any(D22):
+        return controller
+    K = controller
+    loop = invert_well_posed(-D22, K.D)  # (I + D22 D)^-1
+    seen = loop @ np.hstack([-D22 @ K.C, np.eye(len(D22))])
+    n = K.n_states
+    step, out = K.B @ seen, K.D @ seen
+    return StateSpace(
+        A=K.A + step[:, :n], B=step[:, n:], C=K.C + out[:, :n], D=out[:, n:], dt_s=K.dt_s
+    )
+
+
+def _solve(M: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.solve(M, right), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FreeParameter:
+    """The loop of a plant in discrete time as an affine function of Q."""
+
+    plant: GeneralizedPlant
+    feedback: FloatArray  # (m2, n), F
+    injection: FloatArray  # (n, p2), of the innovation into the state
+    through: FloatArray  # (m2, p2), of the innovation into the control, negative
+    control_unit: FloatArray  # (m2, m2), R^(-1/2)
+    innovation_unit: FloatArray  # (p2, p2), S^(-1/2)
+    T11: StateSpace
+    T12: StateSpace
+    T21: StateSpace
+
+    def controller(self, taps: FloatArray) -> StateSpace:
+        """Return the controller of a Q with finite response, its taps (T, m2, p2)."""
+        P, n = self.plant, len(self.plant.A)
+        p2 = P.sizes[3]
+        stored = (len(taps) - 1) * p2
+        # the innovation, and the control, as functions of [x; past innovations; y]
+        innovation = np.hstack([-P.C2, np.zeros((p2, stored)), np.eye(p2)])
+        unit = self.innovation_unit @ innovation
+        control = (self.control_unit @ taps[0]) @ unit - self.through @ innovation
+        control[:, :n] -= self.feedback
+        if stored:
+            control[:, n : n + stored] += self.control_unit @ np.hstack(list(taps[1:]))
+        rows = np.zeros((n + stored, n + stored + p2))
+        rows[:n, :n] = P.A
+        rows[:n] += P.B2 @ control + self.injection @ innovation
+        if stored:
+            rows[n : n + p2] = unit
+            rows[n + p2 :, n : n + stored - p2] = np.eye(stored - p2)
+        size = n + stored
+        K = StateSpace(
+            A=rows[:, :size],
+            B=rows[:, size:],
+            C=control[:, :size],
+            D=control[:, size:],
+            dt_s=P.dt_s,
+        )
+        return with_seen_controls(K, P.D22)
+
+
+def free_parameter(equations: TwoRiccati) -> FreeParameter:
+    """Return the affine form of the loop of a plant, by its least-variance solutions."""
+    P, control, estimation = equations.plant, equations.control, equations.estimation
+    F, state = control.feedback, estimation.feedback.T
+    seen = F @ estimation.least @ P.C2.T + control.feedforward @ P.D21.T
+    through = np.linalg.solve(estimation.weight, seen.T).T
+    control_unit = np.linalg.inv(np.linalg.cholesky(control.weight).T)
+    innovation_unit = np.linalg.inv(np.linalg.cholesky(estimation.weight))
+    dt_s = P.dt_s
+    B2, D12 = P.B2 @ control_unit, P.D12 @ control_unit
+    C2, D21 = innovation_unit @ P.C2, innovation_unit @ P.D21
+    return FreeParameter(
+        plant=P,
+        feedback=F,
+        injection=state,
+        through=np.asarray(through),
+        control_unit=np.asarray(control_unit),
+        innovation_unit=np.asarray(innovation_unit),
+        T11=P.closed_loop(equations.least_variance()),
+        T12=StateSpace(A=P.A - P.B2 @ F, B=B2, C=P.C1 - P.D12 @ F, D=D12, dt_s=dt_s),
+        T21=StateSpace(A=P.A - state @ P.C2, B=P.B1 - state @ P.D21, C=C2, D=D21, dt_s=dt_s),
+    )
