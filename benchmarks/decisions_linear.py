@@ -3,12 +3,10 @@
 Needs the test dependencies (SLICOT through slycot, mpmath).
 """
 
-import runpy
 import sys
 
 import mpmath
 import numpy as np
-import slycot
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
@@ -42,35 +40,6 @@ def darex() -> None:
         answers = {"ours": lbt.solve_dare(e.A, e.B, e.Q, e.R).X} | peers(e)
         errors = [f"{name} {error_in_digits(X, exact):.1e}" for name, X in answers.items()]
         print(f"{e.name:20s} " + ", ".join(errors))
-
-
-def plain_residual(A, B, Q, R, S, X) -> float:
-    gain = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
-    residual = A.T @ X @ A - X + Q - (A.T @ X @ B + S) @ gain
-    return float(np.linalg.norm(residual) / np.linalg.norm(X))
-
-
-def output_feedback() -> None:
-    """The second equation of the SB10DD example: no X in double precision does better."""
-    script = runpy.run_path("examples/output_feedback.py")
-    calls, solve = [], lbt.solve_dare
-
-    def spy(*parts):
-        calls.append((parts, solve(*parts)))
-        return calls[-1][1]
-
-    lbt.solve_dare = spy
-    plant = [script[name] for name in "ABCD"]
-    script["central_controller"](*plant, controls=2, measurements=2, gamma=script["GAMMA"])
-    lbt.solve_dare = solve
-    parts, solution = calls[1]
-    theirs = slycot.sb10dd(6, 5, 5, 2, 2, script["GAMMA"], *plant)[6]
-    print(
-        f"SB10DD: |Z| {np.linalg.norm(solution.X):.1e}, plain relative residual "
-        f"{plain_residual(*parts, solution.X):.1e}, of SLICOT's Z "
-        f"{plain_residual(*parts, theirs):.1e}; estimated error {solution.error:.1e}, "
-        f"distance from SLICOT's Z {relative(solution.X, theirs):.1e}"
-    )
 
 
 def responses() -> None:
@@ -126,6 +95,5 @@ def mixed() -> None:
 if __name__ == "__main__":
     with np.errstate(all="ignore"):
         darex()
-        output_feedback()
     responses()
     mixed()
