@@ -21,7 +21,11 @@ from lbt_synth.design.shaping.channel import (
 )
 from lbt_synth.design.shaping.objectives import VibrationBand, leaves, spectrum_of
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
-from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.design.shaping.specification import (
+    Specification,
+    specified_limit,
+    violated_demands,
+)
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
@@ -239,15 +243,11 @@ class ShapedDesign(Design):
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...]:
         """Return the demands that a controller violates, none where it couples the modes."""
-        from lbt_synth.design.violated_demands import violated_demands
-
-        return violated_demands(self, controller) or ()
+        return violated_demands(self.specifications, self.loop_hardware, controller) or ()
 
     def facts(self) -> RobustFacts:
         """Return what the controller is, beside the limits over its bands."""
-        from lbt_synth.design.shaping.limit import shaped_limit
-
-        limit_nm, above = shaped_limit(self)
+        limit_nm, above = specified_limit(self.specifications, self.loop_hardware, self.parameters)
         return fill_row(RobustFacts, self, limit_nm=limit_nm, above_limit_percent=above)
 
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:

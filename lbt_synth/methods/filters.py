@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.methods.method import Description, Method, Section
+from lbt_synth.methods.method import Description, Method, RowTable, Section
+from lbt_synth.validation import number
 
 if TYPE_CHECKING:
     from lbt_synth.design.record import DesignRecord
@@ -24,6 +23,7 @@ Horizon = Annotated[
         json_schema_extra={"instead": "Set loop.delay_frames in the configuration instead."},
     ),
 ]
+_CLAIMS = ("gamma_requested", "gamma_least", "gamma_infeasible", "rms_requested")
 BOUNDS = frozenset({"gamma", "gamma_ratio", "rms"})  # at most one is given
 
 
@@ -62,36 +62,69 @@ def require_several_sensors(options: Section) -> None:
             )
 
 
-@dataclass(frozen=True, slots=True)
-class FilterKind:
-    """What filters of one sensor, or of several, are described, recorded and rebuilt with."""
+def _describe_filter(design: Any) -> Description:
+    """Describe a filter, and its loop when some of several sensors fail."""
+    if not design.several_sensors:
+        names = ("gain_predictor", "gain_filter")
+        matrices = {name: getattr(design, name) for name in names}
+        return Description(facts=design.facts(), matrices=matrices)
+    from lbt_synth.design.fusion.failures import failure_rows
 
-    describe: Callable[[Any], Description]
-    pack: Callable[[Any], DesignRecord]
-    unpack: Callable[[DesignRecord], Design]
+    rows = failure_rows(design.problem, design.gains, design.fallbacks)
+    unseen = [row.missing for row in rows if row.must_switch]
+    notes = [
+        "unseen: the readings are zero, or frozen, and the filter believes them: a reading that "
+        "stays leaves an offset, which counts to the residual. Not read: the "
+        "fall-back filter of this file for the remaining sensors, with the same state.",
+    ]
+    if unseen:
+        notes.append(
+            f"note: unstable if these fail unseen: {'; '.join(unseen)}. The computer of the loop "
+            "has to see such a failure, and take the fall-back filter."
+        )
+    return Description(
+        facts=design.facts(),
+        tables=(RowTable(key="failures", title="When sensors fail", rows=rows),),
+        notes=notes,
+        matrices={"gains": design.gains},
+    )
 
 
-def _kind(*, several_sensors: bool) -> FilterKind:
-    """Return the kind of a filter; its module is imported when a design is at hand."""
-    if several_sensors:
-        from lbt_synth.methods.filter_kinds.fused import FUSED
+def _pack_filter(design: Any) -> DesignRecord:
+    """Record the gains and claims of a filter, with its problem."""
+    from lbt_synth.design.record import DesignRecord, record_problem
 
-        return FUSED
-    from lbt_synth.methods.filter_kinds.one_sensor import ONE_SENSOR
+    if design.several_sensors:
+        from lbt_synth.design.fusion.record import record_fused
 
-    return ONE_SENSOR
-
-
-def _describe_filter(design: Design) -> Description:
-    return _kind(several_sensors=design.several_sensors).describe(design)
-
-
-def _pack_filter(design: Design) -> DesignRecord:
-    return _kind(several_sensors=design.several_sensors).pack(design)
+        return record_fused(design)
+    arrays = {"GAIN_PREDICTOR": design.gain_predictor, "GAIN_FILTER": design.gain_filter}
+    if design.witness is not None:
+        arrays |= {"WITNESS_X": design.witness.states, "WITNESS_W": design.witness.disturbances}
+    meta = {name: getattr(design, name) for name in _CLAIMS}
+    return DesignRecord(arrays, meta) | record_problem(design.problem)
 
 
 def _unpack_filter(record: DesignRecord) -> Design:
-    return _kind(several_sensors=record.meta["problem"] == "fused plant").unpack(record)
+    """Rebuild a filter."""
+    if record.meta["problem"] == "fused plant":
+        from lbt_synth.design.fusion.record import rebuild_fused
+
+        return rebuild_fused(record)
+    from lbt_synth.design.result import FilterDesign
+    from lbt_synth.linear import Witness
+
+    problem, arrays = record.problem(), record.arrays
+    rows_cols = (problem.A.shape[0], problem.C.shape[0])
+    said = {name: record.meta[name] for name in _CLAIMS}
+    claims: dict[str, Any] = {k: number(v, k, above=0) for k, v in said.items() if v is not None}
+    for name in ("GAIN_PREDICTOR", "GAIN_FILTER"):
+        if arrays[name].shape != rows_cols:
+            raise ValueError(f"{name} must be {rows_cols} to match the plant")
+        claims[name.lower()] = arrays[name]
+    if "WITNESS_X" in arrays:
+        claims["witness"] = Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
+    return FilterDesign(**record.common(), **claims, problem=problem)
 
 
 filter_method = partial(Method, pack=_pack_filter, unpack=_unpack_filter, describe=_describe_filter)

@@ -1,19 +1,23 @@
 """The specification of one mode of the loop: one objective and any number of demands.
 
-A gain file holds it as plain metadata.
+A gain file holds it as plain metadata. Other controllers are held against it, too.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, TypeAlias, get_args
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.design.certificate import Check
+from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
-from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, mode_loop
 from lbt_synth.design.shaping.frequencies import Grid, distinct_bands, first_grid
 from lbt_synth.design.shaping.objectives import (
     ResidualVariance,
@@ -26,13 +30,24 @@ from lbt_synth.design.shaping.objectives import (
     spectrum_of,
 )
 from lbt_synth.design.shaping.uncertainty import SensorGainRange, Uncertainty
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
+from lbt_synth.loop import BandLimit, ResidualLimit, least_residual, least_worst_residual
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.models import ARModel, Atmosphere, LoopHardware, Spectrum, TabulatedSpectrum
-from lbt_synth.validation import sequence, set_fields
+from lbt_synth.models import (
+    ARModel,
+    Atmosphere,
+    LoopHardware,
+    Spectrum,
+    TabulatedSpectrum,
+    Truth,
+)
+from lbt_synth.models.spectra import SumSpectrum
+from lbt_synth.validation import FloatArray, sequence, set_fields
 
 Demand: TypeAlias = Bound | Uncertainty
+_ZERO = 1e-12  # of an entry, over the largest of its matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -173,3 +188,98 @@ def from_metadata(data: Any) -> Any:
     if isinstance(data, list):
         return tuple(from_metadata(v) for v in data)
     return data
+
+
+def violated_demands(
+    specifications: Sequence[Specification], hardware: LoopHardware, controller: Controller
+) -> tuple[str, ...] | None:
+    """Return the demands on each mode that a controller violates; None if it couples the modes."""
+    found: dict[str, None] = {}
+    for mode, specification in enumerate(specifications):
+        alone = _controller_of_mode(controller, hardware, mode)
+        if alone is None:
+            return None
+        loop = SingleModeLoop(hardware=hardware.single_mode(), controller=alone)
+        for demand in specification.demands:
+            try:
+                met = all(check.passed for check in demand.checks(loop))
+            except UnstableLoopError:
+                met = False
+            if not met:
+                found[demand.label] = None
+    return tuple(found)
+
+
+def _controller_of_mode(
+    controller: Controller, hardware: LoopHardware, mode: int
+) -> Controller | None:
+    """Return the part of a controller that acts on a mode, None if it mixes modes."""
+    A, B = controller.A, controller.B @ hardware.sensor
+    C = hardware.influence @ controller.C
+    D = hardware.influence @ controller.D @ hardware.sensor
+    n, modes = len(A), len(D)
+    whole = np.zeros((n + modes, n + modes))  # which state or mode acts on which
+    whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:] = map(_entries, (A, B, C, D))
+    _, label = connected_components(whole)
+    if np.count_nonzero(label[n:] == label[n + mode]) > 1:
+        return None
+    own = label[:n] == label[n + mode]
+    return Controller(
+        A=A[np.ix_(own, own)],
+        B=B[own, mode : mode + 1],
+        C=C[mode : mode + 1, own],
+        D=D[mode : mode + 1, mode : mode + 1],
+        dt_s=controller.dt_s,
+    )
+
+
+def _entries(matrix: FloatArray) -> FloatArray:
+    """Return 1 where a matrix has an entry, and 0 where it has rounding."""
+    size = np.abs(matrix)
+    return np.asarray(size > _ZERO * np.max(size, initial=0.0), dtype=np.float64)
+
+
+def specified_limit(
+    specifications: Sequence[Specification],
+    hardware: LoopHardware,
+    parameters: Sequence[Controller],
+) -> tuple[float, float]:
+    """Return the limit of the specified spectra [nm rms], and the residual above it [%].
+
+    Both are over all modes at unit sensor gain: the variance plus the worst of the band. They
+    are nan where a mode has no variance at unit gain, or several bands, as the limit of their
+    sum is not known.
+    """
+    limit_nm2, residual_nm2 = 0.0, 0.0
+    for spec, parameter in zip(specifications, parameters, strict=True):
+        at_unit = [leaf for leaf in leaves(spec.objective) if leaf.sensor_gain == 1]
+        variances = [leaf for leaf in at_unit if isinstance(leaf, ResidualVariance)]
+        bands = [leaf for leaf in at_unit if isinstance(leaf, VibrationBand)]
+        if not variances or len(bands) > 1:
+            return np.nan, np.nan
+        spectra = [each.turbulence for each in variances if each.turbulence is not None]
+        truth = Truth(
+            turbulence=SumSpectrum(parts=tuple(spectra)) if spectra else None,
+            noise_nm=float(np.linalg.norm([each.noise_nm for each in variances])),
+        )
+        found = limit_or_nan(partial(_mode_limit, hardware.single_mode(), truth, bands))
+        loop = mode_loop(hardware, parameter)
+        limit_nm2 += found**2
+        residual_nm2 += sum(variance.measured_nm2(loop) for variance in variances)
+        residual_nm2 += sum(band.measured_nm2(loop) for band in bands)
+    limit_nm = float(np.sqrt(limit_nm2))
+    return limit_nm, above_percent(float(np.sqrt(residual_nm2)), limit_nm)
+
+
+def _mode_limit(
+    hardware: LoopHardware, truth: Truth, bands: list[VibrationBand]
+) -> ResidualLimit | BandLimit:
+    if not bands:
+        return least_residual(hardware, truth)
+    return least_worst_residual(
+        hardware,
+        truth,
+        band_hz=(bands[0].low_hz, bands[0].high_hz),
+        rms_nm=bands[0].rms_nm,
+        direction=(1.0,),
+    )

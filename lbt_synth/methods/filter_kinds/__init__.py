@@ -1,1 +1,0 @@
-"""Filters of one sensor and of several: how each is described, recorded and rebuilt."""
