@@ -22,7 +22,7 @@ FORBIDDEN = {
         "Only studies.study.cluster imports distributed",
     ),
     "report/page/new_chart.py": ("bokeh", "Only report.charts.bokeh_* imports bokeh"),
-    "report/page/new_sheet.py": ("fpdf", "Only report.page.pdf imports fpdf"),
+    "report/page/new_sheet.py": ("weasyprint", "Only report.page.page_files imports weasyprint"),
     "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),
     "loop/new_figure.py": ("matplotlib", "Only report imports matplotlib"),
     "linear/new_system.py": ("control", "Only linear.other_systems imports control"),

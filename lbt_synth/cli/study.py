@@ -13,6 +13,7 @@ from lbt_synth.cli.engine import choose_engine, keep_finished, require_counts
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import write_study_page
+from lbt_synth.report.page.page_files import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.storage.words import count_text, duration_text
@@ -28,6 +29,8 @@ def run(arguments: Namespace) -> Report:
     """Run a study, say what it would cost, or replay one of its rows."""
     require_counts(arguments, "jobs")
     folder = Path(arguments.output)
+    if arguments.pdf:
+        require_weasyprint()
     with show_spinner("reading the study, designing", quiet=arguments.json):
         loaded = studies.load_study(arguments.study, directory=folder)
     choose_config_unit(arguments, loaded.config)

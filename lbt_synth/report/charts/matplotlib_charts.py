@@ -88,14 +88,6 @@ def chart_svg(chart: Chart) -> str:
     return re.sub(r'(<(?:path|image|pattern|clipPath)\b[^>]*?) id="([^"]*)"', named_once, svg)
 
 
-def chart_png(chart: Chart) -> bytes:
-    """Return a chart as a PNG file."""
-    buffer = io.BytesIO()
-    with _chart_style():
-        draw_figure(chart.panels, columns=chart.columns).savefig(buffer, format="png", dpi=220)
-    return buffer.getvalue()
-
-
 def draw_figure(
     panels: Sequence[Panel], *, columns: int = 1, title: str = "", axes: OwnAxes = None
 ) -> Figure:
@@ -214,7 +206,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> Any:
     width_in = axes.get_window_extent().width / axes.figure.dpi
     title = scales.shorten(panel.title, max(8, int(width_in / paper_layout.LETTER_IN)))
     axes.set_title(title, loc="left", parse_math=False)
-    # fpdf2 does not cut collections off at the edges of a panel
+    # error bars end at the edges of a panel
     low, high = sorted(scales.scale_ends(panel)[1])
     for mark in panel.marks:
         match mark:

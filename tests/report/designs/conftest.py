@@ -43,5 +43,5 @@ def report(config, designs):
 
 @pytest.fixture(scope="session")
 def text(report, folder):
-    lbt.report.write_report(report, folder / "a.html", pdf=folder / "a.pdf")
+    lbt.report.write_report(report, folder / "a.html")
     return (folder / "a.html").read_text()
