@@ -70,7 +70,7 @@ lowest:                  ## the default tests with the lowest versions of all de
 	$(UV) pip install --quiet --python $(VENV)-lowest/bin/python -e . --group test --constraint $(VENV)-lowest/lowest.txt
 	$(VENV)-lowest/bin/python -m pytest -n 2 -m "not study and not e2e and not browser" tests
 
-e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT, Dask, Parquet, PDF, pyRTC; a test that is skipped, or none at all, fails
+e2e: $(VENV)/.ready-e2e  ## with the optional extras: SPECULA, AOT, Dask, PDF, pyRTC; a test that is skipped, or none at all, fails
 	$(BIN)/pytest -n 2 -m e2e --no-skips tests
 
 browser: $(VENV)/.ready-browser ## pages in headless Chromium (Debian: chromium, chromium-driver); no test may be skipped
