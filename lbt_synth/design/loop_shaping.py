@@ -10,7 +10,6 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design.certificate import Certificate, Check, certify_loop
-from lbt_synth.design.expected_disturbance import ModeDisturbance
 from lbt_synth.design.facts import RobustFacts
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.design.shaping.channel import (
@@ -19,7 +18,7 @@ from lbt_synth.design.shaping.channel import (
     laguerre_basis,
     mode_loop,
 )
-from lbt_synth.design.shaping.objectives import VibrationBand, leaves, spectrum_of
+from lbt_synth.design.shaping.objectives import VibrationBand, leaves
 from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
 from lbt_synth.design.shaping.specification import (
     Specification,
@@ -30,7 +29,6 @@ from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.spectra import SumSpectrum
 from lbt_synth.storage.rows import fill_row
 from lbt_synth.validation import (
     ComplexArray,
@@ -236,10 +234,16 @@ class ShapedDesign(Design):
         specs = enumerate(self.specifications)
         return tuple((mode, demand.label) for mode, spec in specs for demand in spec.demands)
 
-    def expected_disturbance(self) -> tuple[ModeDisturbance, ...]:
-        """Return what the specifications name on each mode."""
-        rate = self.loop_hardware.frame_rate_hz
-        return tuple(_named_disturbance(spec, rate) for spec in self.specifications)
+    @property
+    def expected_residual_nm(self) -> float:
+        """Root of the sum of the squared objectives of the modes."""
+        return float(np.linalg.norm(self.objective_nm))
+
+    @property
+    def vibration_bands(self) -> tuple[VibrationBand, ...]:
+        """Bands of the specifications, mode by mode."""
+        parts = (leaf for spec in self.specifications for leaf in leaves(spec.objective))
+        return tuple(part for part in parts if isinstance(part, VibrationBand))
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...]:
         """Return the demands that a controller violates, none where it couples the modes."""
@@ -284,16 +288,6 @@ class ShapedDesign(Design):
         apart = float(np.max(np.abs(whole - single)))
         how = f"sensitivity at {f.size} frequencies"
         return Check("whole loop against its modes", apart, 1e-6, how)
-
-
-def _named_disturbance(specification: Specification, frame_rate_hz: float) -> ModeDisturbance:
-    """Return what a specification names, at the first of its sensor gains."""
-    every = leaves(specification.objective)
-    parts = [part for part in every if part.sensor_gain == every[0].sensor_gain]
-    bands = tuple(part for part in parts if isinstance(part, VibrationBand))
-    found = [spectrum_of(part, frame_rate_hz) for part in parts]
-    spectra = tuple(spectrum for spectrum in found if spectrum is not None)
-    return ModeDisturbance(spectrum=SumSpectrum(parts=spectra) if spectra else None, bands=bands)
 
 
 def _mode_checks(

@@ -21,7 +21,6 @@ from lbt_synth.design.certificate import (
     certify_infeasible,
     certify_loop,
 )
-from lbt_synth.design.expected_disturbance import ModeDisturbance, modelled_disturbance
 from lbt_synth.design.facts import FilterFacts, model_facts, summarise_design
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
@@ -40,6 +39,7 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
+    from lbt_synth.design.shaping import VibrationBand
     from lbt_synth.loop import AnyLoop
 
 ORIGIN = "distance from its Riccati filter"
@@ -107,9 +107,15 @@ class Design(Summarised):
         """Whether the design reads other sensors beside the loop's own, by a periodic filter."""
         return False
 
-    def expected_disturbance(self) -> tuple[ModeDisturbance, ...] | None:
-        """Return what the design expects on each mode; None if it was made for no disturbance."""
+    @property
+    def expected_residual_nm(self) -> float | None:
+        """Residual that the design expects, rms of all modes; None if it was made for none."""
         return None
+
+    @property
+    def vibration_bands(self) -> tuple[VibrationBand, ...]:
+        """Bands in which the design expects a vibration anywhere."""
+        return ()
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...] | None:
         """Return the demands on the design that a controller violates; None if it has none."""
@@ -199,9 +205,10 @@ class EstimatorDesign(Design, ABC):
         """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
         return False
 
-    def expected_disturbance(self) -> tuple[ModeDisturbance, ...] | None:
-        """Return what the plant has on each mode; None for a bare estimation problem."""
-        return modelled_disturbance(self.problem)
+    @property
+    def expected_residual_nm(self) -> float | None:
+        """Standard deviation of the estimation error; None for a bare estimation problem."""
+        return None if self.hardware is None else self.rms
 
     @abstractmethod
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:

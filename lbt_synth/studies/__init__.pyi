@@ -28,7 +28,5 @@ from .tradeoff import TradeoffPoint as TradeoffPoint
 from .tradeoff import tradeoff as tradeoff
 from .truth_comparison import TruthComparison as TruthComparison
 from .truth_comparison import compare_in_truth as compare_in_truth
-from .unexpected_power import UnexpectedPower as UnexpectedPower
-from .unexpected_power import unexpected_power as unexpected_power
 from .worst_residual import GuaranteedResidual as GuaranteedResidual
 from .worst_residual import guaranteed_residual as guaranteed_residual

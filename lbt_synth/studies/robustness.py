@@ -304,12 +304,10 @@ def robustness_map(
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
     """Return the errors at which the vibration that moves most is within a band of the design."""
     lines = truth.lines_hz
-    expected = design.expected_disturbance()
-    if not lines or expected is None:
+    if not lines:
         return None
     most_hz = max(lines, key=lambda f: truth.frequency_shift_hz(f, 1.0))
-    bands = (band for mode in expected for band in mode.bands)
-    held = (band for band in bands if band.low_hz <= most_hz <= band.high_hz)
+    held = (band for band in design.vibration_bands if band.low_hz <= most_hz <= band.high_hz)
     return next(((band.low_hz - most_hz, band.high_hz - most_hz) for band in held), None)
 
 

@@ -56,3 +56,11 @@ def test_to_control_is_the_same_controller(axis_plant):
     stepped = [run.step([value])[0] for value in y]
     _, response = control.forced_response(system, U=y)
     assert np.allclose(np.ravel(response), stepped, rtol=1e-9, atol=1e-12)
+
+
+def test_what_a_design_expects_to_leave(axis_plant):
+    filter_design = lbt.kalman(axis_plant)
+    assert filter_design.expected_residual_nm == filter_design.rms
+    bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    assert lbt.kalman(bare).expected_residual_nm is None
+    assert lbt.integrator(axis_plant.hardware, gain=0.4).expected_residual_nm is None

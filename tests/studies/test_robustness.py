@@ -294,7 +294,7 @@ def test_a_map_knows_the_band_of_its_design(kalman, settings):
 
     assert band(kalman, settings.truth) is None
     low, high = band(robust, settings.truth)
-    (edges,) = {(part.low_hz, part.high_hz) for part in robust.expected_disturbance()[0].bands}
+    (edges,) = {(part.low_hz, part.high_hz) for part in robust.vibration_bands}
     assert (20.0 + low, 20.0 + high) == pytest.approx(edges)
     assert band(robust, replace(settings.truth, vibrations=(sinusoid(70.0),))) is None
     assert band(robust, replace(settings.truth, vibrations=())) is None
