@@ -19,7 +19,7 @@ FORBIDDEN = {
     "files/telemetry/new_format.py": ("aotpy", "Only files.telemetry.aot imports aotpy"),
     "studies/study/new_pool.py": (
         "distributed",
-        "Only studies.study.cluster imports distributed",
+        "Only cli.engine imports distributed",
     ),
     "report/page/new_chart.py": ("bokeh", "Only report.charts.bokeh_* imports bokeh"),
     "report/page/new_sheet.py": ("weasyprint", "Only report.page.page_files imports weasyprint"),

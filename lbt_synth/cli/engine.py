@@ -1,18 +1,21 @@
-"""What runs the cases of a command: processes of this machine, or a Dask cluster."""
+"""What runs a study: processes of this machine, or a Dask cluster. Nothing else imports Dask."""
 
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
+import lbt_synth
 from lbt_synth.cli.argument_kinds import option_name
 from lbt_synth.cli.streams import print_error
-from lbt_synth.errors import ProblemError
-from lbt_synth.studies.study.cluster import connect_cluster
+from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.validation import integer
+
+_TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 
 
 def require_counts(arguments: Namespace, *names: str) -> None:
@@ -40,3 +43,52 @@ def keep_finished(folder: Path) -> Iterator[None]:
     except KeyboardInterrupt:
         print_error(f"what is finished is kept in {folder}; start it again to continue")
         raise
+
+
+@contextmanager
+def connect_cluster(
+    address: str, *, tls: Sequence[str] | None = None
+) -> Iterator[tuple[Executor, int]]:
+    """Provide the executor of a Dask scheduler with this package, and how many threads it has.
+
+    A scheduler can run code on its clients: name only one that you trust. ``tls`` names the
+    files of the authority, of the certificate and of the key of an encrypted connection.
+    """
+    try:
+        from distributed import Client
+        from distributed.security import Security
+    except ImportError as error:
+        raise MissingExtraError(
+            '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
+        ) from error
+    names = ("tls_ca_file", "tls_client_cert", "tls_client_key")
+    try:
+        files = dict(zip(names, tls, strict=True)) if tls else {}
+        security = Security(**files, require_encryption=True if tls else None)
+        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False, security=security)
+    except (OSError, ValueError, TypeError) as error:
+        text = " ".join(str(error).split()) or "no answer"
+        raise ProblemError(
+            f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
+            "such as tcp://host:8786; start one with dask scheduler, and dask worker."
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+        except TimeoutError as error:
+            raise ProblemError(
+                f"the scheduler at {address} has no workers; start some with dask worker {address}."
+            ) from error
+        _require_versions(address, client)
+        yield client.get_executor(pure=False), sum(client.ncores().values())
+
+
+def _require_versions(address: str, client: Any) -> None:
+    """Refuse workers without this version, whose results would be others."""
+    hosts = client.get_versions(packages=["lbt_synth"])["workers"]
+    versions = {host["packages"].get("lbt_synth") or "none" for host in hosts.values()}
+    if versions != {lbt_synth.__version__}:
+        raise ProblemError(
+            f"all workers must have lbt_synth {lbt_synth.__version__}, as here; those of {address} "
+            f"have {', '.join(sorted(versions))}. Start them from the same environment."
+        )

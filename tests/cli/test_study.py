@@ -241,7 +241,7 @@ def test_an_encrypted_scheduler(tmp_path, capsys, certificate, monkeypatch):
     from distributed import LocalCluster
     from distributed.security import Security
 
-    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 5)
+    monkeypatch.setattr("lbt_synth.cli.engine._TIMEOUT_S", 5)
     own, key = map(str, certificate)
     sides = {
         f"tls_{side}_{what}": name
@@ -268,7 +268,7 @@ def test_an_encrypted_scheduler(tmp_path, capsys, certificate, monkeypatch):
 @pytest.mark.e2e
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""])
 def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
-    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.cli.engine._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     before = time.monotonic()
     status, _, error = run(capsys, "study", path, "-o", tmp_path / "out", "--dask", address)
@@ -282,7 +282,7 @@ def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
 def test_a_scheduler_without_workers(tmp_path, capsys, monkeypatch):
     from distributed import LocalCluster
 
-    monkeypatch.setattr("lbt_synth.studies.study.cluster._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.cli.engine._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
         status, _, error = run(

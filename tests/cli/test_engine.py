@@ -12,8 +12,8 @@ import pytest
 from support.studies import assert_whole, evaluate_quickly, study_file
 
 import lbt_synth as lbt
+from lbt_synth.cli.engine import connect_cluster
 from lbt_synth.errors import NumericalError
-from lbt_synth.studies.study.cluster import connect_cluster
 from lbt_synth.studies.study.store import list_parts
 
 PARAMETERS = (
