@@ -15,8 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.accelerometers.band_fit import BandFit, fit_band
-from lbt_synth.identification.accelerometers.line_bands import LineBand, line_bands
+from lbt_synth.identification.accelerometers.line_bands import (
+    BandFit,
+    LineBand,
+    fit_band,
+    line_bands,
+)
 from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
