@@ -19,12 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lbt_synth.identification.commands.spectral_peaks import (
-    find_spectral_peaks,
-    smooth_neighbours,
-)
 from lbt_synth.identification.fit.periodogram import half_angle_square, tukey
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _SEGMENT_S = 6.0
 _SHORTEST = 512  # frames of a segment, where the record has them
@@ -37,6 +33,9 @@ _LINE_DAMPING = 0.004  # only the skirts of a line are compared, which do not sh
 _SMALLEST = 1e-9  # of the measured power
 _FIRST_PASSES, _MOST_PASSES, _SETTLED = 20, 40, 0.05
 _LARGEST = 2.0  # step of the logarithm of an amplitude
+_PEAK, _SKIRT = 3.0, 1.25  # over the surroundings
+_SURROUNDINGS, _REACH, _MOST_PEAKS = 81, 40, 16  # frequencies, frequencies, peaks
+_APART = 4  # frequencies between peaks
 
 
 class Quadratic(NamedTuple):
@@ -160,12 +159,34 @@ def coarse_axis(
     )
 
 
-def _bands(
-    frequency_hz: FloatArray, frame_rate_hz: float, step: float, *, least: int = 1
-) -> IntArray:
-    """Return the band of each frequency, (f,), of at least some steps."""
+def find_spectral_peaks(
+    frequency_hz: FloatArray, power: FloatArray
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Return the frequencies at peaks (f,), where the peaks are (l,), and their widths (l,)."""
+    from scipy.ndimage import median_filter
+    from scipy.signal import find_peaks
+
+    log = np.log(np.convolve(np.pad(power, 1, mode="edge"), np.full(3, 1 / 3), mode="valid"))
+    above = log - median_filter(log, size=_SURROUNDINGS, mode="nearest")
+    tops, _ = find_peaks(above, height=float(np.log(_PEAK)), distance=_APART)
+    is_peak = np.zeros(power.size, dtype=np.bool_)
+    for top in tops[np.argsort(-above[tops], kind="stable")][:_MOST_PEAKS]:
+        low, high = max(top - _REACH, 0), min(top + _REACH + 1, power.size)
+        ends = np.flatnonzero(above[low:high] <= np.log(_SKIRT)) + low
+        start = np.max(ends[ends < top], initial=low)
+        stop = np.min(ends[ends > top], initial=high - 1)
+        is_peak[max(start - 1, 0) : stop + 2] = True
+    edges = np.flatnonzero(np.diff(np.r_[False, is_peak, False].astype(int))).reshape(-1, 2)
+    lines = np.array([frequency_hz[a + np.argmax(power[a:b])] for a, b in edges])
+    step = frequency_hz[1] - frequency_hz[0]
+    width = np.array([max(2.0, 0.3 * (b - a)) * step for a, b in edges])
+    return is_peak, lines, width / lines
+
+
+def _bands(frequency_hz: FloatArray, frame_rate_hz: float, step: float) -> IntArray:
+    """Return the band of each frequency, (f,), of at least one step."""
     width = np.minimum(_BAND * frequency_hz, _WIDEST_BAND * frame_rate_hz)
-    width = np.maximum(width, least * step)
+    width = np.maximum(width, step)
     _, band = np.unique(np.floor(np.cumsum(step / width) - 1e-9), return_inverse=True)
     return np.asarray(band)
 
@@ -354,30 +375,3 @@ class _Fit:
         level = np.max(trial[:, 1:k], axis=1, keepdims=True)
         trial[:, 1:k] = np.maximum(trial[:, 1:k], level - 40)
         return trial
-
-
-def coherence_credit(
-    one: ComplexArray,
-    other: ComplexArray,
-    frequency_hz: FloatArray,
-    *,
-    independent: float,
-    frame_rate_hz: float,
-) -> float:
-    """Return what the coherence of two axes adds to the contrast, at most 0.
-
-    Their transforms are (segments, f) each.
-    A line along a diagonal is in both axes; a guess that removes it from one of them must not
-    count as an explanation. What shakes along a direction has no phase between the axes; the
-    coupling that a wrong guess leaves has one, and no credit.
-    """
-    step = float(frequency_hz[1] - frequency_hz[0])
-    band = _bands(frequency_hz, frame_rate_hz, step, least=3)
-    power = [smooth_neighbours(np.mean(abs(x) ** 2, axis=0)) for x in (one, other)]
-    x, y = (each / np.sqrt(p) for each, p in zip((one, other), power, strict=True))
-    cross = np.mean((x * y.conj()).real, axis=0)
-    sums = [np.bincount(band, weights=np.mean(abs(each) ** 2, axis=0)) for each in (x, y)]
-    mixed = np.bincount(band, weights=cross) ** 2
-    coherent = np.minimum(mixed / (sums[0] * sums[1]), 1 - 1e-6)
-    gained = np.bincount(band) * independent * np.log1p(-coherent) + 0.5
-    return float(np.sum(np.minimum(gained, 0)))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
-from lbt_synth.identification.commands.control_law import FOLLOWED, ControlLaw
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.commands.control_law import FOLLOWED, ControlLaw, fit_control_law
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
 from lbt_synth.identification.commands.plausibility import could_have_run
 from lbt_synth.identification.records.faults import equal_runs, mark, runs
@@ -19,6 +22,8 @@ _SAME_ROWS = 0.05  # sine of the angle between the rows of a gain that are one
 _NO_STEADY_GAIN = 1e-3  # of the size of the taps, in their sum
 _SHORT = 3  # order of a law whose loop can be judged
 _PARTS_OF_GAIN, _TRIED = np.array([1.0, 0.3, 0.1]), np.geomspace(1.0, 1e-6, 19)
+_PARTS = 8  # of a record whose series may slip
+_ALIKE = 0.2  # of the largest tap, between laws that are one
 _RELATED = 30.0  # nats by which the commands of an axis must be likelier than none
 _FUZZ = 1e-6  # of the range of values, within which two are the same
 STEPPED = 1e-6  # of the variance of increments, in rounding that may move a gain
@@ -71,6 +76,26 @@ def doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray)
         "a loop with the law that they follow is unstable at any sensor gain. Check what the "
         "series are"
     )
+
+
+def doubt_parts(record: LoopRecord) -> str | None:
+    """Return that parts of a record have one law at different lags, in words."""
+    assert record.commands is not None
+    laws = []
+    for frames in np.array_split(np.arange(record.frames), _PARTS):
+        series = record.measurements[frames], record.commands[frames]
+        with suppress(ProblemError):
+            law = fit_control_law(*series, usable=record.usable[frames])
+            laws += [law] if law.is_sure and np.all(law.axis_coherence > FOLLOWED) else []
+    for one, other in pairwise(laws):
+        if one.lag_frames == other.lag_frames or one.taps.shape != other.taps.shape:
+            continue
+        if np.max(np.abs(one.taps - other.taps)) < _ALIKE * np.max(np.abs(one.taps)):
+            return (
+                f"parts of them follow their measurements at different lags, {one.lag_frames} and "
+                f"{other.lag_frames} frames, as if frames of one series were lost. Cut the record"
+            )
+    return None
 
 
 def doubt_axes(coarse: CoarseRecord, law: ControlLaw) -> str | None:

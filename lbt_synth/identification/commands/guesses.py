@@ -12,7 +12,6 @@ from lbt_synth.identification.commands.coarse_spectrum import (
     CoarseAxis,
     CoarseFit,
     coarse_axis,
-    coherence_credit,
     fit_guesses,
     fit_profile,
     segment_transforms,
@@ -59,10 +58,14 @@ class Comparison:
     """Guesses on one record."""
 
     guesses: tuple[Guess, ...]
-    contrast: FloatArray  # minus the log-likelihood of each, (guesses,)
-    axis_contrast: FloatArray  # that of each axis, without the coherence of both, (axes, guesses)
+    axis_contrast: FloatArray  # minus the log-likelihood of each axis, (axes, guesses)
     gain: FloatArray  # best gain of the sensor, (axes, guesses)
     misfit: FloatArray  # mean deviance of a band: about 1 if the coarse spectrum fits, (guesses,)
+
+    @property
+    def contrast(self) -> FloatArray:
+        """Minus the log-likelihood of each guess, (guesses,)."""
+        return np.asarray(self.axis_contrast.sum(axis=0))
 
     def dispersion(self, i: int) -> float:
         """Return the factor by which a misfit of guess i raises what decides, at least 1."""
@@ -133,19 +136,15 @@ class CoarseRecord:
         """Return the likelihood of each guess, at its best gains."""
         corrections = np.array([self.transform(guess) for guess in guesses])
         fits = [self._fit_axis(i, corrections[:, i]) for i in range(self.record.axes)]
-        gain = np.array([fit.gain for fit in fits])
-        own = np.array([fit.contrast for fit in fits])
-        credit = [self._credit(c, g) for c, g in zip(corrections, gain.T, strict=True)]
         return Comparison(
             guesses=tuple(guesses),
-            contrast=own.sum(axis=0) + credit,
-            axis_contrast=own,
-            gain=gain,
+            axis_contrast=np.array([fit.contrast for fit in fits]),
+            gain=np.array([fit.gain for fit in fits]),
             misfit=np.mean([fit.misfit for fit in fits], axis=0),
         )
 
     def profile(self, guess: Guess, gains: FloatArray) -> FloatArray:
-        """Return the contrasts (axes, n) at gains (axes, n), without the coherence of the axes."""
+        """Return the contrasts (axes, n) at gains (axes, n)."""
         corrections = self.transform(guess)
         each = zip(corrections, gains, strict=True)
         fits = [fit_profile(self._axis(i, c[None]), g) for i, (c, g) in enumerate(each)]
@@ -153,9 +152,8 @@ class CoarseRecord:
 
     def unrelated(self) -> float:
         """Return the contrast of commands that do not reach the measurements."""
-        given, nothing = Guess(kind="as given"), np.zeros(self.record.axes)
-        own = float(np.sum(self.profile(given, nothing[:, None])))
-        return own + self._credit(self.transform(given), nothing)
+        nothing = np.zeros((self.record.axes, 1))
+        return float(np.sum(self.profile(Guess(kind="as given"), nothing)))
 
     def _axis(self, i: int, corrections: ComplexArray) -> CoarseAxis:
         """Return the bands of one axis, for all guesses of its corrections."""
@@ -176,16 +174,3 @@ class CoarseRecord:
         least = max(_STEADY * level, np.finfo(float).tiny)  # clipped commands may hardly move
         natural = _NATURAL * np.sqrt(level / np.maximum(steps, least))
         return fit_guesses(self._axis(i, corrections), natural[:, None] * _NATURAL_GAINS)
-
-    def _credit(self, corrections: ComplexArray, gain: FloatArray) -> float:
-        """Return what the coherence of the axes adds to the contrast, at most 0."""
-        if self.record.axes == 1:
-            return 0.0
-        one, other = self.measured + gain[:, None, None] * corrections
-        return coherence_credit(
-            one,
-            other,
-            self.frequency_hz,
-            independent=self.independent,
-            frame_rate_hz=self.record.frame_rate_hz,
-        )

@@ -26,14 +26,14 @@ def find_scale(
     guess: Guess,
     found: FloatArray,
     *,
-    own_contrast: float,
+    contrast: float,
     clear: float,
     plausible: tuple[float, float],
 ) -> FloatArray:
     """Return the factors (axes,) of commands that make implausible gains plausible ones.
 
-    ``found`` are the gains (axes,) of a guess, ``own_contrast`` is its contrast there without the
-    coherence of the axes, and ``clear`` what decides.
+    ``found`` are the gains (axes,) of a guess, ``contrast`` is its contrast there, and ``clear``
+    what decides.
     """
     low, high = plausible
     bounded, nothing = np.clip(found, low, high), np.ones(found.size)
@@ -41,7 +41,7 @@ def find_scale(
         return nothing
     inside = np.geomspace(low, high, _INSIDE)
     near = coarse.profile(guess, np.tile(inside, (found.size, 1)))
-    if np.sum(np.min(near, axis=1)) - own_contrast < clear:
+    if np.sum(np.min(near, axis=1)) - contrast < clear:
         return nothing
     gains = fit_gains(coarse, guess, found)
     scale, usual = likely_factors(gains, plausible), _usual_gain(plausible)

@@ -13,6 +13,7 @@ from lbt_synth.identification.commands.control_law import ControlLaw, record_con
 from lbt_synth.identification.commands.doubts import (
     doubt_axes,
     doubt_law,
+    doubt_parts,
     doubt_running,
     doubt_steps,
     held_while_moving,
@@ -244,7 +245,7 @@ def _doubt_series(record: LoopRecord, law: ControlLaw | None) -> str | None:
     """Return what is wrong with the series of a record whatever the sensor sees, in words."""
     if held := held_while_moving(record):
         return held
-    return doubt_law(law) if law is not None and law.is_sure else None
+    return doubt_law(law) if law is not None and law.is_sure else doubt_parts(record)
 
 
 def _doubt_commands(coarse: CoarseRecord, law: ControlLaw, steps: str | None) -> str | None:
@@ -268,7 +269,7 @@ class _Best:
 
     guess: Guess
     nats: float  # over the record as given
-    own_contrast: float  # of the axes, without their coherence
+    contrast: float
     gain: FloatArray  # (axes,)
     clear: float  # nats that decide
 
@@ -276,7 +277,7 @@ class _Best:
         self, coarse: CoarseRecord, law: ControlLaw | None, plausible: tuple[float, float]
     ) -> FloatArray:
         """Return the factors of commands that make implausible gains plausible ones."""
-        decides = {"own_contrast": self.own_contrast, "clear": self.clear}
+        decides = {"contrast": self.contrast, "clear": self.clear}
         return find_scale(coarse, law, self.guess, self.gain, plausible=plausible, **decides)
 
 
@@ -286,7 +287,7 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     guesses = list_guesses(record, earliest_frames=1.0 - lag)
     if lag > SHIFTS[-1]:
         guesses.append(Guess(kind="shift", shift_frames=-lag))
-    if law is not None and law.axis_matrix.kind == "general":
+    if law is not None and law.is_sure and law.axis_matrix.kind == "general":
         guesses += [Guess(kind="matrix", matrix=each) for each in _unmix_axes(law.gain)]
     compared = coarse.compare(guesses)
     score, surprising = score_guesses(compared, record, law, lag)
@@ -313,7 +314,7 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     return _Best(
         guess=guesses[best],
         nats=nats,
-        own_contrast=float(np.sum(compared.axis_contrast[:, best])),
+        contrast=float(compared.contrast[best]),
         gain=compared.gain[:, best],
         clear=clear,
     )

@@ -8,7 +8,7 @@ import pytest
 from lbt_synth.identification.commands import coarse_spectrum as coarse
 from lbt_synth.identification.commands.coarse_spectrum import (
     coarse_axis,
-    coherence_credit,
+    find_spectral_peaks,
     fit_guesses,
     fit_profile,
     segment_transforms,
@@ -105,16 +105,6 @@ def test_derivatives_of_the_contrast() -> None:
     np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-3 * np.max(abs(gradient)))
 
 
-def test_the_coherence_of_two_axes_is_credited() -> None:
-    f, z, n = segment_transforms(white(9, 2), [(0, FRAMES)], RATE)
-    options = {"independent": n, "frame_rate_hz": RATE}
-    assert -80 < coherence_credit(z[0], z[1], f, **options) <= 0
-    # two values of coherence r^2 in each of N frequencies save N log(1 - r^2)
-    mixed = 0.6 * z[0] + 0.8 * z[1]
-    saved = f.size * n * np.log(1 - 0.36)
-    assert coherence_credit(z[0], mixed, f, **options) == pytest.approx(saved, rel=0.1)
-
-
 @pytest.mark.parametrize("rate_hz", [1e-3, 0.8, 10.0])
 def test_slow_loops_have_whole_segments(rate_hz):
     """Six seconds are few frames there, or none: 0.8 may be a rate in kHz."""
@@ -125,3 +115,17 @@ def test_slow_loops_have_whole_segments(rate_hz):
     density = np.mean(np.abs(z) ** 2)
     assert density == pytest.approx(2 / rate_hz, rel=0.1)  # of white noise of variance 1
     assert independent > 1
+
+
+def test_peaks_are_the_lines_of_a_spectrum():
+    rng = np.random.default_rng(1)
+    frequency = np.arange(1, 2000) / 6
+    lines = [40 / (1 + (frequency - f) ** 2) for f in (60, 200)]
+    power = 1e3 / frequency**2 + 1 + lines[0] + lines[1]
+    scatter = rng.gamma(8.0, 1 / 8.0, frequency.size)
+    is_peak, places, width = find_spectral_peaks(frequency, power * scatter)
+    assert [min(abs(places - f)) < 1 for f in (60, 200)] == [True, True]
+    assert is_peak[np.searchsorted(frequency, [60, 200])].all()
+    assert width.shape == places.shape
+    assert np.all(width > 0)
+    assert np.mean(is_peak) < 0.2

@@ -19,6 +19,12 @@ RATE_HZ, FRAMES = 800.0, 8000
 HELD = np.arange(FRAMES) // 2000 % 2 == 1
 
 
+def slipped(y, u):
+    later = u.copy()
+    later[6000:] = u[5999:-1]
+    return y, later
+
+
 def of_another_night(y, u):
     return y, np.column_stack([u[:, 0], ordinary_loop(5)[1][:, 1]])
 
@@ -37,6 +43,7 @@ def explain_spoilt(spoil):
         (lambda y, u: (y, u[:, [1, 1]]), "one axis was recorded twice"),
         (of_another_night, "those of axis 1 have nothing to do with its measurements"),
         (lambda y, u: (np.diff(y[:5000], axis=0), u[1:5000]), "unstable at any sensor gain"),
+        (slipped, "follow their measurements at different lags, 0 and 1 frames"),
     ],
 )
 def test_what_cannot_be_is_named(spoil, words: str) -> None:
