@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 from lbt_synth.design import Check, Design, ShapedDesign
 from lbt_synth.design.result import require_hardware
 from lbt_synth.interop.dao.direct_form import InnerLoop, direct_form, direct_form_rows
-from lbt_synth.interop.dao.lattice_rounding import round_together
-from lbt_synth.interop.dao.mode_loop import DirectFormLoop, shaped_mode_loop
-from lbt_synth.interop.dao.refit import refit
+from lbt_synth.interop.dao.refit import (
+    DirectFormLoop,
+    refit,
+    round_together,
+    shaped_mode_loop,
+)
 from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
@@ -148,10 +151,12 @@ def _proved_columns(design: Design, order: int) -> _Proved:
         rounded = exact.astype(np.float32)
     loops = _mode_loops(design, order)
     checks = prove_written(design, *_as_computed(rounded, design, loops))
-    made_again = not all(check.passed for check in checks) and _can_make_again(loops, exact)
-    if made_again:
-        rounded = _made_again(design, exact)
-        checks = prove_written(design, *_as_computed(rounded, design, loops))
+    made_again = False
+    if isinstance(design, ShapedDesign) and not all(check.passed for check in checks):
+        made_again = _can_make_again(exact)
+        if made_again:
+            rounded = _made_again(design, exact)
+            checks = prove_written(design, *_as_computed(rounded, design, loops))
     require_proved(checks, "single precision, in direct form", _HINT)
     return _Proved(rounded, checks, made_again)
 
@@ -190,27 +195,24 @@ def _mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
     return [found[mode] for mode in design.first_equal_modes]
 
 
-def _can_make_again(loops: list[DirectFormLoop], exact: FloatArray) -> bool:
-    """Whether the controller of each mode is a starting point: a shaped one, of an even order."""
+def _can_make_again(exact: FloatArray) -> bool:
+    """Whether the controller of each mode is a starting point: of an even order, not late."""
     odd = (len(exact) // 2) % 2
     unused = exact[[len(exact) // 2, -1]]
-    return bool(loops) and bool(exact[0].all()) and not (odd and unused.any())
+    return bool(exact[0].all()) and not (odd and unused.any())
 
 
-def _made_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
+def _made_again(design: ShapedDesign, exact: FloatArray) -> NDArray[np.float32]:
     """Return the matrix of controllers made for this arithmetic; equal modes are made once."""
     order = len(exact) // 2
     used = np.arange(len(exact))
     if order % 2:  # the search takes coefficients in pairs
         used = np.delete(used, [order, 2 * order])
+    loops = _mode_loops(design, order - order % 2)
+    modes = design.first_equal_modes
+    made = {k: round_together(loops[k], refit(loops[k], exact[used, k])) for k in set(modes)}
     rounded = np.zeros(exact.shape, dtype=np.float32)
-    found: dict[tuple[int, bytes], NDArray[np.float32]] = {}
-    for mode, loop in enumerate(_mode_loops(design, order - order % 2)):
-        key = id(loop), exact[:, mode].tobytes()
-        if key not in found:
-            best = refit(loop, exact[used, mode])
-            found[key] = round_together(best, loop.slopes(best))
-        rounded[used, mode] = found[key]
+    rounded[used] = np.stack([made[k] for k in modes], axis=1)
     return rounded
 
 

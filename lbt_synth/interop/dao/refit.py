@@ -1,10 +1,10 @@
-"""A controller made again for coarse arithmetic: as many coefficients as the computer has.
+"""A controller made again for single precision, in direct form: all its coefficients, rounded.
 
-A direct form of poles close to z = 1 is fragile: its polynomials nearly vanish there, so an error
-of one coefficient, or the rounding of a sum, moves the loop by much. A larger order than the
-controller needs leaves freedom: a factor common to both polynomials, with roots far from z = 1,
-makes them larger where they are small. From there all coefficients are moved until what the loop
-leaves, rounding included, is least: a nonlinear least-squares problem.
+Poles close to z = 1 make both polynomials nearly vanish there, so an error of one coefficient, or
+the rounding of a sum, moves the loop by much. A factor common to both, with roots far from z = 1,
+makes them larger. From there the coefficients move until what the loop leaves, rounding included,
+is least: a nonlinear least-squares problem. Last they are rounded one by one; after each, the
+others are solved again.
 """
 
 from __future__ import annotations
@@ -12,16 +12,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from lbt_synth.interop.dao.mode_loop import DirectFormLoop, Scenario
+from lbt_synth.design.shaping.channel import Channel, laguerre_basis
+from lbt_synth.design.shaping.objectives import (
+    ResidualVariance,
+    VibrationBand,
+    leaves,
+    spectrum_of,
+)
+from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.design.shaping.uncertainty import SensorGainRange
+from lbt_synth.interop.written_loop import ROUNDOFF
+from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
+# Mean square of the relative error of an operation. The error is uniform within half a step, and a
+# step is 2^-24 to 2^-23 of the number: of normal numbers of any size the mean square is at most
+# 0.544 of what it would be if all steps were the widest, of a sinusoid 0.66.
+ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
 _RADIUS = 0.92  # of the roots that are added
-_ROOM = 2e-3  # of each limit
-_ENOUGH = 1.006  # times what the design leaves
-_EDGE = 3e-3  # weight of the loops at the ends of the sensor gains
-_FAR = -1.7  # a section with a larger first coefficient is far from z = 1
+_ROOM = 2e-3  # of each limit, for what lies between the nodes
+_ENOUGH = 1.006  # times what the design leaves; 1.01 is proved
 # Weight of the rounding, weight of what exceeds a limit, largest squared modulus of the roots of
 # sections far from z = 1: one search each.
 _STEPS = (
@@ -29,47 +42,216 @@ _STEPS = (
     *((1.0, 3.0, 0.94), (1.0, 6.0, 0.96), (1.0, 10.0, 0.96)),
     *[(1.0, 15.0, 0.96)] * 12,
 )
+_FAR = -1.7  # a section with a larger first coefficient is far from z = 1
+_STIFF = 30.0  # weight of its roots beyond their modulus
+_UNSTABLE = 1e3  # each error of a loop that is
 _LINE = 0.3  # weight of a vibration's mean power; its largest is a limit
 _HASTE = 12  # power of its residual with which a scenario gains weight
 _EVALUATIONS = 60  # of one search
-_DAMPED = 0.5  # of the own loop's distance from instability, at least
+_DAMPED = 0.5  # of the design's distance from instability, at least
 _GAINS = 25  # sensor gains at which a step must be stable
+_ORDERS = 3000  # in which the coefficients are rounded; the best one counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Targets:
-    """What the controller of the design leaves, which another must not exceed."""
+class Scenario:
+    """What disturbs one mode at a sensor gain, at the loop's frequencies."""
 
-    residuals_nm: FloatArray  # (G,)
-    peaks_nm: FloatArray  # (G,) of the vibration
-    radius: float  # largest over the sensor gains
-    sensitivity: float  # largest at unit sensor gain
-    edges: tuple[float, float]  # largest at the lowest and the highest sensor gain
+    sensor_gain: float
+    phase_nm2: FloatArray  # (F,) power of turbulence and skirts at each node
+    noise_nm2: FloatArray  # (F,)
+    line_nm: FloatArray  # (F,) rms of the vibration that may be there, or 0
+    spread_nm2: FloatArray  # (F,) its power, spread evenly over its band
 
 
-@dataclass(frozen=True, slots=True)
-class _Weights:
-    scenarios: FloatArray  # (G,)
-    rounding: float
-    limits: float
-    modulus: float
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DirectFormLoop:
+    """One mode, whose controller is ``c = (b_0 .. b_M, a_1 .. a_M)``.
+
+    With the path of the loop L (delay and mirror) and the polynomials in ``z^-1``
+    ``b = sum b_j z^-j`` and ``a = 1 - sum a_i z^-i``, the loop at the sensor gain g has the
+    polynomial ``p = a + g L b``; it leaves ``a / p`` of the phase and ``L b / p`` of the noise.
+    """
+
+    powers: ComplexArray  # (F, M + 1), z^-j at each node
+    path: ComplexArray  # (F,)
+    path_taps: FloatArray  # of the path, in powers of z^-1
+    shares: FloatArray  # (F,) of the frequencies that a node stands for; their sum is 1
+    scenarios: tuple[Scenario, ...]
+    low: float  # ends of the sensor gains for which the loop is to be stable
+    high: float
+
+    @property
+    def order(self) -> int:
+        """M."""
+        return int(self.powers.shape[1]) - 1
+
+    def polynomials(self, c: FloatArray, sensor_gain: float) -> tuple[ComplexArray, ...]:
+        """Return a, b and p at the nodes, (F,) each."""
+        b = self.powers @ c[: self.order + 1]
+        a = 1 - self.powers[:, 1:] @ c[self.order + 1 :]
+        return a, b, a + sensor_gain * self.path * b
+
+    def slopes(self) -> tuple[ComplexArray, ComplexArray]:
+        """Return the slopes of a and of L b, (F, 2 M + 1) each."""
+        size, M = self.path.size, self.order
+        of_a = np.hstack([np.zeros((size, M + 1)), -self.powers[:, 1:]])
+        of_b = np.hstack([self.path[:, None] * self.powers, np.zeros((size, M))])
+        return of_a, of_b
+
+    def residuals_nm(self, c: FloatArray, *, rounding: bool = False) -> FloatArray:
+        """Return the rms of the residual in each scenario, in exact or in rounded arithmetic."""
+        variances = []
+        for s in self.scenarios:
+            a, b, p = self.polynomials(c, s.sensor_gain)
+            variance = s.phase_nm2 @ np.abs(a / p) ** 2
+            variance += s.noise_nm2 @ np.abs(self.path * b / p) ** 2
+            variance += np.max(s.line_nm * np.abs(a / p)) ** 2
+            if rounding:
+                entering = self.shares @ np.abs(self.path / p) ** 2
+                variance += self.sums_nm2(c, s.sensor_gain) * entering
+            variances.append(variance)
+        return np.sqrt(variances)
+
+    def rounding_matrix(self, c: FloatArray, s: Scenario) -> FloatArray:
+        """Return the matrix V with which ``c' V c`` is the variance of the sums' rounding [nm^2].
+
+        Each product and each partial sum is rounded. Their sizes are those of the measurements and
+        commands that the loop around c remembers.
+        """
+        a, b, p = self.polynomials(c, s.sensor_gain)
+        memory = np.hstack([self.powers * (a / p)[:, None], self.powers[:, 1:] * (b / p)[:, None]])
+        phase = s.phase_nm2 + s.spread_nm2
+        size = np.sqrt(s.sensor_gain**2 * phase + s.noise_nm2)[:, None] * memory
+        moments = (size.conj().T @ size).real
+        index = np.arange(c.size)
+        after = c.size - np.maximum(np.maximum.outer(index, index), 1)  # sums that hold both terms
+        variance: FloatArray = ROUNDING * (moments * after + np.diag(np.diag(moments)))
+        return variance
+
+    def sums_nm2(self, c: FloatArray, sensor_gain: float) -> float:
+        """Return the variance of the rounding of the sums at a sensor gain of a scenario."""
+        (scenario,) = (s for s in self.scenarios if s.sensor_gain == sensor_gain)
+        return float(c @ self.rounding_matrix(c, scenario) @ c)
+
+    def radius(self, c: FloatArray) -> float:
+        """Return the largest spectral radius over the sensor gains."""
+        M, extra = self.order, self.path_taps.size - 1
+        gains = np.append(np.geomspace(self.low, self.high, _GAINS), 1.0)
+        a = np.concatenate([[1.0], -c[M + 1 :], np.zeros(extra)])
+        p = a + gains[:, None] * np.convolve(self.path_taps, c[: M + 1])
+        companion = np.tile(np.eye(M + extra, k=-1), (gains.size, 1, 1))
+        companion[:, 0] = -p[:, 1:] / p[:, :1]
+        return float(np.max(np.abs(np.linalg.eigvals(companion))))
+
+
+def shaped_mode_loop(
+    hardware: LoopHardware, specification: Specification, order: int
+) -> DirectFormLoop:
+    """Return the loop of one mode of a shaped design, at the frequencies that it was shaped at."""
+    single = hardware.single_mode()
+    channel = Channel(hardware=single, basis=laguerre_basis(1, 0.0, dt_s=single.dt_s))
+    grid = specification.grid(channel, fineness=2)
+    terms = leaves(specification.objective)
+    bands = [term for term in terms if isinstance(term, VibrationBand)]
+    inside = [grid.within(band.low_hz, band.high_hz) for band in bands]
+    more = np.concatenate([grid.points_hz, *inside])
+    f = np.concatenate([grid.nodes_hz, more])
+    width = np.concatenate([grid.weights_hz, np.zeros(more.size)])
+    scenarios = []
+    for gain in sorted({term.sensor_gain for term in terms}, reverse=True):
+        phase, noise, line, spread = np.zeros((4, f.size))
+        for term in terms:
+            if term.sensor_gain != gain:
+                continue
+            spectrum = spectrum_of(term, single.frame_rate_hz)
+            phase += 0.0 if spectrum is None else width * spectrum.psd(f)
+            if isinstance(term, ResidualVariance):
+                noise += width / channel.nyquist_hz * term.noise_nm**2
+            else:
+                covered = (f >= term.low_hz) & (f <= term.high_hz)
+                line = np.hypot(line, np.where(covered, term.rms_nm, 0.0))
+                evenly = np.where(covered, width, 0.0)
+                spread += term.rms_nm**2 * evenly / np.sum(evenly)
+        scenarios.append(
+            Scenario(
+                sensor_gain=gain, phase_nm2=phase, noise_nm2=noise, line_nm=line, spread_nm2=spread
+            )
+        )
+    ranges = [d for d in specification.demands if isinstance(d, SensorGainRange)]
+    powers = np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(order + 1)))
+    taps = np.concatenate([[0.0], single.mirror_taps])
+    return DirectFormLoop(
+        powers=powers,
+        path=np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(taps.size))) @ taps,
+        path_taps=taps,
+        shares=width / channel.nyquist_hz,
+        scenarios=tuple(scenarios),
+        low=min([1.0, *(r.low for r in ranges)]),
+        high=max([1.0, *(r.high for r in ranges)]),
+    )
 
 
 def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
     """Return coefficients (2 M + 1,), M even, whose loop leaves least, rounding included."""
-    targets = _targets(loop, exact)
-    theta = _sections(loop, _widened(loop, exact))
-    weights = np.ones(len(loop.scenarios))
+    allowed_nm, limits = loop.residuals_nm(exact), _limits(loop, exact)
+    least_damping = _DAMPED * (1 - loop.radius(exact))
+    theta, weights = _sections(_widened(loop, exact), loop.order), np.ones(len(loop.scenarios))
     for rounding, steepness, modulus in _STEPS:
-        theta = _search(loop, targets, theta, _Weights(weights, rounding, steepness, modulus))
-        c = _coefficients(loop, theta)
-        left = np.hypot(loop.residuals_nm(c), loop.rounding_nm(c)) / targets.residuals_nm
-        if np.max(left) < _ENOUGH and steepness == _STEPS[-1][1]:
+        goals = _Goals(np.sqrt(weights) / allowed_nm, rounding, limits, steepness, modulus)
+        theta = _search(loop, goals, theta, 1 - least_damping)
+        c = _coefficients(theta)
+        lost = loop.residuals_nm(c, rounding=True) / allowed_nm
+        if np.max(lost) < _ENOUGH and steepness == _STEPS[-1][1]:
             break
         if rounding == 1.0:
-            weights *= left**_HASTE
+            weights *= lost**_HASTE
             weights /= np.mean(weights)
     return c
+
+
+def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float32]:
+    """Round coefficients one by one; those that are left make up for it, where the loop sees it.
+
+    What the loop sees is the relative change of its polynomial p at the nodes. The order decides,
+    and of many at random the best one counts.
+    """
+    of_a, of_b = loop.slopes()
+    seen = np.concatenate(
+        [(of_a + g * of_b) / loop.polynomials(exact, g)[2][:, None] for g in _gains(loop)]
+    )
+    used = np.flatnonzero(exact)
+    step = np.spacing(np.abs(exact[used]).astype(np.float32)).astype(np.float64)
+    triangle = np.linalg.qr(np.concatenate([seen.real, seen.imag])[:, used] * step)[1]
+    steps, rng = exact[used] / step, np.random.default_rng(0)
+    least, best = np.inf, steps
+    for _ in range(_ORDERS):
+        order = rng.permutation(used.size)
+        R, wanted, whole = np.linalg.qr(triangle[:, order])[1], steps[order], np.zeros(used.size)
+        for k in range(used.size - 1, -1, -1):
+            made_up = R[k, k + 1 :] @ (wanted[k + 1 :] - whole[k + 1 :]) / R[k, k]
+            whole[k] = np.round(wanted[k] + made_up)
+        miss = float(np.linalg.norm(R @ (whole - wanted)))
+        if miss < least:
+            least, best = miss, whole[np.argsort(order)]
+    rounded = np.zeros(exact.size, dtype=np.float32)
+    rounded[used] = best * step
+    return rounded
+
+
+@dataclass(frozen=True, slots=True)
+class _Goals:
+    """What a search makes small."""
+
+    shares: FloatArray  # (scenarios,) weight of a nanometre of residual
+    rounding: float  # weight of the rounding in it
+    limits: dict[float, FloatArray]  # largest modulus of the sensitivity at each node, by gain
+    steepness: float  # weight of what exceeds a limit
+    modulus: float  # largest squared modulus of the roots far from z = 1
+
+
+def _gains(loop: DirectFormLoop) -> list[float]:
+    return sorted({1.0, loop.low, loop.high, *(s.sensor_gain for s in loop.scenarios)})
 
 
 def _widened(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
@@ -86,48 +268,38 @@ def _widened(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
     return wide
 
 
-def _targets(loop: DirectFormLoop, exact: FloatArray) -> _Targets:
-    def sensitivity(gain: float) -> FloatArray:
+def _limits(loop: DirectFormLoop, exact: FloatArray) -> dict[float, FloatArray]:
+    """Return what the sensitivity of the design does not exceed: in the bands, and everywhere."""
+    limits = {}
+    for gain in _gains(loop):
         a, _, p = loop.polynomials(exact, gain)
-        return np.abs(a / p)
-
-    peaks = [np.max(s.line_nm * sensitivity(s.sensor_gain)) for s in loop.scenarios]
-    return _Targets(
-        residuals_nm=loop.residuals_nm(exact),
-        peaks_nm=np.array(peaks),
-        radius=loop.radius(exact, _gains(loop)),
-        sensitivity=float(np.max(sensitivity(1.0))),
-        edges=(float(np.max(sensitivity(loop.low))), float(np.max(sensitivity(loop.high)))),
-    )
-
-
-def _gains(loop: DirectFormLoop) -> FloatArray:
-    return np.concatenate([np.geomspace(loop.low, loop.high, _GAINS), [1.0]])
+        S = np.abs(a / p)
+        limits[gain] = np.full(S.size, np.max(S) if gain in (1.0, loop.low, loop.high) else np.inf)
+        for s in loop.scenarios:
+            band = s.line_nm > 0
+            if s.sensor_gain == gain and np.any(band):
+                limits[gain][band] = np.max((s.line_nm * S)[band]) / s.line_nm[band]
+    return limits
 
 
 def _search(
-    loop: DirectFormLoop,
-    targets: _Targets,
-    theta: FloatArray,
-    weights: _Weights,
+    loop: DirectFormLoop, goals: _Goals, theta: FloatArray, largest_radius: float
 ) -> FloatArray:
     """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken."""
-    gains = _gains(loop)
-    loop_limit = 1 - _DAMPED * (1 - targets.radius)
     latest: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def rows(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         key = x.tobytes()
         if key not in latest:
             latest.clear()
-            latest[key] = _rows(loop, targets, x, weights)
+            latest[key] = _rows(loop, goals, x)
         return latest[key]
 
     count = rows(theta)[0].size
 
     def errors(x: FloatArray) -> FloatArray:
-        stable = loop.radius(_coefficients(loop, x), gains) < loop_limit
-        return rows(x)[0] if stable else np.full(count, 1e3)
+        stable = loop.radius(_coefficients(x)) < largest_radius
+        return rows(x)[0] if stable else np.full(count, _UNSTABLE)
 
     def slopes(x: FloatArray) -> FloatArray:
         return rows(x)[1]
@@ -144,162 +316,74 @@ def _search(
     return np.asarray(found.x)
 
 
-def _rows(
-    loop: DirectFormLoop,
-    targets: _Targets,
-    theta: FloatArray,
-    weights: _Weights,
-) -> tuple[FloatArray, FloatArray]:
+def _rows(loop: DirectFormLoop, goals: _Goals, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the errors whose squares are minimised, and their Jacobian."""
-    a, b, da, db = _responses(loop, theta)
-    c, dc = _coefficients(loop, theta), _coefficient_slopes(loop, theta)
-    blocks: list[tuple[FloatArray | ComplexArray, FloatArray | ComplexArray]] = []
+    c = _coefficients(theta)
+    of_a, of_b = loop.slopes()
+    blocks: list[tuple[FloatArray, FloatArray]] = []
 
-    def below(size: FloatArray, slope: FloatArray, limit: float) -> None:
+    def small(size: ComplexArray, slope: ComplexArray) -> None:
+        blocks.extend([(size.real, slope.real), (size.imag, slope.imag)])
+
+    def below(size: FloatArray, slope: FloatArray, limit: FloatArray | float) -> None:
         over = np.maximum(size / limit - 1 + _ROOM, 0.0)
-        blocks.append((weights.limits * over, weights.limits / limit * slope * (over > 0)[:, None]))
+        share = goals.steepness * (over > 0) / limit
+        blocks.append((goals.steepness * over, share[:, None] * slope))
 
-    cases = list(
-        zip(loop.scenarios, weights.scenarios, targets.residuals_nm, targets.peaks_nm, strict=True)
-    )
-    for s, weight, residual, peak in cases:
-        S, dS, p, dp = _sensitivity(loop, s.sensor_gain, a, b, da, db)
-        share = np.sqrt(weight) / residual
-        size = share * np.sqrt(s.phase_nm2 + _LINE * s.spread_nm2)
-        blocks.append((size * S, size[:, None] * dS))
-        size = share * np.sqrt(s.noise_nm2) * loop.path
-        blocks.append((size * b / p, size[:, None] * (db - (b / p)[:, None] * dp) / p[:, None]))
-        blocks.append(_rounding_rows(loop, s, c, dc, p, dp, share * weights.rounding))
-        inside = s.line_nm > 0
-        if np.any(inside):
-            line = s.line_nm[inside]
-            modulus, slope = _modulus(S[inside], dS[inside])
-            below(line * modulus, line[:, None] * slope, peak)
-    S, dS, *_ = _sensitivity(loop, 1.0, a, b, da, db)
-    below(*_modulus(S, dS), targets.sensitivity)
-    for gain, edge in zip((loop.low, loop.high), targets.edges, strict=True):
-        S_edge, dS_edge, *_ = _sensitivity(loop, gain, a, b, da, db)
-        below(*_modulus(S_edge, dS_edge), edge)
-        size = np.sqrt(_EDGE * loop.shares)
-        blocks.append((size * S_edge, size[:, None] * dS_edge))
-    if loop.low < 1:  # the loop at g is stable while Re T is below 1 / (1 - g)
-        below(1 - S.real, -dS.real, 1 / (1 - loop.low))
-    if loop.high > 1:
-        below(S.real - 1, dS.real, 1 / (loop.high - 1))
-    blocks.append(_root_rows(loop, theta, weights.modulus))
-    errors = np.concatenate([np.asarray(error, dtype=np.complex128) for error, _ in blocks])
-    slopes = np.concatenate([np.asarray(slope, dtype=np.complex128) for _, slope in blocks])
-    return np.r_[errors.real, errors.imag], np.r_[slopes.real, slopes.imag]
+    for gain, limit in goals.limits.items():
+        a, b, p = loop.polynomials(c, gain)
+        S, T, dp = a / p, loop.path * b / p, of_a + gain * of_b
+        dS, dT = (of_a - S[:, None] * dp) / p[:, None], (of_b - T[:, None] * dp) / p[:, None]
+        below(np.abs(S), ((S.conj() / np.abs(S))[:, None] * dS).real, limit)
+        if gain == 1 and loop.low < 1:  # the loop at g is stable while Re T is below 1 / (1 - g)
+            below(T.real, dT.real, 1 / (1 - loop.low))
+        if gain == 1 and loop.high > 1:
+            below(-T.real, -dT.real, 1 / (loop.high - 1))
+        for s, share in zip(loop.scenarios, goals.shares, strict=True):
+            if s.sensor_gain != gain:
+                continue
+            size = share * np.sqrt(s.phase_nm2 + _LINE * s.spread_nm2)
+            small(size * S, size[:, None] * dS)
+            size = share * np.sqrt(s.noise_nm2)
+            small(size * T, size[:, None] * dT)
+            V = loop.rounding_matrix(c, s)  # its own slopes are left out
+            sums = np.sqrt(c @ V @ c)
+            entry = share * goals.rounding * np.sqrt(loop.shares) * loop.path / p
+            small(entry * sums, entry[:, None] * (V @ c / sums - sums * dp / p[:, None]))
+    # slopes in theta: each coefficient is linear in each number of theta
+    moved = np.array([_coefficients(theta + unit) - c for unit in np.eye(theta.size)]).T
+    errors, slopes = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    roots, root_slopes = _root_rows(theta, goals.modulus)
+    return np.concatenate([errors, roots]), np.concatenate([slopes @ moved, root_slopes])
 
 
-def _sensitivity(
-    loop: DirectFormLoop,
-    gain: float,
-    a: ComplexArray,
-    b: ComplexArray,
-    da: ComplexArray,
-    db: ComplexArray,
-) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-    """Return S, its slopes, p and its slopes."""
-    p, dp = a + gain * loop.path * b, da + gain * loop.path[:, None] * db
-    S = a / p
-    return S, (da - S[:, None] * dp) / p[:, None], p, dp
-
-
-def _modulus(values: ComplexArray, slopes: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    modulus = np.abs(values)
-    turned = (values.conj() / np.maximum(modulus, 1e-300))[:, None] * slopes
-    return modulus, turned.real
-
-
-def _rounding_rows(
-    loop: DirectFormLoop,
-    scenario: Scenario,
-    c: FloatArray,
-    dc: FloatArray,
-    p: ComplexArray,
-    dp: ComplexArray,
-    share: float,
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return what the rounding leaves; the memory's size counts as constant in the slopes."""
-    V = loop.rounding_matrix(c, scenario)
-    sums = np.sqrt(c @ V @ c)
-    size = share * np.sqrt(loop.shares) * loop.path / p
-    return size * sums, size[:, None] * ((c @ V @ dc / sums)[None] - sums * dp / p[:, None])
-
-
-def _root_rows(
-    loop: DirectFormLoop, theta: FloatArray, modulus: float
-) -> tuple[FloatArray, FloatArray]:
+def _root_rows(theta: FloatArray, modulus: float) -> tuple[FloatArray, FloatArray]:
     """Keep the roots far from z = 1 well inside the circle: the loop does not see them."""
-    first = _first_coefficients(loop)
+    M = theta.size // 2
+    first = np.concatenate([np.arange(0, M, 2), np.arange(M + 1, 2 * M + 1, 2)])
     over = np.where(theta[first] > _FAR, np.maximum(theta[first + 1] - modulus, 0.0), 0.0)
     slopes = np.zeros((first.size, theta.size))
-    slopes[np.arange(first.size), first + 1] = 30.0 * (over > 0)
-    return 30.0 * over, slopes
+    slopes[np.arange(first.size), first + 1] = _STIFF * (over > 0)
+    return _STIFF * over, slopes
 
 
-def _first_coefficients(loop: DirectFormLoop) -> np.ndarray:
-    """Return where in theta each section's coefficient of z^-1 stands."""
-    M = loop.order
-    return np.concatenate([np.arange(0, M, 2), np.arange(M + 1, 2 * M + 1, 2)])
-
-
-def _sections(loop: DirectFormLoop, c: FloatArray) -> FloatArray:
+def _sections(c: FloatArray, order: int) -> FloatArray:
     """Return theta: the quadratic sections of a, the factor of b, the sections of b."""
-    M = loop.order
     parts = []
-    for polynomial in (np.r_[1.0, -c[M + 1 :]], c[: M + 1] / c[0]):
-        roots = np.roots(polynomial[: M + 1])
-        roots = np.concatenate([roots, np.zeros(M - roots.size)])
-        pairs = roots[roots.imag > 0]
-        real = np.sort(roots[roots.imag == 0].real)
-        quadratic = [np.stack([-2 * pairs.real, np.abs(pairs) ** 2], axis=1)]
-        quadratic.append(np.stack([-(real[::2] + real[1::2]), real[::2] * real[1::2]], axis=1))
-        parts.append(np.concatenate(quadratic).ravel())
+    for polynomial in (np.r_[1.0, -c[order + 1 :]], c[: order + 1] / c[0]):
+        roots = np.roots(polynomial)
+        roots = np.concatenate([roots, np.zeros(order - roots.size)])
+        pairs, real = roots[roots.imag > 0], np.sort(roots[roots.imag == 0].real)
+        first = np.concatenate([-2 * pairs.real, -(real[::2] + real[1::2])])
+        second = np.concatenate([np.abs(pairs) ** 2, real[::2] * real[1::2]])
+        parts.append(np.stack([first, second], axis=1).ravel())
     return np.concatenate([parts[0], c[:1], parts[1]])
 
 
-def _expand(sections: FloatArray) -> FloatArray:
-    polynomial = np.ones(1)
-    for first, second in sections.reshape(-1, 2):
-        polynomial = np.convolve(polynomial, [1.0, first, second])
-    return polynomial
-
-
-def _coefficients(loop: DirectFormLoop, theta: FloatArray) -> FloatArray:
-    M = loop.order
-    c = np.zeros(2 * M + 1)
-    c[: M + 1] = theta[M] * _expand(theta[M + 1 :])
-    c[M + 1 :] = -_expand(theta[:M])[1:]
-    return c
-
-
-def _coefficient_slopes(loop: DirectFormLoop, theta: FloatArray) -> FloatArray:
-    """Return the slopes (2 M + 1, theta) of the coefficients."""
-    M = loop.order
-    slopes = np.zeros((2 * M + 1, theta.size))
-    slopes[: M + 1, M] = _expand(theta[M + 1 :])
+def _coefficients(theta: FloatArray) -> FloatArray:
+    M = theta.size // 2
+    a, b = np.ones(1), theta[M : M + 1]
     for k in range(0, M, 2):
-        rest = -_expand(np.delete(theta[:M], [k, k + 1]))
-        slopes[M + 1 : 2 * M, k] = rest
-        slopes[M + 2 :, k + 1] = rest
-        rest = theta[M] * _expand(np.delete(theta[M + 1 :], [k, k + 1]))
-        slopes[1:M, M + 1 + k] = rest
-        slopes[2 : M + 1, M + 2 + k] = rest
-    return slopes
-
-
-def _responses(loop: DirectFormLoop, theta: FloatArray) -> tuple[ComplexArray, ...]:
-    """Return a and b at the nodes, and their slopes (F, theta)."""
-    M, late = loop.order, loop.powers[:, 1:3]
-    a_sections = 1 + theta[:M].reshape(-1, 2) @ late.T  # (sections, F)
-    b_sections = 1 + theta[M + 1 :].reshape(-1, 2) @ late.T
-    a, unit = np.prod(a_sections, axis=0), np.prod(b_sections, axis=0)
-    b = theta[M] * unit
-    da, db = np.zeros((2, a.size, theta.size), dtype=np.complex128)
-    db[:, M] = unit
-    for k in range(2):
-        da[:, k:M:2] = (a * late[:, k] / a_sections).T
-        db[:, M + 1 + k :: 2] = (b * late[:, k] / b_sections).T
-    return a, b, da, db
+        a = np.convolve(a, [1.0, *theta[k : k + 2]])
+        b = np.convolve(b, [1.0, *theta[M + 1 + k : M + 3 + k]])
+    return np.concatenate([b, -a[1:]])
