@@ -35,7 +35,7 @@ import numpy as np
 from support.pyrtc_systems import drawn, pol_series, residual_rms, running
 
 import lbt_synth as lbt
-from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
+from lbt_synth.interop.pyrtc.pol_filter import InnerLoop
 from lbt_synth.loop.simulation.run import step_loop
 
 FRAMES, SETTLE, QUIET = 16_000, 2000, 5

@@ -1,7 +1,9 @@
-"""What all exports share: a rehearsal beside the controller, text on its origin, the result."""
+"""What all exports share: a rehearsal, text on the origin, the result, and its certificate."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,9 +19,12 @@ from lbt_synth.design import Check, Design, FusedFilter, certify_loop
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.arithmetic_cost import FrameCost
+from lbt_synth.interop.target import CERTIFICATE, Arithmetic
 from lbt_synth.linear import Controller
 from lbt_synth.linear.state_space import LinearSystem, RunningController
 from lbt_synth.loop.simulation.run import SteppedController, step_loop
+from lbt_synth.storage.atomic_files import write_together
+from lbt_synth.storage.rows import json_record
 from lbt_synth.validation import FloatArray, require_instance
 
 FRAMES = 2000
@@ -213,3 +218,45 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
 def comment_text(text: str) -> str:
     """Return text without what could end a comment of C."""
     return _UNSAFE.sub("_", text)
+
+
+def write_export(
+    files: dict[Path, bytes],
+    *,
+    target: str,
+    arithmetic: Arithmetic,
+    checks: Sequence[Check],
+    gain_digest: str | None,
+    error: float,
+    start: Callable[[float], SteppedController],
+    error_single: float | None = None,
+    cost: FrameCost | None = None,
+    **facts: Any,
+) -> Exported:
+    """Write files and their certificate, named after the first file; all or none.
+
+    ``facts`` are what else the files depend on. Without another one, the error is that of single
+    precision.
+    """
+    digests = {path.name: hashlib.sha256(data).hexdigest() for path, data in files.items()}
+    first, *others = files
+    certificate: dict[str, Any] = {
+        "target": target,
+        "file": first.name,
+        "file_sha256": digests[first.name],
+        **({"others_sha256": {o.name: digests[o.name] for o in others}} if others else {}),
+        "gain_sha256": gain_digest,
+        **facts,
+        "arithmetic": json_record(arithmetic),
+        "checks": [json_record(check) for check in checks],
+    }
+    text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
+    written = (*files.items(), (first.with_name(first.name + CERTIFICATE), text.encode()))
+    return Exported(
+        files=write_together(dict(written)),
+        error=error,
+        error_single=error if error_single is None else error_single,
+        start=start,
+        checks=tuple(checks),
+        cost=cost,
+    )

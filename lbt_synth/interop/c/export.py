@@ -14,22 +14,21 @@ import numpy as np
 from lbt_synth.design import Design, FusedFilter
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.interop.arithmetic_cost import frame_cost, has_straight_line_form
+from lbt_synth.interop.c.arithmetic import join, read_source
 from lbt_synth.interop.c.fused_export import export_fused
-from lbt_synth.interop.c.joined import join
-from lbt_synth.interop.c.reading import read_source
 from lbt_synth.interop.c.source_text import (
     exact_constant,
     render_source,
     round_to_single,
     wrap_sum,
 )
-from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     FRAMES,
     Exported,
     provenance_lines,
     require_certified,
     require_exportable,
+    write_export,
 )
 from lbt_synth.interop.modes import ModalDesign, all_modes
 from lbt_synth.interop.target import Arithmetic, Target

@@ -20,8 +20,7 @@ from lbt_synth.interop.c.fused_terms import (
     prove_fused,
 )
 from lbt_synth.interop.c.source_text import exact_constant, render_source, wrap_sum
-from lbt_synth.interop.export_certificate import write_export
-from lbt_synth.interop.export_checks import Exported, comment_text, provenance_lines
+from lbt_synth.interop.export_checks import Exported, comment_text, provenance_lines, write_export
 from lbt_synth.interop.target import Arithmetic
 from lbt_synth.interop.written_loop import require_proved
 from lbt_synth.validation import BoolArray, FloatArray

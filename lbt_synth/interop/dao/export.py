@@ -19,12 +19,12 @@ from lbt_synth.interop.dao.refit import (
     round_together,
     shaped_mode_loop,
 )
-from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
     provenance_lines,
     rehearsal_error,
+    write_export,
 )
 from lbt_synth.interop.modes import ModalDesign, all_modes
 from lbt_synth.interop.target import Arithmetic, Target

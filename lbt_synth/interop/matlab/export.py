@@ -11,7 +11,6 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Check, Design
-from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     MatrixForm,
@@ -19,6 +18,7 @@ from lbt_synth.interop.export_checks import (
     provenance_lines,
     rehearsal_error,
     require_exportable,
+    write_export,
 )
 from lbt_synth.interop.target import Arithmetic, Target
 from lbt_synth.interop.written_loop import (

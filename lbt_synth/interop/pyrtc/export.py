@@ -13,16 +13,15 @@ from scipy.linalg import block_diag
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.interop.export_certificate import write_export
 from lbt_synth.interop.export_checks import (
     Exported,
     join_labels,
     provenance_lines,
     rehearsal_error,
+    write_export,
 )
 from lbt_synth.interop.modes import all_modes
-from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
-from lbt_synth.interop.pyrtc.pol_filter import pol_filter
+from lbt_synth.interop.pyrtc.pol_filter import InnerLoop, pol_filter
 from lbt_synth.interop.target import CERTIFICATE, Arithmetic, Target
 from lbt_synth.interop.written_loop import prove_written, require_proved
 from lbt_synth.storage.atomic_files import make_directory

@@ -11,7 +11,7 @@ from support.compiled import Compiled
 from support.exports import bare_design, lbt_designs
 
 import lbt_synth as lbt
-from lbt_synth.interop.c.reading import read_source
+from lbt_synth.interop.c.arithmetic import read_source
 from lbt_synth.interop.export_checks import rehearsal_error
 from lbt_synth.linear import estimator_form
 

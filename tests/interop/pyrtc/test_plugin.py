@@ -20,7 +20,7 @@ from support.pyrtc_systems import (
 
 import lbt_synth as lbt
 from lbt_synth.interop.pyrtc import plugin
-from lbt_synth.interop.pyrtc.inner_loop import InnerLoop
+from lbt_synth.interop.pyrtc.pol_filter import InnerLoop
 from lbt_synth.loop.simulation.run import step_loop
 
 QUIET = 5  # frames without a signal, until the loop runs
