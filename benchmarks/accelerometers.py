@@ -24,6 +24,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.loop.fusion.fused_loop import close_fused_loop
+from lbt_synth.models.fusion.plant import FusedPlant
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -193,7 +195,7 @@ def loss(seed: int, frames: int) -> float:
     return (lbt.residual_budget(loop, truth).rms_nm / least_nm) ** 2 - 1
 
 
-def true_plant(it: Case, *channels: str) -> lbt.models.FusedPlant:
+def true_plant(it: Case, *channels: str) -> FusedPlant:
     """Return the plant of a record as it was drawn, with some of its useful channels."""
     own = lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
@@ -222,7 +224,7 @@ def true_plant(it: Case, *channels: str) -> lbt.models.FusedPlant:
 
 def close(plant, controller, suite):
     """Close the loop of the truth around a controller that reads some channels."""
-    return lbt.loop.close_fused_loop(plant.own.hardware, suite, controller)
+    return close_fused_loop(plant.own.hardware, suite, controller)
 
 
 def main() -> None:

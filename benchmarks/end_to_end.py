@@ -13,6 +13,7 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.interop.specula import optics
+from lbt_synth.loop.fusion.fused_loop import close_fused_loop
 
 CACHE = sys.argv[2] if len(sys.argv) > 2 else None
 SETUP = replace(lbt.load_config("examples/lbt.yaml").end_to_end, frames=800)
@@ -112,9 +113,7 @@ def sensor_row(config: lbt.config.Config, design: lbt.Design, seed: int) -> list
     if isinstance(design, lbt.design.FusedFilter):
         suite, missing = design.problem.suite, ("truth",)
         own = design.controllers[frozenset(missing)]
-        loop = lbt.loop.close_fused_loop(
-            config.hardware, suite, own, sensor_gain=gain, blind=missing
-        )
+        loop = close_fused_loop(config.hardware, suite, own, sensor_gain=gain, blind=missing)
     exact = np.sqrt(np.diag(lbt.residual_budget(loop, truth).total_nm2))
     tip, tilt = run.rms_nm[:2]
     return [run.strehl, tip, exact[0], tilt, exact[1], run.tip_tilt_gain]

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
+from lbt_synth.report.figures.studies import mirror_figure
 from lbt_synth.report.figures.style import save_figure
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
@@ -147,9 +148,7 @@ def main() -> None:
     errors()
     if len(sys.argv) > 1:
         for name, file in (("500 Hz", "mirror_quick.png"), ("100 Hz", "mirror_slow.png")):
-            figure = lbt.report.figures.mirror_figure(
-                replace(CONFIG.hardware, mirror=MIRRORS[name])
-            )
+            figure = mirror_figure(replace(CONFIG.hardware, mirror=MIRRORS[name]))
             print(save_figure(figure, f"{sys.argv[1]}/{file}"))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 import lbt_synth as lbt
+from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.report.figures.style import save_figure
 
 MODES, RATE_HZ, FRAMES = 672, 800.0, 4000
@@ -39,7 +40,7 @@ def main() -> None:
     output = parser.parse_args().output
     air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
     modes = lbt.models.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
-    radial, _ = lbt.models.noll_orders(MODES)
+    radial, _ = noll_orders(MODES)
     noise = lbt.models.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
 
     def integrators(gains):

@@ -5,6 +5,7 @@ import time
 import numpy as np
 
 import lbt_synth as lbt
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 RATE, GAIN, FRAMES = 800, 0.6, 48_000
 CAMERA = lbt.Imaging(diameter_m=8.22)
@@ -99,7 +100,7 @@ def tables() -> None:
     print(f"predictor less Kalman: {more:.0f} +- {error:.0f} nm^2, unpaired +- {apart:.0f}")
 
     print("lines 3 Hz too high in the model")
-    wrong = lbt.models.retuned_plant(model, 3.0)
+    wrong = retuned_plant(model, 3.0)
     show(
         lbt.identification.prediction_against_data(
             wrong, z[2:], {"Kalman": lbt.kalman(wrong)}, **known

@@ -19,13 +19,15 @@ from lbt_synth.linear.periodic.riccati import least_periodic_gamma, proved_perio
 sys.path.insert(0, "tests")
 from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
 
+from lbt_synth.linear.periodic.riccati import PeriodicRiccati
+
 CASES, LONGEST_SETTLING = 200, 20_000
 SETTLED = 1e-6  # what is left of the first error
 
 
 def score(
     problem: lbt.linear.PeriodicProblem,
-    solution: lbt.linear.PeriodicRiccati,
+    solution: PeriodicRiccati,
     frames: int,
     seed: int,
 ) -> float | None:
@@ -60,7 +62,7 @@ def score(
     return float((powers.mean() - exact) / (powers.std(ddof=1) / np.sqrt(CASES)))
 
 
-def bracket(problem: lbt.linear.PeriodicProblem, solution: lbt.linear.PeriodicRiccati) -> float:
+def bracket(problem: lbt.linear.PeriodicProblem, solution: PeriodicRiccati) -> float:
     """Return how far the least gamma is above what is proved that no filter reaches, relative."""
     norm = lbt.hinf_norm(problem.error_system(solution.gains).lifted_compactly()).upper
     least = least_periodic_gamma(problem, solution, norm)

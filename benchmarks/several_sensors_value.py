@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 import lbt_synth as lbt
+from lbt_synth.loop.fusion.fused_loop import AnyLoop, close_fused_loop
 from lbt_synth.loop.fusion.simulation import simulate_fused
 
 CONFIG = """\
@@ -57,7 +58,7 @@ def load(air: str, ratio: float, damping: float) -> lbt.config.Config:
         return lbt.load_config(path)
 
 
-def tip_nm(config: lbt.config.Config, loop: lbt.loop.AnyLoop) -> float:
+def tip_nm(config: lbt.config.Config, loop: AnyLoop) -> float:
     """Return what a loop leaves of tip."""
     return float(np.sqrt(lbt.residual_budget(loop, config.truth).total_nm2[0, 0]))
 
@@ -67,7 +68,7 @@ def fused_tip_nm(air: str, ratio: float, damping: float) -> float:
     config = load(air, ratio, damping)
     plant = config.fused_plant
     controller = plant.controller(lbt.linear.periodic_kalman(plant).gains)
-    return tip_nm(config, lbt.loop.close_fused_loop(config.hardware, plant.suite, controller))
+    return tip_nm(config, close_fused_loop(config.hardware, plant.suite, controller))
 
 
 def halving_excess(ratio: float, *, air: str, damping: float, half_nm: float) -> float:

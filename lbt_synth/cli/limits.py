@@ -14,7 +14,7 @@ from lbt_synth.cli.truth_table import say_limit
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.methods.registry import reference_methods
-from lbt_synth.report.figures import limits_figure
+from lbt_synth.report.figures.studies import limits_figure
 from lbt_synth.storage.display_unit import nm_text
 
 

@@ -14,7 +14,7 @@ from lbt_synth.design.model_limits import limit_or_nan
 from lbt_synth.errors import ConfigError
 from lbt_synth.loop import least_residual
 from lbt_synth.models import PositionLoop
-from lbt_synth.report.figures import mirror_figure
+from lbt_synth.report.figures.studies import mirror_figure
 from lbt_synth.storage.rows import column, fill_row, table_row
 
 _SHOWN_TAPS = 8

@@ -17,6 +17,7 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
 from lbt_synth.errors import ConfigError
+from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.report.figures import modal_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, row_table, table_row
@@ -176,7 +177,7 @@ def _total_rms(rms: FloatArray) -> float:
 def _order_rows(
     turbulence: FloatArray, noise: FloatArray, gains: FloatArray, *residuals: FloatArray
 ) -> list[OrderRow]:
-    radial, _ = models.noll_orders(noise.size)
+    radial, _ = noll_orders(noise.size)
     rows = []
     for order in np.unique(radial):
         which = radial == order

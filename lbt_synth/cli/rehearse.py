@@ -24,7 +24,7 @@ from lbt_synth.loop import Imaging, Simulation, series_strehl
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report.figures import simulation_figure
+from lbt_synth.report.figures.simulation import simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray, integer

@@ -14,7 +14,8 @@ from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.errors import ProblemError
-from lbt_synth.report import DesignAssessment, design_report, write_report
+from lbt_synth.report import design_report, write_report
+from lbt_synth.report.designs.assessment import DesignAssessment
 from lbt_synth.report.designs.report import count_steps
 from lbt_synth.report.designs.tables import AssessmentRow, assessment_row, good_range, verdict
 from lbt_synth.report.page.page_files import require_page_names

@@ -36,7 +36,7 @@ from lbt_synth.loop import (
 from lbt_synth.loop.fusion.simulation import READINGS, Drop
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import Truth
-from lbt_synth.report.figures import sensor_failure_figure, simulation_figure
+from lbt_synth.report.figures.simulation import sensor_failure_figure, simulation_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit

@@ -8,14 +8,7 @@ import sys
 
 
 def printable(text: str) -> str:
-    r"""Return a text in one line, with escapes for what a terminal would obey.
-
-    Examples
-    --------
-    >>> from lbt_synth.cli.streams import printable
-    >>> print(printable("\33[31mred\n café"))
-    \x1b[31mred\n café
-    """
+    r"""Return a text in one line, with escapes for what a terminal would obey."""
     return "".join(
         c if c.isprintable() or c == "\t" else c.encode("unicode_escape").decode() for c in text
     )

@@ -10,7 +10,7 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import track_progress
 from lbt_synth.config import load_config
-from lbt_synth.report.figures import tradeoff_figure
+from lbt_synth.report.figures.studies import tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import tradeoff
 from lbt_synth.studies.tradeoff import FAMILIES

@@ -90,19 +90,7 @@ class SampleView:
 def view_samples(
     settings: FileSection, reads: Reads, values: Mapping[Keys, FloatArray] | None = None
 ) -> FileSection:
-    """Return the settings of samples with arrays (b,) at some keys; it records what is read.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.config.samples import Reads, view_samples
-    >>> reads = Reads()
-    >>> settings = view_samples(lbt.load_config("examples/lbt.yaml").settings, reads)
-    >>> settings.loop.per_sample.delay_frames, settings.loop.frame_rate_hz
-    (2.0, 800.0)
-    >>> [reads.take_arrays_at(("loop", key)) for key in ("delay_frames", "frame_rate_hz")]
-    [True, False]
-    """
+    """Return the settings of samples with arrays (b,) at some keys; it records what is read."""
     return cast(FileSection, SampleView(settings, reads, values or {}))
 
 

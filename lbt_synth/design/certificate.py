@@ -10,14 +10,14 @@ from lbt_synth.errors import CertificateError, DimensionError, ProblemError
 from lbt_synth.linear import (
     Controller,
     EstimationProblem,
-    HinfNorm,
     StateSpace,
-    Witness,
     hinf_norm,
     infeasible_level,
     largest_singular_values,
 )
+from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
+from lbt_synth.linear.norms import HinfNorm
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN

@@ -9,9 +9,9 @@ import numpy as np
 from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
 from lbt_synth.errors import CertificateError, InfeasibleError, NumericalError, ProblemError
-from lbt_synth.linear import EstimationProblem, Witness, hinf_norm, infeasible_level
+from lbt_synth.linear import EstimationProblem, hinf_norm, infeasible_level
 from lbt_synth.linear.estimation_problem import require_problem
-from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
+from lbt_synth.linear.infeasibility_proof import Witness, worst_invisible_disturbance
 from lbt_synth.linear.riccati.filtering import (
     FilterRiccati,
     gamma_riccati,

@@ -14,7 +14,8 @@ from lbt_synth.models import FullStatePlant, TipTiltPlant
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import EstimatorDesign
-    from lbt_synth.loop import BandLimit, ResidualLimit
+    from lbt_synth.loop.least_residuals.band_limit import BandLimit
+    from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 
 T = TypeVar("T")
 

@@ -23,8 +23,9 @@ from lbt_synth.design.certificate import (
 )
 from lbt_synth.design.facts import FilterFacts, model_facts, summarise_design
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
+from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.estimation_problem import decorrelate
+from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.riccati.filtering import (
     FilterRiccati,
@@ -40,7 +41,7 @@ from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
     from lbt_synth.design.shaping import VibrationBand
-    from lbt_synth.loop import AnyLoop
+    from lbt_synth.loop.fusion.fused_loop import AnyLoop
 
 ORIGIN = "distance from its Riccati filter"
 

@@ -30,29 +30,8 @@ _CACHED = 500_000  # input and output values worked on at once
 def filter_series(system: StateSpace, inputs: ArrayLike) -> FloatArray:
     """Compute the outputs of a discrete-time system from a zero state.
 
-    Parameters
-    ----------
-    system : StateSpace
-        The system, with m inputs and p outputs.
-    inputs : (..., frames, m) array_like
-        Input series; leading dimensions are independent cases.
-
-    Returns
-    -------
-    (..., frames, p) ndarray
-        ``y(k) = C x(k) + D u(k)``.
-
-    Raises
-    ------
-    ProblemError
-        If the inputs are not finite or have another shape.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> total = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[1.0]])
-    >>> lbt.loop.filter_series(total, [[1.0], [2.0], [3.0]])[:, 0].tolist()
-    [1.0, 3.0, 6.0]
+    From inputs (..., frames, m) to ``y(k) = C x(k) + D u(k)``, (..., frames, p); leading dimensions
+    are independent cases. Inputs that are not finite or have another shape raise a ProblemError.
     """
     u = np.asarray(inputs, dtype=np.float64)
     m, p = system.B.shape[1], system.C.shape[0]
@@ -94,13 +73,6 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
 
     The drive (frames, n) is halved repeatedly: two steps of A with two drives are one step of A^2
     with ``A drive + drive``.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.block_filtering import last_state
-    >>> last_state(np.array([[0.5]]), np.array([[4.0], [2.0], [1.0]])).tolist()
-    [3.0]
     """
     step = A
     while len(drive) > 1:
@@ -112,17 +84,7 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
 
 
 class BatchedSystems:
-    """Small systems (N, n, n), (N, n, m), (N, p, n), (N, p, m) that filter one series each.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.block_filtering import BatchedSystems
-    >>> one = np.ones((2, 1, 1))
-    >>> sums = BatchedSystems(np.array([[[1.0]], [[0.5]]]), one, one, one)
-    >>> sums.filter(np.ones((2, 3, 1)))[:, :, 0].tolist()
-    [[1.0, 2.0, 3.0], [1.0, 2.0, 2.5]]
-    """
+    """Small systems (N, n, n), (N, n, m), (N, p, n), (N, p, m) that filter one series each."""
 
     def __init__(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
         self._operators = _block_operators(A, B, C, D, _BATCH_BLOCK)

@@ -32,27 +32,13 @@ _ROUNDED = 4 * float(np.finfo(np.float64).eps)  # of the terms of a difference t
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EstimatorForm:
-    """A controller that is given the last applied command; made by :func:`estimator_form`.
+    """A controller that is given the last applied command; made by :func:`estimator_form`."""
 
-    Attributes
-    ----------
-    A : (n, n) ndarray
-        State matrix, stable.
-    B : (n, q) ndarray
-        Measurements to state.
-    applied : (n, m) ndarray
-        Commands that were applied in the last frame to state.
-    C : (m, n) ndarray
-        New state to commands.
-    dt_s : float
-        Sampling period [s].
-    """
-
-    A: FloatArray
-    B: FloatArray
-    applied: FloatArray
-    C: FloatArray
-    dt_s: float
+    A: FloatArray  # (n, n): state matrix, stable
+    B: FloatArray  # (n, q): measurements to state
+    applied: FloatArray  # (n, m): commands that were applied in the last frame to state
+    C: FloatArray  # (m, n): new state to commands
+    dt_s: float  # sampling period [s]
 
     @property
     def spectral_radius(self) -> float:
@@ -66,20 +52,7 @@ class EstimatorForm:
 
 @dataclass(slots=True, eq=False)
 class RunningEstimator:
-    """An estimator form with its state: call ``step(y, applied) -> u`` once per sample.
-
-    Examples
-    --------
-    An integrator of gain 0.5 whose mirror stops at 1 turns round at once:
-
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.Controller(A=[[1.0]], B=[[0.5]], C=[[1.0]], D=[[0.0]])
-    >>> run, applied = lbt.linear.estimator_form(slow).start(), [0.0]
-    >>> for y in (1.0, 1.0, 1.0, 1.0, -1.0):
-    ...     applied = run.step([y], applied).clip(-1, 1)
-    >>> float(applied[0])
-    0.5
-    """
+    """An estimator form with its state: call ``step(y, applied) -> u`` once per sample."""
 
     estimator: EstimatorForm
     state: FloatArray = field(init=False)

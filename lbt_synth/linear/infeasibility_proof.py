@@ -39,18 +39,10 @@ _STRAYED = 1e-9  # share of the successors that may lie where no filter has an e
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Witness:
-    """Pairs of states and disturbances that no measurement shows.
+    """Pairs of states and disturbances that no measurement shows."""
 
-    Attributes
-    ----------
-    states : (n, r) ndarray
-        States x of the problem.
-    disturbances : (p, r) ndarray
-        The disturbance w of each state.
-    """
-
-    states: FloatArray
-    disturbances: FloatArray
+    states: FloatArray  # (n, r): states x of the problem
+    disturbances: FloatArray  # (p, r): the disturbance w of each state
 
     def __post_init__(self) -> None:
         states = matrix(self.states, "states")

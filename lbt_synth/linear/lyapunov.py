@@ -30,26 +30,8 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Solve ``X = A X A' + Q`` for a stable A, with iterative refinement.
 
     By squaring, or by squaring the triangular form of A if that leaves a smaller residual: its
-    powers keep the eigenvalues of a matrix that is far from normal.
-
-    Parameters
-    ----------
-    A : (n, n) ndarray
-        State matrix, spectral radius below 1 (not checked here).
-    Q : (n, n) ndarray
-        Symmetric covariance of the driving noise.
-
-    Returns
-    -------
-    (n, n) ndarray
-        The covariance of ``x(k+1) = A x(k) + v(k)``.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> float(lbt.linear.stationary_covariance(np.array([[0.6]]), np.array([[64.0]]))[0, 0])
-    100.0
+    powers keep the eigenvalues of a matrix that is far from normal. That the spectral radius of A
+    (n, n) is below 1 is not checked; Q (n, n) is symmetric.
     """
     squared, residuals = stationary_covariances(A[None], Q[None])
     if residuals[0] < _SOLVED:
@@ -78,14 +60,6 @@ def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
 
     By squaring with refinement; by roots (:func:`stationary_root`) where that does not settle, as
     with several poles next to each other and to the unit circle.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.lyapunov import stationary_covariances
-    >>> X, residuals = stationary_covariances(np.array([[[0.6]]]), np.array([[[64.0]]]))
-    >>> round(float(X[0, 0, 0]), 12), bool(residuals[0] < 1e-14)
-    (100.0, True)
     """
     with np.errstate(all="ignore"):  # the caller judges the residuals
         X = smith_sum(A, Q)
@@ -153,14 +127,6 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
     of their rms a share of the largest rms of a state, where a covariance has that of its square.
     The triangular form of A keeps its eigenvalues in every power. Like any squaring, it loses
     digits as A nears the unit circle.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.lyapunov import stationary_root
-    >>> root = stationary_root(np.array([[0.6]]), np.array([[8.0]]))
-    >>> round(float(abs(root[0, 0])), 12)
-    10.0
     """
     triangle, into, back = _triangular_form(A)
     root = into @ B

@@ -346,15 +346,6 @@ class RunningController:
     """A controller with its state: call ``step(y) -> u`` once per sample, or ``reset()``.
 
     The plain form assumes that its commands are applied; :func:`estimator_form` does not.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> run = lbt.Controller(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]]).start()
-    >>> _ = run.step([2.0])
-    >>> run.reset()
-    >>> float(run.step([3.0])[0])
-    3.0
     """
 
     controller: Controller

@@ -21,18 +21,10 @@ _TURN, _ROUNDS = 0.15, 6  # a response turns less from one frequency to the next
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MarginPoint:
-    """A point of a broken loop from which a margin is read.
+    """A point of a broken loop from which a margin is read."""
 
-    Attributes
-    ----------
-    frequency_hz : float
-        Where it is [Hz].
-    response : complex
-        The broken loop there.
-    """
-
-    frequency_hz: float
-    response: complex
+    frequency_hz: float  # where it is [Hz]
+    response: complex  # the broken loop there
 
     @property
     def phase_deg(self) -> float:
@@ -47,26 +39,14 @@ class MarginPoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BrokenLoop:
-    """A loop broken at one measurement, the others closed: ``1 / S_ii - 1`` over frequency.
+    """A loop broken at one measurement, the others closed: ``1 / S_ii - 1`` over frequency."""
 
-    Attributes
-    ----------
-    measurements : tuple of int
-        The measurements, from 0, that have this response.
-    frequency_hz : (f,) ndarray
-        Frequencies up to half the frame rate [Hz], more of them around resonances.
-    response : (f,) complex ndarray
-        The loop gain; the loop is critical where it is -1.
-    gain_crossings : tuple of MarginPoint
-        Where the gain is one, with increasing frequency.
-    phase_crossings : tuple of MarginPoint
-        Where the phase is -180 degrees, with increasing frequency.
-    """
-
-    measurements: tuple[int, ...]
+    measurements: tuple[int, ...]  # the measurements, from 0, that have this response
+    # (f,): frequencies up to half the frame rate [Hz], more of them around resonances
     frequency_hz: FloatArray
-    response: ComplexArray
-    gain_crossings: tuple[MarginPoint, ...]
+    response: ComplexArray  # (f,): the loop gain; the loop is critical where it is -1
+    gain_crossings: tuple[MarginPoint, ...]  # where the gain is one, with increasing frequency
+    # where the phase is -180 degrees, with increasing frequency
     phase_crossings: tuple[MarginPoint, ...]
 
     @property

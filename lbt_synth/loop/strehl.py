@@ -165,18 +165,7 @@ def jitter_strehl(
 
 
 def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any) -> FloatArray:
-    """Strehl ratios (p,) of jitters of covariances (p, n, n) and sinusoids (p, s, n).
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, numpy as np
-    >>> from lbt_synth.loop.strehl import jitter_strehls
-    >>> jitters = np.array([0.0, 300.0])[:, None, None] ** 2 * np.eye(2)
-    >>> jitter_strehls(
-    ...     jitters, imaging=lbt.Imaging(diameter_m=8.22), line_amplitudes_nm=np.zeros((2, 0, 2))
-    ... ).round(3).tolist()
-    [1.0, 0.379]
-    """
+    """Strehl ratios (p,) of jitters of covariances (p, n, n) and sinusoids (p, s, n)."""
     covariance = semidefinite(covariance_nm2, "covariance_nm2", stacked=True)
     count, size, _ = covariance.shape
     _require_axes(size)

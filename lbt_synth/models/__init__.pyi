@@ -1,5 +1,4 @@
 from .ar_model import ARModel as ARModel
-from .fusion.plant import FusedPlant as FusedPlant
 from .fusion.plant import fused_plant as fused_plant
 from .fusion.sensors import Accelerometer as Accelerometer
 from .fusion.sensors import Motion as Motion
@@ -7,11 +6,9 @@ from .fusion.sensors import SensorSuite as SensorSuite
 from .fusion.sensors import WavefrontSensor as WavefrontSensor
 from .loop_hardware import LoopHardware as LoopHardware
 from .mirror.position_loop import PositionLoop as PositionLoop
-from .mirror.position_loop import StepResponse as StepResponse
 from .plant.frequency_prior import spread_plant as spread_plant
 from .plant.full_state import FullStatePlant as FullStatePlant
 from .plant.tip_tilt import TipTiltPlant as TipTiltPlant
-from .plant.tip_tilt import retuned_plant as retuned_plant
 from .plant.tip_tilt import tip_tilt_plant as tip_tilt_plant
 from .sensor import illuminated_subapertures as illuminated_subapertures
 from .sensor import nm_per_mas as nm_per_mas
@@ -28,7 +25,6 @@ from .turbulence.atmosphere import Atmosphere as Atmosphere
 from .turbulence.frozen_flows import FrozenFlows as FrozenFlows
 from .turbulence.modal import ModalTurbulence as ModalTurbulence
 from .turbulence.modal import modal_turbulence as modal_turbulence
-from .turbulence.zernike import noll_orders as noll_orders
 from .vibration import DriftingVibration as DriftingVibration
 from .vibration import SinusoidalVibration as SinusoidalVibration
 from .vibration import Vibration as Vibration

@@ -27,7 +27,9 @@ from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 if TYPE_CHECKING:
-    from lbt_synth.loop import AnyLoop, BandLimit, ResidualLimit
+    from lbt_synth.loop.fusion.fused_loop import AnyLoop
+    from lbt_synth.loop.least_residuals.band_limit import BandLimit
+    from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 
 _GRID = 65  # shifts over the range of errors, at least
 

@@ -24,8 +24,9 @@ from lbt_synth.loop import (
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
-from lbt_synth.models import LoopHardware, TipTiltPlant, Truth, retuned_plant
+from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
 from lbt_synth.validation import (

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.loop import ResidualLimit
+from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies.limits import LimitRow, limits

@@ -8,6 +8,7 @@ from support.exact_covariance import exact_covariance
 
 import lbt_synth as lbt
 from lbt_synth.design.certificate import certify_error
+from lbt_synth.linear.infeasibility_proof import Witness
 
 
 def test_certificate_checks_are_independent(axis_plant):
@@ -69,6 +70,6 @@ def test_variance_of_a_system_far_from_normal(apart):
 
 def test_a_level_of_zero_claims_nothing():
     problem = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    nothing = lbt.linear.Witness(states=np.zeros((1, 1)), disturbances=np.zeros((2, 1)))
+    nothing = Witness(states=np.zeros((1, 1)), disturbances=np.zeros((2, 1)))
     assert lbt.design.certify_infeasible(problem, 0.0, nothing).passed
     assert not lbt.design.certify_infeasible(problem, 1e-3, nothing).passed

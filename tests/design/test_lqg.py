@@ -17,6 +17,8 @@ from support.plants import lbt_axis_plant
 import lbt_synth as lbt
 from lbt_synth.design.lqg import estimation_plant, loop_variances
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.models.plant.tip_tilt import retuned_plant
+from lbt_synth.report.figures.studies import mirror_figure
 
 
 def model_rms(plant, controller):
@@ -236,7 +238,7 @@ def test_wrong_arguments_are_refused():
     with pytest.raises(lbt.errors.ProblemError, match="needs a TipTiltPlant"):
         lbt.studies.mirror(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
     with pytest.raises(lbt.errors.ProblemError, match="settles at once"):
-        lbt.report.figures.mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
+        mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
 
 
 def test_complex_zeros_outside_the_circle_have_no_limit():
@@ -265,7 +267,7 @@ def test_complex_zeros_outside_the_circle_have_no_limit():
 def test_other_disturbances_meet_the_same_loop():
     plant = slow_plant(2.25, shell())
     design = lbt.lqg(plant)
-    moved = lbt.models.retuned_plant(plant, 2.0)
+    moved = retuned_plant(plant, 2.0)
     assert astuple(moved.hardware.mirror) == astuple(plant.hardware.mirror)
     error = design.error_system(moved)
     from lbt_synth.linear.lyapunov import stationary_covariance

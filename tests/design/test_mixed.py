@@ -14,6 +14,7 @@ from support.plants import LBT_YAML, lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,7 @@ def test_a_plant_with_memory_is_not_assembled_again(plant):
     design = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
     for again in (
         lambda: design.problem.ahead(2),
-        lambda: lbt.models.retuned_plant(design.problem, 1.0),
+        lambda: retuned_plant(design.problem, 1.0),
     ):
         with pytest.raises(lbt.errors.ProblemError, match="holds the memory of a mixed filter"):
             again()
@@ -198,8 +199,7 @@ def panic(*arguments, **options):
 
 def test_a_solver_that_panics_below_cvxpy_is_an_error_of_ours(monkeypatch):
     import cvxpy
-
-    from lbt_synth.linear.lmi.solver import solve
+    from lbt_synth.linear.lmi.output_feedback import solve
 
     monkeypatch.setattr(cvxpy.Problem, "solve", panic)
     size = cvxpy.Variable(nonneg=True)

@@ -12,7 +12,8 @@ from support.fused_loops import SLOW, example_plant
 import lbt_synth as lbt
 from lbt_synth.interop.cacao.truncation import predictive_filter
 from lbt_synth.interop.target import target_named, target_names
-from lbt_synth.loop.simulation.run import filter_series, step_loop
+from lbt_synth.linear.block_filtering import filter_series
+from lbt_synth.loop.simulation.run import step_loop
 
 pytestmark = pytest.mark.usefixtures("short_rehearsal")
 PATH = lbt.LoopHardware(frame_rate_hz=800)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from support.plants import random_problem
 
 import lbt_synth as lbt
+from lbt_synth.linear.infeasibility_proof import Witness
 
 
 def test_the_witness_is_a_signal_that_no_measurement_shows(axis_plant):
@@ -39,7 +40,7 @@ def test_no_witness_proves_too_much(seed, n, r):
     covariance = lbt.solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R, problem.S).X
     states = rng.standard_normal((n, r)) * rng.choice([0.0, 1e-3, 1.0])
     disturbances = rng.standard_normal((problem.B.shape[1], r))
-    witness = lbt.linear.Witness(states=states, disturbances=disturbances)
+    witness = Witness(states=states, disturbances=disturbances)
     least = lbt.hinf(problem, route="riccati").gamma_least
     assert lbt.linear.infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
     assert least <= kalman.gamma * (1 + 1e-9)
@@ -55,7 +56,7 @@ def test_a_forged_claim_is_found_out(axis_plant):
         lbt.design.certify_infeasible(
             axis_plant,
             1.0,
-            lbt.linear.Witness(states=np.ones((3, 1)), disturbances=np.ones((3, 1))),
+            Witness(states=np.ones((3, 1)), disturbances=np.ones((3, 1))),
         )
 
 
@@ -64,7 +65,7 @@ def test_states_without_error_prove_nothing():
     p = lbt.EstimationProblem(
         A=np.diag([0.9, 0.5]), B=[[1, 0], [0, 0]], C=[[1, 0]], D=[[0, 1]], L=[[1, 1]]
     )
-    free = lbt.linear.Witness(states=[[0.0], [1.0]], disturbances=[[1e-6], [0.0]])
+    free = Witness(states=[[0.0], [1.0]], disturbances=[[1e-6], [0.0]])
     assert not lbt.design.certify_infeasible(p, 1e5, free).passed
     least = lbt.hinf(p, route="riccati").gamma_least
     assert least == pytest.approx(1.34536, abs=1e-5)
@@ -73,7 +74,7 @@ def test_states_without_error_prove_nothing():
     assert not lbt.design.certify_infeasible(
         extended,
         1.1 * least,
-        lbt.linear.Witness(states=memory, disturbances=1e-6 * np.ones((2, 2))),
+        Witness(states=memory, disturbances=1e-6 * np.ones((2, 2))),
     ).passed
 
 
@@ -82,10 +83,10 @@ def test_claims_need_a_proof_and_must_fit_the_filter(axis_plant):
     bare = dataclasses.replace(design, witness=None)
     assert not bare.recertify().passed
     with pytest.raises(lbt.errors.DimensionError, match="states must be a matrix"):
-        lbt.linear.Witness(states=np.zeros(2), disturbances=np.zeros(2))
+        Witness(states=np.zeros(2), disturbances=np.zeros(2))
     with pytest.raises(lbt.errors.DimensionError, match="disturbances must have 3 columns"):
-        lbt.linear.Witness(states=np.zeros((2, 3)), disturbances=np.zeros((2, 2)))
+        Witness(states=np.zeros((2, 3)), disturbances=np.zeros((2, 2)))
     with pytest.raises(lbt.errors.NonFiniteError):
-        lbt.linear.Witness(states=[[np.nan]], disturbances=[[1.0]])
+        Witness(states=[[np.nan]], disturbances=[[1.0]])
     with pytest.raises(lbt.errors.ProblemError, match="level must be at least 0"):
         lbt.design.certify_infeasible(axis_plant, -5.0, design.witness)

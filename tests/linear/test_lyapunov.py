@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from support.exact_covariance import exact_covariance
 
 import lbt_synth as lbt
-from lbt_synth.linear.lyapunov import stationary_covariances, stationary_root
+from lbt_synth.linear.lyapunov import stationary_covariance, stationary_covariances, stationary_root
 
 
 def test_stacked_lyapunov_is_scipys():
@@ -46,7 +46,7 @@ def test_covariance_of_a_matrix_far_from_normal():
     modes = np.array([[1.0, 1.0], [1.0, 1.0 + 2.0**-14]])
     A, B = modes @ np.diag([0.9, 0.5]) @ np.linalg.inv(modes), np.eye(2, 1)
     exact = exact_covariance(A, B).astype(float)
-    assert lbt.linear.stationary_covariance(A, B @ B.T) == pytest.approx(exact, rel=1e-5)
+    assert stationary_covariance(A, B @ B.T) == pytest.approx(exact, rel=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -92,6 +92,8 @@ def test_a_measurement_that_is_not_finite_is_refused_and_leaves_the_state(bad):
     with pytest.raises(lbt.errors.NonFiniteError, match="Hold the last command"):
         run.step([0.0, bad])
     assert run.step([1.0, 0.0]) == 1.0
+    run.reset()
+    assert run.step([1.0, 0.0]) == 0.5
 
 
 def test_states_of_very_different_sizes_are_balanced_without_a_warning():

@@ -12,6 +12,7 @@ from support.plants import lbt_axis_plant
 import lbt_synth as lbt
 from lbt_synth.design.model_limits import model_limit
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.report.figures.studies import limits_figure
 
 
 def test_study(config):
@@ -31,7 +32,7 @@ def test_study(config):
         assert row.worst_nm == pytest.approx(
             study.band.rms_nm * (1 + row.above_band_limit_percent / 100)
         )
-    (axis,) = lbt.report.figures.limits_figure(study).axes
+    (axis,) = limits_figure(study).axes
     assert axis.get_xlabel() == "frequency of the true vibration [Hz]"
     assert axis.get_ylabel() == "residual [nm rms]"
     assert len({str(line.get_linestyle()) for line in axis.get_lines()[:2]}) == 2
@@ -44,7 +45,7 @@ def test_study_of_an_unstable_design(config):
     (row,) = study.rows
     assert not row.stable
     assert np.isnan([row.residual_nm, row.strehl, row.worst_nm, row.above_limit_percent]).all()
-    lbt.report.figures.limits_figure(study)
+    limits_figure(study)
 
 
 def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(fused, fused_config):
@@ -70,7 +71,7 @@ def test_bad_studies(config):
     still = lbt.studies.limits(designs, *good)
     assert still.band is None
     with pytest.raises(lbt.errors.ProblemError, match="a vibration that moves"):
-        lbt.report.figures.limits_figure(still)
+        limits_figure(still)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3, 2.7])

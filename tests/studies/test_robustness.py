@@ -14,6 +14,7 @@ from support.robustness_maps import evaluate_point
 import lbt_synth as lbt
 from lbt_synth.methods.registry import gain_robust_method
 from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 def test_robustness_rows(config):
@@ -31,7 +32,7 @@ def test_robustness_rows(config):
         parts = row.vibration_nm**2 + row.turbulence_nm**2 + row.noise_nm**2
         assert row.residual_nm**2 == pytest.approx(parts)
     # the same as designing and evaluating by hand
-    moved = lbt.kalman(lbt.models.retuned_plant(config.plant, -3, hold="driving"))
+    moved = lbt.kalman(retuned_plant(config.plant, -3, hold="driving"))
     budget = lbt.residual_budget(lbt.close_loop(moved.hardware, moved.controller), config.truth)
     assert kalman[3].residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
 
@@ -316,7 +317,7 @@ def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
     (row,) = lbt.studies.robustness(
         plant, truth, settings.imaging, errors_hz=[2.0], methods=["kalman"]
     )
-    moved = lbt.kalman(lbt.models.retuned_plant(plant, [0.0, -2.0], hold="driving"))
+    moved = lbt.kalman(retuned_plant(plant, [0.0, -2.0], hold="driving"))
     budget = lbt.residual_budget(lbt.close_loop(moved.hardware, moved.controller), truth)
     assert row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
 

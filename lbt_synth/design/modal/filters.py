@@ -29,9 +29,10 @@ from lbt_synth.design.modal.plants import (
 )
 from lbt_synth.design.modal.reconstructor import name_modes
 from lbt_synth.errors import DetectabilityError, NumericalError
-from lbt_synth.linear import Controller, DareSolution, solve_dare
+from lbt_synth.linear import Controller, solve_dare
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import frobenius_norms, transpose
+from lbt_synth.linear.riccati.dare import DareSolution
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray, frozen_copy, integer, read_only

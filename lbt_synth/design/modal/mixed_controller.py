@@ -20,7 +20,8 @@ from lbt_synth.design.modal.plants import number_per_mode
 from lbt_synth.design.modal.reconstructor import Reconstructor, mode_indices
 from lbt_synth.design.result import Design
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.linear import Controller, RunningController
+from lbt_synth.linear import Controller
+from lbt_synth.linear.state_space import RunningController
 from lbt_synth.loop.simulation.run import SteppedController
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray, float_array, real_array, require_instance

@@ -33,8 +33,10 @@ from lbt_synth.design.shaping.uncertainty import SensorGainRange, Uncertainty
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
-from lbt_synth.loop import BandLimit, ResidualLimit, least_residual, least_worst_residual
+from lbt_synth.loop import least_residual, least_worst_residual
 from lbt_synth.loop.closed_loop import require_loop_rate
+from lbt_synth.loop.least_residuals.band_limit import BandLimit
+from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 from lbt_synth.models import (
     ARModel,
     Atmosphere,

@@ -23,8 +23,9 @@ from scipy.fft import rfft
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.stretches import Stretches
+from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.loop import ClosedLoop, filter_series
+from lbt_synth.loop import ClosedLoop
 from lbt_synth.validation import ComplexArray, FloatArray
 
 FEWEST = 100  # frames that give a standard error

@@ -1,8 +1,8 @@
 """A controller as a filter of the pseudo-open-loop history, cut after some steps.
 
 In the loop that a design believes, the command is a stable filter Q of the pseudo-open-loop
-measurement, whatever the controller (:mod:`lbt_synth.loop.youla`), and every stable Q keeps that
-loop stable. At the sensor gain g, with the path L of norm 1, the commands are
+measurement, whatever the controller (:func:`lbt_synth.loop.youla_controller`), and every stable Q
+keeps that loop stable. At the sensor gain g, with the path L of norm 1, the commands are
 ``Q w / D`` with ``D = 1 - (1 - g) L Q``. Without a part E of Q they change by ``E w / D D'``, where
 ``D' = D + (1 - g) L E``: no more than a small gain, ``|1 - g| |E / D| < 1``, allows.
 

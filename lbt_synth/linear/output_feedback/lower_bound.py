@@ -53,21 +53,12 @@ _SideOf: TypeAlias = Callable[[GeneralizedPlant], Side]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControlWitness:
-    """Why no controller reaches a level.
+    """Why no controller reaches a level."""
 
-    Attributes
-    ----------
-    unseen : Witness or None
-        States (n, r) and disturbances (m1, r) that no measurement shows.
-    unmoved : Witness or None
-        Costates (n, s) and weights of the error (p1, s) that no control moves.
-    reason : str
-        The reason in words.
-    """
-
-    unseen: Witness | None
+    unseen: Witness | None  # states (n, r) and disturbances (m1, r) that no measurement shows
+    # costates (n, s) and weights of the error (p1, s) that no control moves
     unmoved: Witness | None
-    reason: str
+    reason: str  # the reason in words
 
 
 NO_PROOF = ControlWitness(unseen=None, unmoved=None, reason="no proof was found")
@@ -83,33 +74,9 @@ class _Moments:
 
 
 def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -> float:
-    """Level of gamma below which a witness proves that no controller exists.
+    """Level of gamma below which a witness proves that no controller exists; 0 if it proves none.
 
-    Parameters
-    ----------
-    plant : GeneralizedPlant
-        The plant.
-    witness : ControlWitness
-        The pairs; what measurements would show or controls move is removed first.
-
-    Returns
-    -------
-    float
-        The level; 0 if the witness proves nothing.
-
-    Examples
-    --------
-    A disturbance that is seen only after it has acted:
-
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.linear import ControlWitness, GeneralizedPlant, Witness
-    >>> P = GeneralizedPlant(A=0.0, B1=1.0, B2=0.0, C1=0.0, C2=1.0, D11=2.0, D12=1.0)
-    >>> push = Witness(states=np.zeros((1, 1)), disturbances=np.ones((1, 1)))
-    >>> lbt.linear.infeasible_control_level(
-    ...     P, ControlWitness(unseen=push, unmoved=None, reason="not seen in time")
-    ... )
-    2.0
+    What measurements would show or controls move is removed from the pairs first.
     """
     pairs = (witness.unseen, estimation_side), (witness.unmoved, control_side)
     sides = [_moments(plant, side_of, each) for each, side_of in pairs if each is not None]

@@ -32,24 +32,14 @@ Triple = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PeriodicRiccati:
-    """Solution of a periodic filter equation.
+    """Solution of a periodic filter equation."""
 
-    Attributes
-    ----------
-    P : (N, n, n) ndarray
-        Covariance of the prediction error at each phase (Kalman), or its H-infinity counterpart.
-    gains : (N, n, q) ndarray
-        Predictor gains; zero for measurements that are not read.
-    residual : float
-        Relative change of P in the last Newton step.
-    steps : int
-        Newton steps made after the doubling, each a Lyapunov equation.
-    """
-
+    # (N, n, n): covariance of the prediction error at each phase (Kalman), or its H-infinity
+    # counterpart
     P: FloatArray
-    gains: FloatArray
-    residual: float
-    steps: int
+    gains: FloatArray  # (N, n, q): predictor gains; zero for measurements that are not read
+    residual: float  # relative change of P in the last Newton step
+    steps: int  # Newton steps made after the doubling, each a Lyapunov equation
 
 
 def join_triples(first: Triple, then: Triple) -> Triple:
@@ -177,32 +167,8 @@ def periodic_hinf(
     """Solve the gamma-Riccati equation of the central H-infinity predictor of a level.
 
     As for a filter of one rate, the excess over the Kalman filter's covariance is solved for (see
-    ``riccati.filtering.GammaEquation``), phase by phase.
-
-    Parameters
-    ----------
-    problem : PeriodicProblem
-        The problem.
-    gamma : float
-        Level of the norm of the error over all samples.
-    start : PeriodicRiccati
-        The Kalman filter's solution.
-
-    Returns
-    -------
-    PeriodicRiccati or None
-        None where no filter meets the level.
-
-    Examples
-    --------
-    >>> from lbt_synth.linear.periodic.problem import PeriodicProblem
-    >>> from lbt_synth.linear.periodic.riccati import periodic_hinf, periodic_kalman
-    >>> walk = PeriodicProblem(
-    ...     A=[[[1.0]]], B=[[[1.0, 0.0]]], C=[[[1.0]]], D=[[[0.0, 1.0]]], L=[[1.0]], read=[[True]]
-    ... )
-    >>> start = periodic_kalman(walk)
-    >>> periodic_hinf(walk, 1.4, start) is None, periodic_hinf(walk, 1.5, start) is None
-    (True, False)
+    ``riccati.filtering.GammaEquation``), phase by phase, from the Kalman filter's solution. None
+    where no filter meets the level, of the norm of the error over all samples.
     """
     triples = []
     for t in range(problem.period):

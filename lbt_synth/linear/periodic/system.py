@@ -35,14 +35,6 @@ class PeriodicSystem:
     ------
     ProblemError
         If a matrix is not finite or the sizes clash.
-
-    Examples
-    --------
-    >>> from lbt_synth.linear.periodic.system import PeriodicSystem
-    >>> one = [[[1.0]]]
-    >>> slow = PeriodicSystem(A=[[[0.5]], [[0.8]]], B=one, C=one, D=[[[0.0]]])
-    >>> slow.spectral_radius
-    0.4
     """
 
     A: FloatArray
@@ -94,16 +86,7 @@ class PeriodicSystem:
         return float(self.spectral_radius ** (1 / self.period))
 
     def lifted(self) -> StateSpace:
-        """Return the system over a period: inputs and outputs of all phases side by side.
-
-        Examples
-        --------
-        >>> from lbt_synth.linear.periodic.system import PeriodicSystem
-        >>> one = [[[1.0]]]
-        >>> slow = PeriodicSystem(A=[[[0.5]], [[0.8]]], B=one, C=one, D=[[[0.0]]])
-        >>> slow.lifted().C.ravel().tolist()
-        [1.0, 0.5]
-        """
+        """Return the system over a period: inputs and outputs of all phases side by side."""
         (N, p, m), n = self.D.shape, self.n_states
         reach, inputs = np.eye(n), np.zeros((n, N * m))
         C, D = np.zeros((N * p, n)), np.zeros((N * p, N * m))
@@ -153,14 +136,6 @@ class PeriodicSystem:
 
         The output is this amplitude times the input's own ``exp``: for one phase it is the
         transfer matrix. Its mean square over the phases is the mean power of the output.
-
-        Examples
-        --------
-        >>> from lbt_synth.linear.periodic.system import PeriodicSystem
-        >>> one = [[[1.0]]]
-        >>> slow = PeriodicSystem(A=[[[0.5]], [[0.8]]], B=one, C=one, D=[[[0.0]]])
-        >>> slow.frequency_response([0.0])[0, :, 0, 0].real.tolist()
-        [3.0, 2.5]
         """
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
@@ -194,12 +169,6 @@ class PeriodicController(PeriodicSystem):
     """Controller ``x(k+1) = A[t] x(k) + B[t] y(k)``, ``u(k) = C[t] x(k+1) + D[t] y(k)``.
 
     The output is read from the new state, as in :class:`Controller`, which is the case N = 1.
-
-    Examples
-    --------
-    >>> from lbt_synth.linear.periodic.system import PeriodicController
-    >>> PeriodicController(A=[[[1.0]]], B=[[[0.5]]], C=[[[1.0]]], D=[[[0.0]]]).phase(0).n_states
-    1
     """
 
     def phase(self, t: int) -> Controller:

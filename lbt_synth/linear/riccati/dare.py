@@ -34,57 +34,34 @@ _CONTRACTION = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attempt:
-    """What one route did.
+    """What one route did."""
 
-    Attributes
-    ----------
-    route : str
-        "doubling", "shifted doubling" or "schur".
-    tried, solved : int
-        Numbers of equations that it was given, and that it solved.
-    """
-
-    route: str
+    route: str  # "doubling", "shifted doubling" or "schur"
+    # numbers of equations that it was given, and that it solved
     tried: int
     solved: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DareSolution:
-    """Stabilising solution of a discrete algebraic Riccati equation, or of a stack of them.
+    """Stabilising solution of a discrete algebraic Riccati equation, or of a stack of them."""
 
-    Attributes
-    ----------
-    X : (..., n, n) ndarray
-        The solution, symmetric.
-    gain_feedback : (..., m, n) ndarray
-        ``(R + B'XB)^-1 (B'XA + S')``; the closed loop is ``A - B gain_feedback``.
-    poles : (..., n) complex ndarray
-        Poles of the closed loop.
-    residuals : (...) ndarray
-        Relative residual of each equation: its norm (Frobenius) over ``||X|| (1 + ||closed
-        loop||^2) + ||A'XA|| + ||Q||``, in units of the states that balance the equation.
-        The first term is what rounding X can make of it.
-    errors : (...) ndarray
-        Estimate of the relative error of X: the size of the next Newton step. It grows
-        with the condition of the equation.
-    negative : (...) int ndarray
-        Number of negative eigenvalues of ``R + B'XB``. Where it is zero, X is the least
-        cost of the control problem; elsewhere X is a saddle point.
-    iterations : int
-        Most doublings made for an equation.
-    attempts : tuple of Attempt
-        Routes in the order they were tried.
-    """
-
-    X: FloatArray
+    X: FloatArray  # (..., n, n): the solution, symmetric
+    # (..., m, n): ``(R + B'XB)^-1 (B'XA + S')``; the closed loop is ``A - B gain_feedback``
     gain_feedback: FloatArray
-    poles: ComplexArray
+    poles: ComplexArray  # (..., n): poles of the closed loop
+    # (...): relative residual of each equation: its norm (Frobenius) over ``||X|| (1 + ||closed
+    # loop||^2) + ||A'XA|| + ||Q||``, in units of the states that balance the equation. The first
+    # term is what rounding X can make of it
     residuals: FloatArray
+    # (...): estimate of the relative error of X: the size of the next Newton step. It grows with
+    # the condition of the equation
     errors: FloatArray
+    # (...): number of negative eigenvalues of ``R + B'XB``. Where it is zero, X is the least cost
+    # of the control problem; elsewhere X is a saddle point
     negative: IntArray
-    iterations: int
-    attempts: tuple[Attempt, ...]
+    iterations: int  # most doublings made for an equation
+    attempts: tuple[Attempt, ...]  # routes in the order they were tried
 
     @property
     def residual(self) -> float:

@@ -29,29 +29,17 @@ from lbt_synth.validation import FloatArray, frozen_copy
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterRiccati:
-    """A solved filter equation.
+    """A solved filter equation."""
 
-    Attributes
-    ----------
-    P : (n, n) ndarray
-        Covariance of the prediction error (Kalman), or its H-infinity counterpart.
-    gain_predictor, gain_filter : (n, q) ndarray
-        Gains of the measurement and the time update together, and of the measurement update
-        alone.
-    residual : float
-        Relative residual of the equation.
-    iterations : int
-        Number of doublings.
-    status : str
-        The route that gave P.
-    """
-
+    # (n, n): covariance of the prediction error (Kalman), or its H-infinity counterpart
     P: FloatArray
+    # (n, q): gains of the measurement and the time update together, and of the measurement update
+    # alone
     gain_predictor: FloatArray
     gain_filter: FloatArray
-    residual: float
-    iterations: int
-    status: str
+    residual: float  # relative residual of the equation
+    iterations: int  # number of doublings
+    status: str  # the route that gave P
 
 
 def require_detectable(problem: EstimationProblem) -> None:
@@ -282,14 +270,6 @@ def least_gamma(
     """Bracket the least gamma, at which ``gamma^2 I - L P L'`` stops being positive.
 
     Returns the ends of the bracket, and the filter at the upper one.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.linear.riccati.filtering import least_gamma
-    >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> round(least_gamma(p, lower=1.2, upper=2.0)[1], 9)
-    1.414213562
     """
     equation = GammaEquation(problem, kalman_riccati(problem) if start is None else start)
     met: dict[float, LevelTrial] = {}

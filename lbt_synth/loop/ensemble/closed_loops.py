@@ -82,18 +82,7 @@ class Subloop:
 def split_into_subloops(
     matrices: tuple[FloatArray, ...], hardware: LoopHardware
 ) -> tuple[list[Subloop], list[FloatArray]]:
-    """Split a loop into independent subloops, and the state matrices that reach no mode.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.loop.ensemble.closed_loops import split_into_subloops
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> textbook = lbt.integrator(path, gain=0.5).controller.to_statespace()
-    >>> matrices = tuple(m[None] for m in (textbook.A, textbook.B, textbook.C, textbook.D))
-    >>> [subloop.modes.tolist() for subloop in split_into_subloops(matrices, path)[0]]
-    [[0], [1]]
-    """
+    """Split a loop into independent subloops, and the state matrices that reach no mode."""
     A, B, C, D = matrices
     sensor, influence = hardware.sensor, hardware.influence
     s, q, m, n = A.shape[-1], B.shape[-1], C.shape[-2], hardware.modes

@@ -42,22 +42,14 @@ _AT_ONCE = 1024  # loops with vibrations
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleResiduals:
-    """Stationary residuals of p loops; nan where a loop is unstable.
+    """Stationary residuals of p loops; nan where a loop is unstable."""
 
-    Attributes
-    ----------
-    stable : (p,) bool ndarray
-        Whether each loop is stable.
-    turbulence_nm2, noise_nm2, random_vibration_nm2 : (p, n, n) ndarray
-        Covariances over the modes [nm^2].
-    line_amplitudes_nm : (p, s, n) complex ndarray
-        Complex amplitude that each sinusoid leaves on each mode [nm].
-    """
-
-    stable: BoolArray
+    stable: BoolArray  # (p,): whether each loop is stable
+    # (p, n, n): covariances over the modes [nm^2]
     turbulence_nm2: FloatArray
     noise_nm2: FloatArray
     random_vibration_nm2: FloatArray
+    # (p, s, n): complex amplitude that each sinusoid leaves on each mode [nm]
     line_amplitudes_nm: ComplexArray
 
     @property

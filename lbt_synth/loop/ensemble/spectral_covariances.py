@@ -330,15 +330,6 @@ def batched_response(
 
     A system whose eigenvectors are nearly dependent fails at some probes; its points are then
     solved one by one.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.loop.ensemble.spectral_covariances import batched_response
-    >>> halves = np.array([[[0.5]], [[-0.5]]])
-    >>> one = np.ones((2, 1, 1))
-    >>> batched_response(halves, one, one, 0 * one, np.array([1.0 + 0j])).real.ravel().round(6)
-    array([2.      , 0.666667])
     """
     out = np.empty((len(A), z.size, C.shape[1], B.shape[2]), dtype=np.complex128)
     if A.shape[1] == 0:

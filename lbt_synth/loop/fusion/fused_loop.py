@@ -20,8 +20,7 @@ from lbt_synth.loop.closed_loop import (
 )
 from lbt_synth.loop.residual import ResidualBudget, require_true_gain
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, Truth, Vibration
-from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
-from lbt_synth.models.fusion.plant import FusedPlant
+from lbt_synth.models.fusion.plant import FusedPlant, memory, own_exposure, suite_exposures
 from lbt_synth.models.fusion.sensors import (
     OWN_SENSOR,
     Motion,
@@ -35,30 +34,15 @@ from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FusedLoop:
-    """A loop around the controller of several sensors.
+    """A loop around the controller of several sensors."""
 
-    Attributes
-    ----------
-    system : PeriodicSystem
-        From ``[phi_tot (n), added to each reading (q)]`` to ``[phi_res (n), u (m), y (q)]``.
-    hardware : LoopHardware
-        Mirror, delay and own sensor.
-    suite : SensorSuite
-        The other sensors.
-    controller : PeriodicController
-        The controller.
-    sensor_gain : float
-        Real gain of the loop's own sensor, relative to its matrix.
-    blind : tuple of str
-        Sensors and channels whose readings are zero, or frozen.
-    """
-
+    # from ``[phi_tot (n), added to each reading (q)]`` to ``[phi_res (n), u (m), y (q)]``
     system: PeriodicSystem
-    hardware: LoopHardware
-    suite: SensorSuite
-    controller: PeriodicController
-    sensor_gain: float
-    blind: tuple[str, ...] = ()
+    hardware: LoopHardware  # mirror, delay and own sensor
+    suite: SensorSuite  # the other sensors
+    controller: PeriodicController  # the controller
+    sensor_gain: float  # real gain of the loop's own sensor, relative to its matrix
+    blind: tuple[str, ...] = ()  # sensors and channels whose readings are zero, or frozen
 
     @property
     def spectral_radius(self) -> float:
@@ -97,43 +81,11 @@ def close_fused_loop(
     sensor_gain: float = 1.0,
     blind: tuple[str, ...] = (),
 ) -> FusedLoop:
-    """Close the loop of several sensors.
+    """Close the loop of several sensors, stable or not.
 
-    Parameters
-    ----------
-    hardware : LoopHardware
-        Mirror, delay and own sensor.
-    suite : SensorSuite
-        The other sensors.
-    controller : PeriodicController
-        From all measurements to the commands, as :meth:`FusedPlant.controller` makes it.
-    sensor_gain : float, optional
-        Real gain of the loop's own sensor, relative to its matrix.
-    blind : tuple of str, optional
-        Sensors whose readings do not follow the phase: they are zero, or frozen.
-
-    Returns
-    -------
-    FusedLoop
-        The loop, stable or not.
-
-    Raises
-    ------
-    ProblemError
-        If the controller has other sizes or another sampling period than the loop, or no sensor
-        has one of the names.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
-    >>> own = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=75, modes=1)
-    >>> second = lbt.models.WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
-    >>> plant = lbt.models.fused_plant(own, lbt.models.SensorSuite(sensors=(second,)))
-    >>> gains = lbt.linear.periodic_kalman(plant).gains
-    >>> loop = lbt.loop.close_fused_loop(own.hardware, plant.suite, plant.controller(gains))
-    >>> loop.is_stable
-    True
+    The real gain of the loop's own sensor is relative to its matrix. ``blind`` names sensors whose
+    readings do not follow the phase: they are zero, or frozen. A controller of other sizes or of
+    another sampling period, or a name of no sensor, raises a ProblemError.
     """
     gain, period = number(sensor_gain, "sensor_gain", above=0), suite.period(hardware)
     rows = suite.rows(hardware)
@@ -205,36 +157,7 @@ def fused_radii_by_gain(
 def fused_budget(loop: FusedLoop, truth: Truth) -> ResidualBudget:
     """Return the exact stationary residual of a fused loop under a truth, mean over the period.
 
-    Parameters
-    ----------
-    loop : FusedLoop
-        The loop, at the truth's sensor gain.
-    truth : Truth
-        Turbulence, vibrations and how channels move with them, noise of the loop's own sensor.
-
-    Returns
-    -------
-    ResidualBudget
-        Covariances by origin; the noise is that of all sensors.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is not stable.
-    ProblemError
-        If sensor gains differ, or a vibration drifts.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
-    >>> own = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=75, modes=1)
-    >>> second = lbt.models.WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
-    >>> plant = lbt.models.fused_plant(own, lbt.models.SensorSuite(sensors=(second,)))
-    >>> design = lbt.design.fused_kalman(plant)
-    >>> budget = lbt.loop.fused_budget(design.loop(), lbt.Truth(turbulence=slow, noise_nm=75))
-    >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-9)
-    True
+    The loop has the truth's sensor gain. The noise is that of all sensors.
     """
     require_true_gain(loop.sensor_gain, truth)
     noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)

@@ -12,7 +12,7 @@ from lbt_synth.linear.periodic.system import PeriodicController
 from lbt_synth.loop.simulation.disturbances import draw_noise, draw_parts
 from lbt_synth.loop.simulation.run import Simulation, record_run
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.models.fusion.memory import memory, own_exposure, suite_exposures
+from lbt_synth.models.fusion.plant import memory, own_exposure, suite_exposures
 from lbt_synth.models.fusion.sensors import (
     Accelerometer,
     Motion,
@@ -31,12 +31,6 @@ class Drop:
 
     Its readings are missing, which is seen, so that the fall-back filter takes over; or they are
     zero, or frozen at the last one, which the filter believes.
-
-    Examples
-    --------
-    >>> from lbt_synth.loop.fusion.simulation import Drop
-    >>> Drop(unit="m2", start_s=10.0).reading
-    'missing'
     """
 
     unit: str
@@ -169,14 +163,7 @@ class Segment:
 
 
 def run_segments(drops: Sequence[Drop], duration_s: float) -> tuple[Segment, ...]:
-    """Return the times between failures and returns of sensors in a run.
-
-    Examples
-    --------
-    >>> from lbt_synth.loop.fusion.simulation import Drop, run_segments
-    >>> [s.text for s in run_segments([Drop(unit="m1", start_s=1, end_s=2)], 3.0)]
-    ['', 'm1', '']
-    """
+    """Return the times between failures and returns of sensors in a run."""
     events = {0.0, *(t for d in drops for t in (d.start_s, d.end_s) if t < duration_s)}
     starts = sorted(events)
     out = []

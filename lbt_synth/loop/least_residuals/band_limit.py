@@ -35,31 +35,18 @@ _LARGEST_GAP = 0.1  # the largest relative gap of an answer
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BandLimit:
-    """The least worst residual with a sinusoid anywhere in a band.
+    """The least worst residual with a sinusoid anywhere in a band."""
 
-    Attributes
-    ----------
-    rms_nm : float
-        No linear controller has a smaller worst residual over the band [nm rms].
-    achieved_nm : float
-        Worst residual of the filter that was found (of infinite order) [nm rms]; what can be
-        had lies between the two, which are within 1e-8, for bands of almost all
-        frequencies within some percent.
-    variance_nm2 : (n,) ndarray
-        The limit by direction, that of the sinusoid included [nm^2].
-    directions : (n, n) ndarray
-        Directions over the modes, one per row, along which the loop decouples.
-    frequency_hz : (f,) ndarray
-        Frequencies in the band [Hz].
-    weight : (f,) ndarray
-        Probability of each, of the density that is hardest to reject; the sum is 1.
-    """
-
-    rms_nm: float
+    rms_nm: float  # no linear controller has a smaller worst residual over the band [nm rms]
+    # worst residual of the filter that was found (of infinite order) [nm rms]; what can be had lies
+    # between the two, which are within 1e-8, for bands of almost all frequencies within some
+    # percent
     achieved_nm: float
-    variance_nm2: FloatArray
+    variance_nm2: FloatArray  # (n,): the limit by direction, that of the sinusoid included [nm^2]
+    # (n, n): directions over the modes, one per row, along which the loop decouples
     directions: FloatArray
-    frequency_hz: FloatArray
+    frequency_hz: FloatArray  # (f,): frequencies in the band [Hz]
+    # (f,): probability of each, of the density that is hardest to reject; the sum is 1
     weight: FloatArray
 
 

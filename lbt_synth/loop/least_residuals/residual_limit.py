@@ -20,7 +20,7 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.fusion.memory import suite_exposures
+from lbt_synth.models.fusion.plant import suite_exposures
 from lbt_synth.models.fusion.sensors import SensorSuite
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
@@ -28,21 +28,13 @@ from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ResidualLimit:
-    """The least residual of any linear controller.
+    """The least residual of any linear controller."""
 
-    Attributes
-    ----------
-    variance_nm2 : (n,) ndarray
-        Least variance along each direction [nm^2].
-    directions : (n, n) ndarray
-        Directions over the modes, one per row, along which the loop decouples.
-    change : float
-        What the last refinement of the integrals changed, relative to the variance; the
-        largest over the directions.
-    """
-
-    variance_nm2: FloatArray
+    variance_nm2: FloatArray  # (n,): least variance along each direction [nm^2]
+    # (n, n): directions over the modes, one per row, along which the loop decouples
     directions: FloatArray
+    # what the last refinement of the integrals changed, relative to the variance; the largest over
+    # the directions
     change: float
 
     @property

@@ -359,13 +359,6 @@ def acceleration_taps(
     successive samples realise exactly at the vibration's frequency; so is a fraction of a frame.
     The age is -1 for the frame to come; the weights (t,) [m/s^2 per nm] are those of the newest
     sample and of those before.
-
-    Examples
-    --------
-    >>> from lbt_synth.models.fusion.sensors import acceleration_taps
-    >>> newest, taps = acceleration_taps(1.0, 20.0, 1000.0, 1.0)
-    >>> newest, (1e3 * taps).round(9).tolist()
-    (0, [1.0, -2.0, 1.0])
     """
     angle = 2 * np.pi * frequency_hz / frame_rate_hz
     whole = int(np.floor(age_frames + _WHOLE))

@@ -38,30 +38,14 @@ _POINTS = 8  # of a step response per sample
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepResponse:
-    """Position of a mirror after a unit step of its command.
+    """Position of a mirror after a unit step of its command."""
 
-    Attributes
-    ----------
-    time_s : (t,) ndarray
-        Time since the command arrived [s].
-    position : (t,) ndarray
-        Position over its final value.
-    tolerance : float
-        Half width of the band around 1 in which the mirror counts as settled.
-    rise_s : float
-        Time from 10 % to 90 % [s].
-    overshoot : float
-        Largest position less 1; 0 if it stays below.
-    settling_s : float
-        Time after which the position stays within the band [s].
-    """
-
-    time_s: FloatArray
-    position: FloatArray
-    tolerance: float
-    rise_s: float
-    overshoot: float
-    settling_s: float
+    time_s: FloatArray  # (t,): time since the command arrived [s]
+    position: FloatArray  # (t,): position over its final value
+    tolerance: float  # half width of the band around 1 in which the mirror counts as settled
+    rise_s: float  # time from 10 % to 90 % [s]
+    overshoot: float  # largest position less 1; 0 if it stays below
+    settling_s: float  # time after which the position stays within the band [s]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -317,37 +317,11 @@ def _companion(coefficients: FloatArray) -> FloatArray:
 def retuned_plant(
     plant: TipTiltPlant, shift_hz: float | Sequence[float], *, hold: str = "rms"
 ) -> TipTiltPlant:
-    """Return a plant whose model has every vibration at another frequency.
+    """Return a plant whose model has every vibration at another frequency, by shifts [Hz].
 
-    Parameters
-    ----------
-    plant : TipTiltPlant
-        The plant.
-    shift_hz : float or sequence of float
-        Added to the frequency of each vibration [Hz]; one for all of them, or one for each.
-    hold : {"rms", "driving"}, optional
-        What stays: the rms of each vibration, or that of its driving noise.
-
-    Returns
-    -------
-    TipTiltPlant
-        The plant with a frequency error.
-
-    Raises
-    ------
-    ProblemError
-        If a shifted frequency leaves (0, Nyquist), or there is no vibration.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
-    >>> plant = lbt.tip_tilt_plant(
-    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
-    ... )
-    >>> lbt.models.retuned_plant(plant, -3.5).vibrations[0].frequency_hz
-    16.5
+    One shift is for all vibrations, several are for one each. ``hold`` says what stays: the "rms"
+    of each vibration, or that of its "driving" noise. A shifted frequency that leaves (0, Nyquist),
+    or a plant without a vibration, raises a ProblemError.
     """
     shifts = np.broadcast_to(one_or_each(shift_hz, "shift_hz"), (len(plant.vibrations),))
     rate = plant.hardware.frame_rate_hz

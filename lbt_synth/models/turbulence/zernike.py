@@ -18,29 +18,9 @@ _FURTHEST = 30  # the tail of the integral begins at this multiple of the order 
 
 
 def noll_orders(modes: int) -> tuple[IntArray, IntArray]:
-    """Radial and azimuthal orders of the first Zernike modes after piston, in Noll's order.
+    """Radial and azimuthal orders (modes,) of the first Zernike modes after piston.
 
-    Parameters
-    ----------
-    modes : int
-        Number of modes: Noll's numbers j = 2 to ``modes + 1``.
-
-    Returns
-    -------
-    radial, azimuthal : (modes,) int ndarray
-        Orders n and m, the azimuthal one not negative.
-
-    Raises
-    ------
-    ProblemError
-        If ``modes`` is no integer of at least 1.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> radial, azimuthal = lbt.models.noll_orders(10)
-    >>> radial.tolist(), azimuthal.tolist()
-    ([1, 1, 2, 2, 2, 3, 3, 3, 3, 4], [1, 1, 0, 2, 2, 1, 1, 3, 3, 0])
+    They are in Noll's order, j = 2 to ``modes + 1``; the azimuthal order is not negative.
     """
     count = integer(modes, "modes", at_least=1)
     radial: list[int] = []
@@ -62,16 +42,6 @@ def zernike_variances(atmosphere: Atmosphere, highest: int) -> FloatArray:
     They are the same for all azimuthal orders, on a disc without obstruction::
 
         2 pi (n + 1) int 0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) (2 J_n+1(pi D f) / (pi D f))^2 f df
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.turbulence.zernike import zernike_variances
-    >>> air = lbt.Atmosphere(
-    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
-    ... )
-    >>> (zernike_variances(air, 3) ** 0.5).round(1).tolist()
-    [591.6, 308.8, 183.7]
     """
     top = integer(highest, "highest", at_least=1)
     inner = 0.0 if atmosphere.outer_scale_m is None else atmosphere.outer_scale_m**-2

@@ -15,7 +15,6 @@ from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import (
     ClosedLoop,
     LoopMargins,
-    MovingGain,
     ResidualBudget,
     close_loop,
     loop_margins,
@@ -25,6 +24,7 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
+from lbt_synth.loop.moving_gain import MovingGain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.rows import fill_row
@@ -48,75 +48,39 @@ class LoopDesign(Design):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DesignAssessment:
-    """What is known exactly of one design in the loop of a configuration.
+    """What is known exactly of one design in the loop of a configuration."""
 
-    Attributes
-    ----------
-    name : str
-        Its name in the report.
-    design : Design
-        The design.
-    notes : tuple of str
-        How the loop that it was made for differs from this one.
-    stable : bool
-        Whether the loop is stable at the real sensor gain.
-    spectral_radius : float
-        Largest modulus of the closed loop's poles.
-    loop_poles, controller_poles : (n,) complex ndarray
-        Poles of the closed loop, and of the controller alone.
-    gamma, estimation_rms : float
-        Norm and standard deviation of the estimation error in its own model; nan for a design
-        that estimates nothing.
-    budget : ResidualBudget or None
-        Exact residual; None where the loop is unstable.
-    strehl : float
-        Strehl ratio in [0, 1]; nan where the loop is unstable.
-    margins : LoopMargins or None
-        Margins at the real sensor gain; None where the loop is unstable.
-    sensor_gains : tuple of (float, float)
-        Intervals of real sensor gains for which the loop is stable, relative to the sensor
-        matrix of the configuration; searched for between 0.01 and 100 times the assumed one.
-    moving : MovingGain or None
-        Intervals of a sensor gain that moves, around the real one; None where the loop is unstable.
-    checks : tuple of Check
-        The certificate, recomputed.
-    certificate_error : str
-        Why it could not be; empty if it could.
-    cost : FrameCost
-        Arithmetic of one frame, as exported to C.
-    error_norms : (f,) ndarray or None
-        Largest singular values of the estimation error at the frequencies of the report.
-    rejection, noise_transfer : (f,) ndarray or None
-        Those of the loop, from phase to residual and from noise to residual; None where the
-        loop is unstable.
-    curve : RobustnessMap
-        Strehl ratio over the frequency error at the real sensor gain.
-    map : RobustnessMap
-        The same over frequency error and real sensor gain.
-    """
-
-    name: str
-    design: Design
-    notes: tuple[str, ...]
-    stable: bool
-    spectral_radius: float
+    name: str  # its name in the report
+    design: Design  # the design
+    notes: tuple[str, ...]  # how the loop that it was made for differs from this one
+    stable: bool  # whether the loop is stable at the real sensor gain
+    spectral_radius: float  # largest modulus of the closed loop's poles
+    # (n,): poles of the closed loop, and of the controller alone
     loop_poles: ComplexArray
     controller_poles: ComplexArray
+    # norm and standard deviation of the estimation error in its own model; nan for a design that
+    # estimates nothing
     gamma: float
     estimation_rms: float
-    budget: ResidualBudget | None
-    strehl: float
-    margins: LoopMargins | None
+    budget: ResidualBudget | None  # exact residual; None where the loop is unstable
+    strehl: float  # Strehl ratio in [0, 1]; nan where the loop is unstable
+    margins: LoopMargins | None  # margins at the real sensor gain; None where the loop is unstable
+    # intervals of real sensor gains for which the loop is stable, relative to the sensor matrix of
+    # the configuration; searched for between 0.01 and 100 times the assumed one
     sensor_gains: tuple[tuple[float, float], ...]
+    # intervals of a sensor gain that moves, around the real one; None where the loop is unstable
     moving: MovingGain | None
-    checks: tuple[Check, ...]
-    certificate_error: str
-    cost: FrameCost
+    checks: tuple[Check, ...]  # the certificate, recomputed
+    certificate_error: str  # why it could not be; empty if it could
+    cost: FrameCost  # arithmetic of one frame, as exported to C
+    # (f,): largest singular values of the estimation error at the frequencies of the report
     error_norms: FloatArray | None
+    # (f,): those of the loop, from phase to residual and from noise to residual; None where the
+    # loop is unstable
     rejection: FloatArray | None
     noise_transfer: FloatArray | None
-    curve: RobustnessMap
-    map: RobustnessMap
+    curve: RobustnessMap  # Strehl ratio over the frequency error at the real sensor gain
+    map: RobustnessMap  # the same over frequency error and real sensor gain
 
     @property
     def certified(self) -> bool:

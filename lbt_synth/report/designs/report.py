@@ -28,45 +28,21 @@ _MOST_DESIGNS = 36  # more lines cannot be distinguished
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DesignReport:
-    """Designs in the loop of a configuration: what is known of each, beside the limits.
+    """Designs in the loop of a configuration: what is known of each, beside the limits."""
 
-    Attributes
-    ----------
-    config : Config
-        The configuration.
-    config_text : str
-        Its file as it was read.
-    assessments : tuple of DesignAssessment
-        One per design, exact.
-    simulations : mapping of str to DesignSimulation
-        Of the designs whose loop is stable.
-    limits : LimitStudy
-        Residuals over the frequency error, and what no linear controller goes below.
-    truth : TruthComparison
-        The designs beside reference designs, and what they were not made for.
-    frequency_hz : (f,) ndarray
-        Frequencies of the transfer functions [Hz].
-    errors_hz : (e,) ndarray
-        Frequency errors, truth less design [Hz]; only 0 where the truth has no vibration.
-    files : tuple of SourceFile
-        Digests of the files that were read.
-    versions : tuple of (str, str)
-        Programs and libraries.
-    made : datetime
-        When.
-    """
-
-    config: Config
-    config_text: str
-    assessments: tuple[DesignAssessment, ...]
-    simulations: Mapping[str, DesignSimulation]
+    config: Config  # the configuration
+    config_text: str  # its file as it was read
+    assessments: tuple[DesignAssessment, ...]  # one per design, exact
+    simulations: Mapping[str, DesignSimulation]  # of the designs whose loop is stable
+    # residuals over the frequency error, and what no linear controller goes below
     limits: LimitStudy
-    truth: TruthComparison
-    frequency_hz: FloatArray
+    truth: TruthComparison  # the designs beside reference designs, and what they were not made for
+    frequency_hz: FloatArray  # (f,): frequencies of the transfer functions [Hz]
+    # (e,): frequency errors, truth less design [Hz]; only 0 where the truth has no vibration
     errors_hz: FloatArray
-    files: tuple[provenance.SourceFile, ...]
-    versions: tuple[tuple[str, str], ...]
-    made: datetime
+    files: tuple[provenance.SourceFile, ...]  # digests of the files that were read
+    versions: tuple[tuple[str, str], ...]  # programs and libraries
+    made: datetime  # when
 
     @property
     def rows(self) -> tuple[tuple[DesignAssessment, LimitRow], ...]:

@@ -180,38 +180,9 @@ def write_diagnosis(
 ) -> tuple[Path, ...]:
     """Write a diagnosis as one HTML file that opens offline, and as a PDF if that is wanted.
 
-    Parameters
-    ----------
-    found : Diagnosis
-        Result of :func:`lbt_synth.identification.diagnose`.
-    path : path-like
-        File to write, that ends in .html.
-    pdf : path-like, optional
-        File to write, that ends in .pdf.
-    files : sequence of path-like, optional
-        Files of the record and of the given design, whose digests the page gives.
-
-    Returns
-    -------
-    tuple of pathlib.Path
-        The files; all of them are written, or none.
-
-    Raises
-    ------
-    OutputError
-        If a name ends in something else, or a file cannot be written.
-    FileError
-        If one of ``files`` cannot be read.
-
-    Examples
-    --------
-    >>> import numpy as np, lbt_synth as lbt, pathlib, tempfile
-    >>> y = np.random.default_rng(0).standard_normal((3000, 1))
-    >>> record = lbt.identification.loop_record(y, frame_rate_hz=500, unit="nm")
-    >>> found = lbt.identification.diagnose(record)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     [f.name for f in lbt.report.write_diagnosis(found, pathlib.Path(folder) / "d.html")]
-    ['d.html']
+    ``files`` are those of the record and of the given design, whose digests the page gives. All
+    files are written, or none; a wrong ending or a file that cannot be written raises an
+    OutputError.
     """
     require_page_names(path, pdf, inputs=tuple(files))
     return write_page(diagnosis_page(found, files), path, pdf)

@@ -1,16 +1,10 @@
-from .end_to_end import end_to_end_figure as end_to_end_figure
 from .identification import identification_figure as identification_figure
-from .loop import loop_figure as loop_figure
 from .open_loops import bode_figure as bode_figure
 from .open_loops import nichols_figure as nichols_figure
 from .open_loops import nyquist_figure as nyquist_figure
 from .robustness import robustness_figure as robustness_figure
 from .robustness import robustness_map_figure as robustness_map_figure
 from .sigma import sigma_figure as sigma_figure
-from .simulation import sensor_failure_figure as sensor_failure_figure
-from .simulation import simulation_figure as simulation_figure
 from .step import step_figure as step_figure
-from .studies import limits_figure as limits_figure
-from .studies import mirror_figure as mirror_figure
 from .studies import modal_figure as modal_figure
 from .studies import tradeoff_figure as tradeoff_figure

@@ -21,46 +21,7 @@ _MOST_WITH_LONG_LABEL = 2  # panels side by side that leave room for the long la
 
 
 def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
-    """Image, tip and tilt over time, and residual of each mode of an end-to-end run.
-
-    Parameters
-    ----------
-    run : EndToEndRun
-        The run.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Three panels.
-
-    Raises
-    ------
-    ProblemError
-        If ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, numpy as np
-    >>> rng = np.random.default_rng(0)
-    >>> run = lbt.interop.EndToEndRun(
-    ...     system=lbt.load_config("examples/lbt.yaml").end_to_end.system,
-    ...     strehl_series=np.full(40, 0.8),
-    ...     other_modes_series=np.full(40, 0.9),
-    ...     **{
-    ...         name: rng.normal(size=(40, 672))
-    ...         for name in ("measurements", "commands", "residual_nm")
-    ...     },
-    ...     psf=np.eye(60),
-    ...     psf_pixel_mas=18.4,
-    ...     seed=0,
-    ...     settle_frames=400,
-    ...     seconds=1.0,
-    ... )
-    >>> len(lbt.report.figures.end_to_end_figure(run).axes)  # three panels and a colour bar
-    4
-    """
+    """Image, tip and tilt over time, and residual of each mode of an end-to-end run."""
     size = run.psf.shape[0]
     position_mas = (np.arange(size) - size // 2) * run.psf_pixel_mas
     reach_mas = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)

@@ -24,34 +24,7 @@ LoopNorms = tuple[FloatArray, FloatArray | None, FloatArray | None]
 
 
 def loop_figure(loops: Mapping[str, ClosedLoop], *, axes: OwnAxes = None) -> Figure:
-    """Rejection and noise transfer of closed loops.
-
-    Parameters
-    ----------
-    loops : mapping of str to ClosedLoop
-        Loops by the name they get in the legend.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Two panels.
-
-    Raises
-    ------
-    ProblemError
-        If there is no loop,
-        or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
-    >>> len(lbt.report.figures.loop_figure({"integrator": loop}).axes)
-    2
-    """
+    """Rejection and noise transfer of closed loops, by the names that the legend gives them."""
     if not loops:
         raise ProblemError("a loop figure needs at least one loop; got none.")
     norms = {name: loop_norms(loop) for name, loop in loops.items()}

@@ -10,7 +10,8 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop import BrokenLoop, ClosedLoop, broken_loops, close_loop, loop_margins
+from lbt_synth.loop import ClosedLoop, broken_loops, close_loop, loop_margins
+from lbt_synth.loop.broken_loops import BrokenLoop
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.charts.scales import shorten

@@ -20,35 +20,7 @@ _SERIES_S = 1.0  # of a series, in which single oscillations are seen
 def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None) -> Figure:
     """Residual series and spectra before and after the correction.
 
-    Parameters
-    ----------
-    run : Simulation
-        A run; the first second of its first case is drawn, the spectra are means over all cases.
-    title : str, optional
-        Title of the figure.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Series above, spectra below.
-
-    Raises
-    ------
-    ProblemError
-        If ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> lazy = lbt.integrator(path, gain=0.5)
-    >>> run = lbt.simulate(
-    ...     lazy.controller, lbt.Truth(turbulence=None, noise_nm=5.0), hardware=path, frames=512
-    ... )
-    >>> len(lbt.report.figures.simulation_figure(run).axes)
-    2
+    The first second of the first case is drawn; the spectra are means over all cases.
     """
     _, frames, n = run.residual_nm.shape
     names = ("tip", "tilt") if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
@@ -91,40 +63,10 @@ _WINDOW_S = 0.1  # over which the size of the residual is averaged
 def sensor_failure_figure(
     run: Simulation, segments: Sequence[Segment], exact_nm: Sequence[float], *, title: str = ""
 ) -> Figure:
-    """Residual of a run in which sensors fail.
+    """Residual of a run in which sensors fail: the series of its first case, and its size.
 
-    Parameters
-    ----------
-    run : Simulation
-        The run; the series is that of its first case, its size the mean over all.
-    segments : sequence of Segment
-        Times between failures and returns.
-    exact_nm : sequence of float
-        Exact stationary residual of each segment [nm rms]; nan where there is none.
-    title : str, optional
-        Title of the figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Series above, its size below.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.loop.fusion.simulation import Segment
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> run = lbt.simulate(
-    ...     lbt.integrator(path, gain=0.5),
-    ...     lbt.Truth(turbulence=None, noise_nm=5.0),
-    ...     hardware=path,
-    ...     frames=512,
-    ... )
-    >>> whole = Segment(start_s=0.0, end_s=0.64, missing=(), wrong={})
-    >>> figure = lbt.report.figures.sensor_failure_figure(run, [whole], [3.5])
-    >>> len(figure.axes)
-    2
+    The size is the mean over all cases. ``exact_nm`` is the stationary residual of each segment
+    between failures and returns [nm rms], nan where there is none.
     """
     return draw_figure(sensor_failure_panels(run, segments, exact_nm), title=title)
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.loop import LoopStep, step_response
-from lbt_synth.loop.step_response import SHOWN_FRAMES
+from lbt_synth.loop import step_response
+from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
 from lbt_synth.report.charts.description import Axis, Curve, Panel
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import stable_curve

@@ -23,38 +23,8 @@ from lbt_synth.validation import FloatArray, real_array, require_instance
 def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
     """Draw the residual of each design over the vibration's frequency, and the limits.
 
-    Parameters
-    ----------
-    study : LimitStudy
-        Result of :func:`limits`, of a truth with a vibration and a range of errors.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel with a logarithmic residual; unstable designs are named and not drawn.
-
-    Raises
-    ------
-    ProblemError
-        If no vibration moves,
-        or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
-    >>> study = lbt.studies.limits(
-    ...     {"by hand": lbt.integrator(path, gain=0.5)},
-    ...     path,
-    ...     lbt.Truth(turbulence=None, vibrations=(line,), noise_nm=5.0),
-    ...     lbt.Imaging(diameter_m=8.22),
-    ...     errors_hz=[-2, 2],
-    ... )
-    >>> len(lbt.report.figures.limits_figure(study).axes)
-    1
+    Unstable designs are named and not drawn. A study in which no vibration moves raises a
+    ProblemError.
     """
     if study.shift_hz.size < 2:
         raise ProblemError(
@@ -95,32 +65,8 @@ _NAMES = dict(
 def tradeoff_figure(points: Sequence[TradeoffPoint], *, axes: OwnAxes = None) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
-    Parameters
-    ----------
-    points : sequence of TradeoffPoint
-        Points of :func:`tradeoff`.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Above, the standard deviation; below, if there are loops, the interval of sensor
-        gains for which each is stable. Norms that no filter reaches are shaded.
-
-    Raises
-    ------
-    ProblemError
-        If there are no points,
-        or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> points = list(lbt.studies.tradeoff(walk, points=2, families=["central"]))
-    >>> len(lbt.report.figures.tradeoff_figure(points).axes)
-    1
+    Above, the standard deviation; below, if there are loops, the interval of sensor gains for which
+    each is stable. Norms that no filter reaches are shaded.
     """
     if not points:
         raise ProblemError("a trade-off figure needs at least one point; got none.")
@@ -252,38 +198,9 @@ def mirror_figure(
 ) -> Figure:
     """Draw the mirror's step response, and its taps.
 
-    Parameters
-    ----------
-    hardware : LoopHardware
-        A loop with a mirror.
-    tolerance : float, optional
-        Half width of the band in which the mirror counts as settled.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        The step response with the ends of the frames after the command's arrival, and the
-        weights of the commands in the position averaged over an exposure, those of a settled
-        mirror beside them.
-
-    Raises
-    ------
-    ProblemError
-        If the loop has no mirror with dynamics,
-        or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> shell = lbt.models.PositionLoop.from_bandwidth(
-    ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
-    ... )
-    >>> len(
-    ...     lbt.report.figures.mirror_figure(lbt.LoopHardware(frame_rate_hz=800, mirror=shell)).axes
-    ... )
-    2
+    The step response has the ends of the frames after the command's arrival, and the band in which
+    the mirror counts as settled. The taps are the weights of the commands in the position averaged
+    over an exposure, with those of a settled mirror beside them.
     """
     require_instance(hardware, LoopHardware)
     if hardware.mirror is None:

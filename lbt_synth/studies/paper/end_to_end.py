@@ -18,7 +18,8 @@ from lbt_synth.interop.specula.cases import make_case, run_case
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.methods.request import reference_design
-from lbt_synth.models import SinusoidalVibration, Truth, retuned_plant
+from lbt_synth.models import SinusoidalVibration, Truth
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.studies.paper import parameters as given

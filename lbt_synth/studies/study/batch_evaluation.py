@@ -12,8 +12,11 @@ from lbt_synth.config.ensemble import AssumedAxis, Samples
 from lbt_synth.config.samples import Reads
 from lbt_synth.design.modal import ModalFilters, modal_filters
 from lbt_synth.errors import CertificateError
-from lbt_synth.loop import EnsembleResiduals
-from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
+from lbt_synth.loop.ensemble.evaluation import (
+    EnsembleResiduals,
+    residuals_from_matrices,
+    textbook_matrices,
+)
 from lbt_synth.models import PositionLoop, Vibration
 from lbt_synth.studies.study import sample as reference
 from lbt_synth.studies.study.sample import Sample, make_sample

@@ -19,7 +19,8 @@ from lbt_synth.config.samples import Keys
 from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, refuse_config
-from lbt_synth.loop import AnyLoop, ClosedLoop, residual_budget, simulate, strehl
+from lbt_synth.loop import ClosedLoop, residual_budget, simulate, strehl
+from lbt_synth.loop.fusion.fused_loop import AnyLoop
 from lbt_synth.loop.fusion.simulation import simulate_fused
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm

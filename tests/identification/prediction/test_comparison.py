@@ -20,6 +20,8 @@ from support.predictions import (
 )
 
 import lbt_synth as lbt
+from lbt_synth.linear.block_filtering import filter_series
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 def test_on_held_out_data_no_predictor_beats_the_limit():
@@ -62,7 +64,7 @@ def two_different_axes():
     noise = rng.standard_normal((frames, 2)) * [15.0, 10.0]
     ran = lbt.integrator(plant.hardware, gain=0.25)
     loop = lbt.close_loop(plant.hardware, ran.controller)
-    series = lbt.loop.filter_series(loop.system, np.hstack([total, noise]))
+    series = filter_series(loop.system, np.hstack([total, noise]))
     y, u = series[:, 4:], series[:, 2:4]
     return plant, ran, y, pseudo_open_loop(y, u, plant.hardware)
 
@@ -159,7 +161,7 @@ def test_a_table_of_one_axis():
 def test_a_wrong_model_is_found_out():
     """A filter for another frequency: its model promises what the data does not show."""
     plant, _, _, z = two_different_axes()
-    wrong = lbt.models.retuned_plant(plant, 6.0)
+    wrong = retuned_plant(plant, 6.0)
     table = lbt.identification.prediction_against_data(wrong, z, {"Kalman": lbt.kalman(wrong)})
     row, right = table["Kalman"], lbt.kalman(plant).rms
     assert row.deviations > 5

@@ -12,7 +12,7 @@ from support.small_telescope import BRIGHT, PATH, SETUP, needs_specula
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop.specula.fused_filter import AccompaniedFilter, accompany_filter
-from lbt_synth.linear import PeriodicController
+from lbt_synth.linear.periodic.system import PeriodicController
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 

@@ -9,7 +9,8 @@ import pytest
 from support.generalized_plants import random_plant
 
 import lbt_synth as lbt
-from lbt_synth.linear import ControlWitness, Witness, infeasible_control_level
+from lbt_synth.linear.infeasibility_proof import Witness
+from lbt_synth.linear.output_feedback.lower_bound import ControlWitness, infeasible_control_level
 
 
 @pytest.mark.parametrize("seed", range(1, 7))

@@ -7,8 +7,9 @@ from support.plants import random_problem
 
 import lbt_synth as lbt
 from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
-from lbt_synth.linear import PeriodicProblem, periodic_hinf, periodic_kalman
+from lbt_synth.linear import PeriodicProblem, periodic_kalman
 from lbt_synth.linear.periodic import riccati
+from lbt_synth.linear.periodic.riccati import periodic_hinf
 
 
 def recursion(problem, periods):

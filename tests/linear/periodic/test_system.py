@@ -6,7 +6,8 @@ from support.periodic_problems import relative_distance
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError
-from lbt_synth.linear import PeriodicController, PeriodicSystem
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
 
 
 def random_system(seed=0, *, period=5, n=3, m=2, p=2, kind=PeriodicSystem):
@@ -31,7 +32,7 @@ def steps(system, inputs):
 def test_lifted_systems_have_the_norm_and_the_variance(kind):
     system = random_system()
     lifted = getattr(system, kind)()
-    P = lbt.linear.stationary_covariance(lifted.A, lifted.B @ lifted.B.T)
+    P = stationary_covariance(lifted.A, lifted.B @ lifted.B.T)
     outputs = np.diag(lifted.C @ P @ lifted.C.T + lifted.D @ lifted.D.T).reshape(5, 2)
     own = np.array([np.diag(one) for one in system.output_covariances()])
     np.testing.assert_allclose(outputs, own, rtol=1e-10)

@@ -18,8 +18,12 @@ from support.fused_loops import (
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import periodic_kalman
-from lbt_synth.loop import close_fused_loop, fused_budget
-from lbt_synth.loop.fusion.fused_loop import fused_model_budget, fused_radii_by_gain
+from lbt_synth.loop.fusion.fused_loop import (
+    close_fused_loop,
+    fused_budget,
+    fused_model_budget,
+    fused_radii_by_gain,
+)
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
 AGELESS = Accelerometer(

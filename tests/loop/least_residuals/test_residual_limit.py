@@ -14,6 +14,7 @@ from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.model_limits import model_limit
+from lbt_synth.loop.fusion.fused_loop import close_fused_loop
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 
@@ -303,7 +304,7 @@ def fused_variances(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=
     motions = tuple(moves for _, moves in lines)
     plant = lbt.models.fused_plant(own, suite, motions)
     controller = plant.controller(lbt.linear.periodic_kalman(plant).gains)
-    loop = lbt.loop.close_fused_loop(own.hardware, suite, controller)
+    loop = close_fused_loop(own.hardware, suite, controller)
     truth = lbt.Truth(
         turbulence=slow,
         vibrations=tuple(line for line, _ in lines),

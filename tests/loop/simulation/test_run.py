@@ -11,6 +11,7 @@ from support.plants import lbt_axis_plant
 from support.uneven_axes import LINES, LOOPS, SLOW, TABLE
 
 import lbt_synth as lbt
+from lbt_synth.linear.block_filtering import filter_series
 
 
 @pytest.mark.parametrize("delay", [1, 1.4, 2, 2.7, 3])
@@ -113,7 +114,7 @@ def test_wrong_controllers_and_counts_are_refused(axis_plant):
         with pytest.raises(lbt.errors.ProblemError):
             lbt.simulate(controller, truth, hardware=hw, **({"frames": 10} | wrong))
     with pytest.raises(lbt.errors.DimensionError, match="inputs must be"):
-        lbt.loop.filter_series(lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0), np.zeros((5, 2)))
+        filter_series(lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0), np.zeros((5, 2)))
     with pytest.raises(lbt.errors.DimensionError, match="y must have shape"):
         controller.start().step([1.0, 2.0])
     line = lbt.models.SinusoidalVibration(frequency_hz=5, rms_nm=1)
@@ -180,3 +181,39 @@ def test_simulation_by_taps_is_that_of_the_states():
     by_states = lbt.simulate(slow.controller, truth, **same)
     by_taps = lbt.simulate(slow.controller.start(), truth, **same)
     np.testing.assert_allclose(by_states.residual_nm, by_taps.residual_nm, atol=1e-9)
+
+
+PATH = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+
+
+def step(gain, path=PATH, **more):
+    loop = lbt.close_loop(path, lbt.integrator(path, gain=gain).controller)
+    return lbt.loop.step_response(loop, **more)
+
+
+def test_a_step_is_answered_frame_by_frame():
+    found = step(0.5)
+    assert found.time_s[:2] == pytest.approx([0, 0.002])
+    # two frames pass before anything moves: y(1) sees the step, u(1) acts in frame 2
+    expected, u = [1.0], [0.0]
+    for k in range(1, 20):
+        u.append(u[-1] + 0.5 * expected[k - 1])
+        expected.append(1.0 - u[k - 1])
+    assert found.residual[:20] == pytest.approx(expected)
+    assert found.command[:20] == pytest.approx(u)
+    assert found.overshoot_percent == pytest.approx(-100 * min(expected))
+
+
+def test_settling_is_the_last_time_outside_five_percent():
+    found = step(0.1)
+    after = round(found.settling_s * 500)
+    assert abs(found.residual[after - 1]) > 0.05
+    assert np.all(np.abs(found.residual[after:]) <= 0.05)
+    assert np.isnan(step(0.1, frames=5).settling_s)
+
+
+def test_the_step_is_on_the_axis_that_is_named():
+    path = lbt.LoopHardware(frame_rate_hz=500, modes=2)
+    assert step(0.3, path, axis=1).residual == pytest.approx(step(0.3).residual)
+    with pytest.raises(lbt.errors.ProblemError, match="axis must be below 2"):
+        step(0.3, path, axis=2)

@@ -7,6 +7,7 @@ import pytest
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 def slow(pole=0.98, drive=50.0):
@@ -70,9 +71,9 @@ def test_noise_covariance_may_be_given():
 
 def test_retuning_moves_only_the_vibration():
     plant = lbt_axis_plant()
-    moved = lbt.models.retuned_plant(plant, 1.5, hold="rms")
+    moved = retuned_plant(plant, 1.5, hold="rms")
     assert moved.vibrations[0].frequency_hz == 21.5
-    back = lbt.models.retuned_plant(moved, -1.5)
+    back = retuned_plant(moved, -1.5)
     for name in "ABCDL":
         assert np.allclose(getattr(back, name), getattr(plant, name), rtol=1e-12)
 
