@@ -15,7 +15,7 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
-from lbt_synth.design.facts import DesignFacts, without_units
+from lbt_synth.design.result import DesignFacts, without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.loop import close_loop, loop_margins

@@ -5,6 +5,7 @@ from .certificate import Check as Check
 from .certificate import certify_filter as certify_filter
 from .certificate import certify_infeasible as certify_infeasible
 from .certificate import certify_loop as certify_loop
+from .filter_design import FilterDesign as FilterDesign
 from .fusion.failures import FailureRow as FailureRow
 from .fusion.failures import Fallback as Fallback
 from .fusion.failures import failure_rows as failure_rows
@@ -32,6 +33,5 @@ from .output_feedback.mixed_controller import mixed_controller as mixed_controll
 from .output_feedback.result import ControllerDesign as ControllerDesign
 from .result import Design as Design
 from .result import EstimatorDesign as EstimatorDesign
-from .result import FilterDesign as FilterDesign
 from .result import SolverReport as SolverReport
 from .robust import robust as robust

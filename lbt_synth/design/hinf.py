@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.kalman import error_scale
-from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import CertificateError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, hinf_norm, infeasible_level
 from lbt_synth.linear.estimation_problem import require_problem

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth.design.certificate import Certificate, certify_loop
-from lbt_synth.design.facts import IntegratorFacts
-from lbt_synth.design.integrator_law import PURE, IntegratorLaw
+from lbt_synth.design.integrator_law import PURE, IntegratorFacts, IntegratorLaw
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller

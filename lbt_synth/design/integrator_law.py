@@ -13,9 +13,22 @@ from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.loop import ClosedLoop, broken_loops
 from lbt_synth.loop.broken_loops import phase_margin_deg
 from lbt_synth.models import LoopHardware
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import Positive, check_fields, frozen_copy
 
 MARGIN_TOLERANCE = 1e-6
+
+
+@table_row
+class IntegratorFacts:
+    """Gain and law of an integrator."""
+
+    gain: float = column("gain")
+    leak: float | None = column("left of a command after a frame")
+    integrators: int | None = column("integrators")
+    zero_hz: float | None = column("corner of the zero", unit="Hz")
+    phase_margin_demand_deg: float | None = column("phase margin demanded", unit="deg")
+    modulus_margin_demand: float | None = column("modulus margin demanded")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

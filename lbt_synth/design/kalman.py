@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.design.filter_design import FilterDesign, filter_design
+from lbt_synth.design.result import SolverReport
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati

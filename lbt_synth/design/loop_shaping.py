@@ -10,7 +10,6 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design.certificate import Certificate, Check, certify_loop
-from lbt_synth.design.facts import RobustFacts
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.design.shaping.channel import (
     Channel,
@@ -29,7 +28,7 @@ from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import fill_row
+from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -154,6 +153,18 @@ def shape(
         long_functions=size,
     )
     return with_certificate(design, "Try more functions, or looser demands.")
+
+
+@table_row
+class RobustFacts:
+    """What a robust controller is, beside the limits over its bands."""
+
+    states_per_mode: int = column("states of one mode, past commands included")
+    loss: float = column("objective above the long parameter's", unit="%", scale=100)
+    limit_nm: float = column("least worst residual over its bands, all modes", unit="nm")
+    above_limit_percent: float = column("residual at unit sensor gain above it", unit="%")
+    objective_nm: tuple[float, ...] = column(unit="nm")
+    long_objective_nm: tuple[float, ...] = column(unit="nm")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -28,8 +28,13 @@ from lbt_synth.design.certificate import (
     certify_filter,
     certify_loop,
 )
-from lbt_synth.design.facts import LqgFacts, model_facts
-from lbt_synth.design.result import UNCERTIFIED, EstimatorDesign, SolverReport, with_certificate
+from lbt_synth.design.result import (
+    UNCERTIFIED,
+    EstimatorDesign,
+    LqgFacts,
+    SolverReport,
+    with_certificate,
+)
 from lbt_synth.errors import DimensionError, InfeasibleError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, solve_dare
 from lbt_synth.linear.lyapunov import output_variances, stationary_covariance, stationary_root
@@ -87,7 +92,7 @@ class LqgDesign(EstimatorDesign):
 
     def facts(self) -> LqgFacts:
         """Return what the controller leaves, beside what is possible."""
-        return model_facts(LqgFacts, self)
+        return self.model_facts(LqgFacts)
 
     @property
     def estimation(self) -> TipTiltPlant:

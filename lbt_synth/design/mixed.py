@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from scipy.optimize import brentq
 
+from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
-from lbt_synth.design.result import FilterDesign, SolverReport, filter_design
+from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import (
     EstimationProblem,

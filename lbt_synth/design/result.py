@@ -3,47 +3,83 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from lbt_synth.design.certificate import (
-    GAIN_TOLERANCE,
-    INFEASIBLE_TOLERANCE,
-    LEVEL_SETS,
-    NORM_TOLERANCE,
-    ORIGIN_TOLERANCE,
-    Certificate,
-    Check,
-    certify_filter,
-    certify_infeasible,
-    certify_loop,
-)
-from lbt_synth.design.facts import FilterFacts, model_facts, summarise_design
-from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.design.certificate import Certificate
+from lbt_synth.design.model_limits import above_percent, limit_or_nan
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.linear.estimation_problem import decorrelate
-from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.matrix_functions import relative_distance
-from lbt_synth.linear.riccati.filtering import (
-    FilterRiccati,
-    GammaEquation,
-    gamma_riccati,
-    kalman_riccati,
-)
-from lbt_synth.loop import close_loop
+from lbt_synth.linear.state_space import sigma_sparkline
+from lbt_synth.loop import close_loop, loop_margins, model_budget
+from lbt_synth.loop.closed_loop import REJECTION
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
+from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import ComplexArray, FloatArray, set_fields
+from lbt_synth.validation import ComplexArray
 
 if TYPE_CHECKING:
     from lbt_synth.design.shaping import VibrationBand
     from lbt_synth.loop.fusion.fused_loop import AnyLoop
 
-ORIGIN = "distance from its Riccati filter"
+Facts = TypeVar("Facts")
+
+_LIMIT = "least residual of any linear controller in it"  # heading, below the residual
+_BRIEFLY = (
+    *("certificate", "gain", "residual_nm", "limit_nm", "gamma"),
+    *("modulus", "gain_low", "gain_high", "phase_deg"),
+)
+
+
+@table_row
+class DesignFacts:
+    """What every design has."""
+
+    method: str = column("method")
+    route: str = column("route")
+    n_states: int = column("states of the controller")
+
+
+@table_row
+class CertificateFacts:
+    """Whether a design passed its checks."""
+
+    certificate: str = column("certificate")
+
+
+@table_row
+class FilterFacts:
+    """What a filter achieves, beside what it was asked for and what is possible."""
+
+    rms: float = column("estimation error, rms", unit="nm")
+    gamma: float = column("estimation error, H-infinity norm", unit="nm")
+    residual_nm: float | None = column("residual in its model, rms", unit="nm")
+    limit_nm: float | None = column(_LIMIT, unit="nm")
+    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
+    rms_requested: float | None = column("rms asked for", unit="nm")
+    gamma_requested: float | None = column("bound asked for", unit="nm")
+    gamma_least: float | None = column(
+        "least norm of any filter, upper bound", unit="nm", format=".9g"
+    )
+    gamma_infeasible: float | None = column(
+        "least norm of any filter, lower bound", unit="nm", format=".9g"
+    )
+
+
+@table_row
+class LqgFacts:
+    """What an LQG controller leaves, beside what is possible."""
+
+    residual_nm: float = column("residual in its model, rms", unit="nm", key="rms")
+    gamma: float = column("residual, H-infinity norm", unit="nm")
+    limit_nm: float | None = column(_LIMIT, unit="nm")
+    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
+    command_weight: float = column("weight of the command")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +180,17 @@ class Design(Summarised):
         return f"{self.method}{route}, {count_text(self.controller.n_states, 'state')}{loop}"
 
     def _summarise(self) -> Summary:
-        return summarise_design(self)
+        rows = self.facts(), CertificateFacts(certificate=self.certificate._brief())
+        notes = [f"assumes: {assumption}." for assumption in self.assumptions]
+        if self.hardware is None:
+            return Summary(tables=[without_units(fact_table("Design", *rows))], notes=notes)
+        loop = close_loop(self.hardware, self)
+        margins = [loop_margins(loop)] if loop.is_stable else []
+        return Summary(
+            tables=[fact_table("Design", rows[0], *margins, rows[1], only=_BRIEFLY)],
+            notes=notes,
+            curve=sigma_sparkline(loop.rejection(), REJECTION),
+        )
 
     @property
     def poles(self) -> ComplexArray:
@@ -211,6 +257,12 @@ class EstimatorDesign(Design, ABC):
         """Standard deviation of the estimation error; None for a bare estimation problem."""
         return None if self.hardware is None else self.rms
 
+    def model_facts(self, kind: type[Facts]) -> Facts:
+        """Return a row with residual and limit of the own model, None without a loop."""
+        names = ("residual_nm", "limit_nm", "above_limit_percent")
+        values = (None, None, None) if self.hardware is None else model_limit(self)
+        return fill_row(kind, self, **dict(zip(names, values, strict=True)))
+
     @abstractmethod
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
         """System from w to the estimation error.
@@ -222,152 +274,6 @@ class EstimatorDesign(Design, ABC):
         """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FilterDesign(EstimatorDesign):
-    """A Kalman or H-infinity filter, and the controller made of it.
-
-    Attributes
-    ----------
-    problem : EstimationProblem
-        The problem (a plant, for a telescope).
-    gain_predictor : (n, q) ndarray
-        ``(A P C' + S) (C P C' + R)^-1``: of ``x(k+1|k) = A x(k|k-1) + gain (y(k) - C x(k|k-1))``.
-    gain_filter : (n, q) ndarray
-        ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
-    gamma_requested : float or None
-        Bound that the H-infinity design was given.
-    rms_requested : float or None
-        Bound on the standard deviation that the design was given.
-    gamma_least : float or None
-        Norm that a filter of the problem achieves, with the least gamma.
-    gamma_infeasible : float or None
-        Level that no filter reaches: the least gamma is not below it.
-    witness : Witness or None
-        The proof of that level: disturbances that no measurement shows.
-    """
-
-    controller: Controller = field(init=False)
-    gain_predictor: FloatArray
-    gain_filter: FloatArray
-    gamma_requested: float | None = None
-    gamma_least: float | None = None
-    gamma_infeasible: float | None = None
-    witness: Witness | None = None
-    rms_requested: float | None = None
-
-    def __post_init__(self) -> None:
-        set_fields(self, controller=self.problem.controller(self.gain_predictor))
-
-    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the estimation error.
-
-        Parameters
-        ----------
-        problem : EstimationProblem, optional
-            Problem with other disturbances; the design's own by default.
-
-        Returns
-        -------
-        StateSpace
-            The system.
-        """
-        return (problem or self.problem).error_system(self.gain_predictor)
-
-    def facts(self) -> FilterFacts:
-        """Return what the filter achieves, beside what it was asked for and what is possible."""
-        return model_facts(FilterFacts, self)
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether the design was given a bound; without one its variance is the least."""
-        return self.gamma_requested is not None or self.rms_requested is not None
-
-    @property
-    def estimator(self) -> Controller:
-        """Estimator of z whatever the commands are, from [y(k), u(k-1)] for a plant."""
-        return self.problem.estimator(self.gain_predictor)
-
-    @property
-    def poles(self) -> ComplexArray:
-        """Poles of the estimation error, (n,)."""
-        return self.error_system().poles
-
-    def recertify(self) -> Certificate:
-        """Compute the certificate again: the filter, its claims, and its loop if it has one."""
-        problem = self.problem
-        certificate = certify_filter(
-            problem,
-            self.gain_predictor,
-            gamma=self.gamma_requested,
-            least_variance=not self.is_bounded,
-        )
-        checks = [*certificate.checks, *self._claim_checks(certificate)]
-        if self.hardware is not None:
-            checks.append(certify_loop(self.hardware, self.controller))
-        return replace(certificate, checks=tuple(checks))
-
-    def _claim_checks(self, certificate: Certificate) -> list[Check]:
-        """Check the gains against each other, and what is said of bounds."""
-        problem, start = self.problem, kalman_riccati(self.problem)
-        checks = [self._gain_check(), *self._origin_checks(start)]
-        if self.rms_requested is not None:
-            above = certificate.rms / self.rms_requested - 1
-            name = "standard deviation of the estimation error over its bound, less 1"
-            checks.append(Check(name, above, NORM_TOLERANCE, "Lyapunov equation"))
-        if self.gamma_least is not None:
-            equation = GammaEquation(problem, start)
-            meets = [
-                equation.trial(self.gamma_least * (1 + side * NORM_TOLERANCE)).P is not None
-                for side in (-1, 1)
-            ]
-            name, how = "least norm of any filter, error", "gamma-Riccati equation on both sides"
-            off = 0.0 if meets == [False, True] else np.inf
-            checks.append(Check(name, off, NORM_TOLERANCE, how))
-        if self.gamma_infeasible is not None:
-            name = "infeasible level over the norm achieved, less 1"
-            value = self.gamma_infeasible / certificate.gamma - 1
-            checks.append(Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS))
-            # a claim without a witness is not believed
-            proof = self.witness or Witness(
-                states=np.zeros((problem.n_states, 1)),
-                disturbances=np.zeros((problem.B.shape[1], 1)),
-            )
-            proved = certify_infeasible(problem, self.gamma_infeasible, proof)
-            below = -proved.value / (1 + proved.value)
-            name = "level proved over the infeasible level, less 1"
-            checks += [proved, Check(name, below, NORM_TOLERANCE, proved.computed_by)]
-        return checks
-
-    def _gain_check(self) -> Check:
-        """Check that the two gains are of one filter, in the states that go on."""
-        A, _, injection = decorrelate(self.problem)
-        goes_on = np.any(A != 0, axis=1)  # not so the newest innovation of a mixed filter
-        apart = (A @ self.gain_filter + injection - self.gain_predictor)[goes_on]
-        size = max(float(np.max(np.abs(self.gain_predictor), initial=0.0)), 1e-300)
-        value = float(np.max(np.abs(apart), initial=0.0)) / size
-        how = "A times the filter gain, relative"
-        return Check("predictor gain against the filter gain", value, GAIN_TOLERANCE, how)
-
-    def _origin_checks(self, start: FilterRiccati) -> list[Check]:
-        """Check both gains of Kalman's filter and of the central filter of a bound.
-
-        A filter of a bound that is neither has its bound and norms as its proof.
-        """
-        origins = [start]
-        if self.gamma_requested is not None:
-            with suppress(NumericalError):
-                central = gamma_riccati(self.problem, self.gamma_requested, start=start)
-                origins += [] if central is None else [central]
-        own = np.vstack([self.gain_predictor, self.gain_filter])
-        value = min(
-            relative_distance(own, np.vstack([origin.gain_predictor, origin.gain_filter]))
-            for origin in origins
-        )
-        if self.is_bounded and value > ORIGIN_TOLERANCE:
-            return []
-        return [Check(ORIGIN, value, ORIGIN_TOLERANCE, "relative")]
-
-
 UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))
 AnyDesign = TypeVar("AnyDesign", bound=Design)
 
@@ -377,31 +283,34 @@ def with_certificate(design: AnyDesign, hint: str) -> AnyDesign:
     return replace(design, certificate=design.recertify().require(hint))
 
 
-def filter_design(
-    problem: EstimationProblem,
-    gain_predictor: FloatArray,
-    gain_filter: FloatArray,
-    *,
-    method: str,
-    solver: SolverReport,
-    **claims: Any,
-) -> FilterDesign:
-    """Make a design and certify it; raise CertificateError if it fails."""
-    design = FilterDesign(
-        method=method,
-        certificate=UNCERTIFIED,
-        solver=solver,
-        problem=problem,
-        gain_predictor=gain_predictor,
-        gain_filter=gain_filter,
-        **claims,
-    )
-    return with_certificate(design, "Try the other route, or scale the states to similar sizes.")
-
-
 def require_hardware(design: Design, what: str) -> LoopHardware:
     """Return the loop of a design; refuse one of a bare estimation problem."""
     if design.hardware is not None:
         return design.hardware
     got = "one of a bare estimation problem. Design for the plant of a loop"
     raise ProblemError(f"{what} needs the design of a loop; got {got}.")
+
+
+def model_limit(design: EstimatorDesign) -> tuple[float, float, float]:
+    """Return a filter's residual in its own model, the limit there [nm rms], and how far above [%].
+
+    What cannot be computed is nan. The residual is the estimation error where the mirror reaches
+    every command at once, or the design commands for its dynamics.
+    """
+    plant = design.problem
+    if not isinstance(plant, TipTiltPlant | FullStatePlant):
+        return np.nan, np.nan, np.nan
+    hardware, residual_nm = plant.hardware, design.rms
+    settled = hardware.delay_frames % 1 == 0 and hardware.mirror is None
+    if not (settled or design.knows_mirror):
+        residual_nm = np.nan
+        if isinstance(plant, TipTiltPlant):
+            loop = close_loop(hardware, design.controller)
+            residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
+    limit_nm = limit_or_nan(lambda: least_model_residual(plant))
+    return residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
+
+
+def without_units(table: Table) -> Table:
+    """Return the facts of a bare estimation problem, whose signals have no units."""
+    return replace(table, rows=tuple((*row[:2], "") for row in table.rows))

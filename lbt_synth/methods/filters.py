@@ -111,7 +111,7 @@ def _unpack_filter(record: DesignRecord) -> Design:
         from lbt_synth.design.fusion.record import rebuild_fused
 
         return rebuild_fused(record)
-    from lbt_synth.design.result import FilterDesign
+    from lbt_synth.design.filter_design import FilterDesign
     from lbt_synth.linear import Witness
 
     problem, arrays = record.problem(), record.arrays

@@ -10,8 +10,8 @@ from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method, requi
 from lbt_synth.methods.method import DesignInputs
 
 if TYPE_CHECKING:
+    from lbt_synth.design.filter_design import FilterDesign
     from lbt_synth.design.fusion.fused_filter import FusedFilter
-    from lbt_synth.design.result import FilterDesign
 
 
 class MixedOptions(BoundOptions):

@@ -199,6 +199,7 @@ def panic(*arguments, **options):
 
 def test_a_solver_that_panics_below_cvxpy_is_an_error_of_ours(monkeypatch):
     import cvxpy
+
     from lbt_synth.linear.lmi.output_feedback import solve
 
     monkeypatch.setattr(cvxpy.Problem, "solve", panic)

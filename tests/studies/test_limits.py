@@ -10,7 +10,7 @@ from support.limits import RATE, ar
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.design.model_limits import model_limit
+from lbt_synth.design.result import model_limit
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.report.figures.studies import limits_figure
 

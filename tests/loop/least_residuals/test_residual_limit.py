@@ -13,7 +13,7 @@ from support.limits import RATE, Anonymous, ar, budget, path, variance
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.design.model_limits import model_limit
+from lbt_synth.design.result import model_limit
 from lbt_synth.loop.fusion.fused_loop import close_fused_loop
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
