@@ -10,9 +10,9 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
-from lbt_synth.design.model_limits import limit_or_nan
 from lbt_synth.errors import ConfigError
 from lbt_synth.loop import least_residual
+from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.models import PositionLoop
 from lbt_synth.report.figures.studies import mirror_figure
 from lbt_synth.storage.rows import column, fill_row, table_row

@@ -17,7 +17,6 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
 from lbt_synth.design.fusion.fused_filter import FusedFilter
-from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
@@ -34,6 +33,7 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.fusion.simulation import READINGS, Drop
+from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_nan
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.simulation import sensor_failure_figure, simulation_figure

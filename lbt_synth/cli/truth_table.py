@@ -5,9 +5,8 @@ from __future__ import annotations
 from lbt_synth.cli.output import Report
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.design.model_limits import limit_or_none
 from lbt_synth.loop import least_fused_residual
-from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
+from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_or_none
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import compare_in_truth
 

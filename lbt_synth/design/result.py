@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate
-from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.loop import close_loop, loop_margins, model_budget
 from lbt_synth.loop.closed_loop import REJECTION
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.loop.least_residuals.residual_limit import (
+    above_percent,
+    least_model_residual,
+    limit_or_nan,
+)
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
 from lbt_synth.storage.summaries import Summarised, Summary

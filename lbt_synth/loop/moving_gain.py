@@ -66,10 +66,10 @@ def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
     (0.944, 1.0)
     """
     middle = (low + high) / 2
-    there = close_loop(loop.hardware, loop.controller, sensor_gain=middle)
-    if not there.is_stable:
+    centred = close_loop(loop.hardware, loop.controller, sensor_gain=middle)
+    if not centred.is_stable:
         return np.inf
-    S = there.output_sensitivity()
+    S = centred.output_sensitivity()
     T = replace(S, C=-S.C, D=np.eye(len(S.D)) - S.D)
     return (high - low) / (2 * middle) * hinf_norm(T).upper
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.design.model_limits import above_percent, limit_or_none
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import (
     ClosedLoop,
@@ -21,6 +20,7 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.broken_loops import phase_margin_deg
+from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_none
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row

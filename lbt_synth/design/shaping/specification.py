@@ -15,7 +15,6 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.model_limits import above_percent, limit_or_nan
 from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, mode_loop
 from lbt_synth.design.shaping.frequencies import Grid, distinct_bands, first_grid
@@ -36,7 +35,11 @@ from lbt_synth.linear.convex_functions import Constraint, Function
 from lbt_synth.loop import least_residual, least_worst_residual
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.least_residuals.band_limit import BandLimit
-from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
+from lbt_synth.loop.least_residuals.residual_limit import (
+    ResidualLimit,
+    above_percent,
+    limit_or_nan,
+)
 from lbt_synth.models import (
     ARModel,
     Atmosphere,

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 from lbt_synth.design import Design, model_integrator
-from lbt_synth.design.model_limits import limit_or_nan
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
@@ -40,7 +39,7 @@ from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.loop.least_residuals.residual_limit import least_model_residual, limit_or_nan
 from lbt_synth.methods.registry import all_methods, reference_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import TipTiltPlant

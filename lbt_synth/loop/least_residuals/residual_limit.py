@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import assert_never
+from typing import Protocol, TypeVar, assert_never
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.errors import CoupledModesError, ProblemError
+from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_modes, plant_modes
 from lbt_synth.loop.least_residuals.prediction import Prediction
@@ -24,6 +25,16 @@ from lbt_synth.models.fusion.plant import suite_exposures
 from lbt_synth.models.fusion.sensors import SensorSuite
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
+
+T = TypeVar("T")
+
+
+class _Limit(Protocol):
+    """A limit, over all modes."""
+
+    @property
+    def rms_nm(self) -> float:
+        """Least residual [nm rms]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -224,3 +235,22 @@ def mode_limit(mode: ModeSpectrum) -> tuple[float, float]:
     variance = Prediction.of(mode.inner, moments).variance(reference, mode.noise_nm2)
     scale = min(1.0, float(moments[0])) if mode.noise_nm2 > 0 else 1.0
     return variance, panels.change / scale if scale > 0 else 0.0
+
+
+def above_percent(rms_nm: float, limit_nm: float) -> float:
+    """Return how far a residual is above a limit [%]; nan where the limit is 0 or nan."""
+    return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else np.nan
+
+
+def limit_or_nan(limit: Callable[[], _Limit]) -> float:
+    """Return the least residual [nm rms], nan where it cannot be computed."""
+    found = limit_or_none(limit)
+    return np.nan if found is None else found.rms_nm
+
+
+def limit_or_none(limit: Callable[[], T]) -> T | None:
+    """Return the limit, None where it cannot be computed."""
+    try:
+        return limit()
+    except LbtSynthError:
+        return None
