@@ -130,6 +130,7 @@ def test_public_fields_say_which_gain_they_are(name):
         "docs/prediction.md",
         "docs/records.md",
         "docs/identification.md",
+        "docs/theory.md",
         "docs/tracking.md",
     ],
 )
