@@ -335,7 +335,7 @@ def test_every_command_runs(tmp_path, capsys, model, ending):
     )
     assert front["points"]
     checked_output(capsys, "verify", gain)
-    for target, ending in {"c": "c", "dao": "fits", "matlab": "mat"}.items():
+    for target, ending in {"c": "c", "matlab": "mat"}.items():
         exported = tmp_path / f"x.{ending}"
         checked_output(capsys, "export", gain, "-o", exported, "--for", target)
         assert exported.exists()
