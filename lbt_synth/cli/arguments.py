@@ -39,13 +39,9 @@ def init(parser: ArgumentParser) -> None:
     text = "telemetry, for what it knows: timing, telescope, noise, turbulence and lines"
     add_option(parser, "--from", str, text, dest="source", metavar="RECORD")
     add_switch(parser, "--examples", "write the examples of the documentation instead (folder)")
+    add_switch(parser, "--schema", "print the JSON schema for editors instead (.json)")
     add_switch(parser, "--force", "replace files that are there")
     add_output(parser, "file to write (default: telescope or record, .yaml)", required=False)
-
-
-def schema(parser: ArgumentParser) -> None:
-    """Print the JSON schema of a configuration, for editors."""
-    add_output(parser, "file to write (.json)", required=False)
 
 
 def design(parser: ArgumentParser) -> None:

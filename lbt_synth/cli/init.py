@@ -1,4 +1,4 @@
-"""The commands init and schema: a configuration to begin with, and its schema for editors."""
+"""The command init: a configuration to begin with, and its schema for editors."""
 
 from __future__ import annotations
 
@@ -30,8 +30,10 @@ _USUAL = "generic"  # the telescope of which nothing is known
 
 
 def run(arguments: Namespace) -> Report:
-    """Write a configuration of a telescope or a record, or all examples."""
+    """Write a configuration of a telescope or a record, all examples, or the schema."""
     report = Report()
+    if arguments.schema:
+        return _schema(arguments)
     if arguments.examples:
         folder = Path(arguments.output or "examples")
         contents = {folder / name: text for name, text in sorted(example_files().items())}
@@ -117,8 +119,12 @@ def _section(name: str, template: str) -> re.Match[str] | None:
     return re.search(rf"^{name}:.*\n(?:  .*\n)+", template, re.MULTILINE)
 
 
-def run_schema(arguments: Namespace) -> Report:
+def _schema(arguments: Namespace) -> Report:
     """Print the schema of a configuration, or write it."""
+    others = {"--telescope": arguments.telescope, "--from": arguments.source}
+    others |= {"--examples": arguments.examples, "--force": arguments.force}
+    if given := [option for option, value in others.items() if value]:
+        raise ProblemError(f"--schema goes with -o alone; got {', '.join(given)}. Leave it out.")
     schema = config_schema()
     text = json.dumps(schema, indent=1)
     if arguments.output is None:

@@ -28,7 +28,6 @@ DONE, FAILED, WRONG = 0, 1, 2
 _SHARED_MODULES = dict.fromkeys(("bode", "nyquist", "nichols", "sigma", "step"), "loop_views") | {
     "completion": "help",
     "end-to-end-table": "end_to_end",
-    "schema": "init",
     "verify": "show",
 }
 INTERRUPTED, BROKEN_PIPE, TERMINATED = 130, 141, 143  # as shells count signals

@@ -16,7 +16,7 @@ from lbt_synth.errors import ProblemError, suggest_word
 COMMANDS = {
     add_arguments.__name__.replace("_", "-"): add_arguments
     for add_arguments in (
-        *(arguments.init, arguments.schema),
+        arguments.init,
         *(arguments.design, arguments.show, arguments.verify),
         *(arguments.export, arguments.rehearse),
         *(arguments.sigma, arguments.bode, arguments.nyquist, arguments.nichols, arguments.step),

@@ -1,4 +1,4 @@
-"""The commands init and schema."""
+"""The command init."""
 
 from __future__ import annotations
 
@@ -81,10 +81,12 @@ def test_records_that_know_too_little_are_refused(here, capsys):
 def test_the_schema_is_printed_and_written(tmp_path, capsys):
     schema = lbt.config.config_schema()
     for words in ((), ("--json",)):
-        status, out, error = run(capsys, "schema", *words)
+        status, out, error = run(capsys, "init", "--schema", *words)
         assert (status, error) == (0, "")
         assert json.loads(out) == schema
     file = tmp_path / "s.json"
-    assert run(capsys, "schema", "-o", file)[0] == 0
+    assert run(capsys, "init", "--schema", "-o", file)[0] == 0
     assert json.loads(file.read_text()) == schema
-    assert run(capsys, "schema", "-o", tmp_path / "s.yaml")[0] == 2
+    assert run(capsys, "init", "--schema", "-o", tmp_path / "s.yaml")[0] == 2
+    status, _, error = run(capsys, "init", "--schema", "--telescope", "vlt")
+    assert (status, "--schema goes with -o alone; got --telescope" in error) == (2, True)

@@ -15,7 +15,7 @@ from lbt_synth.cli.parser import COMMANDS
 READ_ONLY = {"show", "verify"}  # they write nothing
 
 
-WITHOUT_INPUTS = {"paper", "init", "schema", "help", "completion", "explore"}
+WITHOUT_INPUTS = {"paper", "init", "help", "completion", "explore"}
 
 
 # Inputs by their names in a directory, and arguments; OUT is where the output goes, under the
