@@ -26,7 +26,7 @@ class AccompaniedFilter:
     --------
     >>> import lbt_synth as lbt, numpy as np
     >>> from lbt_synth.interop.specula.fused_filter import AccompaniedFilter
-    >>> from lbt_synth.linear import PeriodicController
+    >>> from lbt_synth.linear.periodic.system import PeriodicController
     >>> mean = PeriodicController(A=[[[0.0]]], B=[[[0.5, 0.5]]], C=[[[1.0]]], D=[[[0.0, 0.0]]])
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
     >>> own = AccompaniedFilter(controller=mean, others=np.array([[4.0], [6.0]]), hardware=path)

@@ -7,4 +7,3 @@ from .robustness import robustness_map_figure as robustness_map_figure
 from .sigma import sigma_figure as sigma_figure
 from .step import step_figure as step_figure
 from .studies import modal_figure as modal_figure
-from .studies import tradeoff_figure as tradeoff_figure

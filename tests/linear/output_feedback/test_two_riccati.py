@@ -103,7 +103,7 @@ def test_least_level_of_nothing_left():
     assert lbt.hinf_controller(plant).gamma_least < 1e-9
 
 
-@pytest.mark.parametrize("seed", [8, 14, 23, 40])
+@pytest.mark.parametrize("seed", [8, 14, 23, 70])
 def test_a_least_variance_of_nothing(seed):
     """Zeros are stable and D12, D21 square: the least variance leaves rounding."""
     plant = sampled_plant(seed, n=3)
