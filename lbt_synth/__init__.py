@@ -4,7 +4,7 @@ The names of a design script and the rooms are listed in ``__init__.pyi`` and ar
 first used, so that ``import lbt_synth`` costs nothing.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 
 def _read_names():
