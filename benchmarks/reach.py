@@ -1,7 +1,7 @@
 """A pytest plugin: which test reaches which line of some files, and its processor seconds.
 
 `pytest -p reach -n 2` writes what each worker traced to the folder REACH_FOLDER, for the files
-that REACH_FILES names, and `load` reads it.
+that REACH_FILES names, and `load` reads it. Without files it writes the seconds alone.
 """
 
 import json
@@ -17,19 +17,21 @@ def pytest_configure(config):
     if not hasattr(config, "workerinput"):
         return
     Path(os.environ["REACH_FOLDER"]).mkdir(exist_ok=True)
-    config.trace = coverage.Coverage(
-        data_file=f"{os.environ['REACH_FOLDER']}/{os.getpid()}.coverage",
-        include=os.environ["REACH_FILES"].split(":"),
-    )
     config.processor_seconds = {}
-    config.trace.start()
+    if files := os.environ.get("REACH_FILES"):
+        config.coverage = coverage.Coverage(
+            data_file=f"{os.environ['REACH_FOLDER']}/{os.getpid()}.coverage",
+            include=files.split(":"),
+        )
+        config.coverage.start()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    if not hasattr(item.config, "trace"):
+    if not hasattr(item.config, "processor_seconds"):
         return (yield)
-    item.config.trace.switch_context(item.nodeid)
+    if hasattr(item.config, "coverage"):
+        item.config.coverage.switch_context(item.nodeid)
     start = time.process_time()
     result = yield
     item.config.processor_seconds[item.nodeid] = round(time.process_time() - start, 2)
@@ -37,9 +39,10 @@ def pytest_runtest_protocol(item):
 
 
 def pytest_unconfigure(config):
-    if hasattr(config, "trace"):
-        config.trace.stop()
-        config.trace.save()
+    if hasattr(config, "coverage"):
+        config.coverage.stop()
+        config.coverage.save()
+    if hasattr(config, "processor_seconds"):
         path = Path(os.environ["REACH_FOLDER"]) / f"{os.getpid()}.json"
         path.write_text(json.dumps(config.processor_seconds))
 
