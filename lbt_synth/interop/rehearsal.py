@@ -25,21 +25,11 @@ _MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RehearsedLoop:
-    """Series of one of the loops, after both have settled.
+    """Series of one of the loops, after both have settled."""
 
-    Attributes
-    ----------
-    residual_nm : (frames, n) ndarray
-        Residual, less noise that was given apart [nm].
-    commands : (frames, m) ndarray
-        Commands that the mirror got.
-    clipped_frames : int
-        Frames in which a command reached the limit.
-    """
-
-    residual_nm: FloatArray
-    commands: FloatArray
-    clipped_frames: int
+    residual_nm: FloatArray  # (frames, n): residual, less noise that was given apart [nm]
+    commands: FloatArray  # (frames, m): commands that the mirror got
+    clipped_frames: int  # frames in which a command reached the limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

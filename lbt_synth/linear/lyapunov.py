@@ -101,13 +101,6 @@ def smith_sum(A: _Matrix, Q: _Matrix) -> _Matrix:
 
     R. A. Smith, SIAM J. Appl. Math. 16, 198 (1968), doi:10.1137/0116017. Not finite where A is
     not stable. Good for corrections only: it loses digits as A nears the unit circle.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.lyapunov import smith_sum
-    >>> round(float(smith_sum(np.array([[[0.6]]]), np.array([[[64.0]]]))[0, 0, 0]), 12)
-    100.0
     """
     X = Q
     with np.errstate(all="ignore"):
@@ -141,27 +134,11 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def output_variances(C: FloatArray, D: FloatArray, root: FloatArray) -> FloatArray:
-    """Return the variances of ``C x + D w``, for a root of the covariance of x, as sums of squares.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.lyapunov import output_variances
-    >>> output_variances(np.array([[0.3]]), np.array([[4.0]]), np.array([[10.0]])).tolist()
-    [25.0]
-    """
+    """Return the variances of ``C x + D w``, sums of squares, for a root of the covariance of x."""
     return np.asarray(np.sum(np.hstack([C @ root, D]) ** 2, axis=1))
 
 
 def join_roots(one: _Matrix, other: _Matrix) -> _Matrix:
-    """Return R (n, r) with ``R R' = one one' + other other'``, real or complex.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.lyapunov import join_roots
-    >>> round(float(abs(join_roots(np.array([[3.0]]), np.array([[4.0]]))[0, 0])), 12)
-    5.0
-    """
+    """Return R (n, r) with ``R R' = one one' + other other'``, real or complex."""
     factor: _Matrix = np.linalg.qr(np.hstack([one, other]).conj().T)[1]
     return factor.conj().T

@@ -26,15 +26,7 @@ def frobenius_norms(stack: npt.NDArray[Entry]) -> FloatArray:
 
 
 def solve_stack(matrices: npt.NDArray[Entry], right: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
-    """Solve each system of a stack, (N, n, n) and (N, n, m); a singular one gives nan.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.matrix_functions import solve_stack
-    >>> solve_stack(np.array([[[2.0]], [[0.0]]]), np.ones((2, 1, 1))).ravel().tolist()
-    [0.5, nan]
-    """
+    """Solve each system of a stack, (N, n, n) and (N, n, m); a singular one gives nan."""
     try:
         return np.asarray(np.linalg.solve(matrices, right))  # type: ignore[arg-type]
     except np.linalg.LinAlgError:
@@ -58,15 +50,7 @@ def relative_distance(own: FloatArray, other: FloatArray) -> float:
 
 
 def nearest_powers_of_two(sizes: FloatArray) -> FloatArray:
-    """Return the powers of two nearest to sizes, by which nothing is rounded; 1 for none.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.matrix_functions import nearest_powers_of_two
-    >>> nearest_powers_of_two(np.array([0.9, 3.0, 0.0])).tolist()
-    [1.0, 4.0, 1.0]
-    """
+    """Return the powers of two nearest to sizes, by which nothing is rounded; 1 for none."""
     return np.asarray(np.exp2(np.round(np.log2(np.where(sizes > 0, sizes, 1.0)))))
 
 
@@ -80,14 +64,6 @@ def complex_schur(A: FloatArray) -> tuple[ComplexArray, ComplexArray]:
     """Return T and U with ``A = U T U*``, T upper triangular and U unitary, (n, n).
 
     On some companion matrices of long filters the complex iteration fails and the real one ends.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.matrix_functions import complex_schur
-    >>> T, U = complex_schur(np.array([[0.0, -1.0], [1.0, 0.0]]))
-    >>> bool(np.allclose(U @ T @ U.conj().T, [[0, -1], [1, 0]]))
-    True
     """
     try:
         T, U = schur(A.astype(np.complex128), output="complex")

@@ -52,18 +52,6 @@ def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
     """Return ``r ||T||_inf`` of an interval of gains, which proves it below ``CIRCLE_LIMIT``.
 
     It is inf where the loop is not stable at the middle of the interval.
-
-    Examples
-    --------
-    Where the loop has one state, the proof reaches as far as the constant gains:
-
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.loop.moving_gain import circle_norm
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
-    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
-    >>> loop = lbt.close_loop(path, lazy)
-    >>> round(circle_norm(loop, low=0.5, high=3.9), 3), round(circle_norm(loop, low=0.5, high=4), 3)
-    (0.944, 1.0)
     """
     middle = (low + high) / 2
     centred = close_loop(loop.hardware, loop.controller, sensor_gain=middle)

@@ -23,19 +23,7 @@ def _methods_of_folder() -> dict[str, Method]:
 
 
 def all_methods() -> dict[str, Method]:
-    """Return the methods of synthesis.
-
-    Returns
-    -------
-    dict of str to Method
-        In the order of their names.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods.registry import all_methods
-    >>> ", ".join(all_methods())
-    'hinf, integrator, kalman, lqg, mixed, robust'
-    """
+    """Return the methods of synthesis."""
     return dict(_methods_of_folder())
 
 

@@ -62,16 +62,7 @@ class DesignRequest:
         return f"{self.method.name} ({given})" if given else self.method.name
 
     def build(self, inputs: DesignInputs) -> Design:
-        """Design a controller; the inputs give defaults of options that are not given.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> from lbt_synth.methods.request import design_request
-        >>> config = lbt.load_config("examples/lbt.yaml")
-        >>> design_request("integrator", {"gain": 0.4}).build(config).gain
-        0.4
-        """
+        """Design a controller; the inputs give defaults of options that are not given."""
         defaults = inputs.design_defaults
         missing = (self.method.configurable & defaults.keys()) - self.given.keys()
         options = self.options.model_copy(update={name: defaults[name] for name in missing})

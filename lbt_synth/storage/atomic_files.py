@@ -50,16 +50,7 @@ def make_directory(path: str | os.PathLike[str], *, parents: bool = True) -> Pat
 def require_writable(
     *paths: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
 ) -> None:
-    """Refuse outputs that cannot be written or would replace an input, before any work is done.
-
-    Examples
-    --------
-    >>> from lbt_synth.storage.atomic_files import require_writable
-    >>> require_writable("nowhere/at/all.png")
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.OutputError: cannot write nowhere/at/all.png: no directory nowhere/at.
-    """
+    """Refuse outputs that cannot be written or would replace an input, before any work is done."""
     refuse_replacing(paths, inputs)
     for path in paths:
         target = Path(path)
@@ -80,16 +71,7 @@ def require_writable(
 def refuse_replacing(
     outputs: Iterable[str | os.PathLike[str]], inputs: Iterable[str | os.PathLike[str]]
 ) -> None:
-    """Refuse to write to an input, under whatever name, symbolic or hard link.
-
-    Examples
-    --------
-    >>> from lbt_synth.storage.atomic_files import refuse_replacing
-    >>> refuse_replacing(["a/../k.fits"], ["k.fits"])
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.OutputError: a/../k.fits must not replace the input k.fits; give another name.
-    """
+    """Refuse to write to an input, under whatever name, symbolic or hard link."""
     read = list(inputs)
     for path in outputs:
         for source in read:
@@ -120,31 +102,12 @@ def _is_same(one: Path, other: Path) -> bool:
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
-    """Write a file through a temporary one in the same directory.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> from lbt_synth.storage.atomic_files import write_atomically
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_atomically(pathlib.Path(folder) / "a.txt", b"whole").read_bytes()
-    b'whole'
-    """
+    """Write a file through a temporary one in the same directory."""
     return write_together({path: content})[0]
 
 
 def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Path, ...]:
-    """Write files that belong together: each is on the disk before the first gets its name.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> from lbt_synth.storage.atomic_files import write_together
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     at = pathlib.Path(folder)
-    ...     [p.name for p in write_together({at / "a.c": b"code", at / "a.h": b"names"})]
-    ['a.c', 'a.h']
-    """
+    """Write files that belong together: each is on the disk before the first gets its name."""
     with contextlib.ExitStack() as streams:
         opened = [streams.enter_context(open_atomically(path)) for path in contents]
         for stream, content in zip(opened, contents.values(), strict=True):
@@ -155,18 +118,7 @@ def write_together(contents: Mapping[str | os.PathLike[str], bytes]) -> tuple[Pa
 
 @contextlib.contextmanager
 def open_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a stream whose content becomes a file only when the block ends without an error.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> from lbt_synth.storage.atomic_files import open_atomically
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with open_atomically(pathlib.Path(folder) / "a.txt") as stream:
-    ...         _ = stream.write(b"part by part")
-    ...     (pathlib.Path(folder) / "a.txt").read_bytes()
-    b'part by part'
-    """
+    """Open a stream whose content becomes a file only when the block ends without an error."""
     target = Path(path)
     temporary = target.with_name(UNFINISHED.replace("*", secrets.token_hex(8)))
     try:

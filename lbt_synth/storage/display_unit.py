@@ -45,17 +45,7 @@ def show_in(unit: DisplayUnit) -> None:
 
 
 def shown_unit(unit: str) -> tuple[str, float]:
-    """Return what is shown for a unit such as "nm rms" or "nm²/Hz", and the factor to it.
-
-    Examples
-    --------
-    >>> from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
-    >>> from lbt_synth.storage.display_unit import nm_text, shown_unit
-    >>> with own_display_unit():
-    ...     show_in(DisplayUnit(name="mas", nm=10.0))
-    ...     shown_unit("nm²/Hz"), shown_unit("Hz"), nm_text(27.46, ".1f")
-    (('mas²/Hz', 0.01), ('Hz', 1.0), '2.75 mas')
-    """
+    """Return what is shown for a unit such as "nm rms" or "nm²/Hz", and the factor to it."""
     shown = _SHOWN.get()
     if shown.nm == 1 or not _NM.match(unit):
         return unit, 1.0

@@ -35,17 +35,7 @@ def open_input(path: str | os.PathLike[str], error: type[FileError]) -> Iterator
 def read_bytes(
     path: str | os.PathLike[str], error: type[FileError], *, most: int = LARGEST_BYTES
 ) -> bytes:
-    """Return the content of a regular file of at most so many bytes.
-
-    Examples
-    --------
-    >>> from lbt_synth.errors import FileError
-    >>> from lbt_synth.storage.input_files import read_bytes
-    >>> read_bytes("/dev/zero", FileError)
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.FileError: cannot read /dev/zero: it is not a regular file.
-    """
+    """Return the content of a regular file of at most so many bytes."""
     with open_input(path, error) as stream:
         fits = os.fstat(stream.fileno()).st_size <= most
         content = stream.read() if fits else b""

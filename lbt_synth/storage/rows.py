@@ -81,29 +81,7 @@ def percent_column(heading: str, **printing: Any) -> Any:
     field_specifiers=(column, nm_column, percent_column, dataclasses.field),
 )
 def table_row(kind: type[Row]) -> type[Row]:
-    r"""Make a frozen dataclass of columns, whose docstring lists them.
-
-    Examples
-    --------
-    >>> from lbt_synth.storage.rows import column, fact_table, json_record, row_table, table_row
-    >>> @table_row
-    ... class Result:
-    ...     '''One design.'''
-    ...
-    ...     design: str = column("design", help="Name of the design")
-    ...     strehl: float = column("Strehl", unit="%", scale=100, format=".1f")
-    ...     residual_nm: float = column("residual", unit="nm rms", format=".1f")
-    >>> row = Result(design="kalman", strehl=0.8, residual_nm=float("nan"))
-    >>> table = row_table("Designs", [row])
-    >>> table.headings, table.rows
-    (('design', 'Strehl [%]', 'residual [nm rms]'), (('kalman', '80.0', '-'),))
-    >>> fact_table("Design", row).rows[1]
-    ('Strehl', '80.0', '%')
-    >>> json_record(row)
-    {'design': 'kalman', 'strehl': 0.8, 'residual_nm': nan}
-    >>> csv_rows([row])
-    b'design,strehl,residual_nm\nkalman,0.8,\n'
-    """
+    r"""Make a frozen dataclass of columns, whose docstring lists them."""
     made = dataclasses.dataclass(frozen=True, slots=True, kw_only=True)(kind)
     lines = [f"{kind.__doc__}\n", "Attributes", "----------"]
     for each in columns(made):

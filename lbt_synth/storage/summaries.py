@@ -67,16 +67,7 @@ class Summarised:
         return self.summary()
 
     def summary(self) -> str:
-        """Return the facts of the object as text, as ``print`` shows them.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> print(lbt.LoopHardware(frame_rate_hz=800).summary())
-        LoopHardware: 2 axes at 800 Hz, delay 2 frames
-          frame rate   800  Hz
-          total delay    2  frames
-        """
+        """Return the facts of the object as text, as ``print`` shows them."""
         found = self._summarise()
         lines = [f"{type(self).__name__}: {self._brief()}"]
         for table in found.tables:

@@ -67,14 +67,7 @@ class Table:
 
 
 def csv_bytes(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
-    r"""Return a CSV table as UTF-8, floats with all their digits.
-
-    Examples
-    --------
-    >>> from lbt_synth.storage.tables import csv_bytes
-    >>> csv_bytes(["f_hz", "strehl"], [[20.0, 0.8]])
-    b'f_hz,strehl\n20.0,0.8\n'
-    """
+    r"""Return a CSV table as UTF-8, floats with all their digits."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerows([_plain_cell(cell) for cell in row] for row in (headings, *rows))

@@ -24,11 +24,6 @@ def dwell_frames(
 
     The norm weighs the error by the covariance of the plant's state, mean over the phases. If a
     filter shrinks it in any number of periods from m to 2 m - 1, it does in any more.
-
-    Returns
-    -------
-    int or None
-        Frames from one switch to the next; None if not proved for 5,000 periods.
     """
     P = plant.error_system(np.zeros_like(gains)).covariances().mean(axis=0)
     root = np.linalg.cholesky(P + _REGULAR * np.diag(np.diag(P)))

@@ -56,16 +56,6 @@ class RunningBanks:
     """Banks with their states: ``step(y) -> u`` once a frame, and ``reset()``.
 
     Every mode belongs to one controller.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.design.modal.banks import Bank, RunningBanks
-    >>> one = np.ones((2, 1, 1))
-    >>> bank = Bank(np.array([[1], [0]]), one, one, one, 0 * one)
-    >>> run = RunningBanks((bank,), 2)
-    >>> [run.step([1.0, 2.0]).tolist() for _ in range(2)]
-    [[1.0, 2.0], [2.0, 4.0]]
     """
 
     banks: Sequence[Bank]

@@ -59,16 +59,7 @@ class Basis:
 
 
 def orthonormal_basis(poles: ComplexArray, *, dt_s: float) -> Basis:
-    """Return the orthonormal functions with given poles, (n,).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.design.shaping.channel import orthonormal_basis
-    >>> three = orthonormal_basis(np.array([0.5, 0.9 + 0.1j, 0.9 - 0.1j]), dt_s=1.0)
-    >>> bool(np.allclose(three.A @ three.A.T + three.B @ three.B.T, np.eye(3)))
-    True
-    """
+    """Return the orthonormal functions with given poles, (n,)."""
     given = np.atleast_1d(np.asarray(poles, dtype=np.complex128))
     radius = float(np.max(np.abs(given)))
     if not radius < 1:

@@ -43,15 +43,6 @@ class AppliedFilter:
     The matrix (modes, steps * modes) has a row per mode of the command. The latency of cacao's
     index arithmetic is one frame more than the total delay. The limit is that of the modulus of a
     command that is applied; the history holds the applied commands.
-
-    Examples
-    --------
-    A filter that gives back the last value, with its sign changed:
-
-    >>> from lbt_synth.interop.cacao.export import AppliedFilter
-    >>> last = AppliedFilter([[-1.0, 0.0]])
-    >>> [float(last.step([y])[0]) for y in (1.0, 0.0, 0.0, 0.0)]
-    [1.0, 0.0, 1.0, 0.0]
     """
 
     def __init__(self, matrix: ArrayLike, delay_frames: float = 2.0, limit: float = np.inf) -> None:

@@ -90,16 +90,7 @@ def _polynomials(
 
 
 def direct_form(rows: FloatArray, dt_s: float) -> Controller:
-    """Return the controller of a matrix (2 M + 1, modes); the first state of each is its command.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.interop.dao.direct_form import direct_form
-    >>> run = direct_form(np.array([[0.5], [0.0], [1.0]]), 1.0).start()
-    >>> [float(run.step([1.0])[0]) for _ in range(3)]
-    [0.5, 1.0, 1.5]
-    """
+    """Return the controller of a matrix (2 M + 1, modes), whose first states are the commands."""
     if not np.all(np.isfinite(rows)):
         raise NumericalError(
             "the coefficients must be numbers of single precision; some are beyond its range. "
@@ -127,17 +118,6 @@ class InnerLoop:
 
     The matrix (2 M + 1, modes) has rows ``b_0 .. b_M``, then ``a_1 .. a_M``; ``to_actuators``
     (actuators, modes) is the identity by default, and the limit that of a voltage's modulus.
-
-    Examples
-    --------
-    An integrator, ``u(k) = u(k-1) + 0.5 y(k)``, and its clipped memory:
-
-    >>> from lbt_synth.interop.dao.direct_form import InnerLoop
-    >>> loop = InnerLoop([[0.5], [0.0], [1.0]], limit=0.75)
-    >>> [float(loop.step([1.0])[0]) for _ in range(3)]
-    [0.5, 0.75, 0.75]
-    >>> float(loop.step([-1.0])[0])
-    0.25
     """
 
     def __init__(

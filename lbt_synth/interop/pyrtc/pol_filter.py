@@ -152,14 +152,6 @@ class InnerLoop:
     """A design as pyRTC runs it: signals and commands in single precision, the filter in double.
 
     It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.interop.pyrtc.pol_filter import InnerLoop
-    >>> loop = InnerLoop(lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5))
-    >>> [float(loop.step([1.0, 0.0])[0]) for _ in range(3)]
-    [0.5, 1.0, 1.5]
     """
 
     def __init__(self, design: Design, limit: float = np.inf) -> None:

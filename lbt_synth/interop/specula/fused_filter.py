@@ -20,19 +20,7 @@ from lbt_synth.validation import FloatArray
 
 @dataclass(kw_only=True, eq=False)
 class AccompaniedFilter:
-    """A filter of several sensors to step with the pyramid alone: it has the other readings.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, numpy as np
-    >>> from lbt_synth.interop.specula.fused_filter import AccompaniedFilter
-    >>> from lbt_synth.linear.periodic.system import PeriodicController
-    >>> mean = PeriodicController(A=[[[0.0]]], B=[[[0.5, 0.5]]], C=[[[1.0]]], D=[[[0.0, 0.0]]])
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> own = AccompaniedFilter(controller=mean, others=np.array([[4.0], [6.0]]), hardware=path)
-    >>> [own.step(np.array([2.0])).tolist() for _ in range(2)]
-    [[3.0], [4.0]]
-    """
+    """A filter of several sensors to step with the pyramid alone: it has the other readings."""
 
     controller: PeriodicController
     others: FloatArray  # readings of the other sensors in each frame, (frames, q)

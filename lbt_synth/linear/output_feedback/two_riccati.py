@@ -173,23 +173,6 @@ def central_controller(
 
     X and Y (n, n) are the stabilising solutions of control and of estimation at the level; an
     infinite level is that of the least variance. NumericalError if it is not above the least one.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.linear.output_feedback.two_riccati import central_controller
-    >>> P = lbt.linear.GeneralizedPlant(
-    ...     A=1.0,
-    ...     B1=[[1.0, 0.0]],
-    ...     B2=1.0,
-    ...     C1=[[1.0], [0.0]],
-    ...     C2=1.0,
-    ...     D12=[[0.0], [1.0]],
-    ...     D21=[[0.0, 1.0]],
-    ... )
-    >>> golden = [[(1 + 5**0.5) / 2]]
-    >>> round(float(central_controller(P, golden, golden).D[0, 0]), 6)  # -1 / golden^2
-    -0.381966
     """
     X, Y = np.asarray(X), np.asarray(Y)
     try:

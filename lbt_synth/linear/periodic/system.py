@@ -22,26 +22,13 @@ _CHUNK = 2_000_000  # complex numbers that a frequency response computes at once
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PeriodicSystem:
-    """System ``x(k+1) = A[t] x(k) + B[t] w(k)``, ``y(k) = C[t] x(k) + D[t] w(k)``, t = k mod N.
+    """System ``x(k+1) = A[t] x(k) + B[t] w(k)``, ``y(k) = C[t] x(k) + D[t] w(k)``, t = k mod N."""
 
-    Parameters
-    ----------
-    A, B, C, D : (N, n, n), (N, n, m), (N, p, n), (N, p, m) array_like
-        Matrices of each phase; those of one phase, (1, ...), are repeated.
-    dt_s : float, optional
-        Sampling period [s].
-
-    Raises
-    ------
-    ProblemError
-        If a matrix is not finite or the sizes clash.
-    """
-
-    A: FloatArray
+    A: FloatArray  # (N, n, n): matrices of each phase; those of one phase, (1, ...), are repeated
     B: FloatArray
     C: FloatArray
     D: FloatArray
-    dt_s: float = 1.0
+    dt_s: float = 1.0  # sampling period [s]
 
     def __post_init__(self) -> None:
         parts = {name: real_array(getattr(self, name), name) for name in "ABCD"}
@@ -108,13 +95,7 @@ class PeriodicSystem:
         return replace(system, B=turned[: self.n_states], D=turned[self.n_states :])
 
     def covariances(self) -> FloatArray:
-        """Return the stationary covariance of x at each phase, for white w of unit variance.
-
-        Returns
-        -------
-        (N, n, n) ndarray
-            Covariances; the system has to be stable.
-        """
+        """Return the stationary covariance of x at each phase, for white w of unit variance."""
         drives = self.B @ self.B.transpose(0, 2, 1)
         whole = np.zeros_like(drives[0])  # of what a period adds
         for A, drive in zip(self.A, drives, strict=True):

@@ -116,14 +116,6 @@ def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, I
     recursion; the convergence is quadratic. G need not be semidefinite. Return X, nan where the
     iteration did not converge, and the steps made (N,). An equation leaves the stack as soon as it
     has converged or diverged.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.linear.riccati.routes import doubling
-    >>> one = np.ones((1, 1, 1))
-    >>> round(float(doubling(one, one, one)[0][0, 0, 0]), 12)  # the golden ratio
-    1.61803398875
     """
     X, going, n = H, np.arange(len(A)), A.shape[-1]
     one = np.eye(n)

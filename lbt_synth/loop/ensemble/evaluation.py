@@ -73,24 +73,7 @@ class EnsembleResiduals:
         return np.sqrt(_power(self.turbulence_nm2) + _power(self.noise_nm2) + self._vibration_nm2())
 
     def strehl(self, imaging: Imaging) -> FloatArray:
-        """Strehl ratio of each loop.
-
-        Parameters
-        ----------
-        imaging : Imaging
-            The camera.
-
-        Returns
-        -------
-        (p,) ndarray
-            Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by
-            more than 160 times its width.
-
-        Raises
-        ------
-        DimensionError
-            If the loops have more than two modes.
-        """
+        """Strehl ratio of each loop."""
         gaussian = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
         lines = self.line_amplitudes_nm
         out = np.full(self.stable.shape, np.nan)

@@ -133,10 +133,7 @@ class FusedPlant(PeriodicProblem, Summarised):
         Its states are the estimates of the plant's states, and the known ones. Entries of a
         measurement that is not read do not matter: their gains are zero.
 
-        Parameters
-        ----------
-        gains : (N, n, q) ndarray
-            Predictor gains.
+        Shapes: gains (N, n, q).
         """
         shape = (self.period, self.n_states, self.n_measurements)
         if np.shape(gains) != shape:

@@ -103,19 +103,7 @@ def ar1_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float) -> ARModel:
 
 
 def ar1_flows(flows: FrozenFlows, *, frame_rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Coefficients (p, 1) and driving noise (p,) [nm] of the AR1 models of p frozen flows.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.turbulence.ar_models import ar1_flows
-    >>> air = lbt.Atmosphere(
-    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
-    ... )
-    >>> poles, driving = ar1_flows(lbt.models.FrozenFlows(atmosphere=air), frame_rate_hz=800)
-    >>> poles.round(4).tolist(), driving.round(2).tolist()
-    ([[0.9886]], [89.08])
-    """
+    """Coefficients (p, 1) and driving noise (p,) [nm] of the AR1 models of p frozen flows."""
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     poles = pole(flows.wind_speed_m_s, flows.atmosphere.diameter_m, rate)
     return poles[:, None], flows.tilt_rms_nm * np.sqrt(1 - poles**2)

@@ -47,16 +47,7 @@ def group_starts(ordered: FloatArray, groups: int) -> IntArray:
 
 
 def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return levels (k,) and the part of the values at or below each, denser in the tails.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.studies.study.binning import cumulative_points
-    >>> level, part = cumulative_points(np.array([0.0, 0.0, 0.5, 1.0]))
-    >>> level, part
-    (array([0. , 0.5, 1. ]), array([0.5 , 0.75, 1.  ]))
-    """
+    """Return levels (k,) and the part of the values at or below each, denser in the tails."""
     ordered = np.sort(values)
     n = len(ordered)
     if n <= 2 * _POINTS:
@@ -86,17 +77,7 @@ def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
 
 
 def binned_map(x: FloatArray, y: FloatArray, result: FloatArray) -> BinnedMap:
-    """Return the mean of a result (n,) over a grid of two varying parameters (n,).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.studies.study.binning import binned_map
-    >>> gain, wind = np.meshgrid(np.linspace(0, 1, 40), [10.0, 20.0])
-    >>> found = binned_map(gain.ravel(), wind.ravel(), wind.ravel() / 100)
-    >>> found.y, found.mean[:, 0]
-    (array([10., 20.]), array([0.1, 0.2]))
-    """
+    """Return the mean of a result (n,) over a grid of two varying parameters (n,)."""
     cells = len(x) / _PER_CELL
     lists = [value_shares(x), value_shares(y)]
     for found in lists:

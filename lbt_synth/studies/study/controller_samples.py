@@ -52,20 +52,7 @@ def read_column(
 def read_controller_samples(
     columns: Mapping[str, Any], controller: str, size: int | None = None
 ) -> ControllerSamples:
-    """Read the columns of a controller, (n,) each.
-
-    Examples
-    --------
-    >>> from lbt_synth.studies.study.controller_samples import read_controller_samples
-    >>> nan = float("nan")
-    >>> columns = {
-    ...     "a.stable": [1, 0, nan],
-    ...     "a.strehl": [0.8, nan, nan],
-    ...     "a.residual_nm": [50, nan, nan],
-    ... }
-    >>> read_controller_samples(columns, "a").strehl
-    array([0.8, 0. , nan])
-    """
+    """Read the columns of a controller, (n,) each."""
     stable_column = read_column(columns, f"{controller}.stable", size)
     size = len(stable_column)
     evaluated, unstable = ~np.isnan(stable_column), stable_column == 0

@@ -34,14 +34,7 @@ class InlineExecutor(futures.Executor):
 
 
 def cut_parts(ranges: Sequence[RowRange], rows: int) -> Iterator[RowRange]:
-    """Yield the parts of some ranges: a number of rows each, and less at the end of a range.
-
-    Examples
-    --------
-    >>> from lbt_synth.studies.study.engine import cut_parts
-    >>> list(cut_parts([(0, 5), (8, 10)], 3))
-    [(0, 3), (3, 5), (8, 10)]
-    """
+    """Yield the parts of some ranges: a number of rows each, and less at the end of a range."""
     for start, stop in ranges:
         for first in range(start, stop, rows):
             yield first, min(first + rows, stop)

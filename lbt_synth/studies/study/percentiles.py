@@ -38,16 +38,7 @@ class Share:
 
 
 def percentiles(values: FloatArray, percents: Sequence[float]) -> tuple[Percentile, ...]:
-    """Return percentiles of a sample (n,), with intervals from order statistics.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.studies.study.percentiles import percentiles
-    >>> (middle,) = percentiles(np.arange(101.0), [50])
-    >>> middle.value, middle.low, middle.high
-    (50.0, 40.0, 60.0)
-    """
+    """Return percentiles of a sample (n,), with intervals from order statistics."""
     from scipy.stats import binom
 
     n, tail = len(values), (1 - CONFIDENCE) / 2
@@ -76,16 +67,7 @@ def _interpolate(ordered: FloatArray, fraction: float) -> float:
 
 
 def share(where: BoolArray) -> Share:
-    """Return the part of the samples (n,) of a mask, with the interval of Clopper and Pearson.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.studies.study.percentiles import share
-    >>> none = share(np.zeros(100, dtype=bool))
-    >>> none.value, none.low, round(none.high, 4)
-    (0.0, 0.0, 0.0362)
-    """
+    """Return the part of the samples (n,) of a mask, with the interval of Clopper and Pearson."""
     from scipy.special import betaincinv
 
     count, total = int(np.count_nonzero(where)), len(where)

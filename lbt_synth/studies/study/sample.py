@@ -70,14 +70,7 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
 
 
 def parse_path(path: str) -> Keys:
-    """Parse a path into its keys.
-
-    Examples
-    --------
-    >>> from lbt_synth.studies.study.sample import parse_path
-    >>> parse_path("truth.vibrations[0].frequency_hz")
-    ('truth', 'vibrations', 0, 'frequency_hz')
-    """
+    """Parse a path into its keys."""
     keys: list[str | int] = []
     for part in path.split("."):
         found = _PART.fullmatch(part)
@@ -166,15 +159,6 @@ def evaluate_rows(
     """Evaluate consecutive rows of ``Study.values``, (b, parameters), one by one.
 
     ``left`` names the controllers to evaluate on each row, by its place; all of them by default.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.studies.study.sample import evaluate_rows
-    >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> batch = evaluate_rows(study, study.values(0, 2), 0)
-    >>> batch.columns["kalman.strehl"].round(3).tolist(), batch.columns["kalman.stable"].tolist()
-    ([0.837, 0.821], [1.0, 1.0])
     """
     if left is None:
         left = dict.fromkeys(range(len(values)), study.controllers)

@@ -65,21 +65,7 @@ class NormalSection(Section):
 
 
 class ParameterSection(Section):
-    """The distribution of one parameter; a bare number is fixed.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.studies.study.schema import ParameterSection
-    >>> level = np.array([0.2, 0.3, 0.5, 0.8413447460685429])
-    >>> for given in ({"list": [10, 20, 30], "weights": [1, 1, 2]}, {"uniform": [10, 20]}):
-    ...     ParameterSection.model_validate(given).quantile(level[:3])
-    array([10., 20., 30.])
-    array([12., 13., 15.])
-    >>> normal = ParameterSection.model_validate({"normal": {"mean": 20, "deviation": 0.5}})
-    >>> normal.quantile(level[2:]).round(6), normal.text
-    (array([20. , 20.5]), 'normal, 20 with deviation 0.5')
-    """
+    """The distribution of one parameter; a bare number is fixed."""
 
     fixed: float | None = None
     uniform: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None

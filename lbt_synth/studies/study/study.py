@@ -198,14 +198,6 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
 
     The seed fixes every point. A longer Sobol sequence begins with the same points, and is
     balanced where it has 2^k of them. A Latin hypercube is made as a whole, once per process.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.studies.study.study import unit_points
-    >>> points = unit_points(lbt.studies.load_study("examples/study.yaml").settings, 2, 0, 8)
-    >>> (points < 0.5).sum(axis=0).tolist()
-    [4, 4]
     """
     if dimensions == 0 or stop == start:
         return np.zeros((stop - start, dimensions))

@@ -197,17 +197,7 @@ def varying_parameters(statistics: StudyStatistics) -> tuple[str, ...]:
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return for each path its last keys, as many as distinguish it from the others.
-
-    Examples
-    --------
-    >>> from lbt_synth.studies.study.summary import short_names
-    >>> found = short_names(
-    ...     ["truth.vibrations[0].rms_mas", "truth.vibrations[1].rms_mas", "truth.sensor_gain"]
-    ... )
-    >>> list(found.values())
-    ['vibrations[0].rms_mas', 'vibrations[1].rms_mas', 'sensor_gain']
-    """
+    """Return for each path its last keys, as many as distinguish it from the others."""
     out = {}
     for name in names:
         keys = name.split(".")
@@ -224,14 +214,7 @@ def percent(value: float, digits: int = 1) -> str:
 
 
 def ordinal(percentile: float) -> str:
-    """Return the name of a percentile.
-
-    Examples
-    --------
-    >>> from lbt_synth.studies.study.summary import ordinal
-    >>> ordinal(1), ordinal(95)
-    ('1st percentile', '95th percentile')
-    """
+    """Return the name of a percentile."""
     suffix = {1: "st", 2: "nd", 3: "rd"}.get(int(percentile) % 10, "th")
     teens = 10 < percentile % 100 < 14
     return f"{percentile:g}{'th' if teens or percentile % 1 else suffix} percentile"
