@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth as lbt
-from lbt_synth.interop import Exported
 from lbt_synth.interop.dao.direct_form import InnerLoop
+from lbt_synth.interop.export_checks import Exported
 from lbt_synth.interop.target import target_named, target_names
 from lbt_synth.linear.block_filtering import filter_series
 

@@ -17,7 +17,8 @@ from lbt_synth.config import load_config
 from lbt_synth.design import Design, FusedFilter
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
-from lbt_synth.interop import Calibration, EndToEndRun, EndToEndSetup, calibrate
+from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
+from lbt_synth.interop.specula.calibration import Calibration
 from lbt_synth.interop.specula.cases import summarise_run
 from lbt_synth.interop.specula.fused_filter import unread_sensors
 from lbt_synth.interop.specula.optics import specula_version

@@ -11,7 +11,8 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.interop import Exported, frame_cost, target_named
+from lbt_synth.interop import frame_cost, target_named
+from lbt_synth.interop.export_checks import Exported
 from lbt_synth.interop.target import CERTIFICATE, target_names
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.input_files import file_sha256

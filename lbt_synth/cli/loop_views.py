@@ -17,7 +17,8 @@ from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.design import Design, EstimatorDesign
+from lbt_synth.design import Design
+from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.report.figures import (

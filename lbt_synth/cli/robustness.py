@@ -26,13 +26,9 @@ from lbt_synth.report.designs.report import refine_values
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, percent_column, row_table, table_row
-from lbt_synth.studies import (
-    GuaranteedResidual,
-    RobustnessMap,
-    guaranteed_residual,
-    robustness_map,
-)
+from lbt_synth.studies import RobustnessMap, guaranteed_residual, robustness_map
 from lbt_synth.studies.robustness import default_methods
+from lbt_synth.studies.worst_residual import GuaranteedResidual
 from lbt_synth.validation import FloatArray, agree, frozen_copy, number
 
 _MOST_VALUES = 2001  # of frequency errors or sensor gains

@@ -7,14 +7,12 @@ from .certificate import certify_infeasible as certify_infeasible
 from .certificate import certify_loop as certify_loop
 from .filter_design import FilterDesign as FilterDesign
 from .fusion.failures import FailureRow as FailureRow
-from .fusion.failures import Fallback as Fallback
 from .fusion.failures import failure_rows as failure_rows
 from .fusion.fused_filter import FusedFilter as FusedFilter
 from .fusion.fused_filter import fused_hinf as fused_hinf
 from .fusion.fused_filter import fused_kalman as fused_kalman
 from .fusion.mixed import fused_mixed as fused_mixed
 from .hinf import hinf as hinf
-from .integrator import IntegratorDesign as IntegratorDesign
 from .integrator import integrator as integrator
 from .integrator import integrator_gain_limit as integrator_gain_limit
 from .integrator import model_integrator as model_integrator
@@ -30,8 +28,6 @@ from .mixed import mixed as mixed
 from .output_feedback.h2_controller import h2_controller as h2_controller
 from .output_feedback.hinf_controller import hinf_controller as hinf_controller
 from .output_feedback.mixed_controller import mixed_controller as mixed_controller
-from .output_feedback.result import ControllerDesign as ControllerDesign
 from .result import Design as Design
-from .result import EstimatorDesign as EstimatorDesign
 from .result import SolverReport as SolverReport
 from .robust import robust as robust

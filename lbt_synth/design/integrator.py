@@ -31,21 +31,12 @@ _LEAST_GAIN = 1e-3  # as a part of that of a usual loop: two integrators are sta
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegratorDesign(Design):
-    """The classical controller ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
-
-    Attributes
-    ----------
-    loop_hardware : LoopHardware
-        The loop.
-    gain : float
-        Integrator gain, per unit of sensor gain.
-    law : IntegratorLaw
-        Leak, zero and second integrator, and the margins that the certificate checks.
-    """
+    """The classical controller ``u(k) = u(k-1) + gain R y(k)``, or one of another law."""
 
     controller: Controller = field(init=False)
-    loop_hardware: LoopHardware
-    gain: float
+    loop_hardware: LoopHardware  # the loop
+    gain: float  # integrator gain, per unit of sensor gain
+    # leak, zero and second integrator, and the margins that the certificate checks
     law: IntegratorLaw = PURE
 
     def __post_init__(self) -> None:

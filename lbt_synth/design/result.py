@@ -223,15 +223,9 @@ class Design(Summarised):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EstimatorDesign(Design, ABC):
-    """A controller that applies an estimator of z.
+    """A controller that applies an estimator of z."""
 
-    Attributes
-    ----------
-    problem : EstimationProblem
-        The problem (a plant, for a telescope).
-    """
-
-    problem: EstimationProblem
+    problem: EstimationProblem  # the problem (a plant, for a telescope)
 
     @property
     def gamma(self) -> float:
@@ -268,13 +262,7 @@ class EstimatorDesign(Design, ABC):
 
     @abstractmethod
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the estimation error.
-
-        Parameters
-        ----------
-        problem : EstimationProblem, optional
-            Problem with other disturbances; the design's own by default.
-        """
+        """System from w to the estimation error."""
 
 
 UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))

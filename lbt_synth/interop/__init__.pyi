@@ -1,15 +1,12 @@
-from .arithmetic_cost import FrameCost as FrameCost
 from .arithmetic_cost import frame_cost as frame_cost
 from .c.export import export_c as export_c
 from .cacao.export import export_cacao as export_cacao
 from .dao.export import export_dao as export_dao
-from .export_checks import Exported as Exported
 from .matlab.export import export_mat as export_mat
 from .pyrtc.export import export_pyrtc as export_pyrtc
 from .pyrtc.replay import pyrtc_commands as pyrtc_commands
 from .rehearsal import Rehearsal as Rehearsal
 from .rehearsal import rehearse as rehearse
-from .specula.calibration import Calibration as Calibration
 from .specula.calibration import calibrate as calibrate
 from .specula.end_to_end_run import EndToEndRun as EndToEndRun
 from .specula.simulation import EndToEndSetup as EndToEndSetup

@@ -16,16 +16,7 @@ _LONGEST = 4096  # terms that are written out at most
 
 @table_row
 class FrameCost:
-    """Arithmetic and memory of one frame of a controller, as exported and with whole matrices.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
-    >>> cost = lbt.interop.frame_cost(slow)
-    >>> cost.multiplications, cost.dense_multiplications, cost.state_bytes_single
-    (2, 16, 16)
-    """
+    """Arithmetic and memory of one frame of a controller, as exported and with whole matrices."""
 
     form: str = column(
         "form of the exported source",

@@ -148,35 +148,20 @@ def _rehearse(design: Design, controller: SteppedController | RunningController)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exported:
-    """Files that were written, and how far they are from the controller.
+    """Files that were written, and how far they are from the controller."""
 
-    Attributes
-    ----------
-    files : tuple of pathlib.Path
-        The files.
-    error : float
-        Largest difference of the commands from those of the controller, over the largest
-        command, with the arithmetic of the file: in the closed loop where the design is of one,
-        on white noise elsewhere.
-    error_single : float
-        The same in single precision; inf if the loop is then unstable.
-    start : callable
-        ``start(limit)``, which returns what was written, stepped in the arithmetic of the target.
-        One that knows its limit clips its commands itself.
-    checks : tuple of Check
-        The proof in the loop, with the numbers of the file.
-    cost : FrameCost or None
-        Arithmetic of a frame, if what is written is counted.
-    made_again : bool
-        Whether the coefficients were made again for the arithmetic of the target.
-    """
-
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # the files
+    # largest difference of the commands from those of the controller, over the largest command,
+    # with the arithmetic of the file: in the closed loop where the design is of one, on white noise
+    # elsewhere
     error: float
-    error_single: float
+    error_single: float  # the same in single precision; inf if the loop is then unstable
+    # ``start(limit)``, which returns what was written, stepped in the arithmetic of the target. One
+    # that knows its limit clips its commands itself
     start: Callable[[float], SteppedController]
-    checks: tuple[Check, ...] = ()
-    cost: FrameCost | None = None
+    checks: tuple[Check, ...] = ()  # the proof in the loop, with the numbers of the file
+    cost: FrameCost | None = None  # arithmetic of a frame, if what is written is counted
+    # whether the coefficients were made again for the arithmetic of the target
     made_again: bool = False
 
 

@@ -1,5 +1,4 @@
 from .limits import LimitRow as LimitRow
-from .limits import LimitStudy as LimitStudy
 from .limits import limits as limits
 from .mirror import MirrorRow as MirrorRow
 from .mirror import mirror as mirror
@@ -11,14 +10,9 @@ from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .study.batch_evaluation import evaluate_samples as evaluate_samples
 from .study.load import load_study as load_study
-from .study.replay import Replay as Replay
 from .study.replay import replay_row as replay_row
-from .study.run import Estimate as Estimate
-from .study.run import StudyRun as StudyRun
 from .study.run import estimate_study as estimate_study
 from .study.run import run_study as run_study
-from .study.statistics import ControllerStatistics as ControllerStatistics
-from .study.statistics import StudyStatistics as StudyStatistics
 from .study.statistics import study_statistics as study_statistics
 from .study.study import BatchResult as BatchResult
 from .study.study import Failure as Failure
@@ -26,7 +20,5 @@ from .study.study import Study as Study
 from .study.summary import summary_tables as summary_tables
 from .tradeoff import TradeoffPoint as TradeoffPoint
 from .tradeoff import tradeoff as tradeoff
-from .truth_comparison import TruthComparison as TruthComparison
 from .truth_comparison import compare_in_truth as compare_in_truth
-from .worst_residual import GuaranteedResidual as GuaranteedResidual
 from .worst_residual import guaranteed_residual as guaranteed_residual

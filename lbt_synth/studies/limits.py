@@ -76,35 +76,21 @@ class LimitRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LimitStudy:
-    """Designs beside the limits, over the true frequency of the vibrations.
+    """Designs beside the limits, over the true frequency of the vibrations."""
 
-    Attributes
-    ----------
-    rows : tuple of LimitRow
-        One per design.
-    limit : ResidualLimit or None
-        The least residual of any linear controller; None where the modes do not decouple.
-    band : BandLimit or None
-        The least worst residual with the sinusoid anywhere in the range of errors; None
-        unless the truth has exactly one vibration, a sinusoid, and there is a range.
-    band_hz : tuple of float or None
-        That range [Hz].
-    shift_hz : (s,) ndarray
-        True frequency less that of the truth [Hz], of the vibration that moves most; empty
-        without vibrations.
-    residual_nm : (designs, s) ndarray
-        Residual of each design at each shift [nm rms]; nan if unstable.
-    frequency_hz : float or None
-        Frequency of the truth's vibrations, if it is one.
-    """
-
-    rows: tuple[LimitRow, ...]
+    rows: tuple[LimitRow, ...]  # one per design
+    # the least residual of any linear controller; None where the modes do not decouple
     limit: ResidualLimit | None
+    # the least worst residual with the sinusoid anywhere in the range of errors; None unless the
+    # truth has exactly one vibration, a sinusoid, and there is a range
     band: BandLimit | None
-    band_hz: tuple[float, float] | None
+    band_hz: tuple[float, float] | None  # that range [Hz]
+    # (s,): true frequency less that of the truth [Hz], of the vibration that moves most; empty
+    # without vibrations
     shift_hz: FloatArray
+    # (designs, s): residual of each design at each shift [nm rms]; nan if unstable
     residual_nm: FloatArray
-    frequency_hz: float | None
+    frequency_hz: float | None  # frequency of the truth's vibrations, if it is one
 
 
 def limits(

@@ -22,25 +22,15 @@ _SURPRISING = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TruthComparison:
-    """Designs in the truth of a configuration.
+    """Designs in the truth of a configuration."""
 
-    Attributes
-    ----------
-    rows : tuple of LimitRow
-        The designs, then the reference designs that are none of them.
-    limit : ResidualLimit or None
-        The least residual of any linear controller; None where the modes do not decouple.
-    warnings : mapping of str to tuple of str
-        What is wrong with a design in this truth: an unstable loop, a residual far above what the
-        design expects, and demands that cost residual.
-    notes : tuple of str
-        Why reference designs are missing.
-    """
-
-    rows: tuple[LimitRow, ...]
+    rows: tuple[LimitRow, ...]  # the designs, then the reference designs that are none of them
+    # the least residual of any linear controller; None where the modes do not decouple
     limit: ResidualLimit | None
+    # what is wrong with a design in this truth: an unstable loop, a residual far above what the
+    # design expects, and demands that cost residual
     warnings: Mapping[str, tuple[str, ...]]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # why reference designs are missing
 
 
 def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComparison:

@@ -47,22 +47,15 @@ class _Line:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuaranteedResidual:
-    """The worst residual over a box of line frequencies and sensor gains.
+    """The worst residual over a box of line frequencies and sensor gains."""
 
-    Attributes
-    ----------
-    upper_nm : float
-        No point of the box leaves more [nm rms]; inf if the loop is unstable at one, or if
-        halving 120 boxes of gains is too little for any bound.
-    value_nm : float
-        The largest found at one set of gains [nm rms]. It occurs where all lines are sinusoids
-        along one axis; for other lines it is a bound at these gains.
-    sensor_gains : tuple of float
-        The gains of that, one per measurement, relative to the sensor matrix.
-    """
-
+    # no point of the box leaves more [nm rms]; inf if the loop is unstable at one, or if halving
+    # 120 boxes of gains is too little for any bound
     upper_nm: float
+    # the largest found at one set of gains [nm rms]. It occurs where all lines are sinusoids along
+    # one axis; for other lines it is a bound at these gains
     value_nm: float
+    # the gains of that, one per measurement, relative to the sensor matrix
     sensor_gains: tuple[float, ...]
 
 

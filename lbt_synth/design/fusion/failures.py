@@ -30,18 +30,10 @@ MOST_UNITS = 6  # sensors and channels of which every subset gets a filter
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fallback:
-    """The filter of the sensors that remain when some have failed.
+    """The filter of the sensors that remain when some have failed."""
 
-    Attributes
-    ----------
-    missing : tuple of str
-        Sensors and channels that are not read.
-    gains : (N, n, q) ndarray
-        Predictor gains, zero for what is missing.
-    """
-
-    missing: tuple[str, ...]
-    gains: FloatArray
+    missing: tuple[str, ...]  # sensors and channels that are not read
+    gains: FloatArray  # (N, n, q): predictor gains, zero for what is missing
 
 
 @table_row

@@ -1,9 +1,7 @@
 from .filters import ModalFilters as ModalFilters
 from .filters import modal_filters as modal_filters
-from .gains import ModalGains as ModalGains
 from .gains import modal_gains as modal_gains
 from .loop import ModalLoop as ModalLoop
-from .loop import ModalRun as ModalRun
 from .loop import modal_loop as modal_loop
 from .mixed_controller import MixedController as MixedController
 from .reconstructor import Reconstructor as Reconstructor

@@ -41,35 +41,19 @@ _SETTLED = 1e-6  # relative change of variances by the last halving
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModalGains:
-    """Integrator gains of least residual.
+    """Integrator gains of least residual."""
 
-    Attributes
-    ----------
-    gains : (n,) ndarray
-        Integrator gain of each mode. 1e-4 of the stability limit is the least that is tried: a
-        mode that has it is better left alone.
-    rms_nm : (n,) ndarray
-        Residual that they leave [nm rms].
-    limit : (n,) ndarray
-        Largest gain that was allowed: the margin below the stability limit, at unit sensor gain
-        and at the mode's own.
-    limited : (n,) bool ndarray
-        Whether the gain is at that limit.
-    noise_nm : (n,) ndarray
-        Measurement noise that was given or found [nm].
-    delay_frames : float
-        Total delay [frames].
-    mirror : PositionLoop or None
-        Dynamics of the mirror; None: it settles at once.
-    """
-
+    # (n,): integrator gain of each mode. 1e-4 of the stability limit is the least that is tried: a
+    # mode that has it is better left alone
     gains: FloatArray
-    rms_nm: FloatArray
+    rms_nm: FloatArray  # (n,): residual that they leave [nm rms]
+    # (n,): largest gain that was allowed: the margin below the stability limit, at unit sensor gain
+    # and at the mode's own
     limit: FloatArray
-    limited: BoolArray
-    noise_nm: FloatArray
-    delay_frames: float
-    mirror: PositionLoop | None
+    limited: BoolArray  # (n,): whether the gain is at that limit
+    noise_nm: FloatArray  # (n,): measurement noise that was given or found [nm]
+    delay_frames: float  # total delay [frames]
+    mirror: PositionLoop | None  # dynamics of the mirror; None: it settles at once
 
 
 def modal_gains(

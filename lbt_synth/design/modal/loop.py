@@ -33,22 +33,13 @@ from lbt_synth.validation import FloatArray, float_array, integer, number, read_
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ModalRun:
-    """Series of a modal loop.
+    """Series of a modal loop."""
 
-    Attributes
-    ----------
-    residual_nm : (n, frames) ndarray
-        Residual phase [nm].
-    commands, measurements : (n, frames) ndarray or None
-        Commands u(k) and measurements y(k) [nm], with ``all_series``.
-    rms_nm : (n,) ndarray
-        Residual of each mode [nm rms].
-    """
-
-    residual_nm: FloatArray
+    residual_nm: FloatArray  # (n, frames): residual phase [nm]
+    # (n, frames): commands u(k) and measurements y(k) [nm], with ``all_series``
     commands: FloatArray | None
     measurements: FloatArray | None
-    rms_nm: FloatArray
+    rms_nm: FloatArray  # (n,): residual of each mode [nm rms]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -49,46 +49,25 @@ class ControllerFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerDesign(Summarised):
-    """A certified controller of a generalised plant.
+    """A certified controller of a generalised plant."""
 
-    Attributes
-    ----------
-    plant : GeneralizedPlant
-        The plant.
-    controller : StateSpace
-        From y to u, in textbook form: ``u = K y``.
-    closed_loop : StateSpace
-        From w to z.
-    gamma : float
-        H-infinity norm of the closed loop, recomputed.
-    rms : float
-        Standard deviation of z for white w of unit variance per sample.
-    gamma_requested, gamma_least, gamma_infeasible : float
-        The bound that was given; the norm that a controller achieves; and a level that none
-        reaches, proved by ``witness``. Where they were not computed they are nan.
-    witness : ControlWitness or None
-        The proof that ``gamma_infeasible`` cannot be reached; its ``reason`` says why in words.
-    certificate : Certificate
-        The checks, computed from the matrices of plant and controller alone.
-    method, route : str
-        "h2", "hinf" or "mixed", and how it was solved.
-    regularised : float
-        Share of the errors and disturbances that was added because the plant's own equations are
-        singular, or leave rounding alone; mostly 0. The certificate is that of the plant as given.
-    """
-
-    plant: GeneralizedPlant
-    controller: StateSpace
-    closed_loop: StateSpace
-    gamma: float
-    rms: float
+    plant: GeneralizedPlant  # the plant
+    controller: StateSpace  # from y to u, in textbook form: ``u = K y``
+    closed_loop: StateSpace  # from w to z
+    gamma: float  # H-infinity norm of the closed loop, recomputed
+    rms: float  # standard deviation of z for white w of unit variance per sample
+    # the bound that was given; the norm that a controller achieves; and a level that none reaches,
+    # proved by ``witness``. Where they were not computed they are nan
     gamma_requested: float = np.nan
     gamma_least: float = np.nan
     gamma_infeasible: float = np.nan
+    # the proof that ``gamma_infeasible`` cannot be reached; its ``reason`` says why in words
     witness: ControlWitness | None = None
-    certificate: Certificate
-    method: str
+    certificate: Certificate  # the checks, computed from the matrices of plant and controller alone
+    method: str  # "h2", "hinf" or "mixed", and how it was solved
     route: str
+    # share of the errors and disturbances that was added because the plant's own equations are
+    # singular, or leave rounding alone; mostly 0. The certificate is that of the plant as given
     regularised: float = 0.0
 
     def _brief(self) -> str:

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 import lbt_synth
-from lbt_synth.design import Design, EstimatorDesign
+from lbt_synth.design import Design
 from lbt_synth.design.record import DesignRecord, Meta, record_common
+from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import CertificateError, GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files.file_checks import FileKind
 from lbt_synth.files.gain_file.agreement import require_agreement, require_certificate, require_same

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lbt_synth.design import Design, IntegratorDesign
+from lbt_synth.design import Design
+from lbt_synth.design.integrator import IntegratorDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.telemetry.fields import Scalar
 from lbt_synth.files.telemetry.telemetry import Telemetry

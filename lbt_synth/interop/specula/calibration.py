@@ -27,27 +27,14 @@ _LAYOUT = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
-    """What is measured once, before a loop is closed.
+    """What is measured once, before a loop is closed."""
 
-    Attributes
-    ----------
-    modes : Modes
-        Shapes of the mirror.
-    reference : (q,) ndarray
-        Slopes of a flat wavefront.
-    reconstructor : Reconstructor
-        Generalised inverse of the interaction matrix (slopes per nanometre of each mode).
-    key : str
-        Digest of everything that it depends on.
-    cached : bool
-        Whether it came from the cache.
-    """
-
-    modes: Modes
-    reference: FloatArray
+    modes: Modes  # shapes of the mirror
+    reference: FloatArray  # (q,): slopes of a flat wavefront
+    # generalised inverse of the interaction matrix (slopes per nanometre of each mode)
     reconstructor: Reconstructor
-    key: str
-    cached: bool
+    key: str  # digest of everything that it depends on
+    cached: bool  # whether it came from the cache
 
 
 def cache_directory(path: str | os.PathLike[str] | None = None) -> Path:

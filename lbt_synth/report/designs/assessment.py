@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.design import Check, Design, EstimatorDesign
+from lbt_synth.design import Check, Design
+from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.interop import FrameCost, frame_cost
+from lbt_synth.interop import frame_cost
+from lbt_synth.interop.arithmetic_cost import FrameCost
 from lbt_synth.linear import Controller, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import (

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.design import Design, EstimatorDesign
+from lbt_synth.design import Design
+from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.linear import hinf_norm, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from lbt_synth.design import Design, EstimatorDesign
+from lbt_synth.design import Design
+from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import largest_singular_values
 from lbt_synth.loop import close_loop

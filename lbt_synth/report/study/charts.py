@@ -10,10 +10,9 @@ import numpy as np
 from lbt_synth.report.charts.description import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
 from lbt_synth.report.page.words import chart
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies import StudyStatistics
 from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
 from lbt_synth.studies.study.controller_samples import ControllerSamples
-from lbt_synth.studies.study.statistics import sample_losses
+from lbt_synth.studies.study.statistics import StudyStatistics, sample_losses
 from lbt_synth.studies.study.summary import varying_parameters
 from lbt_synth.validation import FloatArray
 

@@ -14,7 +14,8 @@ from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import time_text
 from lbt_synth.report.study.sections import StudyInfo, study_info, study_sections
 from lbt_synth.storage.words import count_text
-from lbt_synth.studies import Failure, Study, StudyStatistics, study_statistics
+from lbt_synth.studies import Failure, Study, study_statistics
+from lbt_synth.studies.study.statistics import StudyStatistics
 
 
 def write_study_page(

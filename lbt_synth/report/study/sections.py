@@ -20,13 +20,14 @@ from lbt_synth.report.study import charts
 from lbt_synth.storage.array_file import digest
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import duration_text
-from lbt_synth.studies import ControllerStatistics, Failure, Study, StudyStatistics
+from lbt_synth.studies import Failure, Study
 from lbt_synth.studies.study import summary
 from lbt_synth.studies.study.controller_samples import (
     ControllerSamples,
     read_column,
     read_controller_samples,
 )
+from lbt_synth.studies.study.statistics import ControllerStatistics, StudyStatistics
 from lbt_synth.validation import FloatArray
 
 _MOST_FAILURES = 10  # that are listed

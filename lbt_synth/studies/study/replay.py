@@ -28,33 +28,17 @@ _NOISELESS = "has no noise, which no configuration takes: there is none to simul
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Replay:
-    """A row of a study, computed again.
+    """A row of a study, computed again."""
 
-    Attributes
-    ----------
-    row : int
-        Its number.
-    parameters : dict of str to float
-        Its parameters.
-    stored : dict of str to float
-        Its results in the study; empty if it has none yet.
-    fresh : dict of str to float
-        Its results computed now, by the reference evaluation; without those that failed.
-    failures : tuple of Failure
-        What failed now.
-    files : tuple of pathlib.Path
-        Files that were written: the configuration, and the designs for this sample.
-    unwritten : str
-        Why there is no configuration; empty if there is one.
-    """
-
-    row: int
-    parameters: dict[str, float]
-    stored: dict[str, float]
+    row: int  # its number
+    parameters: dict[str, float]  # its parameters
+    stored: dict[str, float]  # its results in the study; empty if it has none yet
+    # its results computed now, by the reference evaluation; without those that failed
     fresh: dict[str, float]
-    failures: tuple[Failure, ...]
+    failures: tuple[Failure, ...]  # what failed now
+    # files that were written: the configuration, and the designs for this sample
     files: tuple[Path, ...]
-    unwritten: str = ""
+    unwritten: str = ""  # why there is no configuration; empty if there is one
 
 
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:

@@ -52,52 +52,26 @@ class FinishedStudy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyRun:
-    """What a run of a study did.
+    """What a run of a study did."""
 
-    Attributes
-    ----------
-    directory, results, failed : pathlib.Path
-        Directory, table of results and table of failures.
-    samples : int
-        Rows of the results.
-    computed : int
-        How many of them this run computed.
-    failures : int
-        Controllers of samples that have no result.
-    computing_s, seconds : float
-        Time of this run until the last row was computed, and to its end [s].
-    """
-
-    directory: Path
+    directory: Path  # directory, table of results and table of failures
     results: Path
     failed: Path
-    samples: int
-    computed: int
-    failures: int
-    computing_s: float
+    samples: int  # rows of the results
+    computed: int  # how many of them this run computed
+    failures: int  # controllers of samples that have no result
+    computing_s: float  # time of this run until the last row was computed, and to its end [s]
     seconds: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """What a study will cost.
+    """What a study will cost."""
 
-    Attributes
-    ----------
-    measured_rows : int
-        Rows of the batch that was measured.
-    measured_s : float
-        Time that it took in one process [s].
-    seconds : float
-        Time of the whole study on the requested processes [s].
-    disk_bytes : int
-        Largest size of its directory, while it holds both results and parts.
-    """
-
-    measured_rows: int
-    measured_s: float
-    seconds: float
-    disk_bytes: int
+    measured_rows: int  # rows of the batch that was measured
+    measured_s: float  # time that it took in one process [s]
+    seconds: float  # time of the whole study on the requested processes [s]
+    disk_bytes: int  # largest size of its directory, while it holds both results and parts
 
 
 def run_study(

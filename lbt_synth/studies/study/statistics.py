@@ -65,71 +65,33 @@ class WorstRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerStatistics:
-    """Statistics of one controller over all samples.
+    """Statistics of one controller over all samples."""
 
-    Attributes
-    ----------
-    controller : str
-        Its name.
-    samples : int
-        Samples on which it was evaluated.
-    failed : int
-        Samples on which the evaluation failed; all that follows leaves them out.
-    unstable : Share
-        Loops that are unstable. Their Strehl ratio counts as 0, their residual as infinite.
-    mean, mean_error : float
-        Mean of the Strehl ratio, and its standard error for independent samples.
-    strehl : tuple of Percentile
-        Percentiles of the Strehl ratio.
-    above : dict of float to Share
-        Samples whose Strehl ratio is above each level.
-    residual_nm : tuple of Percentile
-        Percentiles of the residual [nm rms].
-    parts_nm : dict of str to float
-        Median of each part of the residual over the stable loops [nm rms].
-    loss : Loss
-        Loss against the best controller of each sample.
-    worst : tuple of WorstRow
-        Samples on which it does worst.
-    """
-
-    controller: str
-    samples: int
-    failed: int
+    controller: str  # its name
+    samples: int  # samples on which it was evaluated
+    failed: int  # samples on which the evaluation failed; all that follows leaves them out
+    # loops that are unstable. Their Strehl ratio counts as 0, their residual as infinite
     unstable: Share
-    mean: float
+    mean: float  # mean of the Strehl ratio, and its standard error for independent samples
     mean_error: float
-    strehl: tuple[Percentile, ...]
-    above: dict[float, Share]
-    residual_nm: tuple[Percentile, ...]
-    parts_nm: dict[str, float]
-    loss: Loss
-    worst: tuple[WorstRow, ...]
+    strehl: tuple[Percentile, ...]  # percentiles of the Strehl ratio
+    above: dict[float, Share]  # samples whose Strehl ratio is above each level
+    residual_nm: tuple[Percentile, ...]  # percentiles of the residual [nm rms]
+    parts_nm: dict[str, float]  # median of each part of the residual over the stable loops [nm rms]
+    loss: Loss  # loss against the best controller of each sample
+    worst: tuple[WorstRow, ...]  # samples on which it does worst
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StudyStatistics:
-    """Statistics of a study.
+    """Statistics of a study."""
 
-    Attributes
-    ----------
-    samples : int
-        Samples in the study so far.
-    parameters : tuple of str
-        Their names.
-    controllers : tuple of ControllerStatistics
-        Each controller by itself.
-    comparisons : tuple of Comparison
-        Each controller against each later one, on the same samples.
-    sensitivities : tuple of ControllerSensitivity
-        What each controller depends on.
-    """
-
-    samples: int
-    parameters: tuple[str, ...]
-    controllers: tuple[ControllerStatistics, ...]
+    samples: int  # samples in the study so far
+    parameters: tuple[str, ...]  # their names
+    controllers: tuple[ControllerStatistics, ...]  # each controller by itself
+    # each controller against each later one, on the same samples
     comparisons: tuple[Comparison, ...]
-    sensitivities: tuple[ControllerSensitivity, ...]
+    sensitivities: tuple[ControllerSensitivity, ...]  # what each controller depends on
 
 
 def study_statistics(
