@@ -17,6 +17,7 @@ import numpy as np
 from wrong_commands import draw_lines, frozen_flow
 
 import lbt_synth as lbt
+from lbt_synth.identification.auto import RecordedDesign
 
 
 def draw(seed: int, seconds: float) -> tuple[lbt.identification.LoopRecord, lbt.Truth]:
@@ -64,7 +65,7 @@ def main() -> None:
             print(f"{seed:3d}  refused: {error}", flush=True)
             continue
         seconds = time.process_time() - start
-        if isinstance(model, lbt.identification.RecordedDesign):
+        if isinstance(model, RecordedDesign):
             usual = lbt.integrator(model.model.hardware, gain=0.4 / truth.sensor_gain)
             left, its = (residual_nm(made, record, truth) for made in (model.design, usual))
             words = f"  leaves {left:6.1f} nm, the integrator {its:6.1f}"

@@ -9,12 +9,12 @@ from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.identification import (
-    AccelerometerTransfers,
     LoopRecord,
     SpectrumRecord,
     accelerometer_transfers,
     identify,
 )
+from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 
 
 def run(arguments: Namespace) -> Report:

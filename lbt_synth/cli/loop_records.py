@@ -16,7 +16,6 @@ from lbt_synth.config.write import config_text
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
-    AccelerometerTransfers,
     IdentifiedAxis,
     IdentifiedModel,
     LinePrior,
@@ -32,6 +31,7 @@ from lbt_synth.identification.accelerometers.readings import (
     fill_missing,
     load_readings,
 )
+from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.fit.identified_model import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS

@@ -13,7 +13,8 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import AccelerometerTransfers, IdentifiedModel
+from lbt_synth.identification import IdentifiedModel
+from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")

@@ -40,34 +40,16 @@ _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RecordedDesign(Summarised):
-    """A controller designed from a record.
+    """A controller designed from a record."""
 
-    Attributes
-    ----------
-    model : IdentifiedModel
-        Identified from all usable frames.
-    design : Design
-        The certified design for it.
-    half_model : IdentifiedModel
-        Identified from the first half of the usable frames.
-    held_out : PredictionTable
-        Residuals on the second half: of the loop that ran, of a design from the first half by
-        the same method, of the best integrator and of a predictor by least squares.
-    name : str
-        Row of the design in ``held_out``, the title of its method.
-    notes : tuple of str
-        Warnings about the design.
-    choice : MethodChoice or None
-        How its method was chosen; None if it was given.
-    """
-
-    model: IdentifiedModel
-    design: Design
-    half_model: IdentifiedModel
+    model: IdentifiedModel  # from all usable frames
+    design: Design  # certified for this model
+    half_model: IdentifiedModel  # from the first half of the usable frames
+    # residuals on the second half: what ran, a design from the first half, references
     held_out: PredictionTable
-    name: str
-    notes: tuple[str, ...]
-    choice: MethodChoice | None = None
+    name: str  # row of the design in held_out, the title of its method
+    notes: tuple[str, ...]  # warnings about the design
+    choice: MethodChoice | None = None  # how the method was chosen; None if it was given
 
     @property
     def controller(self) -> Controller:

@@ -30,27 +30,13 @@ _WINDOWS = 2  # lengths of the window that are recorded, for the state of a new 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackingUpdate:
-    """What one update found and did.
+    """What one update found and did."""
 
-    Attributes
-    ----------
-    time_s : float
-        Time since the reset of the loop [s]; the window ends here.
-    frequencies_hz : tuple of float
-        Frequencies for which the filter that runs from now on was designed [Hz].
-    rms_nm : tuple of float
-        Their rms [nm].
-    noise_nm : tuple of float
-        Standard deviation of the noise that it assumes, one per measurement [nm].
-    reason : str
-        Why the running filter stayed; empty if a new one runs.
-    """
-
-    time_s: float
-    frequencies_hz: tuple[float, ...]
-    rms_nm: tuple[float, ...]
-    noise_nm: tuple[float, ...]
-    reason: str
+    time_s: float  # since the reset of the loop; the window ends here
+    frequencies_hz: tuple[float, ...]  # of the filter that runs from now on
+    rms_nm: tuple[float, ...]  # of these lines
+    noise_nm: tuple[float, ...]  # standard deviation that the filter assumes, one per measurement
+    reason: str  # why the running filter stayed; empty if a new one runs
 
 
 class TrackingController:
@@ -154,22 +140,7 @@ class TrackingController:
     def step(self, y: ArrayLike) -> FloatArray:
         """Take the measurements y(k), (q,), return the command u(k), (m,); update if it is time.
 
-        Parameters
-        ----------
-        y : (q,) array_like
-            Measurements; where one of them is not finite the command is held.
-
-        Returns
-        -------
-        (m,) ndarray
-            The command.
-
-        Raises
-        ------
-        ProblemError
-            If they are no real numbers.
-        DimensionError
-            If there is another number of measurements.
+        Where a measurement is not finite the command is held.
         """
         F, K, C, to_command = self._filter
         S, mirror = self._hardware.sensor, self._mirror

@@ -9,6 +9,12 @@ import pytest
 from support.identified_models import ONE_AXIS, SHELL, TILT, TIP, TWO, Line, Model, save_identified
 
 import lbt_synth as lbt
+from lbt_synth.identification.accelerometers.laying import ClockShift
+from lbt_synth.identification.accelerometers.transfers import (
+    AccelerometerTransfers,
+    ChannelRow,
+    TransferRow,
+)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +146,7 @@ def test_models_that_no_configuration_can_hold(model, options, text):
 @pytest.mark.parametrize(("age", "delay"), [(0, 1.0), (4, 5.0), (-3, 2.0), (500, 2.0)])
 def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
     """One channel shows the second line; the other adds nothing. A clock that is off gets age 1."""
-    row = lbt.identification.TransferRow(
+    row = TransferRow(
         channel="m1",
         line=1,
         frequency_hz=47.0,
@@ -153,13 +159,10 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
         useful=True,
     )
     names = ("m1", "m2")
-    found = lbt.identification.AccelerometerTransfers(
+    found = AccelerometerTransfers(
         transfers=(row, replace(row, channel="m2", line=0, useful=False)),
-        channels=tuple(
-            lbt.identification.ChannelRow(channel=name, noise_m_s2=2e-4, verdict="")
-            for name in names
-        ),
-        shift=lbt.identification.ClockShift(frames=age - 1, error_frames=0.1, by_phases=True),
+        channels=tuple(ChannelRow(channel=name, noise_m_s2=2e-4, verdict="") for name in names),
+        shift=ClockShift(frames=age - 1, error_frames=0.1, by_phases=True),
         age_frames=age,
         rate_hz=1000.0,
     )

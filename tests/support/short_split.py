@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.forward_chaining import forward_split
+from lbt_synth.identification.prediction.forward_chaining import forward_split, forward_splits
 
 RATE, NOISE, GAIN = 500.0, 5.0, 0.8
 PATH = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
@@ -28,5 +28,5 @@ def short_record() -> lbt.identification.LoopRecord:
 def short_split() -> lbt.identification.ForwardSplit:
     """The first of its two splits, at the true sensor gain."""
     record = short_record()
-    pairs = lbt.identification.forward_splits(record.stretches(), record.frames, splits=2)
+    pairs = forward_splits(record.stretches(), record.frames, splits=2)
     return forward_split(record, *pairs[0], sensor_gain=GAIN, most_lines=2)

@@ -43,20 +43,11 @@ Pair = tuple[LineBand, BandFit, int, int]  # band, fit of the channel, line of t
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockShift:
-    """By how many frames readings lag behind the wavefront's measurement of the same frame.
+    """By how many frames readings lag behind the wavefront's measurement of the same frame."""
 
-    Attributes
-    ----------
-    frames : float
-        The shift; above 0 for readings that come late.
-    error_frames : float
-        Its standard error; infinite without any line.
-    by_phases : bool
-        Whether the phases of several lines give it; else the slope of the phase within lines.
-    """
-
-    frames: float
-    error_frames: float
+    frames: float  # shift [frames], above 0 for readings that come late
+    error_frames: float  # standard error [frames]; infinite without any line
+    # whether phases of several lines give it, or the slope of the phase within lines
     by_phases: bool
 
 

@@ -88,28 +88,15 @@ class ChannelRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AccelerometerTransfers:
-    """What accelerometers show of the lines of a model.
+    """What accelerometers show of the lines of a model."""
 
-    Attributes
-    ----------
-    transfers : tuple of TransferRow
-        Each channel with each line, in the convention of the model's configuration.
-    channels : tuple of ChannelRow
-        Each channel with its noise and a verdict.
-    shift : ClockShift
-        By how many frames the readings lag behind the wavefront, as they were given.
-    age_frames : int
-        Age of a reading for which the phases hold [frames]: 1 is that of the wavefront's
-        measurement of the same frame.
-    rate_hz : float
-        Readings per second, after averaging [Hz].
-    """
-
+    # each channel with each line, in the convention of the model's configuration
     transfers: tuple[TransferRow, ...]
-    channels: tuple[ChannelRow, ...]
-    shift: ClockShift
+    channels: tuple[ChannelRow, ...]  # each channel with its noise and a verdict
+    shift: ClockShift  # lag of the readings behind the wavefront, as they were given
+    # age of a reading for which the phases hold; 1 is the wavefront's of the same frame
     age_frames: int
-    rate_hz: float
+    rate_hz: float  # readings per second, after averaging
 
     @property
     def used(self) -> tuple[ChannelRow, ...]:

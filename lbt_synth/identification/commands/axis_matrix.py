@@ -40,13 +40,6 @@ def classify_matrix(
 
     Elements within four standard errors of zero, or below a part of the largest one, the tolerance,
     count as zero.
-
-    Examples
-    --------
-    >>> classify_matrix([[-0.3, 0.0], [0.01, 0.5]]).signs
-    (-1, 1)
-    >>> classify_matrix([[0.0, 0.4], [0.4, 0.0]]).kind
-    'swapped'
     """
     g = square(values, "values")
     part = number(tolerance, "tolerance", at_least=0)

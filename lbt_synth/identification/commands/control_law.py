@@ -58,58 +58,27 @@ class ControlLaw:
 
         u_i(k) = sum_j past[i, j-1] u_i(k-j) + sum_l taps[i, l, :] y(k - lag_frames - l)
 
-    Attributes
-    ----------
-    kind : str
-        "pure integrator", "leaky integrator", "double integrator", "proportional" (no memory),
-        "higher order", or "none": the commands do not follow from the measurements.
-    lag_frames : int
-        Lag of the first measurement: 0 if u(k) follows from measurements up to y(k), 2 if two
-        frames later than that; negative if commands know measurements of the future.
-    gain : (axes, axes) ndarray
-        Increment of u per unit of y at low frequencies: the gain of an integrator. Of a law
-        without memory, u per unit of y; of a double integrator, the second increment. Sign and
-        structure are those of the law at low frequencies, whatever its order; the size of one of
-        higher order depends on all of its poles. Zeros where there is no law.
-    gain_error : (axes, axes) ndarray
-        Standard errors of the gain.
-    axis_matrix : AxisMatrix
-        Signs and structure of the gain.
-    leak : (axes,) ndarray
-        Pole nearest 1; nan of a law without memory.
-    poles : (axes, order) complex ndarray
-        Poles of the law of each axis.
-    order : int
-        Past commands of an axis that the law uses.
-    past : (axes, order) ndarray
-        Weights of the past commands.
-    taps : (axes, lags, axes) ndarray
-        Weights of the measurements.
-    residual : float
-        Part of the variance of the increments of u that the law leaves unexplained.
-    coherence : float
-        Part of what past commands leave of the increments that follows from measurements: 1
-        of a deterministic law, 0 of the commands of another night; the mean of the axes.
-    axis_coherence : (axes,) ndarray
-        The same of each axis; there is a law if any of them is not 0.
-    odd_frames : int
-        Frames that do not follow the law of the others, and were left out.
+    The gain is the increment of u per unit of y at low frequencies: that of an integrator. It is u
+    per unit of y of a law without memory, and the second increment of a double integrator; the size
+    of one of higher order depends on all of its poles.
     """
 
-    kind: LawKind
+    kind: LawKind  # "none": the commands do not follow from the measurements
+    # of the first measurement; negative if commands know measurements of the future
     lag_frames: int
-    gain: FloatArray
-    gain_error: FloatArray
-    axis_matrix: AxisMatrix
-    leak: FloatArray
-    poles: ComplexArray
-    order: int
-    past: FloatArray
-    taps: FloatArray
-    residual: float
+    gain: FloatArray  # (axes, axes); zeros where there is no law
+    gain_error: FloatArray  # (axes, axes), standard errors
+    axis_matrix: AxisMatrix  # signs and structure of the gain
+    leak: FloatArray  # (axes,), pole nearest 1; nan without memory
+    poles: ComplexArray  # (axes, order)
+    order: int  # past commands of an axis that the law uses
+    past: FloatArray  # (axes, order), weights of past commands
+    taps: FloatArray  # (axes, lags, axes), weights of measurements
+    residual: float  # unexplained part of the variance of the increments of u
+    # 1 of a deterministic law, 0 of the commands of another night; mean of the axes
     coherence: float
-    axis_coherence: FloatArray
-    odd_frames: int
+    axis_coherence: FloatArray  # (axes,); part that past commands leave and measurements explain
+    odd_frames: int  # frames left out because they do not follow the law of the others
 
     @property
     def exact(self) -> bool:

@@ -46,33 +46,9 @@ def already_integrates(law: ControlLaw) -> bool:
 
 
 def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
-    """Return a control law as a controller.
+    """Return a control law as a controller, whose state holds past commands and measurements.
 
-    Parameters
-    ----------
-    law : ControlLaw
-        The law.
-    frame_rate_hz : float
-        Frame rate [Hz].
-
-    Returns
-    -------
-    Controller
-        Its state holds past commands and measurements.
-
-    Raises
-    ------
-    ProblemError
-        If there is no law, or it knows measurements of the future.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.identification.commands.control_law import fit_control_law
-    >>> y = np.random.default_rng(1).standard_normal((2000, 1))
-    >>> again = law_controller(fit_control_law(y, 0.3 * np.cumsum(y, axis=0)), 500).start()
-    >>> [round(float(again.step([1.0])[0]), 6) for _ in range(3)]
-    [0.3, 0.6, 0.9]
+    ProblemError refuses the absence of a law, and one that knows measurements of the future.
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     if law.kind == "none" or law.lag_frames < 0:

@@ -114,37 +114,10 @@ class CommandRepair:
 
 
 def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
-    """Return a record with the commands that the mirror followed.
+    """Return a closed-loop record with the commands that the mirror followed.
 
-    Parameters
-    ----------
-    record : LoopRecord
-        A closed-loop record.
-    repair : CommandRepair
-        What its commands need.
-
-    Returns
-    -------
-    LoopRecord
-        With other commands, and the frames that are usable with them.
-
-    Raises
-    ------
-    ProblemError
-        If the record has no commands, or the repair does not fit its axes.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> seen = lbt.identification.loop_record(
-    ...     [[4.0], [3.0], [1.0], [2.0]],
-    ...     [[0.0], [5.0], [1.0], [1.0]],
-    ...     frame_rate_hz=800,
-    ...     unit="nm",
-    ... )
-    >>> repair = lbt.identification.CommandRepair(increments=True, sign=(-1,))
-    >>> lbt.identification.repair_commands(seen, repair).commands[:, 0].tolist()
-    [0.0, -5.0, -6.0, -7.0]
+    The usable frames are those of the new commands. ProblemError refuses a record
+    without commands, and a repair that does not fit its axes.
     """
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to repair.")

@@ -42,38 +42,17 @@ _WORST_CONDITION = 100.0  # of the gain of a law that is inverted
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CommandVerdict:
-    """How the commands of a record reach its measurements.
+    """How the commands of a record reach its measurements."""
 
-    Attributes
-    ----------
-    explanation : str
-        What explains the record best, in words; "as given" if that is what was given.
-    accepted : bool
-        Whether a model may be fitted.
-    repair : CommandRepair or None
-        What the commands need; None where nothing is wrong or nothing helps.
-    delay_frames : float or None
-        The delay that fits, where another was given.
-    nats : float
-        Logarithm of the likelihood of the explanation over that of the record as given; 0 where
-        the control law alone decides.
-    gain : (axes,) ndarray
-        Coarse sensor gain of the explanation; nan where it is far from any plausible one, because
-        the coarse spectrum does not show it.
-    law : ControlLaw or None
-        The control law of the record; None where too few frames show it.
-    notes : tuple of str
-        What to look at although the record is accepted.
-    """
-
-    explanation: str
-    accepted: bool
-    repair: CommandRepair | None = None
-    delay_frames: float | None = None
+    explanation: str  # the best one, in words; "as given" if that is what was given
+    accepted: bool  # whether a model may be fitted
+    repair: CommandRepair | None = None  # None where nothing is wrong or nothing helps
+    delay_frames: float | None = None  # delay that fits, where another was given
+    # log-likelihood above that of the record as given; 0 where the law alone decides
     nats: float = 0.0
-    gain: FloatArray
-    law: ControlLaw | None
-    notes: tuple[str, ...] = ()
+    gain: FloatArray  # (axes,), coarse sensor gain; nan where the coarse spectrum does not show it
+    law: ControlLaw | None  # None where too few frames show it
+    notes: tuple[str, ...] = ()  # what to look at although the record is accepted
 
     @property
     def options(self) -> str:
@@ -92,13 +71,7 @@ class CommandVerdict:
         return (f"the record is right, although its commands look as if {what}",)
 
     def require_accepted(self) -> None:
-        """Refuse a record that is explained better by something else.
-
-        Raises
-        ------
-        RecordError
-            With the explanation, and the options that repair the record.
-        """
+        """Refuse a record that something else explains better; name the options that repair it."""
         if not self.accepted:
             advice = f" Repair it as the options {self.options} do." if self.options else ""
             raise RecordError(

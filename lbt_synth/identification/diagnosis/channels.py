@@ -43,17 +43,7 @@ class ChannelRow:
 
 
 def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
-    """Return what is known of each channel of a record, the measurements first.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> y = np.random.default_rng(0).standard_normal((4096, 2)) * [1.0, 9.0]
-    >>> record = lbt.identification.loop_record(y, frame_rate_hz=800, unit="nm")
-    >>> [(row.channel, row.state) for row in judge_channels(record)]
-    [('tip measurement', 'good'), ('tilt measurement', 'noisy')]
-    """
+    """Return what is known of each channel of a record, the measurements first."""
     names = AXES if record.axes == len(AXES) else ("",)
     measured = record.usable if record.measured is None else record.measured
     everything = np.ones(record.frames, dtype=np.bool_)

@@ -25,32 +25,7 @@ _LEAST_PART = 0.05  # of the residual variance, of a part that is named
 
 
 def diagnosis_verdict(found: Diagnosis) -> tuple[str, str, str]:
-    """Return three sentences: the record, what its residual is made of, what to change first.
-
-    Parameters
-    ----------
-    found : Diagnosis
-        The diagnosis.
-
-    Returns
-    -------
-    tuple of str
-        Three sentences.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> y = np.random.default_rng(0).standard_normal((5000, 1))
-    >>> u = np.random.default_rng(1).standard_normal((5000, 1))
-    >>> record = lbt.identification.loop_record(y, u, frame_rate_hz=500, delay_frames=2, unit="nm")
-    >>> for sentence in lbt.identification.diagnosis_verdict(lbt.identification.diagnose(record)):
-    ...     print(sentence)  # doctest: +NORMALIZE_WHITESPACE
-    The commands are not those that the mirror followed: they have nothing to do with the
-    measurements, as if of another night.
-    Nothing can be said of its residual.
-    First find the commands that belong to these measurements.
-    """
+    """Return three sentences: the record, what its residual is made of, what to change first."""
     return _state_sentence(found), _residual_sentence(found), _advice_sentence(found)
 
 

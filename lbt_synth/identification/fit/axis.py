@@ -251,47 +251,13 @@ def identify_spectrum(
     averages: float | None = None,
     **options: Any,
 ) -> IdentifiedAxis:
-    """Identify one axis from its power spectrum.
+    """Identify one axis from its one-sided density (f,) [nm^2/Hz] at even frequencies (f,) [Hz].
 
-    Parameters
-    ----------
-    frequency_hz : (f,) array_like
-        Increasing frequencies above 0 and below half the frame rate [Hz], evenly spaced.
-    density_nm2_hz : (f,) array_like
-        One-sided density of the phase [nm^2/Hz], above 0.
-    frame_rate_hz : float
-        Frame rate of the loop to come [Hz].
-    averages : float, optional
-        Number of independent periodograms that the density is the mean of; by default found
-        from its scatter. A density that scatters less than the mean of 1000 was smoothed,
-        interpolated or computed, and counts as one periodogram.
-    **options
-        ``announced``, ``lowest_line_hz`` and ``most_lines`` of :func:`identify_axis`.
-
-    Returns
-    -------
-    IdentifiedAxis
-        As from a series; the sensor gain is 1.
-
-    Raises
-    ------
-    ProblemError
-        If the frequencies or densities are not a spectrum.
-    NumericalError
-        If the fit fails.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> f = np.arange(1, 400) * 1.0
-    >>> line = lbt.Vibration(frequency_hz=50, damping=0.05, rms_nm=30).ar_model(1000)
-    >>> chance = np.random.default_rng(0).gamma(8.0, 1 / 8.0, f.size)
-    >>> found = lbt.identification.identify_spectrum(
-    ...     f, (line.psd(f) + 1.0) * chance, frame_rate_hz=1000
-    ... )
-    >>> [round(line.frequency_hz) for line in found.lines]
-    [50]
+    The frequencies lie above 0 and below half the frame rate of the loop to come; the sensor gain
+    of the result is 1. The density is the mean of ``averages`` independent periodograms, by default
+    found from its scatter: one that scatters less than the mean of 1000 was smoothed, interpolated
+    or computed, and counts as one. Options are ``announced``, ``lowest_line_hz`` and ``most_lines``
+    of :func:`identify_axis`.
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     f = real_array(frequency_hz, "frequency_hz")

@@ -112,26 +112,17 @@ class IdentifiedLine:
 class IdentifiedTurbulence:
     """The slow part of a spectrum: a resonance with the roll-off of tilt, or without.
 
-    Attributes
-    ----------
-    frequency_hz, frequency_error_hz : float
-        Natural frequency of the second-order process and its standard error [Hz].
-    damping, damping_error : float
-        Its damping ratio (1 and more: two real poles) and the standard error.
-    corner_hz, corner_error_hz : float or None
-        Corner beyond which its density falls by another f^(-5/3), as that of frozen flow does, and
-        its standard error [Hz]; None for none.
-    rms_nm, rms_error_nm : float
-        Standard deviation of the process that is nearest, and its standard error [nm].
+    Each value has its standard error.
     """
 
-    frequency_hz: float
+    frequency_hz: float  # natural frequency of the second-order process
     frequency_error_hz: float
-    damping: float
+    damping: float  # damping ratio; 1 and more: two real poles
     damping_error: float
+    # corner beyond which the density falls by another f^(-5/3), as of frozen flow
     corner_hz: float | None
     corner_error_hz: float | None
-    rms_nm: float
+    rms_nm: float  # standard deviation of the nearest process of finite order
     rms_error_nm: float
 
 

@@ -72,26 +72,15 @@ class ResidualRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PredictionRow:
-    """One controller on the data, and by the model.
-
-    Attributes
-    ----------
-    name : str
-        What it is.
-    replayed : ResidualEstimate or None
-        Residual on the test data; None for the limit, which is no controller.
-    model_nm2 : (n, n) ndarray or None
-        Covariance that the model promises [nm^2]; None for what ran, unless its controller is
-        known.
-    strehl, model_strehl : float
-        Strehl ratios of the two; nan where there is none.
-    """
+    """One controller on the data, and by the model."""
 
     name: str
+    # residual on the test data; None for the limit, which is no controller
     replayed: ResidualEstimate | None
+    # (n, n) covariance that the model promises; None where the controller is not known
     model_nm2: FloatArray | None
-    strehl: float
-    model_strehl: float
+    strehl: float  # of the data; nan where there is none
+    model_strehl: float  # of the model
 
     @property
     def model_nm(self) -> float:

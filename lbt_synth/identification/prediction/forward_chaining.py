@@ -34,39 +34,11 @@ _START_S = 0.5  # after the beginning of a stretch, where a controller has just 
 def forward_splits(
     stretches: StretchesLike | None, frames: int, *, splits: int = 3, first_share: float = 0.5
 ) -> tuple[tuple[Stretches, Stretches], ...]:
-    """Divide a record into pairs of frames to train on and later frames to test on.
+    """Divide a record into pairs of stretches, to train on and later ones to test on.
 
-    Parameters
-    ----------
-    stretches : sequence of (start, stop), or None
-        Contiguous usable frames, in order; None for the whole record.
-    frames : int
-        Frames of the record.
-    splits : int, optional
-        Number of pairs.
-    first_share : float, optional
-        Part of the usable frames that the first pair trains on, in (0, 1). The rest is divided
-        into tests of equal length.
-
-    Returns
-    -------
-    tuple of (training, test)
-        Stretches ((start, stop), ...) of each; a test begins where its training ends.
-
-    Raises
-    ------
-    ProblemError
-        If the stretches do not fit the record, or a test is left without frames.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> for training, test in lbt.identification.forward_splits(
-    ...     [(0, 60), (70, 130)], 130, splits=2
-    ... ):
-    ...     print(training, test)
-    ((0, 60),) ((70, 100),)
-    ((0, 60), (70, 100)) ((100, 130),)
+    Stretches are contiguous usable frames (start, stop), in order; None is the whole record. The
+    first pair trains on ``first_share`` of the usable frames, in (0, 1); the rest is divided into
+    tests of equal length, which begin where their training ends.
     """
     pairs = checked_stretches(stretches, integer(frames, "frames", at_least=1))
     count = integer(splits, "splits", at_least=1)
@@ -171,16 +143,8 @@ class ForwardSplit:
     def replay(self, controller: Controller) -> FloatArray:
         """Return the measured residual of a controller in the test, (frames, axes) [nm].
 
-        Parameters
-        ----------
-        controller : Controller
-            From y(k) to u(k). It runs from the equilibrium for the first of the usable frames
-            before the test.
-
-        Raises
-        ------
-        UnstableLoopError
-            If its loop is unstable.
+        The controller, from y(k) to u(k), runs from the equilibrium for the first of the usable
+        frames before the test. UnstableLoopError refuses one whose loop is unstable.
         """
         loop = close_loop(self.hardware, controller)
         loop.require_stable()
@@ -231,18 +195,10 @@ def forward_split(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ForwardChain:
-    """Designs from the past of a record, compared on what followed.
+    """Designs from the past of a record, compared on what followed."""
 
-    Attributes
-    ----------
-    residuals : PairedResiduals
-        What the designs leave of all tests, one after the other.
-    failures : mapping of str to str
-        Why a design is not among them.
-    """
-
-    residuals: PairedResiduals
-    failures: Mapping[str, str]
+    residuals: PairedResiduals  # what the designs leave of all tests, one after the other
+    failures: Mapping[str, str]  # why a design is not among them
 
 
 def forward_chain(

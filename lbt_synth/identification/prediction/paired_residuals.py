@@ -105,19 +105,10 @@ class PairedResiduals:
         return _error_of_chunks(self._series(name))
 
     def above(self, name: str, other: str) -> tuple[float, float]:
-        """Return by how much a residual is above another, on the same frames.
+        """Return by how much a residual is above another, and its standard error [nm^2].
 
-        The noise and most of the disturbance cancel: the error is smaller than that of either.
-
-        Parameters
-        ----------
-        name, other : str
-            Two of the controllers.
-
-        Returns
-        -------
-        tuple of float
-            Difference of the variances and its standard error [nm^2].
+        On the same frames the noise and most of the disturbance cancel: the error is smaller than
+        that of either.
         """
         differences = self._series(name) - self._series(other)
         return float(np.mean(differences)), _error_of_chunks(differences)
@@ -156,16 +147,6 @@ def bootstrap_error(series: ArrayLike, block: int | None = None) -> float:
 
     It is that of infinitely many draws, as none are made. The series (n,) has at least 8 values, a
     block at most a quarter of them; by default :func:`choose_block_length`.
-
-    Examples
-    --------
-    Of independent values it is the usual one:
-
-    >>> import numpy as np
-    >>> from lbt_synth.identification.prediction.paired_residuals import bootstrap_error
-    >>> values = np.random.default_rng(1).standard_normal(400)
-    >>> bool(abs(bootstrap_error(values, block=1) / (np.std(values, ddof=1) / 20) - 1) < 1e-12)
-    True
     """
     values = real_array(series, "series")
     n = len(values)
@@ -183,14 +164,6 @@ def choose_block_length(series: ArrayLike) -> int:
     """Return the length of blocks that Politis and White found best for such a series (n,).
 
     It is at most a quarter of the values, of which there are at least 8.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lbt_synth.identification.prediction.paired_residuals import choose_block_length
-    >>> white = np.random.default_rng(0).standard_normal(1000)
-    >>> choose_block_length(white) < 5 < choose_block_length(np.cumsum(white))
-    True
     """
     values = real_array(series, "series")
     n = len(values)

@@ -28,24 +28,14 @@ _LEAST_ROWS = 4  # frames per coefficient
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LeastSquaresPredictor:
-    """A predictor fitted to a record, as a controller.
+    """A predictor fitted to a record, as a controller."""
 
-    Attributes
-    ----------
-    coefficients : (n, n, taps) ndarray
-        ``a[i, j, l]``: what z_j(k-l) adds to the correction of mode i that u(k) commands.
-    fitted_nm2 : (n,) ndarray
-        Mean square of the measured residual of each mode in the fit, with noise [nm^2].
-    frames : int
-        Frames that were fitted.
-    controller : Controller
-        From y(k) to u(k), stable in the loop for the sensor gain of the fit.
-    """
-
+    # (n, n, taps): what z_j(k-l) adds to the correction of mode i that u(k) commands
     coefficients: FloatArray
+    # (n,), mean square of the measured residual of each mode in the fit, with noise
     fitted_nm2: FloatArray
-    frames: int
-    controller: Controller
+    frames: int  # frames that were fitted
+    controller: Controller  # from y(k) to u(k), stable for the sensor gain of the fit
 
 
 def least_squares_predictor(

@@ -127,24 +127,10 @@ class ResidualEstimate:
         return float(np.sqrt(max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)))
 
     def above(self, other: ResidualEstimate) -> tuple[float, float]:
-        """Variance of this residual less that of another on the same frames, and its error.
+        """Return how far the variance is above another residual's, and the standard error [nm^2].
 
-        The noise and most of the disturbance cancel: the error is smaller than that of either.
-
-        Parameters
-        ----------
-        other : ResidualEstimate
-            Another loop's residual, of the same frames and noise.
-
-        Returns
-        -------
-        tuple of float
-            Difference and standard error [nm^2].
-
-        Raises
-        ------
-        ProblemError
-            If the frames are others.
+        On the same frames, which alone are allowed, the noise and most of the disturbance cancel:
+        the error is smaller than that of either.
         """
         one, two = self.measured_nm, other.measured_nm
         if self.stretches != other.stretches or one.shape != two.shape:
@@ -154,18 +140,9 @@ class ResidualEstimate:
         return self.total_nm2 - other.total_nm2, error
 
     def strehl(self, imaging: Imaging) -> float:
-        """Strehl ratio of a Gaussian residual of this covariance.
+        """Long-exposure Strehl ratio of a Gaussian residual of this covariance, in [0, 1].
 
-        Parameters
-        ----------
-        imaging : Imaging
-            The camera.
-
-        Returns
-        -------
-        float
-            Long-exposure Strehl ratio, in [0, 1]; nan if the covariance is not positive
-            semidefinite, because the residual is lost in the noise.
+        It is nan if the covariance is not positive semidefinite: the residual is lost in the noise.
         """
         if np.linalg.eigvalsh(self.covariance_nm2)[0] < 0:
             return float("nan")

@@ -189,69 +189,27 @@ HEADINGS = ("finding", "series", "axis", "frames", "%", "first frame", "effect")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One kind of fault in one series.
+    """One kind of fault in one series."""
 
-    Attributes
-    ----------
-    kind : str
-        "missing", "repeated", "not finite", "stuck", "saturated", "outlier", "loop open",
-        "held" or "correction not known".
-    series : str
-        "measurements", "commands" or "frames".
-    axis : int or None
-        Axis from 0; None for all axes.
-    count : int
-        Frames.
-    first_frame : int
-        The first of them.
-    fraction : float
-        Their part of all frames.
-    spoils : bool
-        Whether these frames are not usable; otherwise they are only reported.
-    """
-
-    kind: str
-    series: str
-    axis: int | None
-    count: int
-    first_frame: int
-    fraction: float
-    spoils: bool
+    kind: str  # "missing", "repeated", "not finite", "stuck", "saturated", "outlier", "held", ...
+    series: str  # "measurements", "commands" or "frames"
+    axis: int | None  # from 0; None for all axes
+    count: int  # frames
+    first_frame: int  # the first of them
+    fraction: float  # their part of all frames
+    spoils: bool  # whether these frames are not usable; otherwise they are only reported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordHealth:
-    """What was found in a record.
-
-    Attributes
-    ----------
-    frames, usable : int
-        All frames, and those that count as data.
-    findings : tuple of Finding
-        The faults; empty for a clean record.
-    notes : tuple of str
-        How a file was read, what was repaired, what changes with time.
-    bridged : int
-        Frames that were interpolated.
-    jitter_frames : float or None
-        Rms distance of the rows' times from the regular grid [frames]; None without times.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> seen = lbt.identification.loop_record(
-    ...     [1.0, 3.0, float("nan"), 2.0], frame_rate_hz=500, unit="nm"
-    ... )
-    >>> for row in seen.health.rows():
-    ...     print(row)
-    ('not finite', 'measurements', 0, 1, 25.0, 2, 'spoilt')
-    """
+    """What was found in a record."""
 
     frames: int
-    usable: int
-    findings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
-    bridged: int = 0
+    usable: int  # frames that count as data
+    findings: tuple[Finding, ...] = ()  # empty for a clean record
+    notes: tuple[str, ...] = ()  # how a file was read, what was repaired, what changes with time
+    bridged: int = 0  # frames that were interpolated
+    # rms distance of the rows' times from the regular grid; None without times
     jitter_frames: float | None = None
 
     @property

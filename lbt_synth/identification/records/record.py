@@ -149,13 +149,7 @@ class LoopRecord:
 
     @property
     def hardware(self) -> LoopHardware:
-        """The loop: delay and mirror, one measurement and one command per axis.
-
-        Raises
-        ------
-        ProblemError
-            If the delay is not known.
-        """
+        """The loop of a known delay: its mirror, one measurement and one command per axis."""
         if self.delay_frames is None:
             raise ProblemError(
                 "the total delay of this loop is not known; give delay_frames, from the middle of "
@@ -174,40 +168,21 @@ class LoopRecord:
         return self.hardware.mirror_taps
 
     def corrections(self) -> FloatArray:
-        """Return the correction c(k) inside each measurement [nm].
+        """Return the correction c(k) inside each measurement, (frames, axes) [nm].
 
-        Returns
-        -------
-        (frames, axes) ndarray
-            ``c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...``; zeros of an open loop. The first
-            ``len(mirror_taps)`` rows are not known, and those frames not usable.
-
-        Raises
-        ------
-        ProblemError
-            If there are commands and the delay is not known.
+        ``c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...``; zeros of an open loop. The first
+        ``len(mirror_taps)`` rows are not known, and those frames not usable. A closed loop has to
+        have a known delay.
         """
         if self.commands is None:
             return np.zeros(self.measurements.shape)
         return past_corrections(self.mirror_taps, self.commands)
 
     def pseudo_open_loop(self, sensor_gain: ArrayLike = 1.0) -> FloatArray:
-        """Return the measurements that an open loop would have given [nm].
+        """Return the measurements that an open loop would have given, (frames, axes) [nm].
 
-        Parameters
-        ----------
-        sensor_gain : float or (axes,) array_like, optional
-            Real gain of the sensor.
-
-        Returns
-        -------
-        (frames, axes) ndarray
-            ``y(k)/gain + c(k) = phi_tot(k-1) + w(k)/gain``.
-
-        Raises
-        ------
-        ProblemError
-            If a gain is not above 0, or the delay of a closed loop is not known.
+        They are ``y(k)/gain + c(k) = phi_tot(k-1) + w(k)/gain``, with one real gain of the sensor
+        or one per axis. A closed loop has to have a known delay.
         """
         return np.asarray(self.measurements / self._gains(sensor_gain) + self.corrections())
 
@@ -224,24 +199,10 @@ class LoopRecord:
         return tuple((int(start), int(stop)) for start, stop in runs(self.usable))
 
     def with_delay(self, delay_frames: float, *, mirror: PositionLoop | None = None) -> LoopRecord:
-        """Return the same record of a loop with another delay.
+        """Return the same record of a loop with another total delay [frames], at least 1.
 
-        Parameters
-        ----------
-        delay_frames : float
-            Total delay [frames], at least 1.
-        mirror : PositionLoop, optional
-            Dynamics of the mirror; those of the record by default.
-
-        Returns
-        -------
-        LoopRecord
-            With the frames that are usable then; bridged ones are not.
-
-        Raises
-        ------
-        ProblemError
-            If the delay is out of range or the mirror does not fit.
+        The mirror is that of the record by default. Frames are those usable then; bridged ones are
+        not.
         """
         mirror = self.mirror if mirror is None else mirror
         path = LoopHardware(
@@ -273,29 +234,11 @@ class LoopRecord:
         most_fraction: float = _BRIDGED_FRACTION,
         sensor_gain: ArrayLike = 1.0,
     ) -> LoopRecord:
-        """Return the record with short holes interpolated.
+        """Return the record with short holes interpolated, a note and a count in its health.
 
-        The pseudo-open-loop measurement is interpolated through the two frames on either side (a
-        cubic, or a straight line where there are fewer), the shortest holes first.
-
-        Parameters
-        ----------
-        most : int, optional
-            Longest hole that is bridged [frames].
-        most_fraction : float, optional
-            Most frames that are bridged, as a fraction of the record.
-        sensor_gain : float or (axes,) array_like, optional
-            Sensor gain for which the pseudo-open-loop measurement is that of the interpolation.
-
-        Returns
-        -------
-        LoopRecord
-            With a note and a count in its health.
-
-        Raises
-        ------
-        ProblemError
-            If a value is out of range, or the delay of a closed loop is not known.
+        The pseudo-open-loop measurement for this sensor gain is interpolated through the two frames
+        on either side (a cubic, or a straight line where there are fewer), the shortest holes
+        first: those of at most ``most`` frames, up to ``most_fraction`` of the record.
         """
         longest = integer(most, "most", at_least=1)
         part = number(most_fraction, "most_fraction", at_least=0, at_most=1)

@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 
 RATE = 1000.0
 FRAMES = 20_000
@@ -51,7 +52,7 @@ def reading(*factors: float, age: int = 1, noise: float = 0.0, seed: int = 0) ->
     return np.asarray(second[start : start + FRAMES] + noisy)
 
 
-def find(*channels: np.ndarray, **options) -> lbt.identification.AccelerometerTransfers:
+def find(*channels: np.ndarray, **options) -> AccelerometerTransfers:
     return lbt.identification.accelerometer_transfers(
         night().model, night().record, np.column_stack(channels), **options
     )

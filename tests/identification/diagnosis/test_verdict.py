@@ -9,7 +9,7 @@ from support.control_laws import RATE, SteppedLaw, run_law
 from support.diagnoses import line_diagnosis, short_record
 
 import lbt_synth as lbt
-from lbt_synth.identification import diagnosis_verdict
+from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
 
 
 def test_of_a_good_record():

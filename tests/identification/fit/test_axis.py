@@ -285,9 +285,7 @@ def test_spectrum_of_known_averages() -> None:
     density = line.psd(f) + slow().psd(f) + 0.05
     chance = np.random.default_rng(0).gamma(20.0, 1 / 20.0, f.size)
     for averages in (20.0, None):
-        found = lbt.identification.identify_spectrum(
-            f, density * chance, frame_rate_hz=RATE, averages=averages
-        )
+        found = axis.identify_spectrum(f, density * chance, frame_rate_hz=RATE, averages=averages)
         (peak,) = found.lines
         assert peak.frequency_hz == pytest.approx(52, abs=5 * peak.frequency_error_hz)
         assert peak.rms_nm == pytest.approx(30, abs=5 * peak.rms_error_nm)
@@ -342,7 +340,7 @@ def test_bad_series_are_refused(
 )
 def test_bad_spectra_are_refused(f: np.ndarray, density: np.ndarray, words: str) -> None:
     with pytest.raises(ProblemError, match=words):
-        lbt.identification.identify_spectrum(f, density, frame_rate_hz=RATE)
+        axis.identify_spectrum(f, density, frame_rate_hz=RATE)
 
 
 def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:

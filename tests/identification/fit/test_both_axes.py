@@ -13,6 +13,7 @@ from support.recorded_loops import LINE, integrator_loop, spliced_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification.records.faults import RecordHealth
 
 RATE = 1000.0
 
@@ -179,7 +180,7 @@ def test_a_dead_axis_is_named() -> None:
         frame_rate_hz=RATE,
         measurements=y,
         usable=np.ones(6000, dtype=bool),
-        health=lbt.identification.RecordHealth(frames=6000, usable=6000),
+        health=RecordHealth(frames=6000, usable=6000),
     )
     with pytest.raises(ProblemError, match="axis 1 of the record is constant"):
         lbt.identify(record)

@@ -13,10 +13,8 @@ from support.short_split import short_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.prediction.forward_chaining import forward_split
+from lbt_synth.identification.prediction.forward_chaining import forward_split, forward_splits
 from lbt_synth.identification.prediction.paired_residuals import chunk_squares
-
-forward_splits = lbt.identification.forward_splits
 
 
 @pytest.fixture(scope="module")
