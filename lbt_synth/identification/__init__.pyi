@@ -5,7 +5,6 @@ from .commands.control_law import fit_control_law as fit_control_law
 from .commands.control_law import record_control_law as record_control_law
 from .commands.gain_interval import allowed_gains as allowed_gains
 from .commands.repair import CommandRepair as CommandRepair
-from .commands.verdict import explain_commands as explain_commands
 from .diagnosis.diagnosis import Diagnosis as Diagnosis
 from .diagnosis.diagnosis import diagnose as diagnose
 from .fit.axis import identify_axis as identify_axis
@@ -13,7 +12,6 @@ from .fit.both_axes import identify as identify
 from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
 from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
-from .fit.periodogram import Whiteness as Whiteness
 from .method_choice import MethodChoice as MethodChoice
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data

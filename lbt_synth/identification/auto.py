@@ -83,7 +83,7 @@ def design_from_record(
     """Identify a loop from its record, design a controller, and test it on unseen data.
 
     Before anything is fitted, the commands must explain the measurements as they are given
-    (:func:`explain_commands`). The test is honest and conservative: a model of the first half of
+    (``explain_commands``). The test is honest and conservative: a model of the first half of
     the usable frames gives a design, and that is replayed on the second half. The design that is
     returned is made the same way from all frames.
 

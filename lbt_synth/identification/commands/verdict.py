@@ -85,45 +85,14 @@ class CommandVerdict:
 def explain_commands(
     record: LoopRecord, *, sensor_gain: float | Sequence[float] | None = None
 ) -> CommandVerdict:
-    """Compare explanations of how the commands of a record reach its measurements.
+    """Compare explanations of how the commands of a closed-loop record reach its measurements.
 
     Each explanation gives another pseudo-open-loop series, and only the right one has the simple
     spectrum of turbulence, lines and noise: Whittle's likelihood on a coarse model decides between
     the commands as given, with other signs, exchanged or shifted, increments, other units, and
     commands that have nothing to do with the measurements. The control law that computed the
-    commands says which of these are likely, and tells a shifted record from a wrong delay.
-
-    Parameters
-    ----------
-    record : LoopRecord
-        A closed-loop record with its delay.
-    sensor_gain : float or one per axis, optional
-        Known gain of the sensor; by default anything from 0.2 to 1.25 is plausible.
-
-    Returns
-    -------
-    CommandVerdict
-        The best explanation, and what repairs the record.
-
-    Raises
-    ------
-    ProblemError
-        If the record has no commands or no delay.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=500)
-    >>> truth = lbt.Truth(turbulence=slow, noise_nm=5.0)
-    >>> path = lbt.LoopHardware(frame_rate_hz=500)
-    >>> run = lbt.simulate(
-    ...     lbt.integrator(path, gain=0.4).controller, truth, hardware=path, frames=10_000
-    ... )
-    >>> record = lbt.identification.loop_record(
-    ...     run.measurements[0], -run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
-    ... )
-    >>> lbt.identification.explain_commands(record).options
-    '--command-sign -1'
+    commands says which of these are likely, and tells a shifted record from a wrong delay. A known
+    gain of the sensor is one number or one per axis; by default 0.2 to 1.25 is plausible.
     """
     require_instance(record, LoopRecord)
     delay = record.hardware.delay_frames  # refuses a record without one

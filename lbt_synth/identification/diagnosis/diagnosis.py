@@ -149,7 +149,7 @@ def diagnose(
     Returns
     -------
     Diagnosis
-        Rows for tables; :func:`diagnosis_verdict` makes sentences of them.
+        Rows for tables, and what they are made from.
 
     Raises
     ------

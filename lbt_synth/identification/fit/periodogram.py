@@ -97,35 +97,20 @@ class LoopPeriodogram:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Whiteness:
-    """Tests of the innovations, the prediction errors of the fitted model.
+    """Tests of the innovations, whose spectrum is the ratio of periodogram to model.
 
-    Their spectrum is the ratio of periodogram to model.
-
-    Attributes
-    ----------
-    deviation : float
-        Largest distance of the cumulative periodogram of the innovations from the diagonal, as
-        a part of their power.
-    p_value : float
-        Probability of a larger one if the innovations were white (M. S. Bartlett, An
-        Introduction to Stochastic Processes, 1955; Kolmogorov's distribution).
-    autocorrelation : (lags,) ndarray
-        From lag 1.
-    correlation_p_value : float
-        Of Box and Pierce's sum of squares over these lags (doi:10.1080/01621459.1970.10481180).
-    frequency_hz, cumulative : (f,) ndarray
-        The cumulative periodogram, from 0 to 1.
-    effective : float
-        Number of independent values.
+    The cumulative periodogram is tested by Kolmogorov's distribution (M. S. Bartlett, An
+    Introduction to Stochastic Processes, 1955), the autocorrelation by Box and Pierce's sum of
+    squares (doi:10.1080/01621459.1970.10481180).
     """
 
-    deviation: float
-    p_value: float
-    autocorrelation: FloatArray
-    correlation_p_value: float
-    frequency_hz: FloatArray
-    cumulative: FloatArray
-    effective: float
+    deviation: float  # largest distance of the cumulative periodogram from the diagonal
+    p_value: float  # probability of a larger one if the innovations were white
+    autocorrelation: FloatArray  # (lags,), from lag 1
+    correlation_p_value: float  # of the sum of squares over these lags
+    frequency_hz: FloatArray  # (f,)
+    cumulative: FloatArray  # (f,), from 0 to 1
+    effective: float  # number of independent values
 
     @property
     def white(self) -> bool:

@@ -219,8 +219,10 @@ def forward_chain(
     designs : mapping of str to callable
         From a :class:`ForwardSplit`, of which they may use the training, to a controller. One that
         fails on a split, or whose loop is unstable, is left out.
-    splits, first_share
-        As for :func:`forward_splits`.
+    splits : int, optional
+        Pairs of training and test.
+    first_share : float, optional
+        Part of the usable frames that the first pair trains on, in (0, 1); tests share the rest.
     progress : callable, optional
         Called with 1 after each split.
     **options

@@ -95,7 +95,7 @@ def record_of(y, u):
 def test_a_loop_that_was_held_is_a_good_record(sensor_gain):
     record = record_of(*run_loop(HELD, sensor_gain=sensor_gain))
     assert held_while_moving(record) == ""
-    assert lbt.identification.explain_commands(record).accepted
+    assert explain_commands(record).accepted
 
 
 @pytest.mark.parametrize("sensor_gain", [0.5, 1.0])
@@ -104,7 +104,7 @@ def test_a_record_of_the_commands_that_stops_is_refused(sensor_gain, axes):
     y, u = run_loop(np.zeros(FRAMES, dtype=bool), sensor_gain=sensor_gain)
     for k in np.flatnonzero(HELD):
         u[k, axes] = u[k - 1, axes]
-    verdict = lbt.identification.explain_commands(record_of(y, u))
+    verdict = explain_commands(record_of(y, u))
     assert not verdict.accepted
     assert "they stand still in 50 % of the frames" in verdict.explanation
 
