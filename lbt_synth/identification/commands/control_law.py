@@ -124,18 +124,11 @@ def record_control_law(record: LoopRecord) -> ControlLaw:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
-    >>> wind = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20, frame_rate_hz=1000)
-    >>> night = lbt.simulate(
-    ...     lbt.integrator(path, gain=0.4).controller,
-    ...     lbt.Truth(turbulence=wind, noise_nm=8),
-    ...     hardware=path,
-    ...     frames=4000,
-    ... )
-    >>> record = lbt.identification.loop_record(
-    ...     night.measurements[0], -night.commands[0], frame_rate_hz=1000, unit="nm"
-    ... )
+    >>> y = np.random.default_rng(1).standard_normal((2000, 1))
+    >>> u = -0.4 * np.cumsum(y, axis=0)
+    >>> record = lbt.identification.loop_record(y, u, frame_rate_hz=1000, unit="nm")
     >>> law = lbt.identification.record_control_law(record)
     >>> law.kind, law.lag_frames, law.gain.round(6).tolist()
     ('pure integrator', 0, [[-0.4]])

@@ -44,16 +44,10 @@ def spectral_design(
 
     Parameters
     ----------
-    open_loop : (frames, n) array_like
-        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + w(k) / g`` [nm].
-    hardware : LoopHardware
-        The loop: delay, mirror, sensor and influence matrix, both square and invertible.
+    open_loop, hardware, sensor_gain, stretches
+        As for :func:`least_squares_predictor`; the spectrum is that of the stretches.
     order : int, optional
         Poles of the filter of each mode, from 2 to 40; the states of delay and mirror come on top.
-    sensor_gain : float, optional
-        Sensor gain g that formed z, relative to the sensor matrix; the controller needs it.
-    stretches : sequence of (start, stop), optional
-        Contiguous usable frames to take the spectrum of; by default the whole record.
 
     Returns
     -------

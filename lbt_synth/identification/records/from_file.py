@@ -65,19 +65,11 @@ def load_record(
     kind : {"closed_loop", "open_loop", "spectrum"}, optional
         Residual measurements with commands; the (pseudo-)open-loop series itself; or a power
         spectrum. By default what the names tell.
-    frame_rate_hz : float, optional
-        Frame rate [Hz], where the file does not tell it; a contradiction is refused.
-    delay_frames : float, optional
-        Total delay [frames], where the file does not tell it, or in place of that of the file.
-    unit : str, optional
-        Unit of the measurements (nm, um, m, mas, arcsec, urad, rad; of a spectrum nm^2/Hz or
-        nm/sqrt(Hz) and so on), where the file does not tell it; a contradiction is refused.
-    command_unit : str, optional
-        Unit of the commands; by default ``unit``.
-    diameter_m, obstruction : float, optional
-        Telescope diameter [m], and its central obstruction as a fraction of it.
-    mirror : PositionLoop, optional
-        Dynamics of the mirror.
+    frame_rate_hz, unit, command_unit : optional
+        As for :func:`loop_record`, where the file does not tell them; a contradiction is refused.
+        The unit of a spectrum is nm^2/Hz or nm/sqrt(Hz) and so on.
+    delay_frames, diameter_m, obstruction, mirror : optional
+        As for :func:`loop_record`; the delay also in place of that of the file.
     averages : int, optional
         Periodograms that were averaged in a spectrum.
     axes : sequence of int, optional
@@ -188,18 +180,11 @@ def record_from_telemetry(
         What the loop recorded.
     axes : sequence of int, optional
         Tip and tilt among the modes, from 0; all, where there are one or two.
-    frame_rate_hz : float, optional
-        Frame rate [Hz]; refused where it is not that of the telemetry.
-    delay_frames : float, optional
-        Total delay [frames], where it is not known, or in place of that of the telemetry.
-    mirror : PositionLoop, optional
-        Dynamics of the mirror; by default as in the telemetry.
-    unit, command_unit : str, optional
-        Units of the modal measurements and of the modal commands, where the telemetry does not
-        tell them.
-    diameter_m, obstruction : float, optional
-        Telescope diameter [m], and its central obstruction as a fraction of it, where they are
-        not known, or in place of those of the telemetry.
+    frame_rate_hz, unit, command_unit : optional
+        As for :func:`loop_record`, of modes, where the telemetry does not tell them; another
+        frame rate is refused.
+    delay_frames, diameter_m, obstruction, mirror : optional
+        As for :func:`loop_record`, where they are not known, or in place of the telemetry's.
     source : str, optional
         Where it is from; by default the name of the system.
 
