@@ -1,7 +1,5 @@
 """Designs for the LBT that the tests of all exports share."""
 
-from __future__ import annotations
-
 import pytest
 from support.exports import lbt_config, lbt_designs
 

@@ -1,7 +1,5 @@
 """Counts of the arithmetic and memory of a frame."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """What no export accepts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -9,13 +7,10 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.interop import export_c, export_dao, export_mat
 
 pytestmark = pytest.mark.usefixtures("short_rehearsal")
-EXPORTS = {
-    "k.c": lbt.interop.export_c,
-    "k.mat": lbt.interop.export_mat,
-    "k.npy": lbt.interop.export_dao,
-}
+EXPORTS = {"k.c": export_c, "k.mat": export_mat, "k.npy": export_dao}
 
 
 @pytest.mark.parametrize("file", EXPORTS)
@@ -46,8 +41,8 @@ def test_what_no_format_takes(tmp_path, designs, file):
 
 
 def test_exports_to_two_targets_keep_their_certificates(tmp_path, designs):
-    lbt.interop.export_c(tmp_path / "k.c", designs["integrator"])
-    lbt.interop.export_dao(tmp_path / "k.npy", designs["integrator"])
+    export_c(tmp_path / "k.c", designs["integrator"])
+    export_dao(tmp_path / "k.npy", designs["integrator"])
     found = {path.name: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
     assert {name: read["target"] for name, read in found.items()} == {
         "k.c.certificate.json": "c",

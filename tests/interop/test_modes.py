@@ -1,7 +1,5 @@
 """Matrices of all modes: a design with integrators, filters for each mode."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Controllers rehearsed in the arithmetic of targets."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The targets of an export."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 from fractions import Fraction
 

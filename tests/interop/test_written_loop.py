@@ -1,7 +1,5 @@
 """The proof of a controller in the arithmetic of a target."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Variance and spectrum of auto-regressive processes."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Disturbances in words."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import lbt_synth as lbt

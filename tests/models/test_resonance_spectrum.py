@@ -14,8 +14,7 @@ RATE = 1000.0
 
 
 @given(
-    frequency=st.floats(0.01, 400),
-    damping=st.floats(1e-4, 20).filter(lambda z: abs(z - 1) > 1e-6),
+    frequency=st.floats(0.01, 400), damping=st.floats(1e-4, 20).filter(lambda z: abs(z - 1) > 1e-6)
 )
 @settings(max_examples=60, deadline=None)
 def test_density_is_that_of_the_process_and_its_derivatives_are_right(

@@ -1,7 +1,5 @@
 """Measurement noise of the pyramid sensor."""
 
-from __future__ import annotations
-
 import pytest
 
 import lbt_synth as lbt

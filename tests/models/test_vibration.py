@@ -1,7 +1,5 @@
 """Vibrations: their processes, their drift, and what is no vibration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +8,7 @@ from scipy.signal import hilbert
 from support.drifting import drifting
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models.vibration import checked_direction
 
@@ -41,14 +40,12 @@ def test_direction_becomes_a_unit_vector():
 
 @pytest.mark.parametrize("damping", [0.0, 1.0, 1.5])
 def test_damping_lies_in_the_open_interval(damping):
-    with pytest.raises(lbt.errors.ProblemError, match="damping must be"):
+    with pytest.raises(ProblemError, match="damping must be"):
         lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=1)
 
 
 def test_a_vibration_above_nyquist_is_refused():
-    with pytest.raises(
-        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"
-    ):
+    with pytest.raises(ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"):
         lbt.Vibration(frequency_hz=500, damping=0.1, rms_nm=1).ar_model(800)
 
 
@@ -124,7 +121,7 @@ def test_the_variance_of_the_resonance_is_held_exactly(start, end, duration, dam
     time_s = (np.arange(600) - 100) / 800
     try:
         a1, a2, driving = line.ar_process(time_s, 800)
-    except lbt.errors.ProblemError:
+    except ProblemError:
         assert end < start  # only a falling frequency pumps up the amplitude
         return
     together = a1[0] / (1 - a2)
@@ -146,18 +143,16 @@ def test_wrong_drifts_are_refused():
         ({"direction": (0,)}, "direction must be a vector"),
         ({"damping": 0.5, "end_hz": 8}, "frequency above that"),
     ):
-        with pytest.raises(lbt.errors.ProblemError, match=words):
+        with pytest.raises(ProblemError, match=words):
             drifting(**wrong)
-    with pytest.raises(lbt.errors.ProblemError, match="time_s must be finite"):
+    with pytest.raises(ProblemError, match="time_s must be finite"):
         drifting().frequency_hz_at(np.nan)
-    with pytest.raises(lbt.errors.ProblemError, match="a sinusoid has no AR2 process"):
+    with pytest.raises(ProblemError, match="a sinusoid has no AR2 process"):
         drifting().ar_process(np.arange(3) / 800, 800)
     falls = drifting(start_hz=23, end_hz=10, duration_s=0.5, damping=1e-4)
-    with pytest.raises(lbt.errors.ProblemError, match="must move slowly beside its decay"):
+    with pytest.raises(ProblemError, match="must move slowly beside its decay"):
         drawn(falls, frames=800)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"
-    ):
+    with pytest.raises(ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"):
         checked_direction(drifting(end_hz=500), PATH)
-    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
+    with pytest.raises(DimensionError, match="must have 1 components"):
         checked_direction(drifting(direction=(1, 0)), PATH)

@@ -1,7 +1,5 @@
 """Pages and a browser that the tests of pages share."""
 
-from __future__ import annotations
-
 import pytest
 from support.browser import chromium
 from support.pages import HOSTILE, whole_page

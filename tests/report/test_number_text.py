@@ -1,30 +1,14 @@
 """Numbers and lists as texts."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from lbt_synth.report.number_text import (
-    fixed_text,
-    number_text,
-    signed_text,
-    unbroken_text,
-)
+from lbt_synth.report.number_text import fixed_text, number_text, signed_text, unbroken_text
 
 
 def test_numbers_as_texts():
     assert [
         number_text(v) for v in (0.0, 27.701, 1234.56, 123456.0, 1e-9, -2.5, np.inf, np.nan)
-    ] == [
-        "0",
-        "27.7",
-        "1235",
-        "123456",
-        "1e\u22129",
-        "\u22122.5",
-        "∞",
-        "\u2013",
-    ]
+    ] == ["0", "27.7", "1235", "123456", "1e\u22129", "\u22122.5", "∞", "\u2013"]
     assert fixed_text(-0.001, 1) == "0.0"
     assert fixed_text(float("nan"), 1) == "\u2013"
     assert fixed_text(float("-inf"), 1) == "\u2212∞"

@@ -1,7 +1,5 @@
 """Files of the paper's tables and figures."""
 
-from __future__ import annotations
-
 import csv
 
 import pytest

@@ -1,7 +1,5 @@
 """The time at which a page was made."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 import pytest

@@ -1,7 +1,5 @@
 """The page of designs of several sensors."""
 
-from __future__ import annotations
-
 import hashlib
 
 import pytest

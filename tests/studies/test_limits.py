@@ -1,7 +1,5 @@
 """The study of limits: designs against the least residuals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Robustness to frequency errors, and maps over errors of frequency, gain and delay."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +12,14 @@ from support.robustness_maps import evaluate_point
 import lbt_synth as lbt
 from lbt_synth.methods.registry import gain_robust_method
 from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.models import ARModel, SinusoidalVibration, TabulatedSpectrum
 from lbt_synth.models.plant.tip_tilt import retuned_plant
+from lbt_synth.studies import limits, robustness, robustness_map
 
 
 def test_robustness_rows(config):
     rows = list(
-        lbt.studies.robustness(
+        robustness(
             config.plant, config.truth, config.imaging, errors_hz=[-3, 0, 3], gamma_ratio=1.2
         )
     )
@@ -38,10 +38,8 @@ def test_robustness_rows(config):
 
 
 def test_unstable_rows_say_so(config):
-    from dataclasses import replace
-
     truth = replace(config.truth, sensor_gain=0.3)
-    (row,) = lbt.studies.robustness(
+    (row,) = robustness(
         config.plant, truth, config.imaging, errors_hz=[0], methods=["hinf"], gamma_ratio=1.05
     )
     assert not row.stable
@@ -51,16 +49,13 @@ def test_unstable_rows_say_so(config):
 def test_the_study_refuses_what_it_cannot_do(config):
     turbulence = config.plant.turbulence[0]
     still = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=turbulence, noise_nm=10)
-    with pytest.raises(lbt.errors.ProblemError, match="needs a vibration in the model"):
-        list(lbt.studies.robustness(still, config.truth, config.imaging, errors_hz=[0]))
-    with pytest.raises(lbt.errors.ProblemError, match="method must be one of"):
-        list(
-            lbt.studies.robustness(
-                config.plant, config.truth, config.imaging, errors_hz=[0], methods=["magic"]
-            )
-        )
-    with pytest.raises(lbt.errors.ProblemError, match="above 0"):
-        list(lbt.studies.robustness(config.plant, config.truth, config.imaging, errors_hz=[25]))
+    for plant, options, words in (
+        (still, {"errors_hz": [0]}, "needs a vibration in the model"),
+        (config.plant, {"errors_hz": [0], "methods": ["magic"]}, "method must be one of"),
+        (config.plant, {"errors_hz": [25]}, "above 0"),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            list(robustness(plant, config.truth, config.imaging, **options))
 
 
 def test_what_needs_a_stationary_truth_refuses_it(config):
@@ -76,9 +71,9 @@ def test_what_needs_a_stationary_truth_refuses_it(config):
         lambda: lbt.loop.least_worst_residual(
             hw, truth, band_hz=(15, 25), rms_nm=100, direction=(1,)
         ),
-        lambda: lbt.studies.robustness_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
-        lambda: lbt.studies.limits({"kalman": design}, hw, truth, camera),
-        lambda: list(lbt.studies.robustness(plant, truth, camera, errors_hz=[0])),
+        lambda: robustness_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
+        lambda: limits({"kalman": design}, hw, truth, camera),
+        lambda: list(robustness(plant, truth, camera, errors_hz=[0])),
         lambda: lbt.design.optimal_integrator(hw, truth),
     ):
         with pytest.raises(lbt.errors.ProblemError, match="drifts from 17 to 23 Hz. Simulate it"):
@@ -86,18 +81,12 @@ def test_what_needs_a_stationary_truth_refuses_it(config):
 
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
-
-
-SLOW = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-
-
+SLOW = ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
 DIAGONAL = (0.8, 0.6)
 
 
 def sinusoid(frequency_hz=20.0, rms_nm=797.0, direction=(1.0, 0.0)):
-    return lbt.models.SinusoidalVibration(
-        frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction
-    )
+    return SinusoidalVibration(frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction)
 
 
 def random_line(frequency_hz=20.0, rms_nm=500.0, damping=0.01, direction=(1.0, 0.0)):
@@ -121,8 +110,8 @@ def robust(settings):
     return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
 
 
-def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
-    found = lbt.studies.robustness_map(
+def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,), rel=1e-6):
+    found = robustness_map(
         design, truth, imaging, errors_hz=errors, sensor_gains=gains, delay_errors_frames=delays
     )
     assert found.stable.any()
@@ -135,7 +124,7 @@ def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,)):
                     continue
                 here = found.strehl[i, j, k], found.residual_nm[i, j, k]
                 expected = evaluate_point(design, truth, imaging, error, gain, delay)
-                assert here == pytest.approx(expected, rel=1e-6), (delay, gain, error)
+                assert here == pytest.approx(expected, rel=rel), (delay, gain, error)
     return found
 
 
@@ -152,12 +141,20 @@ TRUTHS = {
 @pytest.mark.parametrize("name", TRUTHS)
 def test_each_point_is_that_of_the_single_evaluator(kalman, air, name):
     vibrations, turbulence = TRUTHS[name]
-    table = lbt.models.TabulatedSpectrum(
-        frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1]
-    )
+    table = TabulatedSpectrum(frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1])
     spectra = {"air": air, "ar": SLOW, "none": None, "table": table}
     truth = lbt.Truth(turbulence=spectra[turbulence], vibrations=vibrations, noise_nm=15.5)
     assert_as_single(kalman, truth, CAMERA, [-2.5, 0.0, 1.0], [0.07, 0.6, 1.0, 1.9])
+
+
+def test_axes_of_their_own_disturbances():
+    truth = lbt.Truth(
+        turbulence=[uneven_axes.SLOW, uneven_axes.TABLE],
+        noise_nm=[15.5, 6.0],
+        vibrations=uneven_axes.LINES,
+    )
+    both = lbt.integrator(uneven_axes.LOOPS[0], gain=0.4)
+    assert_as_single(both, truth, lbt.Imaging(diameter_m=8.22), [0], [0.6, 1.0], rel=1e-8)
 
 
 def test_points_next_to_instability(robust, settings):
@@ -192,14 +189,14 @@ def test_axes_that_the_sensor_mixes(air):
 
 
 def test_unstable_points_are_nan(robust, settings):
-    found = lbt.studies.robustness_map(
+    found = robustness_map(
         robust, settings.truth, settings.imaging, errors_hz=[-1, 0], sensor_gains=[0.3, 1.0, 3.0]
     )
     assert found.stable[0].tolist() == [False, True, False]
     assert np.isnan(found.strehl[0, [0, 2]]).all()
     assert np.isnan(found.residual_nm[0, [0, 2]]).all()
     assert np.isfinite(found.strehl[0, 1]).all()
-    none = lbt.studies.robustness_map(
+    none = robustness_map(
         robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[0.1]
     )
     assert np.isnan(none.strehl).all()
@@ -207,7 +204,7 @@ def test_unstable_points_are_nan(robust, settings):
 
 def test_an_image_that_is_gone_has_no_strehl(robust, settings):
     _, high = lbt.loop.stable_sensor_gains(robust.hardware, robust.controller)
-    found = lbt.studies.robustness_map(
+    found = robustness_map(
         robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[high * (1 - 1e-8)]
     )
     assert found.stable.all()
@@ -219,7 +216,7 @@ def test_order_and_neighbours_change_nothing(kalman, settings):
     """A point is the same alone, among others, in any order, and more of them than fit at once."""
 
     def mapped(errors, gains):
-        return lbt.studies.robustness_map(
+        return robustness_map(
             kalman, settings.truth, settings.imaging, errors_hz=errors, sensor_gains=gains
         )
 
@@ -239,9 +236,7 @@ def test_turning_the_vibration_changes_nothing(kalman, air):
         truth = lbt.Truth(
             turbulence=air, vibrations=(sinusoid(direction=direction),), noise_nm=15.5
         )
-        return lbt.studies.robustness_map(
-            kalman, truth, CAMERA, errors_hz=[0, 2], sensor_gains=[0.5, 1]
-        ).strehl
+        return robustness_map(kalman, truth, CAMERA, errors_hz=[0, 2], sensor_gains=[0.5, 1]).strehl
 
     assert mapped((1.0, 0.0)) == pytest.approx(mapped((0.0, 1.0)), rel=1e-9)
     assert mapped((1.0, 0.0)) == pytest.approx(mapped(DIAGONAL), rel=1e-6)
@@ -252,10 +247,8 @@ def test_the_sign_of_the_error_is_true_less_assumed(kalman, settings):
     moved = replace(
         settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
     )
-    below = lbt.studies.robustness_map(
-        kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1]
-    )
-    error = lbt.studies.robustness_map(
+    below = robustness_map(kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1])
+    error = robustness_map(
         kalman, settings.truth, settings.imaging, errors_hz=[-1.5], sensor_gains=[1]
     )
     assert below.strehl == pytest.approx(error.strehl, rel=1e-12)
@@ -266,9 +259,7 @@ def test_each_line_moves_by_its_share(kalman, settings):
     lines = (sinusoid(0.3, 400.0), sinusoid(20.0, 300.0))
 
     def residual(truth, error):
-        found = lbt.studies.robustness_map(
-            kalman, truth, settings.imaging, errors_hz=[error], sensor_gains=[1]
-        )
+        found = robustness_map(kalman, truth, settings.imaging, errors_hz=[error], sensor_gains=[1])
         return float(found.residual_nm[0, 0, 0])
 
     def at(*frequencies):
@@ -289,7 +280,7 @@ def test_a_map_knows_the_band_of_its_design(kalman, settings):
     robust = design_request(gain_robust_method(), {}).build(inputs)
 
     def band(design, truth):
-        return lbt.studies.robustness_map(
+        return robustness_map(
             design, truth, settings.imaging, errors_hz=[0], sensor_gains=[1]
         ).band_hz
 
@@ -304,19 +295,14 @@ def test_a_map_knows_the_band_of_its_design(kalman, settings):
 def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
     model = [lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50.0) for f in (0.31, 21.0)]
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800,
-        turbulence=settings.plant.turbulence[0],
-        vibrations=model,
-        noise_nm=15.5,
+        frame_rate_hz=800, turbulence=settings.plant.turbulence[0], vibrations=model, noise_nm=15.5
     )
     truth = replace(
         settings.truth,
         vibrations=(sinusoid(0.3, 100.0), sinusoid(20.0, 100.0)),
         frequency_errors_hz=(0.0, 3.5),
     )
-    (row,) = lbt.studies.robustness(
-        plant, truth, settings.imaging, errors_hz=[2.0], methods=["kalman"]
-    )
+    (row,) = robustness(plant, truth, settings.imaging, errors_hz=[2.0], methods=["kalman"])
     moved = lbt.kalman(retuned_plant(plant, [0.0, -2.0], hold="driving"))
     budget = lbt.residual_budget(lbt.close_loop(moved.hardware, moved.controller), truth)
     assert row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
@@ -324,7 +310,7 @@ def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
 
 def test_counts_points_as_they_are_done(kalman, settings):
     counts = []
-    lbt.studies.robustness_map(
+    robustness_map(
         kalman,
         settings.truth,
         settings.imaging,
@@ -354,43 +340,18 @@ WRONG = [
 def test_wrong_axes_are_refused(kalman, settings, wrong, text):
     axes = {"errors_hz": [0], "sensor_gains": [1]} | wrong
     with pytest.raises(lbt.errors.ProblemError, match=text):
-        lbt.studies.robustness_map(kalman, settings.truth, settings.imaging, **axes)
+        robustness_map(kalman, settings.truth, settings.imaging, **axes)
 
 
 def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
-    axes = {"errors_hz": [0, 1], "sensor_gains": [1]}
     walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.errors.ProblemError, match="a map needs the design of a loop"):
-        lbt.studies.robustness_map(lbt.kalman(walk), settings.truth, settings.imaging, **axes)
-    with pytest.raises(lbt.errors.ProblemError, match="needs a vibration in the truth"):
-        lbt.studies.robustness_map(kalman, lbt.Truth(turbulence=None), settings.imaging, **axes)
-    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
-        lbt.studies.robustness_map(lbt.kalman(axis_plant), settings.truth, settings.imaging, **axes)
     three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
-    with pytest.raises(lbt.errors.DimensionError, match="got a loop of 3 modes"):
-        lbt.studies.robustness_map(three, lbt.Truth(turbulence=None), settings.imaging, **axes)
-
-
-def test_the_map_is_the_budget_at_each_point():
-    both, _ = uneven_axes.LOOPS
-    truth = lbt.Truth(
-        turbulence=[uneven_axes.SLOW, uneven_axes.TABLE],
-        noise_nm=[15.5, 6.0],
-        vibrations=uneven_axes.LINES,
-    )
-    design = lbt.integrator(both, gain=0.4)
-    camera = lbt.Imaging(diameter_m=8.22)
-    found = lbt.studies.robustness_map(
-        design, truth, camera, errors_hz=[0], sensor_gains=[0.6, 1.0]
-    )
-    for i, gain in enumerate([0.6, 1.0]):
-        loop = lbt.close_loop(both, design.controller, sensor_gain=gain)
-        real = lbt.Truth(
-            turbulence=truth.turbulence,
-            noise_nm=truth.noise_nm,
-            vibrations=uneven_axes.LINES,
-            sensor_gain=gain,
-        )
-        budget = lbt.residual_budget(loop, real)
-        assert found.residual_nm[0, i, 0] == pytest.approx(budget.rms_nm, rel=1e-8)
-        assert found.strehl[0, i, 0] == pytest.approx(lbt.strehl(budget, camera), rel=1e-8)
+    still, shaken = lbt.Truth(turbulence=None), settings.truth
+    for design, truth, error, words in (
+        (lbt.kalman(walk), shaken, lbt.errors.ProblemError, "a map needs the design of a loop"),
+        (kalman, still, lbt.errors.ProblemError, "needs a vibration in the truth"),
+        (lbt.kalman(axis_plant), shaken, lbt.errors.DimensionError, "must have 1 components"),
+        (three, still, lbt.errors.DimensionError, "got a loop of 3 modes"),
+    ):
+        with pytest.raises(error, match=words):
+            robustness_map(design, truth, settings.imaging, errors_hz=[0, 1], sensor_gains=[1])

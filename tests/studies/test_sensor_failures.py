@@ -1,7 +1,5 @@
 """A loop in which sensors fail on the way, beside the exact answers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

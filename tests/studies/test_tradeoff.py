@@ -1,7 +1,5 @@
 """The trade-off between variance and norm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.figures import legend

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.models import ARModel, SinusoidalVibration
 
 RATE = 500.0
 TURNED = np.array([[0.9, -0.3], [0.2, 1.1]])  # of the mirror, which couples the axes
-AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=RATE)
+AIR = ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=RATE)
 
 
 @cache
@@ -28,10 +29,7 @@ def setting(*, coupled: bool, sinusoids: bool):
     hardware = lbt.LoopHardware(
         frame_rate_hz=RATE, influence_matrix=TURNED if coupled else None, modes=2
     )
-    true = [
-        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=d)
-        for f, rms, d in lines
-    ]
+    true = [SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=d) for f, rms, d in lines]
     truth = lbt.Truth(
         turbulence=AIR,
         vibrations=tuple(true if sinusoids else model),
@@ -134,7 +132,7 @@ def test_what_is_refused(options, message) -> None:
 def test_a_resonance_is_sampled(frequency_hz, damping):
     """Its spectrum falls less steeply near half the frame rate than one in continuous time."""
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    air = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=0.01, frame_rate_hz=800)
+    air = ARModel(coefficients=[0.9], driving_rms_nm=0.01, frame_rate_hz=800)
     line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=100, direction=(1.0,))
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=800, turbulence=air, vibrations=[line], noise_nm=1.0, modes=1
@@ -149,7 +147,7 @@ def test_a_resonance_is_sampled(frequency_hz, damping):
 def test_lines_at_one_frequency_move_by_their_own_errors():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=2)
     lines = tuple(
-        lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=direction)
+        SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=direction)
         for direction in ((1, 0), (0, 1))
     )
     truth = lbt.Truth(

@@ -1,7 +1,5 @@
 """Telemetry in the AOT standard, judged by the standard's own package."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import io

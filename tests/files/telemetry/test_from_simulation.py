@@ -1,10 +1,9 @@
 """Telemetry of a simulated loop."""
 
-from __future__ import annotations
-
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
 
 
 def test_the_camera_gives_telescope_and_strehl_ratio():
@@ -30,20 +29,17 @@ def test_what_is_no_simulation_is_refused(axis_plant):
     path = axis_plant.hardware
     design = lbt.kalman(axis_plant)
     run = lbt.simulate(design.controller, lbt.Truth(turbulence=None), hardware=path, frames=5)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="case must be below the number of cases, 1; got 1"
-    ):
+    with pytest.raises(ProblemError, match="case must be below the number of cases, 1; got 1"):
         lbt.files.telemetry_from_simulation(run, path, case=1)
-    with pytest.raises(lbt.errors.ProblemError, match="must be that of the simulation, at 800 Hz"):
+    with pytest.raises(ProblemError, match="must be that of the simulation, at 800 Hz"):
         lbt.files.telemetry_from_simulation(run, lbt.LoopHardware(frame_rate_hz=500, modes=1))
-    with pytest.raises(lbt.errors.ProblemError, match="expected a Simulation; got int"):
+    with pytest.raises(ProblemError, match="expected a Simulation; got int"):
         lbt.files.telemetry_from_simulation(3, path)
-    with pytest.raises(lbt.errors.ProblemError, match="expected a LoopHardware; got int"):
+    with pytest.raises(ProblemError, match="expected a LoopHardware; got int"):
         lbt.files.telemetry_from_simulation(run, 3)
-    with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got Controller"):
+    with pytest.raises(ProblemError, match="expected a Design; got Controller"):
         lbt.files.telemetry_from_simulation(run, path, design=design.controller)
     with pytest.raises(
-        lbt.errors.DimensionError,
-        match="interaction_matrix must have 1 measurement to match measurements",
+        DimensionError, match="interaction_matrix must have 1 measurement to match measurements"
     ):
         lbt.files.telemetry_from_simulation(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))

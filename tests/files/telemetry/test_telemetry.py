@@ -1,7 +1,5 @@
 """What telemetry takes, and what it refuses."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -9,20 +7,6 @@ import pytest
 from support.telemetry import full
 
 import lbt_synth as lbt
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"mirror": 3}, "expected a PositionLoop; got int"),
-        ({"delay_frames": None}, "needs delay_frames"),
-        ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
-        ({"frame_rate_hz": 790.0, "controller": None}, "whole number of samples per frame"),
-    ],
-)
-def test_a_mirror_that_does_not_fit_is_refused(changes, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
-        full(**changes)
 
 
 def test_hardware_of_slopes_is_seen_through_the_reconstructor():
@@ -56,6 +40,10 @@ def test_hardware_that_is_not_known(changes, text):
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
+        ({"mirror": 3}, "expected a PositionLoop; got int"),
+        ({"delay_frames": None}, "needs delay_frames"),
+        ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
+        ({"frame_rate_hz": 790.0, "controller": None}, "whole number of samples per frame"),
         ({"frame_rate_hz": 0}, "frame_rate_hz must be above 0"),
         ({"delay_frames": -1}, "delay_frames must be at least 0"),
         ({"strehl": 1.1}, "strehl must be at most 1"),

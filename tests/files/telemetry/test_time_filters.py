@@ -1,7 +1,5 @@
 """Controllers as a matrix and scalar filters, against the controllers step by step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.plants import lbt_axis_plant

@@ -1,7 +1,5 @@
 """Structure of a matrix between axes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The control law of a record, on loops whose law is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.control_laws import RATE, SteppedLaw, ordinary_loop, rotation, run_law

@@ -1,7 +1,5 @@
 """The sensor gains that a record allows, and designs at them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop

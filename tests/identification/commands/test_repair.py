@@ -1,7 +1,5 @@
 """Repairs of recorded commands: each undoes its fault."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop

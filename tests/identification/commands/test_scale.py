@@ -1,15 +1,9 @@
 """The factor of commands, against gains that are drawn around plausible ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from lbt_synth.identification.commands.scale import (
-    _usual_gain,
-    likely_factors,
-    wrong_scale,
-)
+from lbt_synth.identification.commands.scale import _usual_gain, likely_factors, wrong_scale
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 
 

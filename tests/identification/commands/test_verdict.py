@@ -10,6 +10,7 @@ from support.recorded_loops import LINE, RATE, crowded_record, spliced_record
 from support.wrong_commands import FAULTS, record, wrong_record
 
 import lbt_synth as lbt
+from lbt_synth.identification import loop_record
 from lbt_synth.identification.commands.guesses import Guess, list_guesses
 from lbt_synth.identification.commands.repair import repair_commands
 from lbt_synth.identification.commands.verdict import (
@@ -48,9 +49,7 @@ def test_a_filter_is_known_although_its_measurements_were_rounded(method) -> Non
         moved = np.roll(u, shift, axis=0) * [1.0, sign]
         rate = config.hardware.frame_rate_hz
         return explain_commands(
-            lbt.identification.loop_record(
-                seen[5:-5], moved[5:-5], frame_rate_hz=rate, delay_frames=2, unit="nm"
-            )
+            loop_record(seen[5:-5], moved[5:-5], frame_rate_hz=rate, delay_frames=2, unit="nm")
         ).options
 
     assert [options(2.0), options(4.0)] == ["", ""]
@@ -164,7 +163,7 @@ def test_the_law_decides_where_the_lines_hide_the_gain(sign_only) -> None:
     y, u = run.measurements[0], run.commands[0]
     u = -u if sign_only else np.roll(u, 1, axis=0)
     verdict = explain_commands(
-        lbt.identification.loop_record(y[5:], u[5:], frame_rate_hz=1000, delay_frames=2, unit="nm")
+        loop_record(y[5:], u[5:], frame_rate_hz=1000, delay_frames=2, unit="nm")
     )
     assert verdict.options == ("--command-sign -1" if sign_only else "--command-shift-frames -1")
 
@@ -183,9 +182,7 @@ def test_the_law_decides_where_the_lines_hide_the_gain(sign_only) -> None:
 def test_the_law_decides_where_crowded_lines_mislead_a_coarse_spectrum(seed, fault) -> None:
     spoil, options = FAULTS[fault]
     y, u = spoil(*hidden_gain_loop(seed))
-    verdict = explain_commands(
-        lbt.identification.loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm")
-    )
+    verdict = explain_commands(loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm"))
     assert verdict.options == options
 
 
@@ -209,7 +206,7 @@ def test_a_record_without_long_stretches_is_not_tested() -> None:
 
 def test_an_open_loop_has_no_commands() -> None:
     y, _ = ordinary_loop()
-    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     with pytest.raises(lbt.errors.ProblemError, match="no commands to explain"):
         explain_commands(seen)
 

@@ -1,7 +1,5 @@
 """Series that the tests of files share."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

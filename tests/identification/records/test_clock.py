@@ -1,7 +1,5 @@
 """Times and counters: missing and repeated frames, stated rates, rounded times."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +7,8 @@ from hypothesis import strategies as st
 from support.effort import count_calls
 from support.records import noise
 
-import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import loop_record
 
 RATE = 1000.0
 
@@ -25,7 +24,7 @@ def test_missing_frames_become_holes(by):
     if by != "times":
         clock["frame_numbers"] = 7000 + kept
     rate = RATE if by == "numbers" else None
-    seen = lbt.identification.loop_record(y[kept], frame_rate_hz=rate, unit="nm", **clock)
+    seen = loop_record(y[kept], frame_rate_hz=rate, unit="nm", **clock)
     assert np.flatnonzero(~seen.usable).tolist() == [100, 101, 300]
     assert seen.frames == 500
     assert seen.frame_rate_hz == pytest.approx(RATE, rel=1e-5)
@@ -37,12 +36,12 @@ def test_rows_that_come_twice():
     y = np.random.default_rng(0).standard_normal((100, 2))
     order = np.sort(np.concatenate([np.arange(100), [20, 20, 50]]))
     rows = y[order].copy()
-    same = lbt.identification.loop_record(rows, frame_rate_hz=RATE, frame_numbers=order, unit="nm")
+    same = loop_record(rows, frame_rate_hz=RATE, frame_numbers=order, unit="nm")
     assert same.usable.all()
     assert np.array_equal(same.measurements, y)
     assert same.health.notes == ("3 rows of a time that had been recorded already were left out",)
     rows[np.flatnonzero(order == 50)[1]] += 1  # two stories of one frame
-    torn = lbt.identification.loop_record(rows, times_s=order / RATE, unit="nm")
+    torn = loop_record(rows, times_s=order / RATE, unit="nm")
     assert np.flatnonzero(~torn.usable).tolist() == [50]
     assert torn.health.rows() == (("repeated", "frames", None, 1, 1.0, 50, "spoilt"),)
 
@@ -71,38 +70,30 @@ def test_rows_that_come_twice():
 )
 def test_clocks_that_are_refused(clock, words):
     y = np.random.default_rng(0).standard_normal((6, 1))
-    with pytest.raises(lbt.errors.ProblemError, match=words):
-        lbt.identification.loop_record(y, unit="nm", **clock)
+    with pytest.raises(ProblemError, match=words):
+        loop_record(y, unit="nm", **clock)
 
 
 def test_a_stated_rate_is_held_against_the_times():
     times = np.arange(20_000) / 1000
     for rate in (1004, 999, 1000.2):
-        with pytest.raises(
-            lbt.errors.ProblemError, match="must be that of the times, 1000 Hz; got"
-        ):
-            lbt.identification.loop_record(
-                noise(20_000), frame_rate_hz=rate, times_s=times, unit="nm"
-            )
-    near = lbt.identification.loop_record(
-        noise(20_000), frame_rate_hz=1000.05, times_s=times, unit="nm"
-    )
+        with pytest.raises(ProblemError, match="must be that of the times, 1000 Hz; got"):
+            loop_record(noise(20_000), frame_rate_hz=rate, times_s=times, unit="nm")
+    near = loop_record(noise(20_000), frame_rate_hz=1000.05, times_s=times, unit="nm")
     assert near.frame_rate_hz == 1000.05
     assert near.health.notes == (
         "frame rate 1000.05 Hz, as stated; by the times 1000 Hz, 1 frames apart over the record",
     )
     # with a counter beside the times, too
-    with pytest.raises(lbt.errors.ProblemError, match="must be that of the times"):
-        lbt.identification.loop_record(
+    with pytest.raises(ProblemError, match="must be that of the times"):
+        loop_record(
             noise(20_000),
             frame_rate_hz=1004,
             times_s=times,
             frame_numbers=np.arange(20_000),
             unit="nm",
         )
-    same = lbt.identification.loop_record(
-        noise(20_000), frame_rate_hz=1000, times_s=times, unit="nm"
-    )
+    same = loop_record(noise(20_000), frame_rate_hz=1000, times_s=times, unit="nm")
     assert same.health.notes == ()
 
 
@@ -110,18 +101,16 @@ def test_jumps_beyond_all_integers():
     late = np.arange(50.0)
     late[30:] += 1e19
     for clock in ({"frame_numbers": late}, {"times_s": late}):
-        with pytest.raises(
-            lbt.errors.ProblemError, match=r"frames would be missing .* cut the record"
-        ):
-            lbt.identification.loop_record(noise(50), frame_rate_hz=500, unit="nm", **clock)
-    with pytest.raises(lbt.errors.ProblemError, match="frames would be missing"):
-        lbt.identification.loop_record(noise(50), times_s=late, unit="nm")
+        with pytest.raises(ProblemError, match=r"frames would be missing .* cut the record"):
+            loop_record(noise(50), frame_rate_hz=500, unit="nm", **clock)
+    with pytest.raises(ProblemError, match="frames would be missing"):
+        loop_record(noise(50), times_s=late, unit="nm")
 
 
 def test_repeated_rows_are_found_on_whole_arrays():
     def load(frames):
         rows = np.repeat(np.arange(frames), 2)
-        seen = lbt.identification.loop_record(
+        seen = loop_record(
             np.repeat(noise(frames), 2), frame_rate_hz=500, frame_numbers=rows, unit="nm"
         )
         assert seen.frames == frames
@@ -135,12 +124,10 @@ def test_rounded_times_of_a_known_rate():
     kept = np.delete(np.arange(2000), [500, 501])
     times = np.round(kept / 800, 3)  # steps of 1 and 2 ms
     y = np.random.default_rng(0).standard_normal(len(kept))
-    seen = lbt.identification.loop_record(y, frame_rate_hz=800, times_s=times, unit="nm")
+    seen = loop_record(y, frame_rate_hz=800, times_s=times, unit="nm")
     assert np.flatnonzero(~seen.usable).tolist() == [500, 501]
-    with pytest.raises(
-        lbt.errors.ProblemError, match="the times may be rounded. Give frame_rate_hz"
-    ):
-        lbt.identification.loop_record(y, times_s=times, unit="nm")
+    with pytest.raises(ProblemError, match="the times may be rounded. Give frame_rate_hz"):
+        loop_record(y, times_s=times, unit="nm")
 
 
 @pytest.mark.parametrize(
@@ -149,9 +136,7 @@ def test_rounded_times_of_a_known_rate():
 @pytest.mark.parametrize("rounding", [np.round, np.floor])
 def test_rounded_times_lose_no_frame_at_a_known_rate(rate, rounding):
     y, ms = noise(40_000), np.arange(40_000) / rate * 1e3
-    seen = lbt.identification.loop_record(
-        y, frame_rate_hz=rate, times_s=1e-3 * rounding(ms + 0.25), unit="nm"
-    )
+    seen = loop_record(y, frame_rate_hz=rate, times_s=1e-3 * rounding(ms + 0.25), unit="nm")
     assert seen.frame_rate_hz == rate
     assert np.array_equal(seen.measurements[:, 0], y)
     assert seen.usable.all()
@@ -160,10 +145,8 @@ def test_rounded_times_lose_no_frame_at_a_known_rate(rate, rounding):
 @pytest.mark.parametrize("rate", [800, 900, 997, 998.5, 1001, 1003, 1050, 1200, 1500])
 def test_rounded_times_do_not_tell_the_rate(rate):
     times = np.round(np.arange(30_000) / rate, 3)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="the times may be rounded. Give frame_rate_hz"
-    ):
-        lbt.identification.loop_record(noise(30_000), times_s=times, unit="nm")
+    with pytest.raises(ProblemError, match="the times may be rounded. Give frame_rate_hz"):
+        loop_record(noise(30_000), times_s=times, unit="nm")
 
 
 @settings(max_examples=60, deadline=None)
@@ -180,8 +163,8 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
     times = quantum * np.round((kept / rate + phase) / quantum)
     y = noise(frames)
     try:
-        seen = lbt.identification.loop_record(y[kept], frame_rate_hz=rate, times_s=times, unit="nm")
-    except lbt.errors.ProblemError:
+        seen = loop_record(y[kept], frame_rate_hz=rate, times_s=times, unit="nm")
+    except ProblemError:
         # never without a reason: times as coarse as frames
         assert quantum * rate > 0.7
         return
@@ -198,9 +181,7 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
 def test_a_lost_frame_of_exact_times_is_still_found():
     kept = np.delete(np.arange(4000), [1700])
     for rate, times in ((1000.0, kept / 1000), (1003.0, kept / 1003)):
-        seen = lbt.identification.loop_record(
-            noise(3999), frame_rate_hz=rate, times_s=times, unit="nm"
-        )
+        seen = loop_record(noise(3999), frame_rate_hz=rate, times_s=times, unit="nm")
         assert np.flatnonzero(~seen.usable).tolist() == [1700]
 
 
@@ -208,17 +189,13 @@ def test_a_lost_frame_that_rounding_hides_is_refused():
     kept = np.delete(np.arange(40_000), [17_000])
     for rate in (1003, 2000):
         times = np.floor(kept / rate * 1e3 + 1e-6) / 1e3
-        with pytest.raises(lbt.errors.ProblemError, match="cannot tell which frames are missing"):
-            lbt.identification.loop_record(
-                noise(39_999), frame_rate_hz=rate, times_s=times, unit="nm"
-            )
+        with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
+            loop_record(noise(39_999), frame_rate_hz=rate, times_s=times, unit="nm")
     # and so it is where the rate is not quite that of the times
     kept = np.delete(np.arange(4000), [1700])
-    with pytest.raises(lbt.errors.ProblemError, match="cannot tell which frames are missing"):
-        lbt.identification.loop_record(
-            noise(3999), frame_rate_hz=1000.1, times_s=kept / 1000, unit="nm"
-        )
+    with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
+        loop_record(noise(3999), frame_rate_hz=1000.1, times_s=kept / 1000, unit="nm")
     # 300 frames of 999 Hz in ms: one step of 2 ms, by rounding or by a frame that is lost
     times = np.floor(np.arange(300) / 999 * 1e3 + 0.9) / 1e3
-    with pytest.raises(lbt.errors.ProblemError, match="cannot tell rounding from missing"):
-        lbt.identification.loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
+    with pytest.raises(ProblemError, match="cannot tell rounding from missing"):
+        loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")

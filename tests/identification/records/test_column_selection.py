@@ -1,12 +1,11 @@
 """Columns chosen by their names, their axes, or the call."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.record_files import csv, write_csv
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
 
 RATE = 500.0
 
@@ -55,9 +54,7 @@ def test_open_loops(tmp_path, series, names, kind):
 
 def test_measurements_alone_are_not_taken_for_an_open_loop(tmp_path, series):
     path = write_csv(tmp_path / "a.csv", ["y0_nm", "y1_nm"], series[0].T)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="Residuals of a closed loop need its commands"
-    ):
+    with pytest.raises(ProblemError, match="Residuals of a closed loop need its commands"):
         lbt.load_record(path, frame_rate_hz=RATE)
 
 
@@ -66,7 +63,7 @@ def test_an_array_that_holds_no_numbers_is_named(tmp_path, series, strange):
     y, u = series
     np.savez(tmp_path / "a.npz", measurements=np.full(y.shape, strange), commands=u, pol_nm=y)
     with pytest.raises(
-        lbt.errors.ProblemError,
+        ProblemError,
         match=r"needs columns of measurements and commands; got .*"
         r"\(measurements holds no real numbers\)\. Choose by",
     ):
@@ -82,9 +79,7 @@ def test_open_loop_and_commands(tmp_path, series):
     assert seen.commands is None
     assert "commands were left out: the record is of an open loop" in seen.health.notes
     both = write_csv(tmp_path / "b.csv", ["y_nm", "u_nm", "pol_nm"], [*y.T, u[:, 0]])
-    with pytest.raises(
-        lbt.errors.ProblemError, match="more than one record; say kind: closed_loop or open_"
-    ):
+    with pytest.raises(ProblemError, match="more than one record; say kind: closed_loop or open_"):
         lbt.load_record(both, frame_rate_hz=RATE)
     assert lbt.load_record(both, kind="open_loop", frame_rate_hz=RATE).measurements[
         :, 0
@@ -110,16 +105,12 @@ def test_axes_of_many_columns(tmp_path):
     y, u = np.random.default_rng(0).standard_normal((2, 60, 5))
     path = tmp_path / "a.npz"
     np.savez(path, y=y, u=u, fs=RATE)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="5 columns of measurements; say which.*axes="
-    ):
+    with pytest.raises(ProblemError, match="5 columns of measurements; say which.*axes="):
         lbt.load_record(path, unit="nm")
     seen = lbt.load_record(path, unit="nm", axes=(3, 1))
     assert np.array_equal(seen.measurements, y[:, [3, 1]])
     assert np.array_equal(seen.commands, u[:, [3, 1]])
-    with pytest.raises(
-        lbt.errors.ProblemError, match="axes must be one or two different numbers below 5"
-    ):
+    with pytest.raises(ProblemError, match="axes must be one or two different numbers below 5"):
         lbt.load_record(path, unit="nm", axes=(0, 5))
 
 
@@ -129,9 +120,7 @@ FRAMES = 60
 def test_measurements_and_commands_are_of_the_same_axes(tmp_path, series):
     y, u = series[0][:, 0], series[1][:, 0]
     path = csv(tmp_path / "a.csv", tilt_nm=y, tip_cmd_nm=u)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="of the same axes; got tilt_nm with tip_cmd_nm"
-    ):
+    with pytest.raises(ProblemError, match="of the same axes; got tilt_nm with tip_cmd_nm"):
         lbt.load_record(path, frame_rate_hz=RATE)
     chosen = {"measurements": "tilt_nm", "commands": "tip_cmd_nm"}
     assert lbt.load_record(path, frame_rate_hz=RATE, columns=chosen).axes == 1
@@ -149,8 +138,7 @@ def test_x_and_y_may_be_a_clock_and_its_series(tmp_path, series):
     clock = csv(tmp_path / "c.csv", x=np.arange(FRAMES), y_nm=y[:, 1])
     for each, names in ((path, "x_nm, y_nm"), (clock, "x, y_nm")):
         with pytest.raises(
-            lbt.errors.ProblemError,
-            match=rf"{names} are all named as .*columns=\{{'\w+': \.\.\.\}}",
+            ProblemError, match=rf"{names} are all named as .*columns=\{{'\w+': \.\.\.\}}"
         ):
             lbt.load_record(each, kind="open_loop", frame_rate_hz=RATE)
     chosen = {"open_loop": ("x_nm", "y_nm")}
@@ -168,7 +156,7 @@ def test_a_clock_without_a_name_is_no_axis(tmp_path, series):
     path = tmp_path / "a.txt"
     np.savetxt(path, np.column_stack([np.arange(FRAMES) / RATE, series[0][:, 0]]))
     with pytest.raises(
-        lbt.errors.ProblemError,
+        ProblemError,
         match=r"needs columns of open_loop; got a column.*columns=\{'open_loop': \.\.\.\}",
     ):
         lbt.load_record(path, kind="open_loop", unit="nm", frame_rate_hz=RATE)

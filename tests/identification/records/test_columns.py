@@ -1,7 +1,5 @@
 """Names of columns are read in linear time, with their units in brackets or after an underscore."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What files hold: nulls, facts in arrays and comments, damage."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Faults of a series: those that are there are found, and no others."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

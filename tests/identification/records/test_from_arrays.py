@@ -1,12 +1,11 @@
 """Records from arrays: gaps, units, commands, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.records import SHELL, kinds, ran
 
 import lbt_synth as lbt
+from lbt_synth.identification import loop_record, require_length
 
 RATE = 1000.0
 
@@ -16,7 +15,7 @@ def test_gaps_of_every_kind():
     y[100, 0] = np.nan
     y[200:203, 1] = np.inf
     y[500:540, 0] = y[500, 0]
-    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert seen.health.rows() == (
         ("not finite", "measurements", 0, 1, 0.05, 100, "spoilt"),
         ("stuck", "measurements", 0, 40, 2.0, 500, "spoilt"),
@@ -35,7 +34,7 @@ def test_gaps_of_every_kind():
 def test_values_whose_squares_are_lost_are_zero():
     y = 1e-200 * np.arange(600.0)[:, None]
     u = np.arange(600.0)[:, None]
-    record = lbt.identification.loop_record(y, u, frame_rate_hz=500, delay_frames=2, unit="nm")
+    record = loop_record(y, u, frame_rate_hz=500, delay_frames=2, unit="nm")
     assert not np.any(record.measurements)
 
 
@@ -45,7 +44,7 @@ def test_masked_and_absurd_values_are_gaps():
     y[30] = -3e105
     masked = np.ma.masked_array(y, mask=np.arange(100)[:, None] == 50)
     for unit in ("nm", "m"):
-        seen = lbt.identification.loop_record(masked, frame_rate_hz=RATE, unit=unit)
+        seen = loop_record(masked, frame_rate_hz=RATE, unit=unit)
         assert np.flatnonzero(~seen.usable).tolist() == [20, 30, 50]
         assert np.all(np.abs(seen.measurements) < 1e11)
 
@@ -53,13 +52,13 @@ def test_masked_and_absurd_values_are_gaps():
 def test_a_dead_axis_leaves_nothing():
     y = np.random.default_rng(0).standard_normal((5000, 2))
     y[:, 1] = 0.0
-    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert not seen.usable.any()
     assert kinds(seen) == {("stuck", "measurements", 1)}
     with pytest.raises(
         lbt.errors.ProblemError, match=r"got 0 \(0 s\), the longest stretch 0. 0 of 5000 frames"
     ):
-        lbt.identification.require_length(seen)
+        require_length(seen)
 
 
 def test_clipped_commands_spoil_open_loops_are_reported():
@@ -68,13 +67,8 @@ def test_clipped_commands_spoil_open_loops_are_reported():
     u = np.clip(run.commands[0], -250, None)
     u[1000:1100] = 0.0
     u[2000:2050, 0] = u[2000, 0]
-    seen = lbt.identification.loop_record(
-        run.measurements[0], u, frame_rate_hz=RATE, delay_frames=2, unit="nm"
-    )
-    assert kinds(seen, spoils=False) == {
-        ("loop open", "commands", None),
-        ("held", "commands", 0),
-    }
+    seen = loop_record(run.measurements[0], u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    assert kinds(seen, spoils=False) == {("loop open", "commands", None), ("held", "commands", 0)}
     count = {f.kind: (f.count, f.first_frame) for f in seen.health.findings if not f.spoils}
     assert count == {"loop open": (100, 1000), "held": (50, 2000)}
     clipped = np.any(run.commands[0] < -250, axis=1) & np.all(u != 0, axis=1)
@@ -87,7 +81,7 @@ def test_clipped_commands_spoil_open_loops_are_reported():
 
 def test_an_open_loop_with_zero_commands():
     y = np.random.default_rng(0).standard_normal((200, 2))
-    seen = lbt.identification.loop_record(y, 0 * y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    seen = loop_record(y, 0 * y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     assert ("loop open", "commands", None, 200, 100.0, 0, "reported") in seen.health.rows()
     assert seen.usable[2:].all()
     assert np.array_equal(seen.pseudo_open_loop(), y)
@@ -96,7 +90,7 @@ def test_an_open_loop_with_zero_commands():
 def test_a_scatter_that_changes_is_said():
     y = np.random.default_rng(0).standard_normal((4000, 2))
     y[:, 1] *= np.linspace(1, 6, 4000)
-    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     (note,) = seen.health.notes
     assert note.startswith("axis 1 is not stationary: the rms difference of two frames is 2")
     assert seen.usable.all()
@@ -117,18 +111,16 @@ def test_a_scatter_that_changes_is_said():
 )
 def test_units(unit, factor):
     y = np.array([1.0, 2.0, -1.0])
-    seen = lbt.identification.loop_record(
-        y / factor, frame_rate_hz=RATE, unit=unit, diameter_m=8.22
-    )
+    seen = loop_record(y / factor, frame_rate_hz=RATE, unit=unit, diameter_m=8.22)
     assert seen.measurements[:, 0] == pytest.approx(y, rel=1e-5)
     if unit in ("mas", "arcsec", "urad", "rad"):
         with pytest.raises(lbt.errors.ProblemError, match="give diameter_m"):
-            lbt.identification.loop_record(y, frame_rate_hz=RATE, unit=unit)
+            loop_record(y, frame_rate_hz=RATE, unit=unit)
 
 
 def test_commands_may_have_a_unit_of_their_own():
     y = np.random.default_rng(0).standard_normal((30, 1))
-    seen = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm", command_unit="um")
+    seen = loop_record(y, y, frame_rate_hz=RATE, unit="nm", command_unit="um")
     assert np.allclose(seen.commands, 1e3 * y)
 
 
@@ -153,12 +145,10 @@ def test_arrays_that_are_refused(change, words):
     y = np.random.default_rng(0).standard_normal((30, 2))
     fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE, "unit": "nm"}
     with pytest.raises(lbt.errors.ProblemError, match=words):
-        lbt.identification.loop_record(**{**fields, **change})
+        loop_record(**{**fields, **change})
 
 
 def test_a_mirror_that_does_not_fit_the_rate_is_refused():
     y = np.random.default_rng(0).standard_normal((30, 1))
     with pytest.raises(lbt.errors.ProblemError, match="whole number of samples per frame"):
-        lbt.identification.loop_record(
-            y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm"
-        )
+        loop_record(y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm")

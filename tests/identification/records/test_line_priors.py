@@ -1,22 +1,18 @@
 """Lines known beforehand: lists, and accelerometers beside the wavefront."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import coherence, lfilter
 
 import lbt_synth as lbt
+from lbt_synth.identification import LinePrior, accelerometer_lines, load_lines
 
 
 def test_headings_of_lists_of_lines(tmp_path):
     path = tmp_path / "lines.csv"
     for heading in ("frequency_error_hz,frequency_hz", "Error [Hz],Frequency [Hz]", "sigma,f"):
         path.write_text(f"{heading}\n0.1,20\n,45\n")
-        found = [
-            (line.frequency_hz, line.frequency_error_hz)
-            for line in lbt.identification.load_lines(path)
-        ]
+        found = [(line.frequency_hz, line.frequency_error_hz) for line in load_lines(path)]
         assert found == [(20.0, 0.1), (45.0, 0.0)]
 
 
@@ -35,32 +31,29 @@ def resonance(frequency_hz, damping, frames, seed):
 
 
 def test_lists():
-    known = lbt.identification.LinePrior(frequency_hz=12, frequency_error_hz=0.3, source="log book")
-    found = lbt.identification.load_lines([45.5, (16, 0.2), known])
+    known = LinePrior(frequency_hz=12, frequency_error_hz=0.3, source="log book")
+    found = load_lines([45.5, (16, 0.2), known])
     assert [(line.frequency_hz, line.frequency_error_hz) for line in found] == [
         (12.0, 0.3),
         (16.0, 0.2),
         (45.5, 0.0),
     ]
     assert found[0] is known
-    assert (
-        lbt.identification.load_lines(np.array([[20.0, 1.0], [10.0, 2.0]]))[0].frequency_error_hz
-        == 2.0
-    )
-    assert lbt.identification.load_lines([]) == ()
+    assert load_lines(np.array([[20.0, 1.0], [10.0, 2.0]]))[0].frequency_error_hz == 2.0
+    assert load_lines([]) == ()
 
 
 def test_files(tmp_path):
     path = tmp_path / "lines.csv"
     path.write_text("frequency_hz,error_hz\n45.5,0.3\n16,\n")
-    found = lbt.identification.load_lines(path)
+    found = load_lines(path)
     assert [(line.frequency_hz, line.frequency_error_hz) for line in found] == [
         (16, 0),
         (45.5, 0.3),
     ]
     assert found[0].source == str(path)
     path.write_text("20\n30.5\n")
-    assert [line.frequency_hz for line in lbt.identification.load_lines(str(path))] == [20, 30.5]
+    assert [line.frequency_hz for line in load_lines(str(path))] == [20, 30.5]
 
 
 @pytest.mark.parametrize(
@@ -77,9 +70,9 @@ def test_files(tmp_path):
 )
 def test_lines_that_are_refused(lines, error, words):
     with pytest.raises(error, match=words):
-        lbt.identification.load_lines(lines)
+        load_lines(lines)
     with pytest.raises(lbt.errors.ProblemError, match="source must be a text"):
-        lbt.identification.LinePrior(frequency_hz=1, source=3)
+        LinePrior(frequency_hz=1, source=3)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +88,7 @@ def test_files_that_are_refused(tmp_path, text, words):
     path = tmp_path / "lines.txt"
     path.write_text(text)
     with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
-        lbt.identification.load_lines(path)
+        load_lines(path)
     assert str(path) in str(caught.value)
 
 
@@ -113,16 +106,14 @@ def test_lines_that_both_feel_are_found_and_no_others():
             0.5 * shared[1] + 0.5 * rng.standard_normal(frames),
         ]
     )
-    found = lbt.identification.accelerometer_lines(a, z, RATE)
+    found = accelerometer_lines(a, z, RATE)
     assert len(found) == 2
     for line, truth in zip(found, (20.0, 47.3), strict=True):
         assert abs(line.frequency_hz - truth) < 3 * line.frequency_error_hz
         assert 0 < line.frequency_error_hz < 0.6
         assert "false alarm 0.001" in line.source
     # the other axis of a wavefront feels nothing
-    both = lbt.identification.accelerometer_lines(
-        a, np.column_stack([15 * rng.standard_normal(frames), z]), RATE
-    )
+    both = accelerometer_lines(a, np.column_stack([15 * rng.standard_normal(frames), z]), RATE)
     assert [line.frequency_hz for line in both] == pytest.approx(
         [line.frequency_hz for line in found], abs=0.1
     )
@@ -136,9 +127,7 @@ def test_false_alarms_are_as_rare_as_stated():
         a = lfilter([1.0], [1, -0.9], rng.standard_normal(8192))
         z = lfilter([1.0], [1, -1.2, 0.9], rng.standard_normal((8192, 2)), axis=0)
         hits += bool(
-            lbt.identification.accelerometer_lines(
-                a, z, RATE, segment_frames=256, false_alarm=0.2, lowest_hz=4
-            )
+            accelerometer_lines(a, z, RATE, segment_frames=256, false_alarm=0.2, lowest_hz=4)
         )
     assert 10 <= hits <= 45  # peaks have to be maxima, too: a little below 30
 
@@ -149,7 +138,7 @@ def test_the_coherence_is_that_of_scipy():
     rng = np.random.default_rng(8)
     line = resonance(61.7, 0.002, frames, 6)
     a, z = line + rng.standard_normal(frames), 3 * line + rng.standard_normal(frames)
-    (found,) = lbt.identification.accelerometer_lines(a, z, RATE, segment_frames=2000)
+    (found,) = accelerometer_lines(a, z, RATE, segment_frames=2000)
     f, c = coherence(np.diff(a), np.diff(z), fs=RATE, nperseg=2000, noverlap=0)
     assert abs(f[np.argmax(c)] - found.frequency_hz) <= f[1]
 
@@ -162,13 +151,13 @@ def test_segments_with_holes_are_left_out():
     usable = np.ones(frames, dtype=bool)
     usable[10_000:10_500] = False
     z[10_000:10_500] = 1e6  # fillers may be anything
-    (line,) = lbt.identification.accelerometer_lines(a, z, RATE, usable=usable)
+    (line,) = accelerometer_lines(a, z, RATE, usable=usable)
     assert abs(line.frequency_hz - 25) < 0.3
     usable[:-8000] = False
     with pytest.raises(
         lbt.errors.ProblemError, match="at least 8 segments of 1249 usable frames; got 6"
     ):
-        lbt.identification.accelerometer_lines(a, z, RATE, usable=usable)
+        accelerometer_lines(a, z, RATE, usable=usable)
 
 
 @pytest.mark.parametrize(
@@ -187,4 +176,4 @@ def test_segments_with_holes_are_left_out():
 def test_accelerations_that_are_refused(change, words):
     given = {"accelerations": np.ones(100), "measurement": np.ones(100), "frame_rate_hz": RATE}
     with pytest.raises(lbt.errors.ProblemError, match=words):
-        lbt.identification.accelerometer_lines(**{**given, **change})
+        accelerometer_lines(**{**given, **change})

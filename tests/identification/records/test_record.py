@@ -1,7 +1,5 @@
 """Records: the exact pseudo-open loop, later delays, bridged holes."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -11,10 +9,10 @@ from hypothesis import strategies as st
 from support.records import ran, record
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification import loop_record, require_length
 
 RATE = 1000.0
-
-
 SHELL = lbt.models.PositionLoop.from_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
 )
@@ -63,9 +61,7 @@ def test_with_noise_it_is_phase_and_noise_over_the_gain(delay, gains, noise, mov
         u[k] = 0.99 * u[k - 1] + 0.1 * y[k]
         seen = [u[k - i] if k >= i else np.zeros(2) for i in range(len(taps))]
         residual = phase[k] - sum(c * past for c, past in zip(taps, seen, strict=True))
-    seen = lbt.identification.loop_record(
-        y, u, frame_rate_hz=RATE, delay_frames=delay, mirror=path.mirror, unit="nm"
-    )
+    seen = loop_record(y, u, frame_rate_hz=RATE, delay_frames=delay, mirror=path.mirror, unit="nm")
     z = seen.pseudo_open_loop(g)
     expected = phase[:-1] + w[1:] / g
     # before the record there were no commands: here even its first frames are right
@@ -74,7 +70,7 @@ def test_with_noise_it_is_phase_and_noise_over_the_gain(delay, gains, noise, mov
 
 def test_an_open_loop_is_its_own_series():
     y = np.random.default_rng(0).standard_normal((50, 1))
-    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert np.array_equal(seen.pseudo_open_loop(), y)
     assert np.array_equal(seen.pseudo_open_loop(0.5), 2 * y)
     assert not seen.corrections().any()
@@ -86,11 +82,9 @@ def test_a_delay_can_come_later():
     run = ran(path)
     u = run.commands[0].copy()
     u[100, 1] = np.nan
-    unknown = lbt.identification.loop_record(run.measurements[0], u, frame_rate_hz=RATE, unit="nm")
+    unknown = loop_record(run.measurements[0], u, frame_rate_hz=RATE, unit="nm")
     assert unknown.usable.all()
-    with pytest.raises(
-        lbt.errors.ProblemError, match="delay of this loop is not known; give delay_fram"
-    ):
+    with pytest.raises(ProblemError, match="delay of this loop is not known; give delay_fram"):
         unknown.corrections()
     seen = unknown.with_delay(2.4)
     # taps of u(k-2), u(k-3): frame 100 enters 102 and 103
@@ -106,9 +100,7 @@ def test_a_spoilt_command_spoils_what_its_correction_enters():
     run = ran(path)
     u = run.commands[0].copy()
     u[50] = np.inf
-    seen = lbt.identification.loop_record(
-        run.measurements[0], u, frame_rate_hz=RATE, delay_frames=3, unit="nm"
-    )
+    seen = loop_record(run.measurements[0], u, frame_rate_hz=RATE, delay_frames=3, unit="nm")
     assert np.flatnonzero(~seen.usable).tolist() == [0, 1, 2, 53]
     assert seen.stretches() == ((3, 53), (54, 300))
     good = seen.usable
@@ -124,9 +116,7 @@ def test_short_holes_are_bridged_on_the_pseudo_open_loop():
     y[300, 0] = np.nan
     y[700:703] = np.nan
     y[900:904] = np.nan
-    seen = lbt.identification.loop_record(
-        y, run.commands[0], frame_rate_hz=RATE, delay_frames=2.4, unit="nm"
-    )
+    seen = loop_record(y, run.commands[0], frame_rate_hz=RATE, delay_frames=2.4, unit="nm")
     whole = seen.bridged(sensor_gain=0.6)
     assert whole.health.bridged == 4
     assert "4 frames in 2 holes of at most 3 were interpolated" in whole.health.notes
@@ -152,7 +142,7 @@ def test_bridges_have_a_budget():
     y = np.random.default_rng(0).standard_normal(1000)
     y[[100, 200, 300]] = np.nan
     y[400:402] = y[500:503] = np.nan
-    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     part = seen.bridged(most_fraction=0.005)
     assert part.health.bridged == 5
     assert part.health.notes[-1].endswith("1 more such holes were left, beyond 0.5 %")
@@ -160,13 +150,13 @@ def test_bridges_have_a_budget():
     assert seen.bridged(1).health.bridged == 3
     assert seen.bridged(most_fraction=0.0) is seen
     for bad in ({"most": 0}, {"most_fraction": 2}, {"sensor_gain": 0}, {"sensor_gain": [1, 1]}):
-        with pytest.raises(lbt.errors.ProblemError, match="must be"):
+        with pytest.raises(ProblemError, match="must be"):
             seen.bridged(**bad)
 
 
 def test_a_hole_with_one_frame_beside_it_is_bridged_straight():
     y = np.array([1.0, 2.0, np.nan, 4.0, np.nan, 7.0, 9.0, 3.0, 2.0, 5.0])
-    seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm").bridged(most_fraction=1)
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm").bridged(most_fraction=1)
     assert seen.measurements[[2, 4], 0] == pytest.approx([3.0, 5.5])
 
 
@@ -177,16 +167,14 @@ def test_another_delay_keeps_the_mirror_and_drops_the_bridges():
     rng = np.random.default_rng(0)
     y, u = np.cumsum(rng.standard_normal((2, 2000)), axis=1)
     u[1000] = np.nan
-    seen = lbt.identification.loop_record(
-        y, u, frame_rate_hz=800, delay_frames=2, mirror=shell, unit="nm"
-    )
+    seen = loop_record(y, u, frame_rate_hz=800, delay_frames=2, mirror=shell, unit="nm")
     other = seen.with_delay(3)
     assert other.mirror is shell
     assert np.array_equal(
         other.mirror_taps,
         lbt.LoopHardware(frame_rate_hz=800, delay_frames=3, mirror=shell).mirror_taps,
     )
-    plain = lbt.identification.loop_record(y, u, frame_rate_hz=800, delay_frames=2, unit="nm")
+    plain = loop_record(y, u, frame_rate_hz=800, delay_frames=2, unit="nm")
     whole = plain.bridged()
     assert whole.usable[1002]
     assert whole.measurements[1002, 0] != y[1002]
@@ -195,44 +183,42 @@ def test_another_delay_keeps_the_mirror_and_drops_the_bridges():
 
 
 def test_records_are_frozen():
-    seen = lbt.identification.loop_record([1.0, 2.0], [1.0, 3.0], frame_rate_hz=RATE, unit="nm")
+    seen = loop_record([1.0, 2.0], [1.0, 3.0], frame_rate_hz=RATE, unit="nm")
     for name in ("measurements", "commands", "usable", "measured", "commanded"):
         assert not getattr(seen, name).flags.writeable
     with pytest.raises(dataclasses.FrozenInstanceError):
         seen.source = "x"
-    with pytest.raises(lbt.errors.DimensionError, match="usable must be 2 truth values"):
+    with pytest.raises(DimensionError, match="usable must be 2 truth values"):
         dataclasses.replace(seen, usable=np.ones(3, dtype=bool))
-    with pytest.raises(lbt.errors.DimensionError, match="commands must have 2 rows"):
+    with pytest.raises(DimensionError, match="commands must have 2 rows"):
         dataclasses.replace(seen, commands=np.ones((3, 1)))
 
 
 def test_length():
     y = np.random.default_rng(0).standard_normal(6000)
     y[::200] = np.nan  # stretches of 199
-    broken = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
+    broken = loop_record(y, frame_rate_hz=RATE, unit="nm")
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"needs 4096 usable frames \(4.1 s at 1000 Hz\).*got 0 "
+        ProblemError, match=r"needs 4096 usable frames \(4.1 s at 1000 Hz\).*got 0 "
     ):
-        lbt.identification.require_length(broken)
-    assert lbt.identification.require_length(broken.bridged()) == 5999
+        require_length(broken)
+    assert require_length(broken.bridged()) == 5999
     whole = broken.bridged()
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"needs 7000 usable frames \(7 s at 1000 Hz\)"
-    ):
-        lbt.identification.require_length(whole, seconds=7)
-    quick = lbt.identification.loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
-    with pytest.raises(lbt.errors.ProblemError, match="needs 8000 usable frames"):
-        lbt.identification.require_length(quick)
+    with pytest.raises(ProblemError, match=r"needs 7000 usable frames \(7 s at 1000 Hz\)"):
+        require_length(whole, seconds=7)
+    quick = loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
+    with pytest.raises(ProblemError, match="needs 8000 usable frames"):
+        require_length(quick)
 
 
 @pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
 def test_commands_before_a_record_do_not_make_it_shorter(delay):
     y = np.random.default_rng(0).standard_normal(5000)
     known = {"frame_rate_hz": RATE, "unit": "nm", "delay_frames": delay}
-    whole = lbt.identification.loop_record(y, y, **known)
+    whole = loop_record(y, y, **known)
     assert whole.stretches() == ((int(np.ceil(delay)), 5000),)
-    assert lbt.identification.require_length(whole, seconds=5) == 5000
+    assert require_length(whole, seconds=5) == 5000
     y[int(np.ceil(delay))] = np.nan  # a frame that was lost
-    late = lbt.identification.loop_record(y, np.zeros(5000), **known)
-    with pytest.raises(lbt.errors.ProblemError, match="needs 5000 usable frames"):
-        lbt.identification.require_length(late, seconds=5)
+    late = loop_record(y, np.zeros(5000), **known)
+    with pytest.raises(ProblemError, match="needs 5000 usable frames"):
+        require_length(late, seconds=5)

@@ -1,7 +1,5 @@
 """The estimator form of the exported C source, compiled and run."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 

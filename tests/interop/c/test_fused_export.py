@@ -1,7 +1,5 @@
 """Exported C source of several sensors, compiled and run beside the simulation of its loop."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

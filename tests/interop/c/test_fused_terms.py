@@ -1,7 +1,5 @@
 """The arithmetic of C source of several sensors, and its proof."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Predictive filters of cacao, read back and run."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import replace

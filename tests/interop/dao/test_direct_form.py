@@ -1,7 +1,5 @@
 """Controllers as matrices of a direct form, and those matrices as controllers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import comb
 
@@ -12,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.dao.direct_form import (
     InnerLoop,
     direct_form,
@@ -91,29 +90,26 @@ def test_modes_that_do_not_decouple(loaded):
         vibrations=[slanted],
         noise_nm=loaded.noise_nm,
     )
-    with pytest.raises(lbt.errors.ProblemError, match="here measurement 2 moves command 1"):
+    with pytest.raises(ProblemError, match="here measurement 2 moves command 1"):
         mode_polynomials(lbt.kalman(plant).controller)
     direct = lbt.Controller(A=[[0.0]], B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[1.0, 0.0], [0.5, 1.0]])
-    with pytest.raises(lbt.errors.ProblemError, match="here measurement 1 moves command 2"):
+    with pytest.raises(ProblemError, match="here measurement 1 moves command 2"):
         mode_polynomials(direct)
     wide = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0]], C=[[1.0]], D=[[0.0, 0.0]])
-    with pytest.raises(lbt.errors.ProblemError, match="got 1 commands and 2 measurements"):
+    with pytest.raises(ProblemError, match="got 1 commands and 2 measurements"):
         mode_polynomials(wide)
 
 
 @pytest.mark.parametrize("beyond", [np.inf, np.nan])
 def test_coefficients_beyond_the_range_are_refused(beyond):
-    with pytest.raises(lbt.errors.NumericalError, match="beyond its range"):
+    with pytest.raises(NumericalError, match="beyond its range"):
         direct_form(np.array([[beyond], [0.0], [1.0]]), 1.0)
 
 
 def test_coefficients_that_overflow_are_refused():
     big = lbt.Controller(A=np.eye(2, k=1), B=[[0.0], [1e30]], C=[[1e30, 0.0]], D=[[0.0]])
     rows = direct_form_rows(big, 2)
-    with (
-        np.errstate(over="ignore"),
-        pytest.raises(lbt.errors.NumericalError, match="beyond its range"),
-    ):
+    with np.errstate(over="ignore"), pytest.raises(NumericalError, match="beyond its range"):
         direct_form(rows.astype(np.float32), 1.0)
 
 
@@ -169,5 +165,5 @@ def test_rows_are_b_then_a():
 
 @pytest.mark.parametrize(("rows", "actuators"), [(4, 2), (3, 3)])
 def test_what_does_not_fit_is_refused(rows, actuators):
-    with pytest.raises(lbt.errors.DimensionError):
+    with pytest.raises(DimensionError):
         InnerLoop(np.zeros((rows, 2)), np.zeros((5, actuators)))

@@ -1,7 +1,5 @@
 """Matrices of dao real-time computers, read back and run."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import replace

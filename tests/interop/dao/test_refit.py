@@ -1,7 +1,5 @@
 """Controllers made again for single precision: their loop, the search, and the rounding."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """MATLAB files, read back and stepped."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.io import loadmat

@@ -1,7 +1,5 @@
 """The folder that pyRTC starts from."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

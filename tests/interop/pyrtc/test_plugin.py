@@ -1,7 +1,5 @@
 """Our gain files in pyRTC's own loop, its processes and its shared memory."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The filter that gives a controller's commands from pyRTC's pseudo-open-loop series."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +8,7 @@ from support.exports import bare_design, lbt_designs, relative
 from support.gain_file_edits import odd_plant
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop.pyrtc.pol_filter import InnerLoop, pol_filter
 from lbt_synth.loop.simulation.run import step_loop
 
@@ -88,21 +87,17 @@ def test_the_noise_of_the_arithmetic_in_closed_form():
 
 
 BAD = [
-    (
-        bare_design(lbt_designs()["kalman"].controller),
-        lbt.errors.ProblemError,
-        "needs the design of a loop",
-    ),
+    (bare_design(lbt_designs()["kalman"].controller), ProblemError, "needs the design of a loop"),
     (
         lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0], [0.5]]), gain=0.3),
-        lbt.errors.ProblemError,
+        ProblemError,
         "got 2 measurements of 1 commands",
     ),
     (
         lbt.integrator(
             lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0, 0.0], [0.0, 1e-5]]), gain=0.3
         ),
-        lbt.errors.ProblemError,
+        ProblemError,
         r"a condition number of 1e\+05 \(limit 10000\)",
     ),
 ]

@@ -1,7 +1,5 @@
 """The predictor that pyRTC runs, without pyRTC."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.exports import lbt_designs

@@ -1,7 +1,5 @@
 """pyRTC's predictors: what they say without it, and what they predict with it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter

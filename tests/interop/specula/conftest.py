@@ -1,7 +1,5 @@
 """The set-up of the LBT, and the cache and calibration of the small telescope."""
 
-from __future__ import annotations
-
 import pytest
 from support.end_to_end import load_setup
 from support.small_telescope import BRIGHT

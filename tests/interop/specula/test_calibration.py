@@ -1,7 +1,5 @@
 """Calibrations and their cache."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

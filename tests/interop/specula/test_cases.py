@@ -1,7 +1,5 @@
 """Cases of an end-to-end simulation, and their runs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Optical gain, Strehl ratio and errors of an end-to-end run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

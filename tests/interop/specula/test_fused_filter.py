@@ -1,7 +1,5 @@
 """Filters of several sensors in an end-to-end simulation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Modes, slopes and images of SPECULA's optics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A controller in closed loop with SPECULA's optics: a small telescope, seconds per test."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Systems of an end-to-end simulation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -9,21 +9,30 @@ from hypothesis import strategies as st
 from support.ensembles import AIR, LINE, RATE, SLOW, plant, weather
 
 import lbt_synth as lbt
+from lbt_synth.loop import EnsembleVibration, LoopEnsemble, ensemble_residuals
+from lbt_synth.models import (
+    ARModel,
+    FrozenFlows,
+    ModalTurbulence,
+    PositionLoop,
+    SinusoidalVibration,
+    SumSpectrum,
+    TabulatedSpectrum,
+    ar2_turbulence,
+)
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
 
 
 def ensemble_of(w, *, turbulence, direction=(1, 0.5)):
-    return lbt.loop.LoopEnsemble(
+    return LoopEnsemble(
         sensor_gain=w["gains"],
         delay_frames=w["delays"],
         noise_nm=w["noise"],
         turbulence=turbulence,
         vibrations=[
-            lbt.loop.EnsembleVibration(
-                frequency_hz=w["frequency"], rms_nm=w["rms"], direction=direction
-            ),
-            lbt.loop.EnsembleVibration(
+            EnsembleVibration(frequency_hz=w["frequency"], rms_nm=w["rms"], direction=direction),
+            EnsembleVibration(
                 frequency_hz=w["frequency"] + 10,
                 rms_nm=w["rms"],
                 damping=w["damping"],
@@ -40,7 +49,7 @@ def truth_of(w, i, turbulence, direction=(1, 0.5)):
         noise_nm=float(w["noise"][i]),
         sensor_gain=float(w["gains"][i]),
         vibrations=(
-            lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=direction),
+            SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=direction),
             lbt.Vibration(
                 frequency_hz=f + 10, rms_nm=rms, damping=float(w["damping"][i]), direction=direction
             ),
@@ -79,16 +88,12 @@ def agree(found, design, w, turbulence_of, *, rel=5e-7):
 @pytest.mark.parametrize("which", ["kalman", "coupled"])
 def test_each_loop_on_its_own_under_frozen_flow(which, request):
     design, w = request.getfixturevalue(which), weather(14)
-    flows = lbt.models.FrozenFlows(
-        atmosphere=AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"]
-    )
+    flows = FrozenFlows(atmosphere=AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"])
 
     def air(i):
         return replace(AIR, seeing_arcsec=w["seeing"][i], wind_speed_m_s=w["wind"][i])
 
-    found = lbt.loop.ensemble_residuals(
-        design.controller, design.hardware, ensemble_of(w, turbulence=flows)
-    )
+    found = ensemble_residuals(design.controller, design.hardware, ensemble_of(w, turbulence=flows))
     agree(found, design, w, air)
 
 
@@ -98,14 +103,10 @@ def test_each_loop_on_its_own_under_processes(which, request):
     design, w = request.getfixturevalue(which), weather(10, seed=1)
     rng = np.random.default_rng(2)
     poles, drive = rng.uniform(0.97, 0.995, 10), rng.uniform(20, 90, 10)
-    each = lbt.models.ModalTurbulence(
-        coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE
-    )
+    each = ModalTurbulence(coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE)
 
     def own(i):
-        return lbt.models.ARModel(
-            coefficients=[poles[i]], driving_rms_nm=drive[i], frame_rate_hz=RATE
-        )
+        return ARModel(coefficients=[poles[i]], driving_rms_nm=drive[i], frame_rate_hz=RATE)
 
     for turbulence, single in (
         (SLOW, lambda i: SLOW),
@@ -114,29 +115,23 @@ def test_each_loop_on_its_own_under_processes(which, request):
         ((AIR, each), lambda i: (AIR, own(i))),
     ):
         ensemble = ensemble_of(w, turbulence=turbulence)
-        found = lbt.loop.ensemble_residuals(design.controller, design.hardware, ensemble)
+        found = ensemble_residuals(design.controller, design.hardware, ensemble)
         agree(found, design, w, single)
 
 
 def test_unstable_loops_have_no_residual(kalman):
     w = weather(20, seed=3)
     w["gains"] = np.linspace(0.2, 4, 20)
-    found = lbt.loop.ensemble_residuals(
-        kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR)
-    )
+    found = ensemble_residuals(kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR))
     assert agree(found, kalman, w, lambda i: AIR) > 3
 
 
 def test_a_mirror_with_dynamics(kalman):
-    shell = lbt.models.PositionLoop.from_bandwidth(
-        natural_frequency_hz=50, damping=0.5, bandwidth_hz=300
-    )
+    shell = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
     design = lbt.kalman(plant(mirror=shell))
     w = weather(6, seed=4)
     w["gains"] = np.linspace(0.5, 1, 6)
-    found = lbt.loop.ensemble_residuals(
-        design.controller, design.hardware, ensemble_of(w, turbulence=AIR)
-    )
+    found = ensemble_residuals(design.controller, design.hardware, ensemble_of(w, turbulence=AIR))
     agree(found, design, w, lambda i: AIR)
 
 
@@ -151,15 +146,15 @@ class Peak:
     "parts",
     [
         [AIR, lbt.Vibration(frequency_hz=133.3, damping=1e-5, rms_nm=500).ar_model(RATE)],
-        [AIR, lbt.models.TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])],
+        [AIR, TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])],
         [Peak(), AIR, SLOW],
     ],
 )
 def test_sums_of_spectra(kalman, parts):
     """A peak that no pole of the loop is near."""
-    spectrum = lbt.models.SumSpectrum(parts=parts)
-    found = lbt.loop.ensemble_residuals(
-        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(turbulence=spectrum)
+    spectrum = SumSpectrum(parts=parts)
+    found = ensemble_residuals(
+        kalman.controller, kalman.hardware, LoopEnsemble(turbulence=spectrum)
     )
     loop = lbt.close_loop(kalman.hardware, kalman.controller)
     single = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum))
@@ -176,8 +171,8 @@ def test_slow_and_fast_winds_together(wind, leak, outer):
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     controller = lbt.Controller(A=leak, B=0.3, C=1.0, D=0.0, dt_s=1 / RATE)
     air = replace(AIR, outer_scale_m=outer)
-    flows = lbt.models.FrozenFlows(atmosphere=air, wind_speed_m_s=wind)
-    found = lbt.loop.ensemble_residuals(controller, path, lbt.loop.LoopEnsemble(turbulence=flows))
+    flows = FrozenFlows(atmosphere=air, wind_speed_m_s=wind)
+    found = ensemble_residuals(controller, path, LoopEnsemble(turbulence=flows))
     loop = lbt.close_loop(path, controller)
     for speed, residual in zip(wind, found.turbulence_nm, strict=True):
         truth = lbt.Truth(turbulence=replace(air, wind_speed_m_s=speed))
@@ -198,20 +193,16 @@ def test_next_to_instability(delay, distance):
     controller = replace(controller, B=np.array([[low * (1 - distance)]]))
     loop = lbt.close_loop(path, controller)
     exact = lbt.residual_budget(loop, lbt.Truth(turbulence=SLOW)).turbulence_nm
-    spectrum = lbt.models.SumSpectrum(parts=[SLOW])
+    spectrum = SumSpectrum(parts=[SLOW])
     single = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum)).turbulence_nm
     assert single == pytest.approx(exact, rel=5e-7)
-    found = lbt.loop.ensemble_residuals(
-        controller, path, lbt.loop.LoopEnsemble(turbulence=spectrum)
-    )
+    found = ensemble_residuals(controller, path, LoopEnsemble(turbulence=spectrum))
     assert found.turbulence_nm[0] == pytest.approx(exact, rel=5e-7)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_states_in_any_units_leave_the_same(seed):
-    shell = lbt.models.PositionLoop.from_bandwidth(
-        natural_frequency_hz=50, damping=0.5, bandwidth_hz=600
-    )
+    shell = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=600)
     design = lbt.kalman(plant(mirror=shell, delay_frames=3))
     k = design.controller
     units = 10 ** np.random.default_rng(seed).uniform(-6, 6, k.n_states)
@@ -231,14 +222,14 @@ def test_a_controller_for_each_loop():
         lbt.kalman(plant(vibrations=[replace(LINE, frequency_hz=f)]))
         for f in (18, 19, 20, 21, 22, 23)
     ]
-    found = lbt.loop.ensemble_residuals(
+    found = ensemble_residuals(
         [design.controller for design in designs],
         designs[0].hardware,
         ensemble_of(w, turbulence=AIR),
     )
     for i, design in enumerate(designs):
         own = {name: values[i : i + 1] for name, values in w.items()}
-        alone = lbt.loop.ensemble_residuals(
+        alone = ensemble_residuals(
             design.controller, design.hardware, ensemble_of(own, turbulence=AIR)
         )
         assert alone.stable[0] == found.stable[i]
@@ -249,15 +240,15 @@ def test_a_controller_for_each_loop():
 def test_loops_that_differ_by_their_lines_only_are_the_same_as_apart(kalman):
     """Rows that share a loop are closed once; each has its own answer all the same."""
     f = np.repeat([18.0, 20.0, 22.0], 5)
-    lines = [lbt.loop.EnsembleVibration(frequency_hz=f, rms_nm=500, damping=0.01)]
+    lines = [EnsembleVibration(frequency_hz=f, rms_nm=500, damping=0.01)]
     given = {"noise_nm": 15.5, "turbulence": AIR, "vibrations": lines}
     gains = np.tile(np.linspace(0.5, 1, 5), 3)
-    together = lbt.loop.ensemble_residuals(
-        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(sensor_gain=gains, **given)
+    together = ensemble_residuals(
+        kalman.controller, kalman.hardware, LoopEnsemble(sensor_gain=gains, **given)
     )
     jitter = gains * (1 + 1e-13 * np.arange(15))  # no two rows alike
-    apart = lbt.loop.ensemble_residuals(
-        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(sensor_gain=jitter, **given)
+    apart = ensemble_residuals(
+        kalman.controller, kalman.hardware, LoopEnsemble(sensor_gain=jitter, **given)
     )
     assert together.rms_nm == pytest.approx(apart.rms_nm, rel=1e-9)
     assert len(np.unique(together.rms_nm)) == 15
@@ -271,17 +262,12 @@ def test_order_and_scale_do_not_matter(kalman, order, scale):
     other = {name: values[list(order)] for name, values in w.items()}
     other["rms"], other["noise"] = scale * other["rms"], scale * other["noise"]
     strength = scale ** (6 / 5)  # seeing^(5/3) is a variance
-    found = lbt.loop.ensemble_residuals(
-        kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR)
-    )
-    again = lbt.loop.ensemble_residuals(
+    found = ensemble_residuals(kalman.controller, kalman.hardware, ensemble_of(w, turbulence=AIR))
+    again = ensemble_residuals(
         kalman.controller,
         kalman.hardware,
         ensemble_of(
-            other,
-            turbulence=lbt.models.FrozenFlows(
-                atmosphere=AIR, seeing_arcsec=np.full(12, 0.8 * strength)
-            ),
+            other, turbulence=FrozenFlows(atmosphere=AIR, seeing_arcsec=np.full(12, 0.8 * strength))
         ),
     )
     assert again.rms_nm == pytest.approx(scale * found.rms_nm[list(order)], rel=1e-7, nan_ok=True)
@@ -292,9 +278,7 @@ def test_noise_through_an_integrator():
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=1, modes=1)
     lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / RATE)
     g = np.array([0.2, 0.5, 1.0, 1.9])
-    found = lbt.loop.ensemble_residuals(
-        lazy, path, lbt.loop.LoopEnsemble(sensor_gain=g / 0.5, noise_nm=3.0)
-    )
+    found = ensemble_residuals(lazy, path, LoopEnsemble(sensor_gain=g / 0.5, noise_nm=3.0))
     # the noise enters as (0.5 / g) of what the closed form has
     assert found.noise_nm**2 == pytest.approx(9 * (0.5 / g) ** 2 * g / (2 - g), rel=1e-9)
 
@@ -304,10 +288,10 @@ def test_noise_through_an_integrator():
 def test_equal_loops_of_axes_that_meet_something_else(kalman, noise, turbulence):
     """Tip and tilt are the same loop: only what reaches both alike is evaluated once."""
     gains = np.array([0.5, 0.8, 1.1])
-    ensemble = lbt.loop.LoopEnsemble(
+    ensemble = LoopEnsemble(
         sensor_gain=gains, noise_nm=np.tile(noise, (3, 1)), turbulence=turbulence
     )
-    found = lbt.loop.ensemble_residuals(kalman.controller, kalman.hardware, ensemble)
+    found = ensemble_residuals(kalman.controller, kalman.hardware, ensemble)
     for i, gain in enumerate(gains):
         truth = lbt.Truth(turbulence=turbulence, noise_nm=noise, sensor_gain=gain)
         loop = lbt.close_loop(kalman.hardware, kalman.controller, sensor_gain=gain)
@@ -325,19 +309,15 @@ def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
         lbt.Controller(A=turn, B=B, C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE) for B in entries
     ]
     controller = next(one for one in resonators if lbt.close_loop(path, one).is_stable)
-    line = lbt.loop.EnsembleVibration(
-        frequency_hz=[RATE / 4, RATE / 4 + 1], rms_nm=100.0, direction=(1.0,)
-    )
-    ensemble = lbt.loop.LoopEnsemble(sensor_gain=[0.9, 0.9], vibrations=[line])
-    left = np.abs(lbt.loop.ensemble_residuals(controller, path, ensemble).line_amplitudes_nm)
+    line = EnsembleVibration(frequency_hz=[RATE / 4, RATE / 4 + 1], rms_nm=100.0, direction=(1.0,))
+    ensemble = LoopEnsemble(sensor_gain=[0.9, 0.9], vibrations=[line])
+    left = np.abs(ensemble_residuals(controller, path, ensemble).line_amplitudes_nm)
     assert left[0, 0, 0] < 1e-9
     truth = lbt.Truth(
         turbulence=None,
         sensor_gain=0.9,
         vibrations=(
-            lbt.models.SinusoidalVibration(
-                frequency_hz=RATE / 4 + 1, rms_nm=100.0, direction=(1.0,)
-            ),
+            SinusoidalVibration(frequency_hz=RATE / 4 + 1, rms_nm=100.0, direction=(1.0,)),
         ),
     )
     budget = lbt.residual_budget(lbt.close_loop(path, controller, sensor_gain=0.9), truth)
@@ -345,23 +325,21 @@ def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
 
 
 def test_nothing_to_meet(kalman):
-    found = lbt.loop.ensemble_residuals(
-        kalman.controller, kalman.hardware, lbt.loop.LoopEnsemble(loops=3)
-    )
+    found = ensemble_residuals(kalman.controller, kalman.hardware, LoopEnsemble(loops=3))
     assert found.rms_nm.tolist() == [0.0] * 3
     assert found.strehl(CAMERA) == pytest.approx([1.0] * 3)
 
 
 def test_controllers_that_do_not_fit(kalman):
-    ensemble = lbt.loop.LoopEnsemble(loops=3)
+    ensemble = LoopEnsemble(loops=3)
     with pytest.raises(lbt.errors.DimensionError, match=r"one per loop \(3\)"):
-        lbt.loop.ensemble_residuals([kalman.controller] * 2, kalman.hardware, ensemble)
+        ensemble_residuals([kalman.controller] * 2, kalman.hardware, ensemble)
     small = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     with pytest.raises(lbt.errors.DimensionError, match="map 1 measurements"):
-        lbt.loop.ensemble_residuals(kalman.controller, small, ensemble)
+        ensemble_residuals(kalman.controller, small, ensemble)
     slow = lbt.LoopHardware(frame_rate_hz=500)
     with pytest.raises(lbt.errors.ProblemError, match="must run at the loop's 500 Hz"):
-        lbt.loop.ensemble_residuals(kalman.controller, slow, ensemble)
+        ensemble_residuals(kalman.controller, slow, ensemble)
 
 
 def test_ripples_far_above_the_wind():
@@ -373,15 +351,13 @@ def test_ripples_far_above_the_wind():
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=606,
         delay_frames=1,
-        turbulence=lbt.models.ar2_turbulence(air, frame_rate_hz=606, noise_nm=0.5),
+        turbulence=ar2_turbulence(air, frame_rate_hz=606, noise_nm=0.5),
         vibrations=[line],
         noise_nm=0.5,
         modes=1,
     )
     controller = lbt.kalman(plant).controller
-    found = lbt.loop.ensemble_residuals(
-        controller, plant.hardware, lbt.loop.LoopEnsemble(turbulence=air)
-    )
+    found = ensemble_residuals(controller, plant.hardware, LoopEnsemble(turbulence=air))
     loop = lbt.close_loop(plant.hardware, controller)
     single = lbt.residual_budget(loop, lbt.Truth(turbulence=air))
     assert found.turbulence_nm[0] == pytest.approx(single.turbulence_nm, rel=3e-6)

@@ -13,8 +13,6 @@ from lbt_synth.loop.ensemble.loop_poles import loop_poles
 from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
 
 LOOPS = 2000
-
-
 PATH = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
 
 

@@ -1,7 +1,5 @@
 """The mirror at the frame rate, against brute force and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,8 +10,6 @@ import lbt_synth as lbt
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, lifted_mirror
 
 QUICK = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 500}
-
-
 SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_samples": 2}
 
 

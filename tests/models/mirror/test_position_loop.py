@@ -1,7 +1,5 @@
 """The local position loop of the mirror, against python-control and closed forms."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest
@@ -10,8 +8,6 @@ from scipy.optimize import brentq
 import lbt_synth as lbt
 
 QUICK = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 500}
-
-
 SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_samples": 2}
 
 

@@ -1,7 +1,5 @@
 """Vibrations whose frequency has a prior."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov

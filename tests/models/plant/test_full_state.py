@@ -1,7 +1,5 @@
 """The plant with its past commands as states is the paper's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.plants import lbt_axis_plant

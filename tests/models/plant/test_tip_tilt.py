@@ -1,17 +1,16 @@
 """The paper's state, entry by entry, and the equivalence of the two forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.models import ARModel
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 def slow(pole=0.98, drive=50.0):
-    return lbt.models.ARModel(coefficients=[pole], driving_rms_nm=drive, frame_rate_hz=800)
+    return ARModel(coefficients=[pole], driving_rms_nm=drive, frame_rate_hz=800)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3, 4])
@@ -19,7 +18,7 @@ def slow(pole=0.98, drive=50.0):
 def test_predicted_error_is_the_closed_loops_residual(delay, order):
     """Where truth is the model, the filter's rms is the residual of the loop, exactly."""
     coefficients = [0.99] if order == 1 else [1.95, -0.955]
-    turbulence = lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=20, frame_rate_hz=800)
+    turbulence = ARModel(coefficients=coefficients, driving_rms_nm=20, frame_rate_hz=800)
     line = lbt.Vibration(frequency_hz=23, damping=0.02, rms_nm=120, direction=(0.6, 0.8))
     rng = np.random.default_rng(3)
     plant = lbt.tip_tilt_plant(
@@ -93,11 +92,7 @@ def test_retuning_moves_only_the_vibration():
         ({"sensor_matrix": [[np.nan, 0], [0, 1]]}, "sensor_matrix must be finite"),
         ({"turbulence": [slow()] * 3}, r"one per mode \(2\); got 3"),
         (
-            {
-                "turbulence": lbt.models.ARModel(
-                    coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500
-                )
-            },
+            {"turbulence": ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
             "must be sampled at the frame rate",
         ),
         (

@@ -1,7 +1,5 @@
 """The tilt of von Karman turbulence, against published numbers and adaptive quadrature."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """AR1 models of Zernike modes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid

@@ -1,7 +1,5 @@
 """Charts for the screen: their data, and the same scales as on paper."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

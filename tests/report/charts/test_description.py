@@ -1,7 +1,5 @@
 """Colours, dashes and markers of curves."""
 
-from __future__ import annotations
-
 from lbt_synth.report.charts.description import colour, dashes, marker_name
 
 

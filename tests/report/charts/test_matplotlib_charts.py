@@ -1,7 +1,5 @@
 """Charts for paper: their text, and titles that fit."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

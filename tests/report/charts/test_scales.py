@@ -1,20 +1,11 @@
 """Ends of scales, and the texts of their ticks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lbt_synth.report.charts.description import (
-    Area,
-    Axis,
-    Curve,
-    Panel,
-    Rule,
-    Span,
-)
+from lbt_synth.report.charts.description import Area, Axis, Curve, Panel, Rule, Span
 from lbt_synth.report.charts.scales import (
     keep_apart,
     legend_entries,

@@ -1,7 +1,5 @@
 """A report of three designs, one of which is unstable."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

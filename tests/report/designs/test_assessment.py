@@ -1,7 +1,5 @@
 """A design in the loop of a configuration is judged by its matrices alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

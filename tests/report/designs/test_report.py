@@ -1,7 +1,5 @@
 """The numbers of a report are those of the library."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulations of a report beside the exact answer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The verdict of a report is made of its numbers."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

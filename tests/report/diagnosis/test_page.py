@@ -1,7 +1,5 @@
 """The page of a diagnosis: it has what is known, and says loudly what is wrong."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 

@@ -1,7 +1,5 @@
 """The page of sliders in Chromium: every slider, every curve, keyboard, phone, files."""
 
-from __future__ import annotations
-
 import json
 import re
 import time
@@ -60,15 +58,17 @@ class Page:
 
 
 @pytest.fixture(scope="module")
-def opened():
-    """What is explored, and its first view."""
-    exploration = explore(lbt.load_config(LBT_YAML), {})
-    return exploration, whole_view(exploration, quick_view(exploration, first_wish()))
+def exploration():
+    return explore(lbt.load_config(LBT_YAML), {})
+
+
+@pytest.fixture(scope="module")
+def first(exploration):
+    return whole_view(exploration, quick_view(exploration, first_wish()))
 
 
 @pytest.fixture
-def own(opened, tmp_path):
-    exploration, first = opened
+def own(exploration, first, tmp_path):
     page = Page(Site(exploration=exploration, first=first, folder=tmp_path))
     yield page
     page.close()
@@ -388,11 +388,6 @@ def test_work_is_shown_in_the_unit_of_the_page():
     lane.close()
 
 
-@pytest.fixture(scope="module")
-def exploration():
-    return explore(lbt.load_config("examples/lbt.yaml"), {})
-
-
 @pytest.mark.parametrize("method", ["kalman", "hinf"])
 def test_the_commands_make_the_files(exploration, tmp_path, monkeypatch, capsys, method):
     wish = Wish(method=method, values={"delay": 2.5, "shift": 0.7, f"{method}-gamma_ratio": 1.4})
@@ -434,9 +429,3 @@ def test_the_head_says_what_was_moved(exploration, tmp_path):
     head = config.read_text().splitlines()[:2]
     assert head[0].startswith("# 'lbt.yaml' with real sensor gain 0.5; lbt_synth ")
     assert head[1] == "# lbt-synth design explored-1.yaml --method kalman -o explored-1.fits"
-
-
-def test_a_folder_that_takes_nothing_is_said(exploration, tmp_path):
-    view = quick_view(exploration, Wish(method="kalman"))
-    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
-        save_view(exploration, view, tmp_path / "nowhere")

@@ -1,7 +1,5 @@
 """Designs that the figures draw."""
 
-from __future__ import annotations
-
 import pytest
 
 import lbt_synth as lbt

@@ -1,7 +1,5 @@
 """The figures of the paper's tables and of one run end to end."""
 
-from __future__ import annotations
-
 import numpy as np
 from support.end_to_end import make_table
 from support.plants import LBT_YAML

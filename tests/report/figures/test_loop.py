@@ -1,7 +1,5 @@
 """The frequencies of curves of loops."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Bode, Nyquist and Nichols plots: curves of closed forms, margins where they are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.figures import legend

@@ -1,7 +1,5 @@
 """The figures of robustness, over the frequency error and as maps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -9,12 +7,11 @@ from support.figures import legend
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
+from lbt_synth.studies import robustness, robustness_map
 
 
 def test_robustness_figure_draws_the_paper_beside(config):
-    rows = list(
-        lbt.studies.robustness(config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1])
-    )
+    rows = list(robustness(config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1]))
     (axis,) = lbt.report.figures.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
     assert legend(axis) == ["Kalman", "Kalman, paper", "H∞"]
     assert "[%]" in axis.get_ylabel()
@@ -29,9 +26,7 @@ def test_robustness_figure_draws_the_paper_beside(config):
 def test_robustness_figure_of_an_unstable_method(config):
     truth = replace(config.truth, sensor_gain=0.3)
     rows = list(
-        lbt.studies.robustness(
-            config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05
-        )
+        robustness(config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05)
     )
     (axis,) = lbt.report.figures.robustness_figure(rows).axes
     assert legend(axis) == ["Kalman", "H∞: unstable"]
@@ -56,7 +51,7 @@ def robust(settings):
 def maps(kalman, robust, settings):
     axes = {"errors_hz": [2, 0, -2, 1], "sensor_gains": [1.5, 0.3, 0.8, 3.0]}
     return {
-        name: lbt.studies.robustness_map(design, settings.truth, settings.imaging, **axes)
+        name: robustness_map(design, settings.truth, settings.imaging, **axes)
         for name, design in (("Kalman", kalman), ("H-infinity", robust))
     }
 
@@ -77,7 +72,7 @@ def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
 
 def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
     def mapped(design, gains, delays):
-        return lbt.studies.robustness_map(
+        return robustness_map(
             design,
             settings.truth,
             settings.imaging,
@@ -100,7 +95,7 @@ def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, 
 def test_map_figures_that_are_refused(maps, kalman, settings):
     with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
         lbt.report.figures.robustness_map_figure({})
-    late = lbt.studies.robustness_map(
+    late = robustness_map(
         kalman,
         settings.truth,
         settings.imaging,

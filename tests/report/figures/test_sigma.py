@@ -1,7 +1,5 @@
 """The sigma plot: labels, units, marked vibrations, and loops that are unstable."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.figures import legend

@@ -1,7 +1,5 @@
 """The simulation figure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import lbt_synth as lbt

@@ -1,7 +1,5 @@
 """The figures of studies: of a set of modes."""
 
-from __future__ import annotations
-
 import pytest
 
 import lbt_synth as lbt

@@ -1,7 +1,5 @@
 """What blocks, charts and tables refuse."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -12,8 +10,6 @@ from lbt_synth.report.page.blocks import Page, Section
 from lbt_synth.storage.tables import Cell, Table
 
 X, Y = Axis(label="x"), Axis(label="y")
-
-
 DOT = Curve(name="a", x=[1.0], y=[1.0])
 
 

@@ -1,7 +1,5 @@
 """Pages as files: the same page is the same file, and a PDF needs its extra."""
 
-from __future__ import annotations
-
 import re
 import sys
 

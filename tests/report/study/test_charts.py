@@ -1,7 +1,5 @@
 """The charts of a study show its numbers, and do not grow with its samples."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

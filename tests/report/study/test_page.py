@@ -1,7 +1,5 @@
 """The page of a study: what it says, and what it must not depend on."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -187,9 +185,3 @@ def test_a_page_from_a_study_file(study, tmp_path):
         "a folder&#39; --row 0",
     ):
         assert words in html, words
-
-
-def test_a_page_must_have_the_name_of_one(study, tmp_path):
-    with pytest.raises(lbt.errors.OutputError, match=r"must end in \.html"):
-        lbt.report.write_study_page(study, {}, tmp_path / "summary.txt")
-    assert list(tmp_path.iterdir()) == []

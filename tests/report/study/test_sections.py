@@ -1,7 +1,5 @@
 """What the page of a study says besides its results."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The tables of the paper, end to end: plans and entries."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

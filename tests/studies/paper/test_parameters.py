@@ -1,7 +1,5 @@
 """Parameters that follow from the paper's Table I."""
 
-from __future__ import annotations
-
 import pytest
 
 import lbt_synth as lbt

@@ -1,7 +1,5 @@
 """The paper's tables, computed again."""
 
-from __future__ import annotations
-
 import pytest
 
 import lbt_synth as lbt

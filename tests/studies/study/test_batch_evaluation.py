@@ -17,17 +17,9 @@ from lbt_synth.studies.study import sample as reference
 COUNT = 8
 NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
 GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
-
-
 LBT = LBT_TEXT.replace("kind: ar1", "kind: {kind}")
-
-
 FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
-
-
 OWN = "{own: {design: kalman, for: sample}}"
-
-
 BOTH = "{kalman: {design: kalman}, own: {design: kalman, for: sample}}"
 
 

@@ -1,7 +1,5 @@
 """Samples in bins: distributions, histograms and maps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

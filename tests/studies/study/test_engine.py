@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from support.studies import assert_whole, evaluate_quickly, load_small_study, make_folder
 
-import lbt_synth as lbt
 from lbt_synth.errors import NumericalError
+from lbt_synth.studies import run_study
 from lbt_synth.studies.study.engine import cut_parts
 from lbt_synth.studies.study.store import list_parts
 
@@ -44,15 +44,13 @@ def raises(study, values, start):
 )
 def test_evaluations_that_are_none(tmp_path, evaluate, message):
     with pytest.raises(NumericalError, match=message):
-        lbt.studies.run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=evaluate)
+        run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=evaluate)
 
 
 def test_any_executor(tmp_path):
     study = load_small_study(tmp_path, samples="300")
     with ThreadPoolExecutor(3) as pool:
-        lbt.studies.run_study(
-            study, folder := make_folder(tmp_path), executor=pool, evaluate=evaluate_quickly
-        )
+        run_study(study, folder := make_folder(tmp_path), executor=pool, evaluate=evaluate_quickly)
         assert pool.submit(int, "3").result() == 3  # it was left open
     assert_whole(folder, study)
 
@@ -84,9 +82,9 @@ def test_an_executor_that_breaks_keeps_what_is_finished(tmp_path, kind, message)
     Breaks.calls, Breaks.kind = 0, kind
     words = f"{message}.*start the study again.*it goes on from there"
     with Breaks(1) as pool, pytest.raises(NumericalError, match=words):
-        lbt.studies.run_study(study, folder, executor=pool, evaluate=evaluate_quickly)
+        run_study(study, folder, executor=pool, evaluate=evaluate_quickly)
     assert 1 <= len(list_parts(folder)) <= 3
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    run_study(study, folder, evaluate=evaluate_quickly)
     assert_whole(folder, study)
 
 
@@ -105,9 +103,9 @@ def test_a_dead_process_ends_the_run_and_the_next_one_goes_on(tmp_path, monkeypa
     monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
     study, folder = load_small_study(tmp_path, samples="80"), make_folder(tmp_path)
     with pytest.raises(NumericalError, match="a process died.*start the study again"):
-        lbt.studies.run_study(study, folder, jobs=2, evaluate=dies_once)
+        run_study(study, folder, jobs=2, evaluate=dies_once)
     kept = sum(part.stop - part.start for part in list_parts(folder))
     assert 0 < kept < 80
-    again = lbt.studies.run_study(study, folder, jobs=2, evaluate=dies_once)
+    again = run_study(study, folder, jobs=2, evaluate=dies_once)
     assert (again.computed, again.failures) == (80 - kept, 0)
     assert_whole(folder, study)

@@ -1,7 +1,5 @@
 """Percentiles and shares against scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """Rows of a study again."""
 
-from __future__ import annotations
-
 import pytest
 from support.studies import LBT_TEXT, evaluate_quickly, load_small_study, make_folder
 

@@ -1,7 +1,5 @@
 """Runs of studies: what they write, resume and refuse."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -128,62 +126,49 @@ def test_other_studies_and_damage_are_refused(tmp_path):
             raise KeyboardInterrupt
         return evaluate_quickly(study, values, start)
 
+    def refused(words, call=lambda: lbt.studies.run_study(study, folder)):
+        with pytest.raises(OutputError, match=words):
+            call()
+
     with pytest.raises(KeyboardInterrupt):
         lbt.studies.run_study(study, folder, evaluate=stops)
     other = load_small_study(tmp_path, samples="60", controllers=TWO, seed="8")
-    with pytest.raises(OutputError, match="is of another study"):
-        lbt.studies.run_study(other, folder)
-    with pytest.raises(OutputError, match="is of another study"):
-        lbt.studies.load_study(other.source, directory=folder)
-    with pytest.raises(OutputError, match="is of another study"):
-        lbt.studies.replay_row(other, folder, 0)
-    manifest = (folder / "study.json").read_text()
-    (folder / "study.json").write_text(
-        manifest.replace(lbt.__version__, "0.0.1").replace(study.digest, "0")
-    )
-    with pytest.raises(OutputError, match=r"was made by lbt_synth 0\.0\.1; this is"):
-        lbt.studies.run_study(study, folder)
-    (folder / "study.json").write_text("{}")
-    with pytest.raises(OutputError, match="no manifest of a study"):
-        lbt.studies.run_study(study, folder)
-    (folder / "study.json").write_text(
-        json.dumps({"schema": "lbt_synth study", "schema_version": 1})
-    )
-    with pytest.raises(OutputError, match="no manifest of a study"):
-        lbt.studies.run_study(study, folder)
+    for call in (
+        lambda: lbt.studies.run_study(other, folder),
+        lambda: lbt.studies.load_study(other.source, directory=folder),
+        lambda: lbt.studies.replay_row(other, folder, 0),
+    ):
+        refused("is of another study", call)
+    path = folder / "study.json"
+    manifest = path.read_text()
+    path.write_text(manifest.replace(lbt.__version__, "0.0.1").replace(study.digest, "0"))
+    refused(r"was made by lbt_synth 0\.0\.1; this is")
     for damage in (
+        "{}",
+        json.dumps({"schema": "lbt_synth study", "schema_version": 1}),
         "{",
         "[" * 100_000,
         manifest.replace('"designs": {', '"designs": {"../x": "0",'),
+        manifest.replace('"tables": {', '"tables": {"/dev/zero": "0"'),
     ):
-        (folder / "study.json").write_text(damage)
-        with pytest.raises(OutputError, match="no manifest of a study"):
-            lbt.studies.run_study(study, folder)
-    (folder / "study.json").write_text(
-        manifest.replace('"tables": {', '"tables": {"/dev/zero": "0"')
-    )
-    with pytest.raises(OutputError, match="no manifest of a study"):
-        lbt.studies.run_study(study, folder)
-    (folder / "study.json").unlink()
-    with pytest.raises(OutputError, match=r"parts of a study without its study\.json"):
-        lbt.studies.run_study(study, folder)
-    (folder / "study.json").write_text(manifest)
+        path.write_text(damage)
+        refused("no manifest of a study")
+    path.unlink()
+    refused(r"parts of a study without its study\.json")
+    path.write_text(manifest)
     part = list_parts(folder)[0].path
     content = part.read_bytes()
     for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
         part.write_bytes(damage)
-        with pytest.raises(OutputError, match="is damaged. Delete it"):
-            lbt.studies.run_study(study, folder)
+        refused("is damaged. Delete it")
     part.write_bytes(content)
     twin = part.with_name("0000000003-0000000005.npz")
     twin.write_bytes(content)
-    with pytest.raises(OutputError, match="has rows that are in"):
-        lbt.studies.run_study(study, folder)
+    refused("has rows that are in")
     twin.unlink()
     design = (folder / "b.fits").read_bytes()
     lbt.save_gain(folder / "b.fits", lbt.integrator(study.config.hardware, gain=0.2))
-    with pytest.raises(OutputError, match="is not the design that the study was begun with"):
-        lbt.studies.run_study(study, folder)
+    refused("is not the design that the study was begun with")
     (folder / "b.fits").write_bytes(design)
     lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
     assert_whole(folder, study)

@@ -1,7 +1,5 @@
 """Samples of a study, and their evaluation one by one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +9,7 @@ from support.studies import LBT_TEXT, load_small_study
 
 import lbt_synth as lbt
 from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.models import SinusoidalVibration
 from lbt_synth.studies.study.sample import make_sample
 
 
@@ -86,11 +85,7 @@ def test_a_point_is_what_the_library_says(tmp_path):
         hardware = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=2 + delay)
         truth = lbt.Truth(
             turbulence=config.plant.turbulence[0],
-            vibrations=(
-                lbt.models.SinusoidalVibration(
-                    frequency_hz=frequency, rms_nm=500, direction=(1.0,)
-                ),
-            ),
+            vibrations=(SinusoidalVibration(frequency_hz=frequency, rms_nm=500, direction=(1.0,)),),
             noise_nm=22.5,
             sensor_gain=0.7,
         )

@@ -1,7 +1,5 @@
 """Distributions of the parameters in a study file, against those of scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import stats
 from support.studies import load_small_study

@@ -1,7 +1,5 @@
 """Sensitivities of controllers to parameters, and first-order indices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -116,11 +114,7 @@ def test_the_index_of_a_list_is_epsilon_squared():
     assert index(values, result).value == pytest.approx(epsilon, rel=1e-9)
 
 
-@given(
-    shift=st.floats(-5, 5),
-    scale=st.sampled_from([-3.0, 0.01, 7.0]),
-    seed=st.integers(0, 1000),
-)
+@given(shift=st.floats(-5, 5), scale=st.sampled_from([-3.0, 0.01, 7.0]), seed=st.integers(0, 1000))
 def test_the_index_knows_no_units(shift, scale, seed):
     u = draw_points("independent", 150, 2, seed)
     result = u[:, 0] ** 2 + 0.3 * u[:, 1]

@@ -1,20 +1,19 @@
 """Statistics of studies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.study_results import make_columns
 
-import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.studies import study_statistics, summary_tables
 
 NAN = float("nan")
 
 
 def test_unstable_counts_as_zero_and_failed_is_left_out(small):
-    found = lbt.studies.study_statistics(small, ["gain"], ["a", "b"], levels=[0.5])
+    found = study_statistics(small, ["gain"], ["a", "b"], levels=[0.5])
     a, b = found.controllers
     assert (a.samples, a.failed, a.unstable.count) == (4, 1, 1)
     assert (b.samples, b.failed, b.unstable.count) == (5, 0, 2)
@@ -30,7 +29,7 @@ def test_unstable_counts_as_zero_and_failed_is_left_out(small):
 
 
 def test_comparison_is_of_the_samples_on_which_neither_failed(small):
-    pair = lbt.studies.study_statistics(small, ["gain"], ["a", "b"]).comparisons[0]
+    pair = study_statistics(small, ["gain"], ["a", "b"]).comparisons[0]
     assert (pair.first, pair.second) == ("a", "b")
     assert pair.better.total == 4
     assert pair.better.count == 2  # rows 10 and 12
@@ -40,19 +39,19 @@ def test_comparison_is_of_the_samples_on_which_neither_failed(small):
 
 
 def test_loss_is_against_the_best_of_each_sample(small):
-    a, b = lbt.studies.study_statistics(small, ["gain"], ["a", "b"]).controllers
+    a, b = study_statistics(small, ["gain"], ["a", "b"]).controllers
     assert (a.loss.best.count, a.loss.best.total) == (4, 4)
     assert b.loss.best.count == 2
     assert b.loss.loss[0].value == pytest.approx(0.05)
 
 
 def test_worst_rows_are_the_unstable_then_those_of_least_strehl(small):
-    a, b = lbt.studies.study_statistics(small, ["gain"], ["a", "b"], worst=3).controllers
+    a, b = study_statistics(small, ["gain"], ["a", "b"], worst=3).controllers
     assert [each.row for each in a.worst] == [11, 12, 14]
     assert [each.stable for each in a.worst] == [False, True, True]
     assert a.worst[1].parameters == {"gain": 0.7}
     assert [each.row for each in b.worst] == [11, 12, 13]
-    none = lbt.studies.study_statistics(small, ["gain"], ["a"], worst=0).controllers[0]
+    none = study_statistics(small, ["gain"], ["a"], worst=0).controllers[0]
     assert none.worst == ()
 
 
@@ -62,7 +61,7 @@ def test_a_stable_loop_without_light_comes_after_unstable_ones_and_ties_by_row()
         {}, {"a": strehl}, row=np.array([4, 9, 2, 8, 1]), **{"a.stable": [1, 1, 1, 0, 1]}
     )
     for count in (4, 10):
-        worst = lbt.studies.study_statistics(columns, [], ["a"], worst=count).controllers[0].worst
+        worst = study_statistics(columns, [], ["a"], worst=count).controllers[0].worst
         assert [each.row for each in worst] == [8, 4, 1, 2, 9][:count]
 
 
@@ -77,13 +76,11 @@ def test_the_order_of_samples_is_of_no_matter(seed):
     columns["a.stable"][rng.random(60) < 0.2] = 0
     columns["b.stable"][rng.random(60) < 0.2] = NAN
     order = rng.permutation(60)
-    here = lbt.studies.study_statistics(columns, ["p", "q"], ["a", "b"])
-    there = lbt.studies.study_statistics(
+    here = study_statistics(columns, ["p", "q"], ["a", "b"])
+    there = study_statistics(
         {name: values[order] for name, values in columns.items()}, ["p", "q"], ["a", "b"]
     )
-    assert [t.rows for t in lbt.studies.summary_tables(here)] == [
-        t.rows for t in lbt.studies.summary_tables(there)
-    ]
+    assert [t.rows for t in summary_tables(here)] == [t.rows for t in summary_tables(there)]
     for one, other in zip(here.controllers, there.controllers, strict=True):
         assert [w.row for w in one.worst] == [w.row for w in other.worst]
 
@@ -91,34 +88,22 @@ def test_the_order_of_samples_is_of_no_matter(seed):
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [
-        (
-            {"a.stable": [1, 2, 1, 1, 1]},
-            lbt.errors.ProblemError,
-            "must be 1, 0 or nan; got 2 at index 1",
-        ),
-        (
-            {"a.strehl": [NAN] * 5},
-            lbt.errors.NonFiniteError,
-            "finite and within .0, 1.*got nan at index 0",
-        ),
-        (
-            {"a.strehl": [1.2, 0, 0, 0, 0]},
-            lbt.errors.ProblemError,
-            "within .0, 1.*got 1.2 at index 0",
-        ),
-        ({"a.residual_nm": [-1, 0, 0, 0, 0]}, lbt.errors.ProblemError, "at least 0 .*got -1"),
-        ({"a.residual_nm": [np.inf, 0, 0, 0, 0]}, lbt.errors.NonFiniteError, "got inf at index 0"),
-        ({"b.stable": [1, 1]}, lbt.errors.DimensionError, "'b.stable' must have 5 rows"),
-        ({"a.strehl": [1, 1]}, lbt.errors.DimensionError, "'a.strehl' must have 5 rows"),
-        ({"gain": [1, 2, NAN, 4, 5]}, lbt.errors.NonFiniteError, "'gain' must be finite; got nan"),
-        ({"gain": [[1, 2]]}, lbt.errors.DimensionError, "'gain' must have 5 rows"),
-        ({"gain": list("abcde")}, lbt.errors.ProblemError, "'gain' must be an array of numbers"),
-        ({"row": [0, 1, NAN, 3, 4]}, lbt.errors.NonFiniteError, "'row' must be finite"),
+        ({"a.stable": [1, 2, 1, 1, 1]}, ProblemError, "must be 1, 0 or nan; got 2 at index 1"),
+        ({"a.strehl": [NAN] * 5}, NonFiniteError, "finite and within .0, 1.*got nan at index 0"),
+        ({"a.strehl": [1.2, 0, 0, 0, 0]}, ProblemError, "within .0, 1.*got 1.2 at index 0"),
+        ({"a.residual_nm": [-1, 0, 0, 0, 0]}, ProblemError, "at least 0 .*got -1"),
+        ({"a.residual_nm": [np.inf, 0, 0, 0, 0]}, NonFiniteError, "got inf at index 0"),
+        ({"b.stable": [1, 1]}, DimensionError, "'b.stable' must have 5 rows"),
+        ({"a.strehl": [1, 1]}, DimensionError, "'a.strehl' must have 5 rows"),
+        ({"gain": [1, 2, NAN, 4, 5]}, NonFiniteError, "'gain' must be finite; got nan"),
+        ({"gain": [[1, 2]]}, DimensionError, "'gain' must have 5 rows"),
+        ({"gain": list("abcde")}, ProblemError, "'gain' must be an array of numbers"),
+        ({"row": [0, 1, NAN, 3, 4]}, NonFiniteError, "'row' must be finite"),
     ],
 )
 def test_columns_that_cannot_be_are_refused(small, change, error, says):
     with pytest.raises(error, match=says):
-        lbt.studies.study_statistics(small | change, ["gain"], ["a", "b"])
+        study_statistics(small | change, ["gain"], ["a", "b"])
 
 
 @pytest.mark.parametrize(
@@ -135,17 +120,17 @@ def test_columns_that_cannot_be_are_refused(small, change, error, says):
     ],
 )
 def test_arguments_that_cannot_be_are_refused(small, arguments, options, says):
-    with pytest.raises(lbt.errors.ProblemError, match=says):
-        lbt.studies.study_statistics(small, *arguments, **options)
+    with pytest.raises(ProblemError, match=says):
+        study_statistics(small, *arguments, **options)
 
 
 def test_rounding_is_neither_better_nor_worse() -> None:
     """The table of results has 9 digits, and the same filter by two routes differs below them."""
     strehl = np.random.default_rng(0).random(200)
     columns = make_columns({}, {"a": strehl, "b": strehl + 1e-8, "c": strehl + 1e-4})
-    found = lbt.studies.study_statistics(columns, [], ["a", "b", "c"])
+    found = study_statistics(columns, [], ["a", "b", "c"])
     first = found.comparisons[0]
     assert (first.better.count, first.equal.count) == (0, 200)
     assert [each.loss.best.count for each in found.controllers] == [0, 0, 200]
-    both = lbt.studies.study_statistics(columns, [], ["a", "b"])
+    both = study_statistics(columns, [], ["a", "b"])
     assert [each.loss.best.count for each in both.controllers] == [200, 200]

@@ -1,7 +1,5 @@
 """Parts of a study."""
 
-from __future__ import annotations
-
 from lbt_synth.studies.study.store import Part, missing_rows
 
 

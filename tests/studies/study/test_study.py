@@ -1,7 +1,5 @@
 """Rows of a study, whichever are requested."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

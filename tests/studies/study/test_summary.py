@@ -1,7 +1,5 @@
 """Tables of statistics."""
 
-from __future__ import annotations
-
 import numpy as np
 from support.study_results import cell_text, make_columns
 
