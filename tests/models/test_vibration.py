@@ -38,17 +38,6 @@ def test_direction_becomes_a_unit_vector():
     assert line.direction == pytest.approx((0.6, 0.8))
 
 
-@pytest.mark.parametrize("damping", [0.0, 1.0, 1.5])
-def test_damping_lies_in_the_open_interval(damping):
-    with pytest.raises(ProblemError, match="damping must be"):
-        lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=1)
-
-
-def test_a_vibration_above_nyquist_is_refused():
-    with pytest.raises(ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"):
-        lbt.Vibration(frequency_hz=500, damping=0.1, rms_nm=1).ar_model(800)
-
-
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
 
 
@@ -133,26 +122,28 @@ def test_the_variance_of_the_resonance_is_held_exactly(start, end, duration, dam
         assert P[0, 0] == pytest.approx(100**2, rel=1e-8)
 
 
-def test_wrong_drifts_are_refused():
-    for wrong, words in (
-        ({"start_hz": 0}, "start_hz must be above 0"),
-        ({"end_hz": -1}, "end_hz must be above 0"),
-        ({"duration_s": 0}, "duration_s must be above 0"),
-        ({"rms_nm": float("nan")}, "rms_nm must be finite"),
-        ({"damping": 1.0}, "damping must be below 1"),
-        ({"direction": (0,)}, "direction must be a vector"),
-        ({"damping": 0.5, "end_hz": 8}, "frequency above that"),
+def test_wrong_vibrations_are_refused():
+    def line(**changes):
+        return lbt.Vibration(**({"frequency_hz": 20, "damping": 0.1, "rms_nm": 1} | changes))
+
+    falls = drifting(start_hz=23, end_hz=10, duration_s=0.5, damping=1e-4)
+    beyond = "below the Nyquist frequency 400 Hz; got 500 Hz"
+    for call, words in (
+        *((lambda v=v: line(damping=v), "damping must be") for v in (0.0, 1.0, 1.5)),
+        (lambda: line(frequency_hz=500).ar_model(800), beyond),
+        (lambda: checked_direction(drifting(end_hz=500), PATH), beyond),
+        (lambda: drifting(start_hz=0), "start_hz must be above 0"),
+        (lambda: drifting(end_hz=-1), "end_hz must be above 0"),
+        (lambda: drifting(duration_s=0), "duration_s must be above 0"),
+        (lambda: drifting(rms_nm=float("nan")), "rms_nm must be finite"),
+        (lambda: drifting(damping=1.0), "damping must be below 1"),
+        (lambda: drifting(direction=(0,)), "direction must be a vector"),
+        (lambda: drifting(damping=0.5, end_hz=8), "frequency above that"),
+        (lambda: drifting().frequency_hz_at(np.nan), "time_s must be finite"),
+        (lambda: drifting().ar_process(np.arange(3) / 800, 800), "a sinusoid has no AR2 process"),
+        (lambda: drawn(falls, frames=800), "must move slowly beside its decay"),
     ):
         with pytest.raises(ProblemError, match=words):
-            drifting(**wrong)
-    with pytest.raises(ProblemError, match="time_s must be finite"):
-        drifting().frequency_hz_at(np.nan)
-    with pytest.raises(ProblemError, match="a sinusoid has no AR2 process"):
-        drifting().ar_process(np.arange(3) / 800, 800)
-    falls = drifting(start_hz=23, end_hz=10, duration_s=0.5, damping=1e-4)
-    with pytest.raises(ProblemError, match="must move slowly beside its decay"):
-        drawn(falls, frames=800)
-    with pytest.raises(ProblemError, match="below the Nyquist frequency 400 Hz; got 500 Hz"):
-        checked_direction(drifting(end_hz=500), PATH)
+            call()
     with pytest.raises(DimensionError, match="must have 1 components"):
         checked_direction(drifting(direction=(1, 0)), PATH)

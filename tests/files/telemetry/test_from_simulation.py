@@ -27,19 +27,18 @@ def test_the_camera_gives_telescope_and_strehl_ratio():
 
 def test_what_is_no_simulation_is_refused(axis_plant):
     path = axis_plant.hardware
-    design = lbt.kalman(axis_plant)
-    run = lbt.simulate(design.controller, lbt.Truth(turbulence=None), hardware=path, frames=5)
-    with pytest.raises(ProblemError, match="case must be below the number of cases, 1; got 1"):
-        lbt.files.telemetry_from_simulation(run, path, case=1)
-    with pytest.raises(ProblemError, match="must be that of the simulation, at 800 Hz"):
-        lbt.files.telemetry_from_simulation(run, lbt.LoopHardware(frame_rate_hz=500, modes=1))
-    with pytest.raises(ProblemError, match="expected a Simulation; got int"):
-        lbt.files.telemetry_from_simulation(3, path)
-    with pytest.raises(ProblemError, match="expected a LoopHardware; got int"):
-        lbt.files.telemetry_from_simulation(run, 3)
-    with pytest.raises(ProblemError, match="expected a Design; got Controller"):
-        lbt.files.telemetry_from_simulation(run, path, design=design.controller)
-    with pytest.raises(
-        DimensionError, match="interaction_matrix must have 1 measurement to match measurements"
+    control = lbt.kalman(axis_plant).controller
+    run = lbt.simulate(control, lbt.Truth(turbulence=None), hardware=path, frames=5)
+    other, two = (lbt.LoopHardware(frame_rate_hz=f, modes=m) for f, m in ((500, 1), (800, 2)))
+    for given, options, words in (
+        ((run, path), {"case": 1}, "case must be below the number of cases, 1; got 1"),
+        ((run, other), {}, "must be that of the simulation, at 800 Hz"),
+        ((3, path), {}, "expected a Simulation; got int"),
+        ((run, 3), {}, "expected a LoopHardware; got int"),
+        ((run, path), {"design": control}, "expected a Design; got Controller"),
     ):
-        lbt.files.telemetry_from_simulation(run, lbt.LoopHardware(frame_rate_hz=800, modes=2))
+        with pytest.raises(ProblemError, match=words):
+            lbt.files.telemetry_from_simulation(*given, **options)
+    words = "interaction_matrix must have 1 measurement to match measurements"
+    with pytest.raises(DimensionError, match=words):
+        lbt.files.telemetry_from_simulation(run, two)

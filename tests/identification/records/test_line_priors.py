@@ -7,15 +7,6 @@ from scipy.signal import coherence, lfilter
 import lbt_synth as lbt
 from lbt_synth.identification import LinePrior, accelerometer_lines, load_lines
 
-
-def test_headings_of_lists_of_lines(tmp_path):
-    path = tmp_path / "lines.csv"
-    for heading in ("frequency_error_hz,frequency_hz", "Error [Hz],Frequency [Hz]", "sigma,f"):
-        path.write_text(f"{heading}\n0.1,20\n,45\n")
-        found = [(line.frequency_hz, line.frequency_error_hz) for line in load_lines(path)]
-        assert found == [(20.0, 0.1), (45.0, 0.0)]
-
-
 RATE = 1000.0
 
 
@@ -30,30 +21,28 @@ def resonance(frequency_hz, damping, frames, seed):
     return x / x.std()
 
 
+def pairs(lines):
+    return [(line.frequency_hz, line.frequency_error_hz) for line in load_lines(lines)]
+
+
 def test_lists():
     known = LinePrior(frequency_hz=12, frequency_error_hz=0.3, source="log book")
-    found = load_lines([45.5, (16, 0.2), known])
-    assert [(line.frequency_hz, line.frequency_error_hz) for line in found] == [
-        (12.0, 0.3),
-        (16.0, 0.2),
-        (45.5, 0.0),
-    ]
-    assert found[0] is known
-    assert load_lines(np.array([[20.0, 1.0], [10.0, 2.0]]))[0].frequency_error_hz == 2.0
+    assert pairs([45.5, (16, 0.2), known]) == [(12.0, 0.3), (16.0, 0.2), (45.5, 0.0)]
+    assert load_lines([45.5, known])[0] is known
+    assert pairs(np.array([[20.0, 1.0], [10.0, 2.0]]))[0] == (10.0, 2.0)
     assert load_lines([]) == ()
 
 
 def test_files(tmp_path):
     path = tmp_path / "lines.csv"
+    for heading in ("frequency_error_hz,frequency_hz", "Error [Hz],Frequency [Hz]", "sigma,f"):
+        path.write_text(f"{heading}\n0.1,20\n,45\n")
+        assert pairs(path) == [(20.0, 0.1), (45.0, 0.0)]
     path.write_text("frequency_hz,error_hz\n45.5,0.3\n16,\n")
-    found = load_lines(path)
-    assert [(line.frequency_hz, line.frequency_error_hz) for line in found] == [
-        (16, 0),
-        (45.5, 0.3),
-    ]
-    assert found[0].source == str(path)
+    assert pairs(path) == [(16, 0), (45.5, 0.3)]
+    assert load_lines(path)[0].source == str(path)
     path.write_text("20\n30.5\n")
-    assert [line.frequency_hz for line in load_lines(str(path))] == [20, 30.5]
+    assert [frequency for frequency, _ in pairs(str(path))] == [20, 30.5]
 
 
 @pytest.mark.parametrize(

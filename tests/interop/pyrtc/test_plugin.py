@@ -122,14 +122,3 @@ def test_a_spoilt_frame_repeats_the_command_and_a_loop_that_stops_is_an_error(
         monkeypatch.setattr(plugin, "_ANSWER_SECONDS", 0.1)
         with pytest.raises(lbt.errors.ProblemError, match="must answer within 0.1 s"):
             telescope.step(np.zeros(2))
-
-
-@pytest.mark.e2e
-def test_a_damaged_gain_file_stops_the_start(tmp_path):
-    pytest.importorskip("pyrtc")
-    export(tmp_path, "integrator")
-    content = bytearray((tmp_path / "gain.fits").read_bytes())
-    content[6000] ^= 1
-    (tmp_path / "gain.fits").write_bytes(content)
-    with pytest.raises(lbt.errors.GainFileError, match="is damaged"), running(tmp_path):
-        pass
