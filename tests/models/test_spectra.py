@@ -30,25 +30,18 @@ def test_sum_of_spectra():
     assert left[0] == pytest.approx(sum(left[1:]), rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("parts", "text"), [([], "at least one"), ([3.0], "psd"), (3.0, "must be a list")]
-)
-def test_sums_of_no_spectra_are_refused(parts, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
-        lbt.models.SumSpectrum(parts=parts)
-
-
-@pytest.mark.parametrize(
-    ("frequency", "density", "text"),
-    [
-        ([1, 2, 3], [1, 1], "same length"),
-        ([2, 1], [1, 1], "increase"),
-        ([1, 2], [1, -1], "at least 0"),
-    ],
-)
-def test_spectrum_tables_are_checked(frequency, density, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
-        lbt.models.TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=density)
+def test_what_is_no_spectrum_is_refused():
+    total, table = lbt.models.SumSpectrum, lbt.models.TabulatedSpectrum
+    for call, words in (
+        (lambda: total(parts=[]), "at least one"),
+        (lambda: total(parts=[3.0]), "psd"),
+        (lambda: total(parts=3.0), "must be a list"),
+        (lambda: table(frequency_hz=[1, 2, 3], density_nm2_hz=[1, 1]), "same length"),
+        (lambda: table(frequency_hz=[2, 1], density_nm2_hz=[1, 1]), "increase"),
+        (lambda: table(frequency_hz=[1, 2], density_nm2_hz=[1, -1]), "at least 0"),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            call()
 
 
 @pytest.fixture(scope="module")

@@ -34,17 +34,21 @@ def test_impossible_values_are_refused(make, value):
         make(value)
 
 
-def test_a_truth_needs_a_spectrum():
-    with pytest.raises(ProblemError, match="psd"):
-        lbt.Truth(turbulence=3.0)
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "text"),
     [
         ({"turbulence": []}, DimensionError, "got an empty sequence"),
         ({"turbulence": [SLOW, 3.0]}, ProblemError, "one per mode; got float"),
+        ({"turbulence": 3.0}, ProblemError, "psd"),
         ({"turbulence": "slow"}, ProblemError, "one per mode; got str"),
+        *(
+            (
+                {"turbulence": None, "vibrations": (v,)},
+                ProblemError,
+                "vibrations must be Vibration, Sinusoidal",
+            )
+            for v in ("abc", 20.0, None)
+        ),
         ({"turbulence": None, "noise_nm": [[1.0]]}, DimensionError, r"got shape \(1, 1\)"),
         ({"turbulence": None, "noise_nm": []}, DimensionError, r"got shape \(0,\)"),
         ({"turbulence": None, "noise_nm": [1.0, -1.0]}, ProblemError, "noise_nm"),
@@ -83,9 +87,3 @@ def test_a_frequency_error_moves_each_vibration_by_its_share():
     with pytest.raises(ProblemError, match="moves the one at 20 Hz to -5 Hz"):
         stated.with_frequency_error(-25.0)
     assert lbt.Truth(turbulence=None).frequency_shift_hz(30.0, 2.0) == 2.0
-
-
-@pytest.mark.parametrize("other", ["abc", 20.0, None])
-def test_what_is_no_vibration_is_refused(other):
-    with pytest.raises(ProblemError, match="vibrations must be Vibration, Sinusoidal"):
-        lbt.Truth(turbulence=None, noise_nm=1.0, vibrations=(other,))

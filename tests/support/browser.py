@@ -1,7 +1,5 @@
 """Pages in headless Chromium, as a desk or a phone shows them."""
 
-from __future__ import annotations
-
 import time
 
 OPTIONS = (

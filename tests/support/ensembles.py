@@ -1,7 +1,5 @@
 """Designs, plants and random conditions for tests of many loops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page of sliders, served by the command and opened in Chromium."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import subprocess

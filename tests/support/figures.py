@@ -1,7 +1,5 @@
 """What tests read out of figures."""
 
-from __future__ import annotations
-
 
 def legend(axis):
     """Names of what is drawn in a plot, in order; the figure's legend shows those of all plots."""

@@ -1,7 +1,5 @@
 """Systems of pyRTC, started from exported folders under stream names of their own."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

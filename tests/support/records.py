@@ -1,7 +1,5 @@
 """Loops and records that the tests of records share."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import lbt_synth as lbt

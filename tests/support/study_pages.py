@@ -1,7 +1,5 @@
 """A study with all that can go wrong in one, and its page."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 import numpy as np

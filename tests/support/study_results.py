@@ -1,7 +1,5 @@
 """Samples and results of studies that were never run."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import qmc
 

@@ -4,8 +4,6 @@ Nothing here uses what the package proves an export with. The loop is one plain 
 frame. Transfer functions are judged in exact numbers, by the recursion of Schur and Cohn.
 """
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

@@ -139,6 +139,10 @@ def test_commands_may_have_a_unit_of_their_own():
         ({"diameter_m": -1}, "diameter_m must be above 0"),
         ({"obstruction": 1}, "obstruction must be below 1"),
         ({"mirror": "shell"}, "expected a PositionLoop"),
+        (
+            {"frame_rate_hz": 777, "delay_frames": 2, "mirror": SHELL},
+            "whole number of samples per frame",
+        ),
     ],
 )
 def test_arrays_that_are_refused(change, words):
@@ -146,9 +150,3 @@ def test_arrays_that_are_refused(change, words):
     fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE, "unit": "nm"}
     with pytest.raises(lbt.errors.ProblemError, match=words):
         loop_record(**{**fields, **change})
-
-
-def test_a_mirror_that_does_not_fit_the_rate_is_refused():
-    y = np.random.default_rng(0).standard_normal((30, 1))
-    with pytest.raises(lbt.errors.ProblemError, match="whole number of samples per frame"):
-        loop_record(y, y, frame_rate_hz=777, delay_frames=2, mirror=SHELL, unit="nm")

@@ -86,27 +86,16 @@ def test_the_noise_of_the_arithmetic_in_closed_form():
     )
 
 
-BAD = [
-    (bare_design(lbt_designs()["kalman"].controller), ProblemError, "needs the design of a loop"),
-    (
-        lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0], [0.5]]), gain=0.3),
-        ProblemError,
-        "got 2 measurements of 1 commands",
-    ),
-    (
-        lbt.integrator(
-            lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=[[1.0, 0.0], [0.0, 1e-5]]), gain=0.3
-        ),
-        ProblemError,
-        r"a condition number of 1e\+05 \(limit 10000\)",
-    ),
-]
-
-
-@pytest.mark.parametrize(("design", "error", "text"), BAD)
-def test_a_loop_that_pyrtc_cannot_hold_is_refused(design, error, text):
-    with pytest.raises(error, match=text):
-        pol_filter(design)
+def test_a_loop_that_pyrtc_cannot_hold_is_refused():
+    with pytest.raises(ProblemError, match="needs the design of a loop"):
+        pol_filter(bare_design(lbt_designs()["kalman"].controller))
+    for sensor, words in (
+        ([[1.0], [0.5]], "got 2 measurements of 1 commands"),
+        ([[1.0, 0.0], [0.0, 1e-5]], r"a condition number of 1e\+05 \(limit 10000\)"),
+    ):
+        path = lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=sensor)
+        with pytest.raises(ProblemError, match=words):
+            pol_filter(lbt.integrator(path, gain=0.3))
 
 
 def series(design, frames, seed=0):

@@ -112,24 +112,11 @@ def test_wrong_parts_are_refused(change, text):
 
 
 def test_sizes_that_clash_are_named():
-    good = {
-        "A": np.eye(3) / 2,
-        "B": np.ones((3, 4)),
-        "C": np.ones((1, 3)),
-        "D": np.ones((1, 4)),
-        "L": np.ones((1, 3)),
-    }
-    for name, value in (
-        ("A", np.ones((3, 2))),
-        ("B", np.ones((2, 4))),
-        ("C", np.ones((1, 2))),
-        ("D", np.ones((1, 3))),
-        ("L", np.ones((1, 5))),
-    ):
+    sizes = {"A": (3, 3), "B": (3, 4), "C": (1, 3), "D": (1, 4), "L": (1, 3)}
+    wrong = {"A": (3, 2), "B": (2, 4), "C": (1, 2), "D": (1, 3), "L": (1, 5)}
+    good = {name: np.ones(size) for name, size in sizes.items()} | {"A": np.eye(3) / 2}
+    for name, size in wrong.items():
         with pytest.raises(lbt.errors.DimensionError, match=f"{name} must"):
-            lbt.EstimationProblem(**(good | {name: value}))
-
-
-def test_a_measurement_without_noise_is_refused():
+            lbt.EstimationProblem(**(good | {name: np.ones(size)}))
     with pytest.raises(lbt.errors.DefinitenessError, match="Every measurement needs noise"):
         lbt.EstimationProblem(A=0.5, B=[[1.0]], C=1.0, D=[[0.0]], L=1.0)

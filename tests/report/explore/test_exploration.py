@@ -101,11 +101,6 @@ def test_sliders_of_other_methods_do_not_count(config):
     assert [knob.key for knob in wish.move(knobs)] == ["delay"]
 
 
-def test_an_unknown_method_is_refused(config):
-    with pytest.raises(lbt.errors.ProblemError, match="Did you mean kalman"):
-        fulfil(Wish(method="kalmann"), list_knobs(config), config)
-
-
 def test_the_configuration_that_was_read_stays_as_it_is(config):
     before = config.text
     fulfil(

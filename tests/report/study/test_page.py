@@ -139,13 +139,9 @@ def test_nothing_evaluated_makes_a_page_without_figures():
     assert page_html(page)
 
 
-def test_no_sample_yet_is_refused():
-    columns = {name: values[:0] for name, values in results().items()}
+def test_columns_that_make_no_page_are_refused():
     with pytest.raises(lbt.errors.ProblemError, match="at least one sample; got none"):
-        page_of(columns)
-
-
-def test_columns_of_other_results_are_refused():
+        page_of({name: values[:0] for name, values in results().items()})
     statistics = lbt.studies.study_statistics(results(), PARAMETERS, CONTROLLERS)
     with pytest.raises(lbt.errors.ProblemError, match="300 samples of the statistics; got 200"):
         study_page(INFO, statistics, results(200))

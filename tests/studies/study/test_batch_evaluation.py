@@ -98,64 +98,56 @@ def test_the_sensor_gain_that_designs_assume(tmp_path, monkeypatch):
     agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=one, count=5)
 
 
-def test_one_axis_and_the_turbulence_of_the_model(tmp_path):
-    parameters = """{
-      'truth.vibrations[0].rms_nm': {uniform: [100, 900]},
-      'model.vibrations[0].frequency_hz': {uniform: [18, 22]},
-      sensor.noise_nm: {uniform: [5, 30]},
-      truth.sensor_gain: {uniform: [0.4, 1.1]}
-    }"""
-    agree(tmp_path, base=BASE, controllers=BOTH, parameters=parameters)
+LOOP = "truth.sensor_gain: {uniform: [0.4, 1.1]}"
+DELAY = "error.delay_frames: {list: [0, 0.25]}"
+TIP = "\n    - {kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}"
+MIRROR = "mirror:\n  local_loop: {natural_frequency_hz: 50, damping: 0.5, bandwidth_hz: 400}\n"
+SPREAD = BASE.replace("rms_nm: 500.0}]", "rms_nm: 500.0, spread_hz: 1.0, lines: 3}]", 1)
+SINUSOID = "[{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]"
+CHANGED = {  # a configuration, what is put in place of what, parameters, samples
+    "one axis and the turbulence of the model": (
+        BASE,
+        {},
+        "'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, 'model.vibrations[0].frequency_hz': "
+        f"{{uniform: [18, 22]}}, sensor.noise_nm: {{uniform: [5, 30]}}, {LOOP}",
+        COUNT,
+    ),
+    "resonances and vibrations of the model, which both move": (
+        LBT_TEXT,
+        {TIP: " model"},
+        "'model.vibrations[0].frequency_hz': {uniform: [18, 22]}, 'model.vibrations[0].rms_mas': "
+        "{uniform: [40, 100]}, 'model.vibrations[0].damping': {uniform: [0.002, 0.02]}, " + DELAY,
+        5,
+    ),
+    "vibrations of the model that are several lines": (
+        SPREAD,
+        {SINUSOID: "model"},
+        f"sensor.noise_nm: {{uniform: [5, 30]}}, {LOOP}",
+        5,
+    ),
+    "a mirror with dynamics": (LBT_TEXT, {"mirror:\n": MIRROR}, f"{LOOP}, {DELAY}", 5),
+    "a diagonal vibration, without a filter per axis": (
+        LBT_TEXT,
+        {"axis: tip,": "direction_deg: 30,", "axis: both,": "direction_deg: 30,"},
+        "'truth.vibrations[0].frequency_hz': {uniform: [19, 21]}",
+        4,
+    ),
+    "the delay that designs assume": (
+        LBT_TEXT,
+        {},
+        "loop.delay_frames: {list: [1, 2, 2.5]}, truth.sensor_gain: {uniform: [0.4, 1]}",
+        12,
+    ),
+}
 
 
-def test_resonances_and_vibrations_of_the_model(tmp_path):
-    """The truth's vibrations are the model's: both move."""
-    base = LBT_TEXT.replace(
-        """  vibrations:
-    - {kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}
-""",
-        "  vibrations: model\n",
-    )
-    assert "vibrations: model" in base
-    parameters = """{
-      'model.vibrations[0].frequency_hz': {uniform: [18, 22]},
-      'model.vibrations[0].rms_mas': {uniform: [40, 100]},
-      'model.vibrations[0].damping': {uniform: [0.002, 0.02]},
-      error.delay_frames: {list: [0, 0.25]}
-    }"""
-    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
-
-
-def test_a_vibration_of_the_model_that_is_several_lines(tmp_path):
-    """The truth's vibrations are the model's, spread over a band; other numbers vary."""
-    base = BASE.replace("rms_nm: 500.0}]", "rms_nm: 500.0, spread_hz: 1.0, lines: 3}]", 1).replace(
-        "[{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]", "model"
-    )
-    assert "lines: 3" in base
-    assert "vibrations: model" in base
-    parameters = "{sensor.noise_nm: {uniform: [5, 30]}, truth.sensor_gain: {uniform: [0.4, 1.1]}}"
-    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
-
-
-def test_a_mirror_with_dynamics(tmp_path):
-    base = LBT_TEXT.replace(
-        "mirror:\n",
-        "mirror:\n  local_loop: {natural_frequency_hz: 50, damping: 0.5, bandwidth_hz: 400}\n",
-    )
-    parameters = """{
-      truth.sensor_gain: {uniform: [0.4, 1.1]},
-      error.delay_frames: {list: [0, 0.25]}
-    }"""
-    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=5)
-
-
-def test_a_diagonal_vibration(tmp_path):
-    """No filter per axis: designed one by one, but evaluated together."""
-    base = LBT_TEXT.replace("axis: tip,", "direction_deg: 30,").replace(
-        "axis: both,", "direction_deg: 30,"
-    )
-    parameters = "{'truth.vibrations[0].frequency_hz': {uniform: [19, 21]}}"
-    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=4)
+@pytest.mark.parametrize("name", CHANGED)
+def test_changed_configurations(tmp_path, name):
+    base, changes, parameters, count = CHANGED[name]
+    for old, new in changes.items():
+        assert old in base
+        base = base.replace(old, new)
+    agree(tmp_path, base=base, controllers=BOTH, parameters=f"{{{parameters}}}", count=count)
 
 
 @pytest.mark.parametrize(
@@ -189,11 +181,6 @@ def test_an_image_that_is_gone(tmp_path):
     strehl = found.columns["slow.strehl"]
     assert (strehl == 0).sum() == COUNT / 2 == (strehl > 0).sum()
     assert (found.columns["slow.stable"] == 1).all()
-
-
-def test_the_delay_that_designs_assume(tmp_path):
-    parameters = "{loop.delay_frames: {list: [1, 2, 2.5]}, truth.sensor_gain: {uniform: [0.4, 1]}}"
-    agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=12)
 
 
 def test_groups_of_what_makes_another_configuration(tmp_path, monkeypatch):
