@@ -220,19 +220,17 @@ def test_the_header_is_fit_for_cpp(tmp_path, written):
     subprocess.run([compiler("c++"), *flags, user], check=True)
 
 
-def test_no_source_is_written_for_a_form_that_it_has_not(tmp_path, fused):
-    with pytest.raises(ProblemError, match="in estimator form alone"):
-        lbt.interop.export_c(tmp_path / "k.c", fused, form="plain")
-    with pytest.raises(ProblemError, match="prefix of the C names must"):
-        lbt.interop.export_c(tmp_path / "k.c", fused, name="kal-man")
-    assert not list(tmp_path.iterdir())
-
-
-def test_what_is_not_certified_is_refused(tmp_path, fused):
+def test_what_has_no_source_is_refused(tmp_path, fused):
     failed = lbt.design.Check("of a test", 1.0, 0.5, "hand")
     wrong = replace(fused, certificate=replace(fused.certificate, checks=(failed,)))
-    with pytest.raises(CertificateError, match="of a test"):
-        lbt.interop.export_c(tmp_path / "k.c", wrong)
+    for design, options, error, words in (
+        (fused, {"form": "plain"}, ProblemError, "in estimator form alone"),
+        (fused, {"name": "kal-man"}, ProblemError, "prefix of the C names must"),
+        (wrong, {}, CertificateError, "of a test"),
+    ):
+        with pytest.raises(error, match=words):
+            lbt.interop.export_c(tmp_path / "k.c", design, **options)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("short_rehearsal")

@@ -266,6 +266,8 @@ def test_what_the_filter_cannot_hold_is_refused_with_the_number(tmp_path, path):
     refused(problem, "sensor_matrix must be the identity", lbt.integrator(turned, gain=0.3))
     bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
     refused(problem, "needs the design of a loop", bare)
+    with pytest.raises(lbt.errors.DimensionError, match="a row per mode"):
+        AppliedFilter(np.ones((2, 5)))
 
 
 def reference(matrix, latency, series):
@@ -321,8 +323,3 @@ def test_its_history_is_the_pseudo_open_loop_measurement():
         commands = np.append(run.step([y]), commands[:-1])
         history.append(run._history[0, 0])
     assert np.allclose(history, phase, atol=1e-6)
-
-
-def test_a_matrix_of_part_of_a_frame_is_refused():
-    with pytest.raises(lbt.errors.DimensionError, match="a row per mode"):
-        AppliedFilter(np.ones((2, 5)))
