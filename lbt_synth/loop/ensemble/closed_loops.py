@@ -16,7 +16,6 @@ from scipy.sparse.csgraph import connected_components
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.state_space import schur_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
-from lbt_synth.loop.ensemble.loop_poles import loop_poles
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response, mirror_system, tapped_mirror
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
@@ -243,11 +242,6 @@ def _close_subloop(
             for one, two in zip(*ends, strict=True)
         )
         n, A = subloop.modes.size, A0 + gain * A1
-        if subloop.is_shared and subloop.is_scalar:
-            extremes = [(end[0][0], end[1][0]) for end in ends]
-            poles = loop_poles(A, sensor_gains[rows], fraction, extremes)
-        else:
-            poles = np.linalg.eigvals(A).astype(np.complex128)
         B, D = (np.broadcast_to(m, (rows.size, *m.shape[1:])) for m in (B, D[:, :n]))
         yield LoopGroup(
             subloop=subloop,
@@ -260,7 +254,7 @@ def _close_subloop(
             B=B,
             C=(C0 + gain * C1)[:, :n],
             D=D,
-            poles=poles,
+            poles=np.linalg.eigvals(A).astype(np.complex128),
         )
 
 
