@@ -1,11 +1,17 @@
-"""The gain at which a fit begins, and searches that rounding does not move."""
+"""The background beside lines, the gain of a start, and searches that rounding does not move."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
+from support.drawn_spectra import NOISE, drawn_search, empty_search, white_noise
 from support.recorded_loops import hidden_resonance_record, integrator_loop
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.order_search import fit_background
+from lbt_synth.identification.fit.whittle import density
 
 RATE = 1000.0
 
@@ -37,3 +43,56 @@ def test_rounding_does_not_move_the_search() -> None:
     assert len(one.parts) == len(other.parts)
     assert one.fitted_model.contrast == pytest.approx(other.fitted_model.contrast, abs=0.5)
     assert one.sensor_gain == pytest.approx(other.sensor_gain, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_narrow_lines_are_hardly_touched_and_wide_ones_are_held(seed: int) -> None:
+    search = empty_search()
+    data = search.data
+    slow = search.component("turbulence", 1.4, 0.45, 6000.0)
+    wide = search.component("line", 30.0, 0.25, 4000.0)
+    narrow = search.component("line", 77.0, 0.002, 3000.0)
+    truth = white_noise().add(slow, wide, narrow)
+    drawn = drawn_search(truth, seed)
+    found = fit_background(drawn, 1.0, [wide, narrow])
+    assert found is not None
+    (turbulence,) = found.spectrum.components
+    assert np.exp(turbulence.log_power) == pytest.approx(6000, rel=0.4)
+    assert np.exp(found.spectrum.log_noise) == pytest.approx(NOISE, rel=0.1)
+    own = density(data, found.spectrum)[data.frequency_hz < 300]
+    expected = density(data, white_noise().add(slow))[data.frequency_hz < 300]
+    assert np.median(own / expected) == pytest.approx(1, rel=0.15)
+    blind = fit_background(drawn, 1.0)  # as if nothing were there
+    assert blind is not None
+    near = np.argmin(np.abs(data.frequency_hz - 30))
+    assert density(data, blind.spectrum)[near] > 3 * density(data, found.spectrum)[near]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_drift_is_a_process_beside_the_turbulence(seed: int) -> None:
+    search = empty_search()
+    data = search.data
+    drift = search.component("drift", 2.0, 30.0, 20_000.0)  # a corner at 1/30 Hz
+    slow = search.component("slow", 2.0, 0.4, 3000.0)
+    truth = white_noise().add(drift, slow)
+    drawn = drawn_search(truth, seed)
+    alone, both = (fit_background(drawn, 1.0, drifts=drifts) for drifts in (False, True))
+    assert alone is not None
+    assert both is not None
+    assert both.spectrum.components[0].kind == "drift"
+    assert [c.kind for c in both.spectrum.components[1:]] == ["slow"]
+    assert both.contrast < alone.contrast - 10
+    middle = (data.frequency_hz > 0.2) & (data.frequency_hz < 100)
+    ratio = density(data, both.spectrum)[middle] / density(data, truth)[middle]
+    assert np.median(ratio) == pytest.approx(1, rel=0.15)
+
+
+@pytest.mark.parametrize("gain", [1e-9, 1e9])
+@pytest.mark.parametrize("drifts", [False, True])
+def test_a_gain_that_ran_away_is_no_error(gain: float, drifts: bool) -> None:
+    search = empty_search()
+    truth = white_noise().add(search.component("turbulence", 1.4, 0.45, 6000.0))
+    drawn = replace(drawn_search(truth, 0), gain=None)
+    found = fit_background(drawn, gain, drifts=drifts)
+    assert found is not None
+    assert 1e-4 < found.spectrum.gain < 1e4
