@@ -24,57 +24,37 @@ CONFIG = str(LBT_YAML)
 
 
 BAD = [
-    (("design", CONFIG, "--method", "hinf", "--gamma", "10", "-o", "OUT.fits"), 1, "at least 15"),
-    (("design", CONFIG, "--method", "hinf", "--gamma", "nan", "-o", "OUT.fits"), 2, "finite"),
-    (
-        ("design", CONFIG, "--method", "hinf", "--gamma-ratio", "0.5", "-o", "OUT.fits"),
-        2,
-        "at least 1",
-    ),
-    (
-        ("design", CONFIG, "--method", "kalman", "--gamma", "200", "-o", "OUT.fits"),
-        2,
-        "goes with --method hinf",
-    ),
-    (
-        ("design", CONFIG, "--method", "kalman", "--route", "lmi", "-o", "OUT.fits"),
-        2,
-        "takes --route riccati or sdp",
-    ),
-    (
-        ("design", CONFIG, "--method", "kalman", "--gain", "0.5", "-o", "OUT.fits"),
-        2,
-        "goes with --method integrator",
-    ),
-    (
-        ("design", CONFIG, "--method", "integrator", "--gain", "1.5", "-o", "OUT.fits"),
-        1,
-        "failed its certificate",
-    ),
-    (("design", CONFIG, "--method", "kalman", "-o", "OUT.txt"), 2, "must end in .fits"),
-    (("design", CONFIG, "--method", "kalman", "-o", "none/OUT.fits"), 2, "cannot write"),
-    (("design", "none.yaml", "--method", "kalman", "-o", "OUT.fits"), 2, "cannot read none.yaml"),
-    (("design", CONFIG, "--method", "magic", "-o", "OUT.fits"), 2, "invalid choice"),
-    (("design", CONFIG), 2, "required"),
-    (("show", "none.fits"), 2, "cannot read none.fits"),
-    (("show", CONFIG), 2, "is a configuration, expected a gain file"),
-    (("verify", "DAMAGED.fits"), 2, "damaged"),
-    (("sigma", "DAMAGED.fits", "-o", "OUT.png"), 2, "damaged"),
-    (("sigma", "KALMAN", "-o", "OUT.gif"), 2, "must end in .csv, .png"),
-    (("sigma", "KALMAN", "KALMAN", "-o", "OUT.png"), 2, "given once"),
-    (("sigma", "KALMAN", "--sensor-gain", "-1", "-o", "OUT.png"), 2, "above 0"),
-    (("simulate", CONFIG, "KALMAN", "--frames", "0"), 2, "at least 1"),
-    (("simulate", CONFIG, "KALMAN", "--frames", "many"), 2, "invalid int"),
-    (("simulate", CONFIG, "KALMAN", "-o", "OUT.doc"), 2, "must end in .png"),
-    (("robustness", CONFIG, "-o", "OUT.xls"), 2, "must end in .csv"),
-    (("robustness", CONFIG, "--gamma-ratio", "nan"), 2, "finite"),
-    (("design", CONFIG, "--method", "hinf", "--gamma", "1e300", "-o", "OUT.fits"), 2, "at most"),
-    (("simulate", CONFIG, "KALMAN", "--frames", "99999999999999"), 2, "must fit into"),
-    (("simulate", CONFIG, "KALMAN", "-o", "none/OUT.png"), 2, "no directory none"),
-    (("robustness", CONFIG, "-o", "OUT.csv", "-o", "none/OUT.png"), 2, "no directory none"),
-    (("paper", "-o", "FILE"), 2, "cannot make the directory"),
-    (("frobnicate",), 2, "invalid choice"),
-    ((), 2, "required"),
+    ("design CONFIG --method hinf --gamma 10 -o OUT.fits", 1, "at least 15"),
+    ("design CONFIG --method hinf --gamma nan -o OUT.fits", 2, "finite"),
+    ("design CONFIG --method hinf --gamma-ratio 0.5 -o OUT.fits", 2, "at least 1"),
+    ("design CONFIG --method kalman --gamma 200 -o OUT.fits", 2, "goes with --method hinf"),
+    ("design CONFIG --method kalman --route lmi -o OUT.fits", 2, "takes --route riccati or sdp"),
+    ("design CONFIG --method kalman --gain 0.5 -o OUT.fits", 2, "goes with --method integrator"),
+    ("design CONFIG --method integrator --gain 1.5 -o OUT.fits", 1, "failed its certificate"),
+    ("design CONFIG --method kalman -o OUT.txt", 2, "must end in .fits"),
+    ("design CONFIG --method kalman -o none/OUT.fits", 2, "cannot write"),
+    ("design none.yaml --method kalman -o OUT.fits", 2, "cannot read none.yaml"),
+    ("design CONFIG --method magic -o OUT.fits", 2, "invalid choice"),
+    ("design CONFIG", 2, "required"),
+    ("show none.fits", 2, "cannot read none.fits"),
+    ("show CONFIG", 2, "is a configuration, expected a gain file"),
+    ("verify DAMAGED.fits", 2, "damaged"),
+    ("sigma DAMAGED.fits -o OUT.png", 2, "damaged"),
+    ("sigma KALMAN -o OUT.gif", 2, "must end in .csv, .png"),
+    ("sigma KALMAN KALMAN -o OUT.png", 2, "given once"),
+    ("sigma KALMAN --sensor-gain -1 -o OUT.png", 2, "above 0"),
+    ("simulate CONFIG KALMAN --frames 0", 2, "at least 1"),
+    ("simulate CONFIG KALMAN --frames many", 2, "invalid int"),
+    ("simulate CONFIG KALMAN -o OUT.doc", 2, "must end in .png"),
+    ("robustness CONFIG -o OUT.xls", 2, "must end in .csv"),
+    ("robustness CONFIG --gamma-ratio nan", 2, "finite"),
+    ("design CONFIG --method hinf --gamma 1e300 -o OUT.fits", 2, "at most"),
+    ("simulate CONFIG KALMAN --frames 99999999999999", 2, "must fit into"),
+    ("simulate CONFIG KALMAN -o none/OUT.png", 2, "no directory none"),
+    ("robustness CONFIG -o OUT.csv -o none/OUT.png", 2, "no directory none"),
+    ("paper -o FILE", 2, "cannot make the directory"),
+    ("frobnicate", 2, "invalid choice"),
+    ("", 2, "required"),
 ]
 
 
@@ -84,8 +64,8 @@ def test_bad_input(tmp_path, capsys, monkeypatch, gains, arguments, expected, te
     (tmp_path / "DAMAGED.fits").write_bytes(gains["kalman"].read_bytes()[:4000])
     (tmp_path / "FILE").write_text("")
     before = sorted(os.listdir(tmp_path))
-    arguments = [str(gains["kalman"]) if a == "KALMAN" else a for a in arguments]
-    status, out, error = run(capsys, *arguments)
+    files = {"CONFIG": CONFIG, "KALMAN": gains["kalman"]}
+    status, out, error = run(capsys, *(files.get(word, word) for word in arguments.split()))
     assert status == expected
     assert out == ""
     assert text in error
@@ -164,18 +144,8 @@ def loaded_after(code):
 )
 def test_imports_are_quick(code):
     """Nothing heavier than the standard library before a name is used."""
-    heavy = {
-        "cvxpy",
-        "control",
-        "matplotlib",
-        "astropy",
-        "scipy",
-        "pydantic",
-        "rich",
-        "numpy",
-        "bokeh",
-        "jinja2",
-    }
+    heavy = {"cvxpy", "control", "matplotlib", "astropy", "scipy"}
+    heavy |= {"pydantic", "rich", "numpy", "bokeh", "jinja2"}
     assert not heavy & loaded_after(code)
 
 
