@@ -1,7 +1,5 @@
 """Plants that many tests share."""
 
-from __future__ import annotations
-
 import gc
 
 import hypothesis

@@ -1,7 +1,5 @@
 """The contracts of imports hold for modules that are not yet written."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Pages cite files that are there, and the parts made from the code fail where the code says nothing."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Tests lie as the package does: each file has the module or folder that it tests."""
 
-from __future__ import annotations
-
 import pytest
 from support.plants import ROOT
 

@@ -1,7 +1,5 @@
 """``--no-skips``: what was not checked is no pass."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Every public name: importable, documented, with an example."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import importlib

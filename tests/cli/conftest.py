@@ -1,7 +1,5 @@
 """Files that the tests of several commands read."""
 
-from __future__ import annotations
-
 import pytest
 from support.night import GAIN, simulated_night
 from support.plants import LBT_YAML

@@ -1,7 +1,5 @@
 """The command diagnose: good records, bad ones, and a gain file on them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every command that prints a wavefront prints it in the unit that is asked for."""
 
-from __future__ import annotations
-
 import json
 import re
 

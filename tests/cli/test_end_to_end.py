@@ -1,7 +1,5 @@
 """The commands end-to-end and end-to-end-table."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import os

@@ -1,7 +1,5 @@
 """A study on a Dask cluster."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

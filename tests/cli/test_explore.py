@@ -1,7 +1,5 @@
 """The command ``explore``: what it refuses before it serves, and how it begins and ends."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket

@@ -1,7 +1,5 @@
 """The limits command, and the limits that show and simulate print."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """The commands bode, nyquist, nichols, step and sigma: figures, tables and curves."""
 
-from __future__ import annotations
-
 import csv
 import json
 

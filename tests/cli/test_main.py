@@ -1,7 +1,5 @@
 """The command line as a user meets it: bad input, exit codes, help, imports."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

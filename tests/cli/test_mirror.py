@@ -1,7 +1,5 @@
 """The command mirror."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

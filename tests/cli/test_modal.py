@@ -1,7 +1,5 @@
 """The command modal."""
 
-from __future__ import annotations
-
 import csv
 import json
 

@@ -1,7 +1,5 @@
 """No command replaces a file that it reads, by whatever name or link it is given."""
 
-from __future__ import annotations
-
 import os
 import shutil
 

@@ -1,7 +1,5 @@
 """The command paper."""
 
-from __future__ import annotations
-
 import re
 
 from support.commands import run

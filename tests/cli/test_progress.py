@@ -1,7 +1,5 @@
 """Progress without a terminal: a line now and then, and nothing where a program reads."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """The command ``report``: its files, its output, and its errors in one line."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The command robustness, without and with gain files."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import asdict, replace

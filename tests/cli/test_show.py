@@ -1,7 +1,5 @@
 """The commands show and verify."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """The command simulate, with one sensor and with several that may fail."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

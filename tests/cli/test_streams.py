@@ -1,7 +1,5 @@
 """Standard streams that are full or broken, and what must not reach a terminal raw."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

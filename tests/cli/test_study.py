@@ -1,7 +1,5 @@
 """The command study: run, killed, interrupted, replayed, on Dask."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import signal

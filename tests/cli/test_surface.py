@@ -1,7 +1,5 @@
 """Errors speak the words of the terminal: options, and what a file is."""
 
-from __future__ import annotations
-
 import pytest
 from support.commands import run
 from support.plants import LBT_YAML, ROOT

@@ -1,7 +1,5 @@
 """The command telemetry, and the telemetry of simulate."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

@@ -1,7 +1,5 @@
 """The command tradeoff."""
 
-from __future__ import annotations
-
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt

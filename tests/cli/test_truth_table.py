@@ -1,7 +1,5 @@
 """What design and show print of the configured truth."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

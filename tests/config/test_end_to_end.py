@@ -1,7 +1,5 @@
 """Configurations that do not describe an end-to-end simulation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

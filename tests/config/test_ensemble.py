@@ -1,7 +1,5 @@
 """Samples of a configuration as an ensemble of loops: which numbers may differ."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.plants import LBT_YAML

@@ -1,7 +1,5 @@
 """Configurations of identified systems, read again."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 
 import numpy as np

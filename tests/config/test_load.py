@@ -1,7 +1,5 @@
 """Configuration files: what is read, and what is refused with the path of its key."""
 
-from __future__ import annotations
-
 import pytest
 from support.configs import AR, GOOD, change_key, minimal_config, write_config
 from support.plants import ROOT

@@ -1,7 +1,5 @@
 """The plant and the truth that a configuration describes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.configs import AR, OTHER, SMALL, change_key, minimal_config, write_config

@@ -1,7 +1,5 @@
 """A configuration whose builders declare what they take for each sample."""
 
-from __future__ import annotations
-
 import numpy as np
 from support.plants import LBT_YAML
 

@@ -1,7 +1,5 @@
 """The JSON schema of a configuration: what editors read."""
 
-from __future__ import annotations
-
 import pytest
 from ruamel.yaml import YAML
 

@@ -1,7 +1,5 @@
 """Sensors beside the loop's own, in a configuration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.several_sensors import CONFIG, write_config

@@ -1,7 +1,5 @@
 """Templates of telescopes: they load, they design, and every number says where it is from."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

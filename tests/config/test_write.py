@@ -1,7 +1,5 @@
 """Configurations that are written, and read again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Certificates refuse what is not so."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.exact_covariance import exact_covariance

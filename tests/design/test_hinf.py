@@ -1,7 +1,5 @@
 """H-infinity filters: published numbers, two routes, the least gamma, refusals."""
 
-from __future__ import annotations
-
 import itertools
 import sys
 

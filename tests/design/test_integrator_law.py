@@ -1,7 +1,5 @@
 """Integrators with leak, zero and demands, against closed forms and polynomial roots."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

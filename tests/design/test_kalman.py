@@ -1,7 +1,5 @@
 """Kalman filters against other solvers and recursions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

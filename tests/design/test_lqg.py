@@ -1,8 +1,6 @@
 """LQG for a mirror with dynamics: the limit, generic Riccati solvers, the loop itself, and
 certificates that fail."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, replace
 
 import numpy as np

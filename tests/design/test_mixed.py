@@ -1,7 +1,5 @@
 """Mixed filters: bounds that hold, and nothing better to be found."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

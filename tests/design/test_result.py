@@ -1,7 +1,5 @@
 """What every design is: frozen, checked, a controller for others; what it shows and expects."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import FrozenInstanceError, replace
 from xml.etree import ElementTree

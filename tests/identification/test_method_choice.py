@@ -1,7 +1,5 @@
 """The method that a record asks for, and when the default one stays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

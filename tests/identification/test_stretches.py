@@ -1,7 +1,5 @@
 """Stretches of a record: halves to fit and to test on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The tracking controller in the loop: change-overs without a bump, a drift, failures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

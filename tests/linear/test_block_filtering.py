@@ -1,7 +1,5 @@
 """Series of many systems, against their recursion."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Controllers as estimators that are given the applied commands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.episodes import Episodes, frames_to_come_back

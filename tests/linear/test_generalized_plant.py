@@ -1,7 +1,5 @@
 """Generalised plants: their partition, weights, and the loop around a controller."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The proof that no filter reaches a level, and proofs that are none."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lyapunov equations of a stack, against SciPy's."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import mpmath

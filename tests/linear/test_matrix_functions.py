@@ -1,7 +1,5 @@
 """Roots of semidefinite matrices, stability, and the Schur form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

@@ -1,7 +1,5 @@
 """Integrals that the panels cannot settle, and panels that crowd at resonances."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

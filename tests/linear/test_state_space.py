@@ -1,7 +1,5 @@
 """Frequency responses, and the way to python-control and back."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Broken loops of integrators, whose crossings have closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

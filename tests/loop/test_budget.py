@@ -1,7 +1,5 @@
 """The exact residual of a loop against closed forms and brute force."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One closed loop against transfer functions."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A sensor gain that moves: closed forms, common Lyapunov functions, and intervals too wide."""
 
-from __future__ import annotations
-
 import cvxpy as cp
 import numpy as np
 import pytest

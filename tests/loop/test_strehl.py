@@ -1,7 +1,5 @@
 """Strehl ratio against FFT optics and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

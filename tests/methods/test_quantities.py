@@ -1,7 +1,5 @@
 """Every number of a configuration has limits; beyond them it is refused, at them it is computed."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import math

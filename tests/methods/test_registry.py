@@ -1,7 +1,5 @@
 """All that the package knows of a method of synthesis stands in its module."""
 
-from __future__ import annotations
-
 import ast
 import json
 import shutil

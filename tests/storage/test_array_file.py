@@ -1,7 +1,5 @@
 """Arrays in files are real numbers, and archives unpack to a bearable size."""
 
-from __future__ import annotations
-
 import io
 import json
 import random

@@ -1,7 +1,5 @@
 """Files are written whole, never over an input, a link or a device, and leave nothing behind."""
 
-from __future__ import annotations
-
 import os
 import stat
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Only regular files of a bearable size are read, each by every reader of the package."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """Tables as CSV files, which spreadsheets show and do not run."""
 
-from __future__ import annotations
-
 import pytest
 
 from lbt_synth.storage.tables import csv_bytes

@@ -1,7 +1,5 @@
 """Numbers, lists and durations in sentences."""
 
-from __future__ import annotations
-
 from lbt_synth.storage.words import count_text, duration_text, listing_text
 
 

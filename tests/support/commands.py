@@ -1,7 +1,5 @@
 """Commands of ``lbt-synth``, run in the process of the tests."""
 
-from __future__ import annotations
-
 import signal
 
 from lbt_synth.cli.main import main

@@ -4,8 +4,6 @@ C. Scherer, P. Gahinet, M. Chilali, IEEE Trans. Autom. Control 42, 896 (1997),
 doi:10.1109/9.599969, in discrete time.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cvxpy as cp

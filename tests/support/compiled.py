@@ -1,7 +1,5 @@
 """Exported C source, compiled by the system's compiler and called through ctypes."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 import re

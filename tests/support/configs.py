@@ -1,7 +1,5 @@
 """Configurations that tests change, and write to files."""
 
-from __future__ import annotations
-
 import copy
 import re
 

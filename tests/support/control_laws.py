@@ -1,7 +1,5 @@
 """Loops of two axes whose control law is known, for the tests of commands."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small configuration, designs for it, and what tests read out of their report."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Diagnoses of a short record, for the tests of their rows, sentences, pages and command."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A vibration that drifts, and configurations with one."""
 
-from __future__ import annotations
-
 from ruamel.yaml import YAML
 from support.plants import LBT_YAML
 

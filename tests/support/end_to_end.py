@@ -1,7 +1,5 @@
 """End-to-end runs and tables that need no SPECULA."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stationary covariances in rational arithmetic."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

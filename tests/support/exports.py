@@ -1,7 +1,5 @@
 """Designs that the tests of the exports share."""
 
-from __future__ import annotations
-
 import copy
 from functools import cache
 

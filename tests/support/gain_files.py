@@ -1,7 +1,5 @@
 """A design of every method, to be saved in gain files."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

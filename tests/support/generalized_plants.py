@@ -1,7 +1,5 @@
 """Random generalised plants."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import control

@@ -1,7 +1,5 @@
 """Loops, processes and their least residuals for tests of the limits."""
 
-from __future__ import annotations
-
 import lbt_synth as lbt
 
 RATE = 800.0

@@ -1,7 +1,5 @@
 """Plants whose mirror moves slowly."""
 
-from __future__ import annotations
-
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt

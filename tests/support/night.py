@@ -1,7 +1,5 @@
 """A night on which an integrator ran two axes, with a vibration on the first of them."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from support.recorded_loops import RATE, slow

@@ -1,7 +1,5 @@
 """Loops and records that the tests of predictions share."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

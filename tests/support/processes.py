@@ -1,7 +1,5 @@
 """Waiting for processes that a test has started."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of records: text tables and FITS, as others write them."""
 
-from __future__ import annotations
-
 import numpy as np
 from astropy.io import fits
 

@@ -1,7 +1,5 @@
 """The configuration of the robust example, with other sections of the design."""
 
-from __future__ import annotations
-
 from support.plants import ROOT
 
 EXAMPLE = ROOT / "examples" / "lbt_robust.yaml"

@@ -1,7 +1,5 @@
 """Single points of a robustness map."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import lbt_synth as lbt

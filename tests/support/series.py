@@ -1,7 +1,5 @@
 """Series of autoregressive processes."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.signal import lfilter
 

@@ -1,7 +1,5 @@
 """Loops of one mode and specifications to shape them."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

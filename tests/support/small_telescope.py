@@ -1,7 +1,5 @@
 """A small telescope whose end-to-end simulation takes seconds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

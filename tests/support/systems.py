@@ -1,7 +1,5 @@
 """Random linear systems."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

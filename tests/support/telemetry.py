@@ -1,7 +1,5 @@
 """Telemetry with everything in it, any telemetry, and their comparison."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loops whose two axes have different turbulence and noise."""
 
-from __future__ import annotations
-
 import lbt_synth as lbt
 
 RATE = 800.0

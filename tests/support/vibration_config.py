@@ -1,7 +1,5 @@
 """The configuration of the LBT with another vibration."""
 
-from __future__ import annotations
-
 import copy
 
 from ruamel.yaml import YAML

@@ -1,7 +1,5 @@
 """The mixed filter of several sensors, between the H-infinity and the Kalman filter."""
 
-from __future__ import annotations
-
 import pytest
 
 import lbt_synth as lbt

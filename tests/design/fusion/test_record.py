@@ -1,7 +1,5 @@
 """Gain files of filters of several sensors: what they hold, and what they refuse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.gain_files import edited_file

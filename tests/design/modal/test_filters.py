@@ -1,7 +1,5 @@
 """A Kalman filter for every mode, against that of one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.modal import HUM, LINE, RATE, single_plant, some_air

@@ -1,7 +1,5 @@
 """Optimised modal gains from spectra."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Loops of many modes: exact residuals, series, refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov

@@ -1,7 +1,5 @@
 """Mixed controllers: steps written out, loops, refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.effort import count_calls

@@ -1,7 +1,5 @@
 """Plants of many modes, against those of single ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.modal import HUM, LINE, single_plant, some_air

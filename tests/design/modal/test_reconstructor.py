@@ -1,7 +1,5 @@
 """Reconstructors, and modes made orthogonal to others."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Optimised modal gains from telemetry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.series import ar_series

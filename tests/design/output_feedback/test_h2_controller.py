@@ -1,7 +1,5 @@
 """Controllers of least variance of generalised plants."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov

@@ -1,7 +1,5 @@
 """H-infinity controllers of generalised plants, and why there is none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import control

@@ -1,7 +1,5 @@
 """Least variance under a bound on the norm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.common_lyapunov import common_lyapunov_rms

@@ -1,7 +1,5 @@
 """An edited gain file whose digest is written again: never taken for a certified design."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Gain files: round trips, damage, tampering, hostile files."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

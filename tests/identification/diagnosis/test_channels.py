@@ -1,7 +1,5 @@
 """The channels of a record, with one thing wrong at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.control_laws import RATE, ordinary_loop

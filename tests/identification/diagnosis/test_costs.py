@@ -1,7 +1,5 @@
 """Costs of the parts of a disturbance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.diagnoses import line_diagnosis

@@ -1,7 +1,5 @@
 """The autopsy of records: of good ones, and of those of which little can be said."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop

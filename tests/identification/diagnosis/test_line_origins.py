@@ -1,7 +1,5 @@
 """Where lines come from: their direction, with an error that covers the truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

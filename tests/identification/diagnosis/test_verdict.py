@@ -1,7 +1,5 @@
 """Three sentences: the record, what its residual is made of, what to change first."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

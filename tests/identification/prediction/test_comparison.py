@@ -1,7 +1,5 @@
 """The table of controllers on data beside what the model promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.effort import count_calls

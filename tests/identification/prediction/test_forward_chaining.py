@@ -1,7 +1,5 @@
 """Trained on the past of a record, tested on what follows."""
 
-from __future__ import annotations
-
 import runpy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Residuals on the same frames, and block-bootstrap errors of their differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter

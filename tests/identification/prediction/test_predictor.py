@@ -1,7 +1,5 @@
 """The least-squares predictor, against textbook regression and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.predictions import (

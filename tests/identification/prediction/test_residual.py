@@ -1,7 +1,5 @@
 """Controllers replayed on recorded data, against runs under the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

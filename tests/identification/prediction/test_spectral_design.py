@@ -1,7 +1,5 @@
 """The controller of a given order that leaves least of a measured spectrum."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.predictions import SHELL

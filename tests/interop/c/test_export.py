@@ -1,7 +1,5 @@
 """The exported C source, compiled and run beside the controller."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

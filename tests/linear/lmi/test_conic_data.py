@@ -1,7 +1,5 @@
 """Semidefinite programmes as arrays, against programmes with known answers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import sparse

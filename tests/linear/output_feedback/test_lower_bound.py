@@ -1,7 +1,5 @@
 """What a witness proves, and what it does not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

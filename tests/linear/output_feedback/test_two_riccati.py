@@ -1,7 +1,5 @@
 """The least gamma and its controller, against SLICOT, closed forms and the inequality."""
 
-from __future__ import annotations
-
 import runpy
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """solve_dare against published examples, closed forms and other solvers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

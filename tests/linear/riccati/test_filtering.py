@@ -1,7 +1,5 @@
 """The Riccati equations of the predictors, against SLICOT and scipy; the least gamma."""
 
-from __future__ import annotations
-
 import cvxpy as cp
 import mpmath
 import numpy as np

@@ -1,7 +1,5 @@
 """Modes that have no stabilising solution are named."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

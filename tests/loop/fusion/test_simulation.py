@@ -1,7 +1,5 @@
 """Runs of a loop in which sensors fail, against the exact answers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

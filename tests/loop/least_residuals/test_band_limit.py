@@ -1,7 +1,5 @@
 """The least worst residual over a band: saddle points, designs that stay above it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Modes that decouple after a rotation, and those that do not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

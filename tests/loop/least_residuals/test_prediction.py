@@ -1,7 +1,5 @@
 """The prediction error by series and by weight."""
 
-from __future__ import annotations
-
 import pytest
 from support.limits import ar, path, variance
 

@@ -1,7 +1,5 @@
 """The least residual against closed forms, Riccati equations and every stable design."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mpmath

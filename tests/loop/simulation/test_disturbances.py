@@ -1,7 +1,5 @@
 """Random series against the spectra that they are drawn from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid

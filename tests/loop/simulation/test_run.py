@@ -1,7 +1,5 @@
 """Simulated loops against the loop equations and the exact residual."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import hilbert
