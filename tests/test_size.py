@@ -3,8 +3,6 @@
 The numbers are what is there. Who makes a room smaller writes the new number.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator
@@ -16,27 +14,27 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 5585,
-    "config": 2294,
-    "design": 9718,
-    "files": 1734,
-    "identification": 17662,
-    "interop": 6249,
-    "linear": 8662,
-    "loop": 5319,
-    "methods": 1704,
-    "models": 4543,
-    "report": 8174,
-    "storage": 1709,
-    "studies": 7095,
+    "cli": 5135,
+    "config": 2227,
+    "design": 8711,
+    "files": 1689,
+    "identification": 14999,
+    "interop": 5590,
+    "linear": 6057,
+    "loop": 5008,
+    "methods": 1483,
+    "models": 4241,
+    "report": 7108,
+    "storage": 1227,
+    "studies": 5243,
     "errors, validation": 638,
 }
 COUNTS = {
-    "files of the package": 541,
-    "public names": 396,
-    "tuned constants": 1130,
-    "lines of tests": 48752,
-    "words of docs": 113317,
+    "files of the package": 411,
+    "public names": 277,
+    "tuned constants": 934,
+    "lines of tests": 42391,
+    "words of docs": 72412,
 }
 
 
