@@ -16,6 +16,7 @@ from lbt_synth.design import Design
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.report.figures.studies import limits_figure
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.studies.limits import LimitStudy
 
 
 def run(arguments: Namespace) -> Report:
@@ -64,7 +65,7 @@ def _config_designs(config: Config) -> dict[str, Design]:
     }
 
 
-def _limit_notes(study: studies.LimitStudy, config: Config) -> list[str]:
+def _limit_notes(study: LimitStudy, config: Config) -> list[str]:
     if study.limit is None:
         return [
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
@@ -84,9 +85,7 @@ def _limit_notes(study: studies.LimitStudy, config: Config) -> list[str]:
     return notes
 
 
-def _design_notes(
-    config: Config, designs: dict[str, Design], study: studies.LimitStudy
-) -> list[str]:
+def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy) -> list[str]:
     """Warn of rows that compare something else than they seem to."""
     notes = []
     if config.truth.vibrations and not config.plant.vibrations:

@@ -17,7 +17,8 @@ from lbt_synth.report.page.page_files import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import column, fill_row, table_row
 from lbt_synth.storage.words import count_text, duration_text
-from lbt_synth.studies.study.run import FinishedStudy, output_paths
+from lbt_synth.studies.study.run import FinishedStudy, StudyRun, output_paths
+from lbt_synth.studies.study.statistics import StudyStatistics
 from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
 from lbt_synth.studies.study.summary import worst_table
 
@@ -84,12 +85,12 @@ def _compute(
     arguments: Namespace,
     *,
     draws: bool,
-) -> tuple[studies.StudyRun, studies.StudyStatistics, bool]:
+) -> tuple[StudyRun, StudyStatistics, bool]:
     """Run a study; return also whether anything was left to compute.
 
     Its page is written where something was, or where it ``draws`` in any case.
     """
-    found: list[tuple[studies.StudyStatistics, bool]] = []
+    found: list[tuple[StudyStatistics, bool]] = []
     page, *pdf = files
     names = [controller.name for controller in loaded.controllers]
 
