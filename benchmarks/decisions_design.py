@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_are
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.linear.lmi.filters import balance, hinf_lmi, kalman_sdp, least_gamma_lmi
-from lbt_synth.linear.lmi.output_feedback import solve
+from lbt_synth.linear.lmi.programmes import solve
 from lbt_synth.linear.riccati.filtering import gamma_riccati, kalman_riccati
 
 RATE_HZ = 800.0

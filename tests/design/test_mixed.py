@@ -198,7 +198,7 @@ def panic(*arguments, **options):
 def test_a_solver_that_panics_below_cvxpy_is_an_error_of_ours(monkeypatch):
     import cvxpy
 
-    from lbt_synth.linear.lmi.output_feedback import solve
+    from lbt_synth.linear.lmi.programmes import solve
 
     monkeypatch.setattr(cvxpy.Problem, "solve", panic)
     size = cvxpy.Variable(nonneg=True)

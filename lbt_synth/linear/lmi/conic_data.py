@@ -1,6 +1,7 @@
-"""Conic programmes as arrays, given to Clarabel directly.
+"""The settings of the conic solver, and programmes given to it as arrays.
 
-A model of cvxpy takes longer to build than a small programme takes to solve.
+Loop shaping solves many programmes a design, and cvxpy takes longer to build each than Clarabel to
+solve it. All others are stated in cvxpy.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from scipy import sparse
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.validation import FloatArray
 
 # Tighter tolerances end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
@@ -59,46 +60,8 @@ class ConicSolution:
     """What the solver found."""
 
     x: FloatArray  # (n,)
-    dual: FloatArray  # multipliers of all rows, in the order in which they were added
     status: str
     iterations: int
-
-
-def _triangle(d: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rows, columns and scales of the upper triangle as the solver has it, by columns."""
-    column, row = np.tril_indices(d)
-    return row, column, np.where(row == column, 1.0, np.sqrt(2))
-
-
-def dual_matrix(multipliers: FloatArray) -> FloatArray:
-    """Return the multiplier of a symmetric matrix, (d, d), from those of its rows."""
-    d = int(np.sqrt(2 * multipliers.size))
-    row, column, scale = _triangle(d)
-    matrix = np.zeros((d, d))
-    matrix[row, column] = matrix[column, row] = multipliers / scale
-    return matrix
-
-
-class SymmetricUnknown:
-    """A symmetric matrix whose upper triangle is unknown, by rows, between rows of one part."""
-
-    def __init__(self, parts: IntArray) -> None:
-        self.n = len(parts)
-        self.row, self.column = np.nonzero(np.triu(parts[:, None] == parts))
-        self.trace = np.where(self.row == self.column, 1.0, 0.0)
-        self.size = self.row.size
-
-    def congruence(self, M: FloatArray) -> FloatArray:
-        """Return the rows (d, d, size) of ``M P M'``, with M (d, n)."""
-        left, right = M[:, self.row], M[:, self.column]
-        half = left[:, None] * right * np.where(self.row == self.column, 0.5, 1.0)
-        return np.asarray(half + half.swapaxes(0, 1))
-
-    def matrix(self, x: FloatArray) -> FloatArray:
-        """Return the matrix of the unknowns (size,)."""
-        matrix = np.zeros((self.n, self.n))
-        matrix[self.row, self.column] = matrix[self.column, self.row] = x
-        return matrix
 
 
 class ConicProgramme:
@@ -121,15 +84,6 @@ class ConicProgramme:
         """
         count, length = offsets.shape
         self._add(rows, offsets.ravel(), [clarabel.SecondOrderConeT(length)] * count)
-
-    def add_semidefinite(self, rows: sparse.csr_matrix, offsets: FloatArray) -> None:
-        """Require of each of k symmetric matrices, (k d d, n) and (k, d, d), that it is >= 0."""
-        count, d, _ = offsets.shape
-        row, column, scale = _triangle(d)
-        scale = np.tile(scale, count)
-        at = (np.arange(count)[:, None] * d * d + row * d + column).ravel()
-        cones = [clarabel.PSDTriangleConeT(d)] * count
-        self._add(sparse.diags(scale) @ rows[at], scale * offsets.ravel()[at], cones)
 
     def _add(self, rows: Rows, offsets: FloatArray, cones: list[object]) -> None:
         self._rows.append(sparse.csr_matrix(rows))
@@ -160,6 +114,5 @@ class ConicProgramme:
                 raise solver_error("the solver gave up on numbers out of its range.") from error
             status = _STATUS.get(str(found.status))
             if status is not None:
-                x, dual = np.array(found.x), np.array(found.z)
-                return ConicSolution(x, dual, status, int(found.iterations))
+                return ConicSolution(np.array(found.x), status, int(found.iterations))
         raise solver_error("the solver lost its accuracy on the way.")

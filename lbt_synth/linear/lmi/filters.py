@@ -17,19 +17,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cvxpy as cp
 import numpy as np
-from scipy import sparse
-from scipy.linalg import block_diag, null_space
+from scipy.linalg import null_space
 
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
-from lbt_synth.linear.lmi.conic_data import (
-    ConicProgramme,
-    SymmetricUnknown,
-    dual_matrix,
-    require_optimum,
-)
+from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.programmes import solve, symmetric_variable, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.norms import system_parts
 from lbt_synth.validation import FloatArray, IntArray, frozen_copy
@@ -121,56 +117,50 @@ _ADVICE = 'Try route="riccati".'
 
 
 def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: float) -> LmiSolution:
-    """Maximise tr P subject to ``[[APA' + Q - P, APC'], [CPA', R + CPC']] >= 0``.
+    """Maximise tr P subject to ``[[APA' + BB' - P, APC'], [CPA', DD' + CPC']] >= 0``, ``P >= 0``.
 
     The stabilising solution of the filter Riccati equation is the greatest P that satisfies the
     inequality (S. Boyd et al., "Linear Matrix Inequalities in System and Control Theory", SIAM
     (1994), doi:10.1137/1.9781611970777).
     """
     scaled = balance(problem, coordinates, scale)
-    A, B, C = scaled.problem.A, scaled.problem.B, scaled.problem.C
-    P = SymmetricUnknown(_parts(scaled.problem)[0])
-    seen, kept = np.vstack([A, C]), np.eye(len(A) + len(C), len(A))
-    programme = ConicProgramme(P.size)
-    rows = P.congruence(seen) - P.congruence(kept)
-    _require_positive(programme, rows, block_diag(B @ B.T, np.eye(len(C))))
-    _require_positive(programme, P.congruence(np.eye(len(A))), np.zeros_like(A))
-    found = programme.minimize(-P.trace)
-    run = found.status, found.iterations
+    A, B, C, R = scaled.problem.A, scaled.problem.B, scaled.problem.C, scaled.problem.R
+    P = symmetric_variable(_parts(scaled.problem)[0])
+    riccati = cp.bmat([[A @ P @ A.T + B @ B.T - P, A @ P @ C.T], [C @ P @ A.T, R + C @ P @ C.T]])
+    run = solve(cp.Maximize(cp.trace(P)), [symmetrise(riccati) >> 0, P >> 0])
     require_optimum(run, "the semidefinite programme of the Kalman filter", _ADVICE)
-    covariance = P.matrix(found.x)
-    information = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-    return scaled.solution(covariance, information, run)
+    information = np.asarray(np.linalg.inv(P.value), dtype=np.float64)
+    return scaled.solution(P.value, information, run)
 
 
 def least_gamma_lmi(
     problem: EstimationProblem, *, coordinates: FloatArray, scale: float
 ) -> LmiSolution:
-    """Find the least gamma, and a filter that reaches it."""
+    """Find the least gamma, and a filter that reaches it; the dual solution is its witness."""
     scaled = balance(problem, coordinates, scale)
     basis, parts = _invisible_basis(scaled.problem)
-    P, programme = _storage_programme(scaled.problem, basis)
-    programme.add_nonnegative(np.eye(1, P.size + 1, P.size), np.zeros(1))
-    found = programme.minimize(np.append(np.zeros(P.size), 1.0))
-    run = found.status, found.iterations
+    P, level = symmetric_variable(_parts(scaled.problem)[0]), cp.Variable(nonneg=True)
+    dissipation, storage = _storage_inequalities(scaled.problem, basis, P, level, 1.0)
+    run = solve(cp.Minimize(level), [dissipation, storage])
     require_optimum(run, "the least gamma's semidefinite programme", _ADVICE)
-    level = float(found.x[-1])
-    d = basis.shape[1]
-    moments = dual_matrix(found.dual[: d * (d + 1) // 2])
-    witness = scaled.witness(np.where(parts[:, None] == parts, moments, 0.0), basis)
-    return _unpack(scaled, P.matrix(found.x[:-1]) / level, level, run, witness=witness)
+    moments = np.where(parts[:, None] == parts, dissipation.dual_value, 0.0)
+    witness = scaled.witness(moments, basis)
+    return _unpack(scaled, P.value / level.value, float(level.value), run, witness=witness)
 
 
 def hinf_lmi(
     problem: EstimationProblem, gamma: float, *, coordinates: FloatArray, scale: float
 ) -> LmiSolution:
-    """Find the central filter of a given gamma, which has the greatest storage matrix."""
+    """Find the central filter of a given gamma, which has the greatest storage matrix.
+
+    All is divided by ``gamma^2``, which suits large levels.
+    """
     scaled = balance(problem, coordinates, scale)
     level = (gamma / scale) ** 2
+    P = symmetric_variable(_parts(scaled.problem)[0])
     basis, _ = _invisible_basis(scaled.problem)
-    P, programme = _storage_programme(scaled.problem, basis, level)
-    found = programme.minimize(-P.trace)
-    run = found.status, found.iterations
+    inequalities = _storage_inequalities(scaled.problem, basis, P, 1.0, 1 / level)
+    run = solve(cp.Maximize(cp.trace(P)), inequalities)
     if "infeasible" in run[0]:
         raise InfeasibleError(
             f"no H-infinity filter reaches gamma = {gamma:.9g}: the LMI is infeasible. "
@@ -178,32 +168,19 @@ def hinf_lmi(
             gamma=gamma,
         )
     require_optimum(run, "the semidefinite programme of the H-infinity filter", _ADVICE)
-    return _unpack(scaled, P.matrix(found.x), level, run)
+    return _unpack(scaled, P.value, level, run)
 
 
-def _storage_programme(
-    problem: EstimationProblem, basis: FloatArray, level: float | None = None
-) -> tuple[SymmetricUnknown, ConicProgramme]:
-    """Return the storage matrix and its two inequalities, the dissipation first.
-
-    Without a level ``gamma^2`` is one more unknown, the last; with one, all is divided by it,
-    which suits large levels.
-    """
+def _storage_inequalities(
+    problem: EstimationProblem, basis: FloatArray, P: Any, level: Any, weight: float
+) -> list[Any]:
+    """Return both inequalities of the module, with ``level`` for gamma^2 and a weight of L'L."""
     A, B, L = problem.A, problem.B, problem.L
     Nx, Nw = basis[: len(A)], basis[len(A) :]
     step, seen = A @ Nx + B @ Nw, L @ Nx
-    P = SymmetricUnknown(_parts(problem)[0])
-    dissipation, storage = P.congruence(Nx.T) - P.congruence(step.T), P.congruence(np.eye(len(A)))
-    weight, own = 1.0, np.zeros_like(seen.T @ seen)
-    if level is None:
-        dissipation = np.dstack([dissipation, Nw.T @ Nw])
-        storage = np.dstack([storage, np.zeros_like(A)])
-    else:
-        weight, own = 1 / level, Nw.T @ Nw
-    programme = ConicProgramme(dissipation.shape[2])
-    _require_positive(programme, dissipation, own - weight * (seen.T @ seen))
-    _require_positive(programme, storage, -weight * (L.T @ L))
-    return P, programme
+    supplied = Nx.T @ P @ Nx + level * (Nw.T @ Nw)
+    dissipation = supplied - step.T @ P @ step - weight * (seen.T @ seen)
+    return [symmetrise(dissipation) >> 0, P - weight * (L.T @ L) >> 0]
 
 
 def _parts(problem: EstimationProblem) -> tuple[IntArray, IntArray]:
@@ -228,12 +205,6 @@ def _invisible_basis(problem: EstimationProblem) -> tuple[FloatArray, IntArray]:
         basis = np.hstack([basis, vectors])
         parts = np.append(parts, np.full(vectors.shape[1], part))
     return basis, parts
-
-
-def _require_positive(programme: ConicProgramme, rows: FloatArray, offset: FloatArray) -> None:
-    """Require that a symmetric matrix ``offset + rows x``, (d, d) and (d, d, n), is >= 0."""
-    flat = sparse.csr_matrix(rows.reshape(-1, rows.shape[2]))
-    programme.add_semidefinite(flat, (offset + offset.T)[None] / 2)
 
 
 def _unpack(

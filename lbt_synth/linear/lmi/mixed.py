@@ -10,17 +10,19 @@ the norm is bounded at given frequencies; the caller checks between them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import cvxpy as cp
 import numpy as np
-from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.lmi.conic_data import ConicProgramme, require_optimum
+from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.programmes import norm_below, solve
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+from lbt_synth.validation import ComplexArray, FloatArray
 
 _APART = 1e-11  # cosine of two responses below which they have nothing in common
 
@@ -98,40 +100,27 @@ class InnovationProgramme:
     def _solve(
         self, frequency_hz: FloatArray, *, level: float | None, distance: float | None
     ) -> tuple[FloatArray, float, str]:
-        """Minimise the level or the distance, whichever is None; it is the last unknown."""
+        """Minimise the level or the distance, whichever is None."""
         N, E = (s.frequency_response(frequency_hz) for s in (self.innovation, self.error))
-        E = E / self.scale
-        groups = _independent_groups(N, E)
         outputs, q = len(self.target), N.shape[1]
-        # unknown of each tap, (l, T, q): none between groups
-        unknowns = np.full((outputs, self.taps, q), -1)
-        for rows, columns in groups:
-            unknowns[np.ix_(rows, range(self.taps), columns)] = 0
-        free = unknowns.ravel() == 0
-        unknowns[unknowns == 0] = np.arange(np.count_nonzero(free))
-        programme = ConicProgramme(int(np.count_nonzero(free)) + 1)
-        root = sparse.kron(np.eye(outputs), self.root.T, format="csc")[:, free]
-        first = sparse.csr_matrix(([float(distance is None)], ([0], [programme.size - 1])))
-        spread = sparse.csr_matrix(sparse.hstack([root, sparse.csr_matrix((root.shape[0], 1))]))
-        offsets = np.r_[distance or 0.0, -self.target.ravel() / self.scale]
-        programme.add_second_order(sparse.vstack([first, spread]), offsets[None])
+        taps: Any = 0  # (l, T q), zero between groups
+        bound, constraints = cp.Variable(nonneg=True), []
         phase = np.exp(-2j * np.pi * frequency_hz * self.error.dt_s)
         powers = phase[:, None] ** np.arange(1, self.taps + 1)
-        for rows, columns in groups:
-            chosen = unknowns[np.ix_(rows, range(self.taps), columns)]
-            _bound_norm(programme, N[:, columns], E[:, rows], powers, chosen, level)
-        goal = np.zeros(programme.size)
-        goal[-1] = 1.0
-        found = programme.minimize(goal)
-        require_optimum(
-            (found.status, found.iterations),
-            "the programme of the mixed filter",
-            "Try a larger bound, or another number of taps.",
-        )
-        taps = np.zeros(self.target.size)
-        taps[free] = found.x[:-1] * self.scale
-        unscaled = taps.reshape(self.target.shape) @ np.kron(np.eye(self.taps), self.whitening)
-        return np.asarray(unscaled, dtype=np.float64), float(found.x[-1]), found.status
+        for rows, columns in _independent_groups(N, E):
+            Q = cp.Variable((len(rows), self.taps * len(columns)))
+            past = np.kron(np.eye(self.taps), np.eye(q)[columns])
+            taps = taps + np.eye(outputs)[:, rows] @ Q @ past
+            limit = bound if level is None else level
+            responses = N[:, columns], E[:, rows] / self.scale
+            constraints += _bound_norm(*responses, powers, Q, limit)
+        spread = cp.norm(taps @ self.root - self.target / self.scale, "fro")
+        constraints.append(spread <= (bound if distance is None else distance))
+        run = solve(cp.Minimize(bound), constraints)
+        advice = "Try a larger bound, or another number of taps."
+        require_optimum(run, "the programme of the mixed filter", advice)
+        unscaled = self.scale * taps.value @ np.kron(np.eye(self.taps), self.whitening)
+        return np.asarray(unscaled, dtype=np.float64), float(bound.value), run[0]
 
 
 def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int], list[int]]]:
@@ -152,55 +141,30 @@ def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int
 
 
 def _bound_norm(
-    programme: ConicProgramme,
-    N: ComplexArray,
-    E: ComplexArray,
-    powers: ComplexArray,
-    unknowns: IntArray,
-    level: float | None,
-) -> None:
-    """Keep the spectral norm of ``E - Q N`` below a level, or the last unknown, at F frequencies.
+    N: ComplexArray, E: ComplexArray, powers: ComplexArray, Q: Any, level: Any
+) -> list[Any]:
+    """Keep the spectral norm of ``E - Q N`` below a level at F frequencies, of T powers of 1/z.
 
     With ``[N; E] = [[N1, 0], [E1, E2]] U`` and U orthonormal, ``E - Q N`` has the singular
     values of ``[E1 - Q N1, E2]``, of l rows and at most q + l columns.
     """
     count, q, _ = N.shape
-    outputs = E.shape[1]
     stacked = np.concatenate([N, E], axis=1).conj().swapaxes(1, 2)
     triangle = np.asarray(np.linalg.qr(stacked, mode="r")).conj().swapaxes(1, 2)
-    width = triangle.shape[2]
-    fixed, steered = triangle[:, q:], triangle[:, :q]
-    # entry (f, i, k), real then imaginary, changes by minus this per tap
-    slopes = powers[:, None, None, :, None] * steered.swapaxes(1, 2)[:, None, :, None, :]
-    slopes = np.broadcast_to(slopes, (count, outputs, width, *slopes.shape[3:]))
-    parts = np.stack([slopes.real, slopes.imag], axis=3)
-    entries = np.arange(count * outputs * width * 2).reshape(count, outputs, width, 2)
-    taps = np.broadcast_to(unknowns[None, :, None, None], parts.shape)
-    places = np.broadcast_to(entries[..., None, None], parts.shape)
-    rows = sparse.csr_matrix(
-        (-parts.ravel(), (places.ravel(), taps.ravel())), shape=(entries.size, programme.size)
-    )
-    # two further rows: the level, and nothing
-    last = sparse.csr_matrix(
-        ([float(level is None)], ([0], [programme.size - 1])), shape=(2, programme.size)
-    )
-    rows = sparse.vstack([rows, last], format="csr")
-    offsets = np.concatenate(
-        [np.stack([fixed.real, fixed.imag], axis=3).ravel(), [level or 0.0, 0.0]]
-    )
-    bound, nothing = entries.size, entries.size + 1
-    if outputs == 1:
-        chosen = np.column_stack([np.full(count, bound), entries.reshape(count, -1)])
-        programme.add_second_order(rows[chosen.ravel()], offsets[chosen])
-        return
-    size = 2 * (outputs + width)
-    chosen, sign = np.full((count, size, size), nothing), np.ones((size, size))
-    chosen[:, range(size), range(size)] = bound
-    top, left = slice(0, outputs), slice(outputs, 2 * outputs)
-    real, imaginary = slice(2 * outputs, 2 * outputs + width), slice(2 * outputs + width, size)
-    chosen[:, top, real] = chosen[:, left, imaginary] = entries[..., 0]
-    chosen[:, left, real] = chosen[:, top, imaginary] = entries[..., 1]
-    sign[top, imaginary] = -1
-    signs = np.broadcast_to(sign, chosen.shape)
-    signed = sparse.diags(signs.ravel()) @ rows[chosen.ravel()]
-    programme.add_semidefinite(signed.tocsr(), signs * offsets[chosen])
+    # (T q, F, columns) of the innovations, each tap delayed by its frames
+    steered = np.einsum("ft,fqc->tqfc", powers, triangle[:, :q]).reshape(Q.shape[1], count, -1)
+    fixed = triangle[:, q:]
+    if fixed.shape[1] == 1:
+        past = steered.reshape(len(steered), -1)
+        parts = [
+            cp.reshape(now - Q @ before, (count, now.size // count), order="C")
+            for now, before in (
+                (fixed.real.reshape(1, -1), past.real),
+                (fixed.imag.reshape(1, -1), past.imag),
+            )
+        ]
+        return [cp.norm(cp.hstack(parts), 2, axis=1) <= level]
+    return [
+        norm_below(now.real - Q @ before.real, now.imag - Q @ before.imag, level)
+        for now, before in zip(fixed, steered.swapaxes(0, 1), strict=True)
+    ]

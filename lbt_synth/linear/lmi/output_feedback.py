@@ -16,7 +16,8 @@ from scipy.linalg import null_space
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lmi.conic_data import ATTEMPTS, SETTINGS, require_optimum, solver_error
+from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.programmes import norm_below, solve, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.full_information import Side, control_side, estimation_side
 from lbt_synth.linear.output_feedback.lower_bound import (
@@ -25,7 +26,6 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     storage_root,
 )
 from lbt_synth.linear.output_feedback.two_riccati import FreeParameter
-from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
 _RANK = 1e-7  # share of the largest root of a cost that counts as none for the solver
@@ -104,10 +104,7 @@ def least_variance_below(
         wide = np.eye(p2, fixed.shape[1])
         real = fixed.real + place @ (Q @ powers.real) @ wide / gamma
         imaginary = fixed.imag + place @ (Q @ powers.imag) @ wide / gamma
-        block = cp.bmat([[real, -imaginary], [imaginary, real]])
-        rows, columns = (2 * size for size in fixed.shape)
-        whole = cp.bmat([[np.eye(rows), block], [block.T, np.eye(columns)]])
-        constraints.append(symmetrise(whole) >> 0)
+        constraints.append(norm_below(real, imaginary, 1.0))
     run = solve(cp.Minimize(cp.norm(Q, "fro")), constraints)
     require_optimum(
         run, "the programme of the mixed controller", "Try a larger gamma, or more taps."
@@ -120,31 +117,3 @@ def _completed(columns: FloatArray) -> FloatArray:
     full = np.linalg.qr(columns, mode="complete")[0]
     full[:, : columns.shape[1]] = columns
     return np.asarray(full)
-
-
-def symmetrise(expression: Any) -> Any:
-    """Return ``(M + M') / 2``, because cvxpy refuses a matrix that rounding made asymmetric."""
-    return (expression + expression.T) / 2
-
-
-def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
-    """Solve with Clarabel; return the status and the iteration count."""
-    programme = cp.Problem(objective, constraints)
-    for attempt, settings in enumerate(ATTEMPTS):
-        try:
-            # the certificate judges an inaccurate solution, not a warning
-            with ignore_warnings(message="Solution may be inaccurate"):
-                programme.solve(solver=cp.CLARABEL, **SETTINGS, **settings)
-            break
-        except cp.error.SolverError as error:
-            if attempt == len(ATTEMPTS) - 1:
-                raise solver_error("the solver lost its accuracy on the way.") from error
-        except ValueError as error:  # raised by cvxpy on data that are not finite
-            raise solver_error("its numbers are not finite.") from error
-        except BaseException as error:
-            # on numbers out of range the compiled solver raises something other than an Exception
-            if type(error).__name__ != "PanicException":
-                raise
-            raise solver_error("the solver gave up on numbers out of its range.") from error
-    iterations = programme.solver_stats.num_iters if programme.solver_stats else 0
-    return str(programme.status), int(iterations or 0)

@@ -1,0 +1,119 @@
+"""Programmes given to the solver as arrays, against the same programmes stated in cvxpy."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from lbt_synth.linear.convex_functions import (
+    CombinedFunction,
+    Discs,
+    Fractions,
+    FunctionBound,
+    HalfPlanes,
+)
+from lbt_synth.linear.lmi.conic_program import minimize, minimize_relaxation
+
+SIZE, COUNT = 4, 20
+FREQUENCY_HZ = np.linspace(0, 0.5, COUNT)
+
+
+def normal(rng, *shape):
+    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+
+def fractions(rng, *, worst=False):
+    return Fractions(
+        frequency_hz=FREQUENCY_HZ,
+        rows=normal(rng, COUNT, 2, SIZE),
+        centres=normal(rng, COUNT, 2),
+        steering=None,
+        worst=worst,
+    )
+
+
+def stated(function, c):
+    """Return a function as an expression of cvxpy."""
+    if isinstance(function, CombinedFunction):
+        parts = [
+            weight * stated(part, c)
+            for weight, part in zip(function.weights, function.parts, strict=True)
+        ]
+        return cp.maximum(*parts) if function.worst else sum(parts)
+    values = [
+        cp.sum_squares(cp.abs(centre + rows @ c))
+        for centre, rows in zip(function.centres, function.rows, strict=True)
+    ]
+    return cp.maximum(*values) if function.worst else sum(values)
+
+
+def functions(rng):
+    mean, other, worst = fractions(rng), fractions(rng), fractions(rng, worst=True)
+    return {
+        "sum": mean,
+        "largest": worst,
+        "weighted sum": CombinedFunction(parts=(mean, worst), weights=(0.3, 2.0), worst=False),
+        "largest of two": CombinedFunction(parts=(mean, other), weights=(0.7, 1.0), worst=True),
+    }
+
+
+def constraints(rng, c):
+    """Return a set of each kind of constraint, and the same stated in cvxpy."""
+    disc_rows, centres = 0.3 * normal(rng, COUNT, SIZE), 0.1 * normal(rng, COUNT)
+    half_rows, bound = rng.standard_normal((COUNT, SIZE)), fractions(rng)
+    discs = Discs(
+        frequency_hz=FREQUENCY_HZ, rows=disc_rows, centres=centres, radii=np.full(COUNT, 0.4)
+    )
+    half_planes = HalfPlanes(frequency_hz=FREQUENCY_HZ, rows=half_rows, bounds=np.full(COUNT, 0.05))
+    limit = 1.02 * bound.value(np.zeros(SIZE))
+    ours = (discs, half_planes, FunctionBound(function=bound, limit=limit))
+    peer = [
+        cp.abs(centres + disc_rows @ c) <= discs.radii,
+        half_rows @ c <= half_planes.bounds,
+        stated(bound, c) <= limit,
+    ]
+    return ours, peer
+
+
+@pytest.mark.parametrize("name", functions(np.random.default_rng(0)))
+@pytest.mark.parametrize("start", [False, True])
+def test_the_optimum_is_that_of_the_statement(name, start):
+    rng = np.random.default_rng(1)
+    function, c = functions(rng)[name], cp.Variable(SIZE)
+    ours, peer = constraints(rng, c)
+    least = cp.Problem(cp.Minimize(stated(function, c)), peer).solve(solver=cp.CLARABEL)
+    origin = 0.05 * rng.standard_normal(SIZE) if start else None
+    coefficients, status = minimize(
+        function, ours, size=SIZE, scale=function.value(np.zeros(SIZE)), start=origin
+    )
+    assert status == "optimal"
+    assert function.value(coefficients) == pytest.approx(least, rel=1e-6)
+    free = cp.Problem(cp.Minimize(stated(function, c))).solve(solver=cp.CLARABEL)
+    assert least > free * (1 + 1e-4)  # the constraints matter
+    np.testing.assert_allclose(coefficients, minimizer(function, c, peer), atol=2e-3)
+
+
+def minimizer(function, c, peer):
+    cp.Problem(cp.Minimize(stated(function, c)), peer).solve(solver=cp.CLARABEL)
+    return c.value
+
+
+def test_constraints_that_cannot_hold_are_relaxed_as_stated():
+    rows = np.eye(1, SIZE)
+    first = HalfPlanes(frequency_hz=np.zeros(1), rows=rows + 0.2, bounds=np.ones(1))
+    second = Discs(
+        frequency_hz=np.zeros(1),
+        rows=(-rows - 0.2).astype(complex),
+        centres=np.array([4.0 + 0j]),
+        radii=np.ones(1),
+    )
+    assert minimize(fractions(np.random.default_rng(2)), (first, second), size=SIZE, scale=1.0)[
+        1
+    ].startswith("infeasible")
+    groups = ((first,), (second,))
+    np.testing.assert_allclose(
+        minimize_relaxation(groups, size=SIZE, rigid=(True, False)), [0, 2], atol=1e-6
+    )
+    both = minimize_relaxation(groups, size=SIZE, rigid=(False, False))
+    assert np.sum(both) == pytest.approx(2, abs=1e-6)
+    never = minimize_relaxation(groups, size=SIZE, rigid=(True, True))
+    assert np.all(np.isinf(never))
