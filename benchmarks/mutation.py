@@ -1,14 +1,11 @@
 """Mutants of the files that hold the promises, and how many of them the tests kill.
 
-A mutant turns a comparison, changes a number, turns a sign or drops a line, chosen by its function
-and text alone: when code moves, name its new file in `mutation.json`. It meets what killed it last
-time, the tests of its file, and those that reach its line, quick ones first, until one fails. The
-trace leaves out `tests/linear`, with its oracles of 60 digits. `--again` keeps the trace.
+Mutants are chosen by function and text, in the files of `mutation.json`. Each meets what killed it
+last time, then the tests of its file and those that reach its line. `--again` keeps the trace.
 """
 
 import ast
 import concurrent.futures
-import functools
 import hashlib
 import itertools
 import json
@@ -30,27 +27,24 @@ RESULTS = ROOT / "benchmarks" / "mutation.json"
 TRACE = ROOT / ".mutation"  # not kept in the repository
 MUTANTS = 20  # of each row
 SECONDS = 15.0  # of tests of other files that a mutant meets at most
-LIMIT = 150  # seconds of processor time, after which a mutant does not end
+LIMIT_TIME = lambda: resource.setrlimit(resource.RLIMIT_CPU, (150, 150))  # noqa: E731 - seconds
 SUITE = ["-q", "-m", "not study and not e2e and not browser", "--doctest-modules"]
-# in pairs of opposites
-WORDS = ["Lt", "GtE", "Gt", "LtE", "Eq", "NotEq", "Is", "IsNot", "In", "NotIn", "Add", "Sub"]
+WORDS = "Lt GtE Gt LtE Eq NotEq Is IsNot In NotIn Add Sub UAdd USub".split()  # noqa: SIM905
 TURNED = {getattr(ast, word): getattr(ast, WORDS[i ^ 1]) for i, word in enumerate(WORDS)}
 
 
 def run_tests(folder, arguments, **options):
-    environment = os.environ | {"PYTHONPATH": f"{folder}:{folder / 'benchmarks'}"}
+    path = {"PYTHONPATH": f"{folder}:{folder / 'benchmarks'}"}
     command = [sys.executable, "-m", "pytest", *SUITE, *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, check=False, **options)
+    return subprocess.run(command, cwd=folder, env=os.environ | path, check=False, **options)
 
 
 def mutations(node):
     """Yield the kind of a mutation of one node, and a function that makes it."""
     if isinstance(node, ast.Compare) and type(node.ops[0]) in TURNED:
         yield "comparison", lambda: node.ops.__setitem__(0, TURNED[type(node.ops[0])]())
-    if isinstance(node, ast.BinOp | ast.AugAssign) and type(node.op) in TURNED:
+    if type(getattr(node, "op", None)) in TURNED:
         yield "sign", lambda: setattr(node, "op", TURNED[type(node.op)]())
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        yield "sign", lambda: setattr(node, "op", ast.UAdd())
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         number = node.value + 1 if isinstance(node.value, int) or not node.value else 2 * node.value
         yield "number", lambda: setattr(node, "value", number)
@@ -58,9 +52,9 @@ def mutations(node):
 
 def statement_mutants(statement, name):
     """Yield (identity, kind, line, mutation) of a statement without those that it contains."""
-    skipped = [getattr(statement, "annotation", None)]
-    for block in ("body", "orelse", "finalbody", "handlers"):
-        skipped += getattr(statement, block, [])
+    blocks = ("body", "orelse", "finalbody", "handlers")
+    skipped = [n for block in blocks for n in getattr(statement, block, [])]
+    skipped.append(getattr(statement, "annotation", None))
     pending, text, count = [statement], ast.unparse(statement).splitlines()[0], 0
     while pending:
         node = pending.pop()
@@ -86,14 +80,12 @@ def tree_mutants(tree, name=""):
 
 def choose(files):
     """Return a row's mutants (identity, file, kind, line): five a kind, the rest by rank."""
-    mutants = {}
-    for file in files:
-        for identity, kind, line, _ in tree_mutants(ast.parse((PACKAGE / file).read_text())):
-            mutants.setdefault((identity, file), (kind, line))
-    rows = [(*key, *value) for key, value in mutants.items()]
-    rows.sort(key=lambda m: hashlib.sha256(m[0].encode()).hexdigest())
-    by_kind = [[m for m in rows if m[2] == kind] for kind in sorted({m[2] for m in rows})]
-    first = [m for kind_rows in by_kind for m in kind_rows[: MUTANTS // 4]]
+    trees = {file: ast.parse((PACKAGE / file).read_text()) for file in files}
+    mutants = [(m[0], file, *m[1:3]) for file in files for m in tree_mutants(trees[file])]
+    unique = {m[:2]: m for m in reversed(mutants)}.values()
+    rows = sorted(unique, key=lambda m: hashlib.sha256(m[0].encode()).hexdigest())
+    kinds = sorted({m[2] for m in rows})
+    first = [m for k in kinds for m in [m for m in rows if m[2] == k][: MUTANTS // 4]]
     return (first + [m for m in rows if m not in first])[:MUTANTS]
 
 
@@ -103,8 +95,7 @@ def meet(mutant, copies, lines, seconds, killers):
     by_line = lines.get(str(PACKAGE / file), {})
     home = f"tests/{Path(file).parent}/test_{Path(file).name}"
     reaching = by_line.get(line) or set().union(*by_line.values())
-    others = [t for t in reaching if t in seconds and not t.startswith(home)]
-    order = sorted(others, key=seconds.get)
+    order = sorted((t for t in reaching if t in seconds and home not in t), key=seconds.get)
     count = sum(s <= SECONDS for s in itertools.accumulate(seconds[t] for t in order))
     last = [killers[identity]] if "::" in (killers.get(identity) or "") else []
     selections = [last, [home] * (ROOT / home).exists() + order[:count]]
@@ -122,37 +113,34 @@ def meet(mutant, copies, lines, seconds, killers):
 def killer(copy, tests):
     """Return the first test that fails; None if all pass."""
     (copy / "chosen").write_text("\n".join(tests))
-    limit = functools.partial(resource.setrlimit, resource.RLIMIT_CPU, (LIMIT, LIMIT))
-    options = {"capture_output": True, "text": True, "preexec_fn": limit}
+    options = {"capture_output": True, "text": True, "preexec_fn": LIMIT_TIME}
     run = run_tests(copy, ["-x", "-p", "no:cacheprovider", "@chosen"], **options)
     failed = re.search("^(?:FAILED|ERROR) (.+?)(?: - |$)", run.stdout, re.MULTILINE)
     if run.returncode in (0, 4) and "not found" in run.stdout + run.stderr:
         return None  # the test of last time has gone
-    words = "does not end" if run.returncode < 0 else "cannot be imported"
-    return (failed[1] if failed else words) if run.returncode else None
+    return (failed[1] if failed else "no test ended") if run.returncode else None
 
 
 def main():
     book = json.loads(RESULTS.read_text())
-    files = [str(PACKAGE / file) for row in book["files"].values() for file in row]
-    os.environ |= {"REACH_FOLDER": str(TRACE), "REACH_FILES": ":".join(files)}
+    files = ":".join(str(PACKAGE / file) for row in book["files"].values() for file in row)
+    os.environ |= {"REACH_FOLDER": str(TRACE), "REACH_FILES": files}
     if "--again" not in sys.argv:
         shutil.rmtree(TRACE, ignore_errors=True)
         run_tests(ROOT, ["-p", "reach", "-n", "2", "--ignore=tests/linear", "lbt_synth", "tests"])
     lines, seconds = reach.load(TRACE)
     killers, copies = {m["identity"]: m["killed_by"] for m in book["mutants"]}, queue.Queue()
+    slowest = sorted(seconds, key=seconds.get)[:-301:-1]
     rows = [(row, mutant) for row, names in book["files"].items() for mutant in choose(names)]
     with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(2) as pool:
         ignored = shutil.ignore_patterns(".*", "out", "__pycache__", "_build")
         for name in "ab":
             copies.put(Path(shutil.copytree(ROOT, Path(folder) / name, ignore=ignored)))
         results = pool.map(lambda row: meet(row[1], copies, lines, seconds, killers), rows)
-        book["mutants"] = []
+        book |= {"mutants": [], "slowest_tests_s": {test: seconds[test] for test in slowest}}
         for (row, mutant), killed_by in zip(rows, results, strict=True):
             book["mutants"] += [{"row": row, "identity": mutant[0], "killed_by": killed_by}]
             RESULTS.write_text(json.dumps(book, indent=1) + "\n")
-    book["slowest_tests_s"] = dict(sorted(seconds.items(), key=lambda item: -item[1])[:300])
-    RESULTS.write_text(json.dumps(book, indent=1) + "\n")
     for row in book["files"]:
         killed = [m["killed_by"] is not None for m in book["mutants"] if m["row"] == row]
         print(f"| {row} | {sum(killed)} of {len(killed)} |")

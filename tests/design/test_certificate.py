@@ -71,3 +71,36 @@ def test_a_level_of_zero_claims_nothing():
     nothing = Witness(states=np.zeros((1, 1)), disturbances=np.zeros((2, 1)))
     assert lbt.design.certify_infeasible(problem, 0.0, nothing).passed
     assert not lbt.design.certify_infeasible(problem, 1e-3, nothing).passed
+
+
+@pytest.mark.parametrize(("off", "passes"), [(0.7e-6, True), (1.5e-6, False)])
+def test_a_gain_beside_the_optimal_one_is_refused_from_a_millionth_on(axis_plant, off, passes):
+    gain = (1 + off) * lbt.kalman(axis_plant).gain_predictor
+    certificate = lbt.design.certify_filter(axis_plant, gain, least_variance=True)
+    distance = next(c for c in certificate.checks if "least-variance gain" in c.name)
+    assert distance.value == pytest.approx(off, rel=1e-3)
+    assert certificate.passed is passes
+
+
+def test_the_peak_of_a_norm_is_sought_up_to_the_nyquist_frequency():
+    """A pole near -1 has its peak at the Nyquist frequency, where a grid that ends before is low.
+
+    A second check of the norm would not notice a level set that misses it.
+    """
+    ringing = lbt.linear.StateSpace(A=[[-0.99]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.01)
+    certificate = certify_error(ringing)
+    assert certificate.gamma == pytest.approx(100, rel=1e-9)
+    peak = next(c for c in certificate.checks if "singular values" in c.name)
+    assert abs(peak.value) < 1e-9
+
+
+def test_what_is_no_witness_of_the_problem_is_refused():
+    problem = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Witness.*; got tuple"):
+        lbt.design.certify_infeasible(problem, 1.0, (np.zeros((1, 1)), np.zeros((2, 1))))
+    wide = Witness(states=np.zeros((2, 1)), disturbances=np.zeros((2, 1)))
+    with pytest.raises(
+        lbt.errors.DimensionError,
+        match=r"1 rows of states, 2 rows of disturbances .*; got \(2, 1\) and \(2, 1\)",
+    ):
+        lbt.design.certify_infeasible(problem, 1.0, wide)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,7 +30,6 @@ from lbt_synth.storage.input_files import open_input
 from lbt_synth.validation import FloatArray, choice, require_instance
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
-_LONGEST_HEADER = 2880 * 36  # bytes, of telemetry
 _TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
 
 
@@ -140,8 +138,7 @@ def is_telemetry(path: Path) -> bool:
     try:
         if path.suffix.lower() in FITS:
             with open_input(path, TelemetryError) as stream:
-                header = io.BytesIO(stream.read(_LONGEST_HEADER))
-            return bool(read_cards(header, _TELEMETRY_CARDS))
+                return bool(read_cards(stream, _TELEMETRY_CARDS))
         if path.suffix.lower() != ".npz":
             return False
         with open_input(path, TelemetryError) as stream:
@@ -263,8 +260,8 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
     n, q, response = seen.modes, seen.measurements.shape[1], seen.modal_response
     if (response is None and q != n) or (response is not None and q > n > 2):
         raise ProblemError(
-            f"this telemetry has {q} measurements and {f'{n} modes' if n != q else 'no modes'}: "
-            "slopes without modal coefficients. Multiply them by the reconstructor of the loop.",
+            f"this telemetry has {q} measurements and {n} modes: slopes without modal "
+            "coefficients. Multiply them by the reconstructor of the loop.",
             in_python="As Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R).",
         )
     if response is None or np.array_equal(response, np.eye(n)):

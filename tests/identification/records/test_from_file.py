@@ -523,7 +523,8 @@ def test_slopes_with_their_modes_and_without():
     )
     assert np.allclose(half.measurements, phase[:, :2])
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"slopes without modal coefficients.*slopes @ R.T"
+        lbt.errors.ProblemError,
+        match=r"has 8 measurements and 3 modes: slopes without modal .*slopes @ R.T",
     ):
         lbt.identification.record_from_telemetry(
             telemetry(measurements=slopes, interaction_matrix=S, commands=phase), axes=(0, 1)
@@ -532,6 +533,21 @@ def test_slopes_with_their_modes_and_without():
         lbt.identification.record_from_telemetry(
             telemetry(measurements=slopes, influence_matrix=np.eye(2))
         )
+
+
+def test_the_timing_of_another_program_is_noted():
+    series = np.random.default_rng(0).standard_normal((50, 2))
+    for metadata, noted in (({}, False), ({"timing": "frames of the program"}, True)):
+        seen = lbt.identification.record_from_telemetry(
+            lbt.files.Telemetry(
+                frame_rate_hz=800,
+                delay_frames=2,
+                commands=series,
+                measurements=series,
+                metadata=metadata,
+            )
+        )
+        assert any("taken for granted" in note for note in seen.health.notes) is noted
 
 
 @pytest.mark.parametrize(
