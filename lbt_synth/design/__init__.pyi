@@ -11,7 +11,7 @@ from .fusion.failures import failure_rows as failure_rows
 from .fusion.fused_filter import FusedFilter as FusedFilter
 from .fusion.fused_filter import fused_hinf as fused_hinf
 from .fusion.fused_filter import fused_kalman as fused_kalman
-from .fusion.mixed import fused_mixed as fused_mixed
+from .fusion.fused_filter import fused_mixed as fused_mixed
 from .hinf import hinf as hinf
 from .integrator import integrator as integrator
 from .integrator import integrator_gain_limit as integrator_gain_limit

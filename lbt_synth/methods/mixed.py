@@ -31,7 +31,7 @@ class MixedOptions(BoundOptions):
 def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign | FusedFilter:
     if inputs.fused_plant is not None:
         require_several_sensors(options)
-        from lbt_synth.design.fusion.mixed import fused_mixed
+        from lbt_synth.design.fusion.fused_filter import fused_mixed
 
         return fused_mixed(inputs.fused_plant, **options.bound())
     from lbt_synth.design.mixed import mixed

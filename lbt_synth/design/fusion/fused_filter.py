@@ -1,4 +1,4 @@
-"""Filters of several sensors: Kalman and H-infinity, periodic where the rates differ."""
+"""Filters of several sensors: Kalman, H-infinity and mixed, periodic where the rates differ."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 
 from lbt_synth.design.certificate import (
     BY_DISTURBANCES,
@@ -19,18 +20,20 @@ from lbt_synth.design.certificate import (
     certify_error,
 )
 from lbt_synth.design.fusion.failures import Fallback, failed_loop, make_fallbacks
-from lbt_synth.design.fusion.levels import central_filter, find_level
-from lbt_synth.design.fusion.switching import dwell_frames
+from lbt_synth.design.hinf import checked_bounds, require_reachable
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
+from lbt_synth.errors import InfeasibleError
+from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.periodic.riccati import (
     PeriodicRiccati,
     kalman_gain,
+    least_periodic_gamma,
     periodic_hinf,
     periodic_kalman,
     proved_periodic_gamma,
 )
-from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.fusion.fused_loop import (
     FusedLoop,
@@ -43,6 +46,11 @@ from lbt_synth.models.fusion.plant import FusedPlant
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.validation import ComplexArray, FloatArray, require_instance, set_fields
+
+LONGEST_DWELL = 10_000  # periods
+_REGULAR = 1e-2  # of the covariance's diagonal, added: some states are functions of others
+_DECADES = 4.0  # of gamma, over which a central filter is searched
+_INSIDE = 1e-7  # by which the norm of a mixed filter stays below its bound
 
 
 def fused_name(claims: Collection[str]) -> str:
@@ -342,6 +350,123 @@ def fused_hinf(
     return make_design(plant, found, **level.claims)
 
 
+def fused_mixed(
+    plant: FusedPlant, *, gamma: float | None = None, gamma_ratio: float | None = None
+) -> FusedFilter:
+    """Design the filter of several sensors that trades variance for a bound of the norm.
+
+    A central H-infinity filter stays below its level. The level is raised until the norm of the
+    error is the bound itself: the variance falls with each step. It is the least among central
+    filters, not among all.
+
+    Parameters
+    ----------
+    plant : FusedPlant
+        Loop, disturbances and sensors.
+    gamma, gamma_ratio : float, optional
+        Bound of the norm of the error over a period, or the bound as a multiple of the least one;
+        by default 1.2 times the least.
+
+    Returns
+    -------
+    FusedFilter
+        Certified design; the Kalman filter where that meets the bound.
+
+    Raises
+    ------
+    InfeasibleError
+        If the bound is below the least gamma; the message names the least.
+    SynthesisError
+        As :func:`fused_kalman`.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
+    >>> own = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=75, modes=1)
+    >>> second = lbt.models.WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
+    >>> plant = lbt.models.fused_plant(own, lbt.models.SensorSuite(sensors=(second,)))
+    >>> both = lbt.design.fused_mixed(plant, gamma_ratio=1.01)
+    >>> both.rms < lbt.design.fused_hinf(plant, gamma_ratio=1.01).rms
+    True
+    """
+    level = find_level(plant, gamma, gamma_ratio)
+    if level.kalman <= level.bound:
+        return make_design(plant, level.start)
+
+    def excess(decades: float) -> float:
+        found = central_filter(plant, level.bound * 10**decades, level.start)
+        return float(np.log(error_norm(plant, found) / level.bound)) + _INSIDE
+
+    decades = 0.0
+    if excess(0.0) < 0 < excess(_DECADES):
+        decades = brentq(excess, 0.0, _DECADES, xtol=1e-9)
+    central = level.bound * 10**decades
+    return make_design(
+        plant,
+        central_filter(plant, central, level.start),
+        **level.claims,
+        gamma_central=central,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Level:
+    """A bound of the norm, beside the least one, one that no filter meets, and the Kalman's."""
+
+    bound: float
+    least: float
+    infeasible: float | None  # that no filter reaches; None where nothing is proved
+    start: PeriodicRiccati  # the Kalman filter
+    kalman: float  # its norm
+
+    @property
+    def claims(self) -> dict[str, float | None]:
+        """What a design of the level says of its norm."""
+        return {
+            "gamma_requested": self.bound,
+            "gamma_least": self.least,
+            "gamma_infeasible": self.infeasible,
+        }
+
+
+def find_level(plant: FusedPlant, gamma: float | None, gamma_ratio: float | None) -> Level:
+    """Find the least gamma, and check the bound that is given, or make it: 1.2 times the least."""
+    require_instance(plant, FusedPlant, "plant")
+    gamma, gamma_ratio = checked_bounds(
+        gamma, gamma_ratio, far_above="the filter is the Kalman filter"
+    )
+    start = periodic_kalman(plant)
+    norm = error_norm(plant, start)
+    least = least_periodic_gamma(plant, start, norm)
+    requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
+    require_reachable(requested, least)
+    return Level(
+        bound=max(requested, least),
+        least=least,
+        infeasible=proved_periodic_gamma(plant, start, least) or None,
+        start=start,
+        kalman=norm,
+    )
+
+
+def error_norm(plant: FusedPlant, solution: PeriodicRiccati) -> float:
+    """Return the norm of a filter's estimation error over a period."""
+    return hinf_norm(plant.error_system(solution.gains).lifted_compactly()).upper
+
+
+def central_filter(plant: FusedPlant, gamma: float, start: PeriodicRiccati) -> PeriodicRiccati:
+    """Return the central filter of a level; InfeasibleError if there is none."""
+    found = periodic_hinf(plant, gamma, start)
+    if found is None:
+        raise InfeasibleError(
+            f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
+            "Try a larger gamma.",
+            gamma=gamma,
+        )
+    return found
+
+
 def make_design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> FusedFilter:
     """Make a design with its fall-backs, and certify it; CertificateError if it fails."""
     design = FusedFilter(
@@ -354,3 +479,44 @@ def make_design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> 
         **claims,
     )
     return with_certificate(design, "Scale the states to similar sizes, or leave out a sensor.")
+
+
+def dwell_frames(
+    plant: FusedPlant, gains: FloatArray, fallbacks: tuple[Fallback, ...]
+) -> int | None:
+    """Return frames that each filter must stay for any sequence of them to be stable.
+
+    Stable filters that take turns need not be stable. Where the plant is its model, the estimation
+    error does not depend on the commands; it shrinks in a fixed norm while a filter stays long
+    enough, whichever filter came before. The norm weighs the error by the covariance of the
+    plant's state, mean over the phases. If a filter shrinks it in any number of periods from m to
+    2 m - 1, it does in any more.
+    """
+    P = plant.error_system(np.zeros_like(gains)).covariances().mean(axis=0)
+    root = np.linalg.cholesky(P + _REGULAR * np.diag(np.diag(P)))
+    filters = [gains, *(each.gains for each in fallbacks)]
+    needed = [_periods(plant.error_system(own), root) for own in filters]
+    periods = [each for each in needed if each is not None]
+    return (max(periods) + 2) * plant.period - 2 if len(periods) == len(filters) else None
+
+
+def _periods(error: PeriodicSystem, root: FloatArray) -> int | None:
+    """Return after how many whole periods an error has shrunk, wherever in a period it begins."""
+    inverse, each = np.linalg.inv(root), np.eye(len(root))
+
+    def size(transition: FloatArray) -> float:
+        return float(np.linalg.norm(inverse @ transition @ root, 2))
+
+    before = after = 1.0  # of the parts of a period at both ends
+    head = tail = each
+    for A, last in zip(error.A[:-1], error.A[:0:-1], strict=True):
+        head, tail = A @ head, tail @ last
+        after, before = max(after, size(head)), max(before, size(tail))
+    allowed, period = 1 / (before * after), error.monodromy
+    transition, shrunk = each, 0
+    for count in range(1, LONGEST_DWELL):
+        transition = period @ transition
+        shrunk = shrunk if size(transition) < allowed else count
+        if count >= 2 * shrunk + 1:
+            return shrunk + 1
+    return None

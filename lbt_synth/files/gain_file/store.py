@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from lbt_synth.design.record import DesignRecord, Meta, record_common
 from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import CertificateError, GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files.file_checks import FileKind
-from lbt_synth.files.gain_file.agreement import require_agreement, require_certificate, require_same
 from lbt_synth.methods.registry import method_of_design
 from lbt_synth.storage.array_file import (
     digest,
@@ -29,7 +29,7 @@ from lbt_synth.storage.array_file import (
 )
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import frozen_copy, real_array, text
+from lbt_synth.validation import agree, frozen_copy, number, real_array, text
 
 SCHEMA = "lbt_synth gain file"
 SCHEMA_VERSION = 2
@@ -41,6 +41,8 @@ CONVENTION = (
     "GAIN_FILTER: x(k|k) = x(k|k-1) + G (y - C x(k|k-1)); A, B, C, D, L of the plant in PLANT_*."
 )
 FITS_LAYOUT_VERSION = 1  # of SPECULA's state-space filter file
+_ARRAY_TOLERANCE = 1e-9  # relative, of an entry; and a thousandth of that, of the largest
+_NUMBER_TOLERANCE = 1e-6  # relative
 
 
 def write_cards(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
@@ -217,3 +219,70 @@ def read_design(path: str | os.PathLike[str]) -> tuple[Design, str]:
                 cards = {key: value for key, (value, _) in write_cards(design, meta).items()}
                 require_same(read_cards(io.BytesIO(content), cards), cards, "header")
     return design, str(meta["digest"])
+
+
+def require_agreement(found: DesignRecord, expected: DesignRecord) -> None:
+    """Refuse a record that lacks something of the expected one, or says something else.
+
+    Entries that no design has are left alone; a certificate is compared by
+    :func:`require_certificate`.
+    """
+    for name, own in expected.arrays.items():
+        array = found.arrays[name]
+        if array.shape != own.shape:
+            raise ValueError(f"{name} must be {own.shape} to match the design; got {array.shape}")
+        if not agree(array, own, _ARRAY_TOLERANCE):
+            apart = float(np.max(np.abs(array - own))) / max(float(np.max(np.abs(own))), 1e-300)
+            raise ValueError(
+                f"{name} is not what plant, loop and gains make: it differs by {apart:.2g} of its "
+                "largest entry"
+            )
+    for key, value in expected.meta.items():
+        if key != "certificate":
+            require_same(found.meta[key], value, key)
+
+
+def require_certificate(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Refuse a certificate with other norms, checks or limits than the one computed again.
+
+    The values of the checks are rounding to a large part, and are not compared.
+    """
+    for key in ("gamma", "rms_per_output"):
+        require_same(found[key], expected[key], f"certificate.{key}")
+    checks, own = ({c["name"]: c for c in cert["checks"]} for cert in (found, expected))
+    if unclaimed := checks.keys() - own.keys():
+        raise ValueError(f"the design does not claim what was checked: {min(unclaimed)}")
+    if missing := own.keys() - checks.keys():
+        raise ValueError(f"the certificate lacks a check of the design: {min(missing)}")
+    for name in checks:
+        require_same(checks[name]["limit"], own[name]["limit"], f"the limit of '{name}'")
+        number(checks[name]["value"], f"the value of '{name}'")
+
+
+def require_same(found: Any, expected: Any, name: str) -> None:
+    """Refuse plain metadata that are not the expected ones, numbers to a relative 1e-6."""
+    if isinstance(expected, Mapping) and isinstance(found, Mapping):
+        for key in expected.keys() | found.keys():
+            if key not in expected:
+                raise ValueError(f"{name}.{key} is not known")
+            if key not in found:
+                raise ValueError(f"{name}.{key} is missing")
+            require_same(found[key], expected[key], f"{name}.{key}")
+        return
+    if isinstance(expected, list) and isinstance(found, list) and len(expected) == len(found):
+        for i, (one, other) in enumerate(zip(found, expected, strict=True)):
+            require_same(one, other, f"{name}[{i}]")
+        return
+    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in (found, expected))
+    same = (
+        abs(found - expected) <= _NUMBER_TOLERANCE * abs(expected)
+        if numbers
+        else type(found) is type(expected) and found == expected
+    )
+    if not same:
+        raise ValueError(f"{name} must be {_brief(expected)} for this design; got {_brief(found)}")
+
+
+def _brief(value: Any) -> str:
+    shown = repr(value)
+    return shown if len(shown) <= 60 else f"{shown[:57]}..."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -26,7 +27,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import read_cards
-from lbt_synth.storage.input_files import open_input
+from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input
 from lbt_synth.validation import FloatArray, choice, require_instance
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
@@ -138,7 +139,8 @@ def is_telemetry(path: Path) -> bool:
     try:
         if path.suffix.lower() in FITS:
             with open_input(path, TelemetryError) as stream:
-                return bool(read_cards(stream, _TELEMETRY_CARDS))
+                header = io.BytesIO(stream.read(LARGEST_TEXT_BYTES))
+            return bool(read_cards(header, _TELEMETRY_CARDS))
         if path.suffix.lower() != ".npz":
             return False
         with open_input(path, TelemetryError) as stream:

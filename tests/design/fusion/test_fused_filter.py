@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.fused_loops import FAST, SLOW, example_plant
+from support.fused_loops import FAST, LINES, SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.design import fused_hinf, fused_kalman
+from lbt_synth.design.fusion import fused_filter
+from lbt_synth.design.fusion.failures import make_fallbacks
+from lbt_synth.design.fusion.fused_filter import dwell_frames
 from lbt_synth.errors import CertificateError, InfeasibleError, LbtSynthError, ProblemError
+from lbt_synth.linear import periodic_kalman
 from lbt_synth.models import Accelerometer, WavefrontSensor
 
 
@@ -100,7 +104,6 @@ def test_a_bound_that_is_not_met(hinf):
 
 
 def test_a_design_that_fails_is_not_returned(monkeypatch):
-    from lbt_synth.design.fusion import fused_filter
 
     solve = fused_filter.periodic_kalman
     monkeypatch.setattr(
@@ -156,3 +159,91 @@ def test_the_loop_of_one_rate_is_that_of_the_filter():
 def test_refusals(make, error, words):
     with pytest.raises(error, match=words):
         make()
+
+
+@pytest.mark.parametrize("ratio", [1.02, 1.1])
+def test_it_lies_between_the_two(fused_config, fused, ratio):
+    plant = fused_config.fused_plant
+    central = lbt.design.fused_hinf(plant, gamma_ratio=ratio)
+    mixed = lbt.design.fused_mixed(plant, gamma_ratio=ratio)
+    assert fused.rms < mixed.rms < central.rms
+    assert central.gamma < mixed.gamma <= mixed.gamma_requested * (1 + 1e-9)
+    assert mixed.gamma == pytest.approx(mixed.gamma_requested, rel=1e-5)
+
+
+def test_a_bound_that_the_kalman_filter_meets(fused_config, fused):
+    found = lbt.design.fused_mixed(fused_config.fused_plant, gamma=1.01 * fused.gamma)
+    assert found.method == "fused kalman"
+    assert found.rms == pytest.approx(fused.rms, rel=1e-12)
+
+
+def test_a_bound_below_the_least(fused_config):
+    with pytest.raises(InfeasibleError, match="gamma must be at least"):
+        lbt.design.fused_mixed(fused_config.fused_plant, gamma=1.0)
+
+
+def test_a_configuration_and_its_gain_file(fused_config, tmp_path):
+    design = fused_config.design("mixed", gamma_ratio=1.05)
+    again = lbt.load_gain(lbt.save_gain(tmp_path / "mixed.npz", design))
+    assert (again.method, again.gamma_central) == ("fused mixed", design.gamma_central)
+    with pytest.raises(ProblemError, match="rms must be left out with several sensors"):
+        fused_config.design("mixed", rms=50.0)
+
+
+SHARP = tuple(replace(line, damping=0.005) for line in LINES)
+CALM = lbt.models.ARModel(coefficients=[1.9975, -0.99755], driving_rms_nm=2, frame_rate_hz=1000)
+EARLY = replace(SLOW, delay_frames=1.25)  # its sums are empty when a period begins
+
+
+def growth_per_frame(plant, turns):
+    """Return what a cycle of turns (gains, frames) makes of the error, per frame."""
+    errors = [(plant.error_system(gains).A, frames) for gains, frames in turns]
+    cycle, phase, total = np.eye(plant.n_states), 0, 0
+    for _ in range(plant.period):  # the cycle may end in the midst of a period
+        for A, frames in errors:
+            for _ in range(frames):
+                cycle = A[phase] @ cycle
+                phase = (phase + 1) % plant.period
+            total += frames
+    return np.max(np.abs(np.linalg.eigvals(cycle))) ** (1 / total)
+
+
+def designed(plant):
+    return periodic_kalman(plant).gains, make_fallbacks(plant)
+
+
+def test_stable_filters_that_take_turns_may_diverge():
+    plant = example_plant((FAST,), lines=SHARP, turbulence=CALM, noise_nm=15)
+    gains, fallbacks = designed(plant)
+    without = next(each.gains for each in fallbacks if each.missing == ("wavefront",))
+    for own in (gains, without):
+        assert growth_per_frame(plant, [(own, 1)]) < 1
+    assert growth_per_frame(plant, [(gains, 3), (without, 30)]) > 1.04
+    frames = dwell_frames(plant, gains, fallbacks)
+    assert frames > 30
+    assert growth_per_frame(plant, [(gains, frames), (without, frames)]) < 1
+
+
+@pytest.mark.parametrize("sensors", [(FAST,), (FAST, SLOW), (EARLY,)])
+def test_filters_that_stay_do_not_diverge(sensors):
+    plant, rng = example_plant(sensors), np.random.default_rng(0)
+    gains, fallbacks = designed(plant)
+    frames = dwell_frames(plant, gains, fallbacks)
+    assert 1 < frames < 300
+    filters = [gains, *(each.gains for each in fallbacks)]
+    for _ in range(5):
+        order = rng.permutation(len(filters))
+        turns = [(filters[i], frames + int(rng.integers(plant.period))) for i in order]
+        assert growth_per_frame(plant, turns) < 1
+
+
+def test_a_single_filter_is_its_own_proof():
+    plant = example_plant((FAST,))
+    gains = periodic_kalman(plant).gains
+    assert dwell_frames(plant, gains, ()) < 100
+
+
+def test_what_is_not_proved(monkeypatch):
+    plant = example_plant((FAST,))
+    monkeypatch.setattr(fused_filter, "LONGEST_DWELL", 10)
+    assert dwell_frames(plant, *designed(plant)) is None
