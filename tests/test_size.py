@@ -16,12 +16,12 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 5135,
     "config": 2227,
-    "design": 8711,
-    "files": 1689,
-    "identification": 14999,
+    "design": 8674,
+    "files": 1673,
+    "identification": 14998,
     "interop": 5590,
-    "linear": 6057,
-    "loop": 5008,
+    "linear": 5971,
+    "loop": 4995,
     "methods": 1483,
     "models": 4241,
     "report": 7108,
@@ -30,10 +30,10 @@ LINES = {
     "errors, validation": 638,
 }
 COUNTS = {
-    "files of the package": 411,
+    "files of the package": 407,
     "public names": 277,
-    "tuned constants": 934,
-    "lines of tests": 42391,
+    "tuned constants": 933,
+    "lines of tests": 42492,
     "words of docs": 72412,
 }
 
