@@ -1,6 +1,7 @@
 """Gain files: round trips, damage, tampering, hostile files."""
 
 import os
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -30,7 +31,7 @@ from support.shaping import shaped_design
 from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
-from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.files.gain_file.store import load_with_digest, require_certificate, require_same
 from lbt_synth.storage.array_file import npz_bytes
 
 
@@ -528,3 +529,27 @@ def test_a_demand_that_is_there_twice_is_refused(tmp_path):
     demands = saved("shaped", "npz").parts["meta"]["shaped"]["specifications"][0]["demands"]
     edit = Edit("shaped", "npz", place, "longer", [*demands, *demands])
     assert judge(edit, tmp_path, ("verify",)) == "refused"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"name": "beauty"}, "the design does not claim what was checked: beauty"),
+        ({"name": "beauty", "extra": True}, "the design does not claim what was checked: beauty"),
+        ({"limit": 2.0}, "the limit of 'radius' must be 1.0 for this design; got 2.0"),
+        ({"value": "small"}, "the value of 'radius' must be a number"),
+        (None, "the certificate lacks a check of the design: radius"),
+    ],
+)
+def test_a_certificate_that_says_something_else(change, words):
+    check = {"name": "radius", "value": 0.5, "limit": 1.0, "computed_by": "eigenvalues"}
+    own = {"gamma": 1.0, "rms_per_output": [2.0], "checks": [check]}
+    require_certificate(own, own)
+    checks = [] if change is None else [check | change]
+    with pytest.raises((ValueError, lbt.errors.ProblemError), match=re.escape(words)):
+        require_certificate(own | {"checks": checks}, own)
+
+
+def test_long_values_are_cut_in_messages():
+    with pytest.raises(ValueError, match="must be 'short' for this design; got 'x{56}[.]{3}$"):
+        require_same("x" * 90, "short", "name")

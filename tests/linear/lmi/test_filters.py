@@ -5,6 +5,10 @@ import pytest
 from scipy.linalg import block_diag
 
 import lbt_synth as lbt
+from lbt_synth.errors import InfeasibleError, NumericalError
+from lbt_synth.linear.lmi import filters
+from lbt_synth.linear.lmi.filters import hinf_lmi, kalman_sdp, least_gamma_lmi
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 
 
 def random_axis(rng):
@@ -51,3 +55,25 @@ def test_the_least_gamma_is_that_of_the_worst_axis(seed):
     both = lbt.hinf(problem_of(axes), route="lmi")
     assert both.gamma_least == pytest.approx(max(alone), rel=1e-6)
     assert both.gamma_infeasible == pytest.approx(max(alone), rel=1e-6)
+
+
+def test_a_level_below_the_least_is_infeasible():
+    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    start = kalman_riccati(walk)
+    least = least_gamma_lmi(walk, coordinates=start.P, scale=1.0).gamma
+    assert hinf_lmi(walk, 1.01 * least, coordinates=start.P, scale=1.0).gamma > least
+    with pytest.raises(InfeasibleError, match="the LMI is infeasible"):
+        hinf_lmi(walk, 0.9 * least, coordinates=start.P, scale=1.0)
+
+
+def test_a_programme_that_did_not_end_gives_no_filter(monkeypatch):
+    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    monkeypatch.setattr(filters, "solve", lambda *_: ("user_limit", 200))
+    P = np.eye(1)
+    for call, words in (
+        (lambda: kalman_sdp(walk, coordinates=P, scale=1.0), "of the Kalman filter ended as"),
+        (lambda: least_gamma_lmi(walk, coordinates=P, scale=1.0), "least gamma's .* ended as"),
+        (lambda: hinf_lmi(walk, 9.0, coordinates=P, scale=1.0), "H-infinity filter ended as"),
+    ):
+        with pytest.raises(NumericalError, match=words):
+            call()
