@@ -127,7 +127,7 @@ def main():
     os.environ |= {"REACH_FOLDER": str(TRACE), "REACH_FILES": files}
     if "--again" not in sys.argv:
         shutil.rmtree(TRACE, ignore_errors=True)
-        run_tests(ROOT, ["-p", "reach", "-n", "2", "--ignore=tests/linear", "lbt_synth", "tests"])
+        run_tests(ROOT, ["-p", "reach", "-n", "2", "lbt_synth", "tests"])
     lines, seconds = reach.load(TRACE)
     killers, copies = {m["identity"]: m["killed_by"] for m in book["mutants"]}, queue.Queue()
     slowest = sorted(seconds, key=seconds.get)[:-301:-1]
