@@ -22,9 +22,9 @@ LINES = {
     "interop": 5590,
     "linear": 5971,
     "loop": 4995,
-    "methods": 1483,
+    "methods": 1477,
     "models": 4241,
-    "report": 7108,
+    "report": 7098,
     "storage": 1227,
     "studies": 5243,
     "errors, validation": 638,
@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 407,
     "public names": 277,
     "tuned constants": 933,
-    "lines of tests": 42494,
+    "lines of tests": 42500,
     "words of docs": 72412,
 }
 

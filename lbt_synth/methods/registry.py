@@ -94,12 +94,6 @@ def record_methods() -> list[str]:
     return [n for n, m in all_methods().items() if m.estimator and not m.needs_options]
 
 
-def plant_methods() -> list[str]:
-    """Return the names of the methods that design for a plant alone, with defaults of all else."""
-    able = {n for n, m in all_methods().items() if m.plant_section is not None}
-    return sorted(able.union(record_methods()))
-
-
 def gain_robust_method() -> str:
     """Return the name of the method that designs for a plant and an interval of sensor gains."""
     return next(n for n, m in all_methods().items() if m.plant_section is not None)

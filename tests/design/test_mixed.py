@@ -195,17 +195,6 @@ def panic(*arguments, **options):
     raise PanicException("out of range")
 
 
-def test_a_solver_that_panics_below_cvxpy_is_an_error_of_ours(monkeypatch):
-    import cvxpy
-
-    from lbt_synth.linear.lmi.programmes import solve
-
-    monkeypatch.setattr(cvxpy.Problem, "solve", panic)
-    size = cvxpy.Variable(nonneg=True)
-    with pytest.raises(lbt.errors.NumericalError, match="numbers out of its range"):
-        solve(cvxpy.Minimize(size), [size >= 1])
-
-
 def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
     import clarabel
 

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.errors import ProblemError
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Rule
-from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.validation import FloatArray
 
 DECADES = 3.6  # of frequency that are drawn, below half the frame rate
@@ -21,14 +19,6 @@ FREQUENCY = Axis(label="frequency", unit="Hz", log=True)
 # Frequencies, largest singular values of the rejection and of the noise transfer, (f,) each; the
 # latter are None where the loop is unstable
 LoopNorms = tuple[FloatArray, FloatArray | None, FloatArray | None]
-
-
-def loop_figure(loops: Mapping[str, ClosedLoop], *, axes: OwnAxes = None) -> Figure:
-    """Rejection and noise transfer of closed loops, by the names that the legend gives them."""
-    if not loops:
-        raise ProblemError("a loop figure needs at least one loop; got none.")
-    norms = {name: loop_norms(loop) for name, loop in loops.items()}
-    return draw_figure(loop_panels(norms, [], list(loops)), axes=axes)
 
 
 def loop_norms(loop: ClosedLoop, lines_hz: Sequence[float] = ()) -> LoopNorms:

@@ -536,17 +536,8 @@ def test_slopes_with_their_modes_and_without():
 
 
 def test_the_timing_of_another_program_is_noted():
-    series = np.random.default_rng(0).standard_normal((50, 2))
     for metadata, noted in (({}, False), ({"timing": "frames of the program"}, True)):
-        seen = lbt.identification.record_from_telemetry(
-            lbt.files.Telemetry(
-                frame_rate_hz=800,
-                delay_frames=2,
-                commands=series,
-                measurements=series,
-                metadata=metadata,
-            )
-        )
+        seen = lbt.identification.record_from_telemetry(telemetry(metadata=metadata), axes=(0, 1))
         assert any("taken for granted" in note for note in seen.health.notes) is noted
 
 

@@ -6,7 +6,7 @@ from support.figures import legend
 
 import lbt_synth as lbt
 from lbt_synth.report.charts.description import Curve
-from lbt_synth.report.figures.loop import frequency_panel, loop_figure
+from lbt_synth.report.figures.loop import frequency_panel
 
 
 def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
@@ -41,7 +41,6 @@ def test_an_unstable_loop_is_named_and_not_drawn(designs):
 def test_empty_figures_are_refused():
     for empty in (
         lambda: lbt.report.figures.sigma_figure({}),
-        lambda: loop_figure({}),
         lambda: lbt.report.figures.robustness_figure([]),
     ):
         with pytest.raises(lbt.errors.ProblemError, match="at least one"):
