@@ -8,8 +8,6 @@ from support.plants import lbt_axis_plant
 import lbt_synth as lbt
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 
-ENDINGS = ("fits", "npz")
-
 
 def every_design():
     plant = lbt_axis_plant(modes=2, delay_frames=2.5)
