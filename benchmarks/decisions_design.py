@@ -106,7 +106,7 @@ def eliminated() -> None:
         scale = float(np.sqrt(p.L @ start.P @ p.L.T)[0, 0])
         truth = lbt.hinf(p, route="riccati").gamma_requested
         began = time.perf_counter()
-        ours = least_gamma_lmi(p, coordinates=start.P, scale=scale)
+        ours, _ = least_gamma_lmi(p, coordinates=start.P, scale=scale)
         middle = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -15,11 +15,11 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
-from lbt_synth.design.result import DesignFacts, without_units
+from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.loop import close_loop, loop_margins
-from lbt_synth.methods.registry import method_of_design, option_names
+from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import Wording, design_request
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import LoopFacts
@@ -42,10 +42,10 @@ def run(arguments: Namespace) -> Report:
     report = describe_design(design)
     with show_spinner("comparing in the truth", quiet=arguments.json):
         add_truth(report, design, config)
-    made_by = method_of_design(design.method)
-    if made_by is not request.method:
+    if design.method != request.method.name:
+        title = design_title(design.method)
         report.notes.append(
-            f"note: the bound leaves no better choice than the {made_by.title}, which is it."
+            f"note: the bound leaves no better choice than the {title}, which is it."
         )
     report.note_written(path)
     return report
@@ -56,12 +56,6 @@ _SMALL_MODULUS = 0.3
 
 def describe_design(design: Design, *, matrices: bool = False) -> Report:
     """Describe a design: what it is, its loop, its certificate, and its matrices if asked for."""
-    described = method_of_design(design.method).describe(design)
-    said = DesignFacts(
-        method=design.method,
-        route=f"{design.solver.route} ({design.solver.status})",
-        n_states=design.controller.n_states,
-    )
     report = Report(
         data={
             "solver": asdict(design.solver),
@@ -69,7 +63,7 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
             "controller_spectral_radius": design.controller.to_statespace().spectral_radius,
         }
     )
-    facts: list[Any] = [said, described.facts]
+    facts: list[Any] = [design.facts()]
     margins = None
     if design.hardware is not None:
         facts.append(_loop_facts(report, design.hardware))
@@ -78,16 +72,16 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
         report.notes += _loop_notes(design, design.hardware, report.data)
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *([] if margins is None else [margins]))
-    report.tables.append(printed if margins or design.several_sensors else without_units(printed))
-    report.notes += described.notes
+    report.tables.append(without_units(printed) if design.hardware is None else printed)
+    report.notes += design.notes()
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
     report.data["assumptions"] = design.assumptions
-    for table in described.tables:
+    for table in design.tables():
         report.add_rows(table.key, table.title, table.rows)
     report.add_rows("checks", "Certificate", design.certificate.checks)
     if matrices:
         named = {name: getattr(design.controller, name) for name in "ABCD"}
-        named |= described.matrices
+        named |= design.arrays()
         report.data["matrices"] = named
         with np.printoptions(precision=8, linewidth=160, suppress=False):
             for name, value in named.items():

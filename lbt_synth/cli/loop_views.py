@@ -18,7 +18,6 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design
-from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.report.figures import (
@@ -151,7 +150,7 @@ def add_margins(report: Report, designs: Mapping[str, Design], sensor_gain: floa
 def _margins(design: Design, sensor_gain: float) -> dict[str, Any]:
     """Return what is known of a design: its norm in its model, and the margins of its loop."""
     known: dict[str, Any] = {"method": design.method}
-    if isinstance(design, EstimatorDesign):
+    if design.is_estimator:
         known |= {"gamma": design.gamma, "rms": design.rms}
     if design.hardware is not None:
         loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)

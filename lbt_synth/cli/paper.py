@@ -57,8 +57,6 @@ def run(arguments: Namespace) -> Report:
 
 def _gamma_ratio(result: PaperResult) -> float:
     design = result.hinf
-    assert design.gamma_requested is not None
-    assert design.gamma_least is not None
     return design.gamma_requested / design.gamma_least
 
 

@@ -1,10 +1,11 @@
-"""The design of a filter: gains, what is claimed of bounds, and their checks."""
+"""The design of a filter: its gains, what is claimed of bounds, and their checks."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,17 +15,17 @@ from lbt_synth.design.certificate import (
     LEVEL_SETS,
     NORM_TOLERANCE,
     ORIGIN_TOLERANCE,
-    Certificate,
     Check,
+    bound_check,
     certify_filter,
     certify_infeasible,
-    certify_loop,
 )
+from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.result import (
-    UNCERTIFIED,
-    EstimatorDesign,
-    FilterFacts,
+    MODEL_LIMITS,
+    Design,
     SolverReport,
+    model_limits,
     with_certificate,
 )
 from lbt_synth.errors import NumericalError
@@ -37,13 +38,84 @@ from lbt_synth.linear.riccati.filtering import (
     gamma_riccati,
     kalman_riccati,
 )
-from lbt_synth.validation import ComplexArray, FloatArray, set_fields
+from lbt_synth.storage.rows import Column
+from lbt_synth.validation import ComplexArray, FloatArray, matrix, set_fields
 
 ORIGIN = "distance from its Riccati filter"
 
 
+def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
+    """Check that the norm keeps its bound, and that the filter is one of this bound."""
+    design, norm = evidence.design, evidence.certificate.gamma
+    yield bound_check(norm, gamma)
+    origins = [evidence.kalman]
+    with suppress(NumericalError):
+        central = gamma_riccati(design.problem, gamma, start=evidence.kalman)
+        origins += [] if central is None else [central]
+    distance = min(_distance(design, origin) for origin in origins)
+    name = f"{ORIGIN}, or of the norm from its bound"
+    value = min(distance, abs(norm / gamma - 1))
+    yield Check(name, value, ORIGIN_TOLERANCE, "relative")
+
+
+def _check_rms_bound(evidence: Evidence, bound: float) -> Iterator[Check]:
+    """Check that the deviation keeps its bound, and uses it."""
+    apart = evidence.certificate.rms / bound - 1
+    name = "standard deviation of the estimation error over its bound, less 1"
+    yield Check(name, apart, NORM_TOLERANCE, "Lyapunov equation")
+    name = "bound over the standard deviation of the estimation error, less 1"
+    yield Check(name, -apart, ORIGIN_TOLERANCE, "Lyapunov equation")
+
+
+def _check_least(evidence: Evidence, least: float) -> Iterator[Check]:
+    """Check the least norm on both sides: the level above is met, the level below is not."""
+    equation = GammaEquation(evidence.design.problem, evidence.kalman)
+    sides = (-NORM_TOLERANCE, NORM_TOLERANCE)
+    meets = [equation.trial(least * (1 + side)).P is not None for side in sides]
+    off = 0.0 if meets == [False, True] else np.inf
+    how = "gamma-Riccati equation on both sides"
+    yield Check("least norm of any filter, error", off, NORM_TOLERANCE, how)
+
+
+def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
+    """Check that the witness proves the level, and that no filter contradicts it."""
+    problem = evidence.design.problem
+    value = level / evidence.certificate.gamma - 1
+    name = "infeasible level over the norm achieved, less 1"
+    yield Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS)
+    proved = certify_infeasible(problem, level, evidence.design.proof)
+    below = -proved.value / (1 + proved.value)
+    yield proved
+    name = "level proved over the infeasible level, less 1"
+    yield Check(name, below, NORM_TOLERANCE, proved.computed_by)
+
+
+RMS = measured_claim("rms", "estimation error, rms")
+GAMMA = measured_claim("gamma", "estimation error, H-infinity norm")
+GAMMA_REQUESTED = Claim(
+    name="gamma_requested", heading="bound asked for", unit="nm", checks=_check_bound
+)
+RMS_REQUESTED = Claim(
+    name="rms_requested", heading="rms asked for", unit="nm", checks=_check_rms_bound
+)
+GAMMA_LEAST = Claim(
+    name="gamma_least",
+    heading="least norm of any filter, upper bound",
+    unit="nm",
+    format=".9g",
+    checks=_check_least,
+)
+GAMMA_INFEASIBLE = Claim(
+    name="gamma_infeasible",
+    heading="least norm of any filter, lower bound",
+    unit="nm",
+    format=".9g",
+    checks=_check_infeasible,
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FilterDesign(EstimatorDesign):
+class FilterDesign(Design):
     """A Kalman or H-infinity filter, and the controller made of it.
 
     Attributes
@@ -54,29 +126,71 @@ class FilterDesign(EstimatorDesign):
         ``(A P C' + S) (C P C' + R)^-1``: of ``x(k+1|k) = A x(k|k-1) + gain (y(k) - C x(k|k-1))``.
     gain_filter : (n, q) ndarray
         ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
-    gamma_requested : float or None
-        Bound that the H-infinity design was given.
-    rms_requested : float or None
-        Bound on the standard deviation that the design was given.
-    gamma_least : float or None
-        Norm that a filter of the problem achieves, with the least gamma.
-    gamma_infeasible : float or None
-        Level that no filter reaches: the least gamma is not below it.
     witness : Witness or None
-        The proof of that level: disturbances that no measurement shows.
+        Disturbances that no measurement shows: the proof that no filter reaches
+        ``gamma_infeasible``.
     """
 
-    controller: Controller = field(init=False)
+    CLAIMS: ClassVar[tuple[Claim, ...]] = (
+        *(RMS, GAMMA, RMS_REQUESTED, GAMMA_REQUESTED, GAMMA_LEAST, GAMMA_INFEASIBLE),
+    )
+    DERIVED: ClassVar[tuple[Column, ...]] = MODEL_LIMITS
+    is_estimator: ClassVar[bool] = True
+
+    problem: EstimationProblem
     gain_predictor: FloatArray
     gain_filter: FloatArray
-    gamma_requested: float | None = None
-    gamma_least: float | None = None
-    gamma_infeasible: float | None = None
     witness: Witness | None = None
-    rms_requested: float | None = None
 
     def __post_init__(self) -> None:
-        set_fields(self, controller=self.problem.controller(self.gain_predictor))
+        problem = self.problem
+        sizes = {
+            "rows": (problem.n_states, f"to match A {problem.A.shape}"),
+            "cols": (len(problem.C), f"to match C {problem.C.shape}"),
+        }
+        set_fields(self, gain_filter=matrix(self.gain_filter, "gain_filter", **sizes))
+        Design.__post_init__(self)
+
+    def make_controller(self) -> Controller:
+        """Return the controller of the predictor gain."""
+        return self.problem.controller(self.gain_predictor)
+
+    @property
+    def gamma_requested(self) -> float:
+        """Bound that the H-infinity design was given; nan without one."""
+        return float(self.claims.get("gamma_requested", np.nan))
+
+    @property
+    def rms_requested(self) -> float:
+        """Bound on the standard deviation that the design was given; nan without one."""
+        return float(self.claims.get("rms_requested", np.nan))
+
+    @property
+    def gamma_least(self) -> float:
+        """Norm that a filter of the problem achieves, with the least gamma; nan if not computed."""
+        return float(self.claims.get("gamma_least", np.nan))
+
+    @property
+    def gamma_infeasible(self) -> float:
+        """Level that no filter reaches: the least gamma is not below it; nan if not computed."""
+        return float(self.claims.get("gamma_infeasible", np.nan))
+
+    @property
+    def proof(self) -> Witness:
+        """The witness; without one, no disturbance at all, which proves nothing."""
+        n, p = self.problem.B.shape
+        nothing = Witness(states=np.zeros((n, 1)), disturbances=np.zeros((p, 1)))
+        return self.witness or nothing
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the design was given a bound; without one its variance is the least."""
+        return not self.claims.keys().isdisjoint({"gamma_requested", "rms_requested"})
+
+    @property
+    def knows_mirror(self) -> bool:
+        """False: a filter counts on a mirror that settles."""
+        return False
 
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
         """System from w to the estimation error.
@@ -93,14 +207,9 @@ class FilterDesign(EstimatorDesign):
         """
         return (problem or self.problem).error_system(self.gain_predictor)
 
-    def facts(self) -> FilterFacts:
-        """Return what the filter achieves, beside what it was asked for and what is possible."""
-        return self.model_facts(FilterFacts)
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether the design was given a bound; without one its variance is the least."""
-        return self.gamma_requested is not None or self.rms_requested is not None
+    def derived(self) -> dict[str, float | None]:
+        """Return residual and limit in the filter's own model."""
+        return dict(model_limits(self))
 
     @property
     def estimator(self) -> Controller:
@@ -112,51 +221,19 @@ class FilterDesign(EstimatorDesign):
         """Poles of the estimation error, (n,)."""
         return self.error_system().poles
 
-    def recertify(self) -> Certificate:
-        """Compute the certificate again: the filter, its claims, and its loop if it has one."""
-        problem = self.problem
-        certificate = certify_filter(
-            problem,
-            self.gain_predictor,
-            gamma=self.gamma_requested,
-            least_variance=not self.is_bounded,
-        )
-        checks = [*certificate.checks, *self._claim_checks(certificate)]
-        if self.hardware is not None:
-            checks.append(certify_loop(self.hardware, self.controller))
-        return replace(certificate, checks=tuple(checks))
-
-    def _claim_checks(self, certificate: Certificate) -> list[Check]:
-        """Check the gains against each other, and what is said of bounds."""
-        problem, start = self.problem, kalman_riccati(self.problem)
-        checks = [self._gain_check(), *self._origin_checks(start)]
-        if self.rms_requested is not None:
-            above = certificate.rms / self.rms_requested - 1
-            name = "standard deviation of the estimation error over its bound, less 1"
-            checks.append(Check(name, above, NORM_TOLERANCE, "Lyapunov equation"))
-        if self.gamma_least is not None:
-            equation = GammaEquation(problem, start)
-            meets = [
-                equation.trial(self.gamma_least * (1 + side * NORM_TOLERANCE)).P is not None
-                for side in (-1, 1)
-            ]
-            name, how = "least norm of any filter, error", "gamma-Riccati equation on both sides"
-            off = 0.0 if meets == [False, True] else np.inf
-            checks.append(Check(name, off, NORM_TOLERANCE, how))
-        if self.gamma_infeasible is not None:
-            name = "infeasible level over the norm achieved, less 1"
-            value = self.gamma_infeasible / certificate.gamma - 1
-            checks.append(Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS))
-            # a claim without a witness is not believed
-            proof = self.witness or Witness(
-                states=np.zeros((problem.n_states, 1)),
-                disturbances=np.zeros((problem.B.shape[1], 1)),
-            )
-            proved = certify_infeasible(problem, self.gamma_infeasible, proof)
-            below = -proved.value / (1 + proved.value)
-            name = "level proved over the infeasible level, less 1"
-            checks += [proved, Check(name, below, NORM_TOLERANCE, proved.computed_by)]
-        return checks
+    def examine(self) -> Evidence:
+        """Compute the norms of the error, and check the gains against each other."""
+        least = not self.is_bounded
+        certificate = certify_filter(self.problem, self.gain_predictor, least_variance=least)
+        if not certificate.checks[0].passed:
+            return Evidence(design=self, certificate=certificate)
+        kalman = kalman_riccati(self.problem)
+        checks = [*certificate.checks, self._gain_check()]
+        if least:
+            distance = _distance(self, kalman)
+            checks.append(Check(ORIGIN, distance, ORIGIN_TOLERANCE, "relative"))
+        certificate = replace(certificate, checks=tuple(checks))
+        return Evidence(design=self, certificate=certificate, kalman=kalman)
 
     def _gain_check(self) -> Check:
         """Check that the two gains are of one filter, in the states that go on."""
@@ -168,24 +245,11 @@ class FilterDesign(EstimatorDesign):
         how = "A times the filter gain, relative"
         return Check("predictor gain against the filter gain", value, GAIN_TOLERANCE, how)
 
-    def _origin_checks(self, start: FilterRiccati) -> list[Check]:
-        """Check both gains of Kalman's filter and of the central filter of a bound.
 
-        A filter of a bound that is neither has its bound and norms as its proof.
-        """
-        origins = [start]
-        if self.gamma_requested is not None:
-            with suppress(NumericalError):
-                central = gamma_riccati(self.problem, self.gamma_requested, start=start)
-                origins += [] if central is None else [central]
-        own = np.vstack([self.gain_predictor, self.gain_filter])
-        value = min(
-            relative_distance(own, np.vstack([origin.gain_predictor, origin.gain_filter]))
-            for origin in origins
-        )
-        if self.is_bounded and value > ORIGIN_TOLERANCE:
-            return []
-        return [Check(ORIGIN, value, ORIGIN_TOLERANCE, "relative")]
+def _distance(design: FilterDesign, origin: FilterRiccati) -> float:
+    """Return how far both gains of a filter are from those of a Riccati equation, relative."""
+    gains = np.vstack([design.gain_predictor, design.gain_filter])
+    return relative_distance(gains, np.vstack([origin.gain_predictor, origin.gain_filter]))
 
 
 def filter_design(
@@ -195,16 +259,17 @@ def filter_design(
     *,
     method: str,
     solver: SolverReport,
+    witness: Witness | None = None,
     **claims: Any,
 ) -> FilterDesign:
     """Make a design and certify it; raise CertificateError if it fails."""
     design = FilterDesign(
         method=method,
-        certificate=UNCERTIFIED,
         solver=solver,
         problem=problem,
         gain_predictor=gain_predictor,
         gain_filter=gain_filter,
-        **claims,
+        witness=witness,
+        claims={name: value for name, value in claims.items() if value is not None},
     )
     return with_certificate(design, "Try the other route, or scale the states to similar sizes.")

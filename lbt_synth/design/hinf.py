@@ -205,9 +205,7 @@ class _LmiRoute:
     def least_gamma(self) -> tuple[SolvedGains, Witness]:
         from lbt_synth.linear.lmi.filters import least_gamma_lmi
 
-        solution = least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
-        assert solution.witness is not None  # the least gamma has a dual solution
-        return solution, solution.witness
+        return least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
 
     def central(self, gamma: float) -> SolvedGains:
         from lbt_synth.linear.lmi.filters import hinf_lmi

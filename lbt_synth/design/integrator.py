@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.design.certificate import Certificate, certify_loop
-from lbt_synth.design.integrator_law import PURE, IntegratorFacts, IntegratorLaw
+from lbt_synth.design.claims import Claim, Evidence
+from lbt_synth.design.integrator_law import LAW_CLAIMS, PURE, IntegratorLaw
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller
@@ -19,7 +20,7 @@ from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance, set_fields
+from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance
 
 TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as fractions of the limit
 # A line far above the bandwidth leaves one minimum with its amplification and one without: the
@@ -31,44 +32,38 @@ _LEAST_GAIN = 1e-3  # as a part of that of a usual loop: two integrators are sta
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegratorDesign(Design):
-    """The classical controller ``u(k) = u(k-1) + gain R y(k)``, or one of another law."""
+    """The classical controller ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
 
-    controller: Controller = field(init=False)
-    loop_hardware: LoopHardware  # the loop
-    gain: float  # integrator gain, per unit of sensor gain
-    # leak, zero and second integrator, and the margins that the certificate checks
-    law: IntegratorLaw = PURE
+    It claims its gain, what its law changes, and the margins that it keeps.
+    """
 
-    def __post_init__(self) -> None:
-        set_fields(self, controller=self.law.controller(self.loop_hardware, self.gain))
+    CLAIMS: ClassVar[tuple[Claim, ...]] = LAW_CLAIMS
+
+    problem: LoopHardware
 
     @property
-    def hardware(self) -> LoopHardware | None:
-        """Loop that the design is for."""
-        return self.loop_hardware
+    def gain(self) -> float:
+        """Integrator gain, per unit of sensor gain."""
+        return float(self.claims["gain"])
 
-    def facts(self) -> IntegratorFacts:
-        """Return the gain and the law, where it is not the usual one."""
-        changes = self.law.changes()
-        return IntegratorFacts(
-            gain=self.gain,
-            **{name: changes.get(name) for name in ("leak", "integrators", "zero_hz")},
-            phase_margin_demand_deg=self.law.phase_margin_deg,
-            modulus_margin_demand=self.law.modulus_margin,
-        )
+    @property
+    def law(self) -> IntegratorLaw:
+        """Leak, zero, second integrator, and the margins to keep."""
+        changes = {name: value for name, value in self.claims.items() if name != "gain"}
+        return IntegratorLaw(**changes)
+
+    def make_controller(self) -> Controller:
+        """Return the controller of the law and its gain."""
+        return self.law.controller(self.problem, self.gain)
 
     @property
     def poles(self) -> ComplexArray:
         """Poles of the closed loop."""
-        return close_loop(self.loop_hardware, self.controller).system.poles
+        return close_loop(self.problem, self.controller).system.poles
 
-    def recertify(self) -> Certificate:
-        """Compute the certificate again from the matrices."""
-        stable = certify_loop(self.loop_hardware, self.controller)
-        checks = [stable]
-        if stable.passed and self.law.demands:
-            checks += self.law.checks(close_loop(self.loop_hardware, self.controller))
-        return replace(UNCERTIFIED, checks=tuple(checks))
+    def examine(self) -> Evidence:
+        """Compute nothing but the loop, which every design's certificate has."""
+        return Evidence(design=self, certificate=UNCERTIFIED)
 
 
 def integrator(
@@ -131,11 +126,9 @@ def _design_with_gain(
     """Make the design of a gain and certify it."""
     design = IntegratorDesign(
         method="integrator",
-        certificate=UNCERTIFIED,
         solver=SolverReport(route=route, status=status, iterations=0),
-        loop_hardware=hardware,
-        gain=gain,
-        law=law,
+        problem=hardware,
+        claims={"gain": gain, **law.changes()},
     )
     return with_certificate(design, f"Lower the gain {gain:.6g}.")
 

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
-from lbt_synth.design.certificate import Check
+from lbt_synth.design.certificate import LEVEL_SETS, Check
+from lbt_synth.design.claims import Claim, Evidence
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, hinf_norm
-from lbt_synth.loop import ClosedLoop, broken_loops
+from lbt_synth.loop import ClosedLoop, broken_loops, close_loop
 from lbt_synth.loop.broken_loops import phase_margin_deg
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import Positive, check_fields, frozen_copy
 
 MARGIN_TOLERANCE = 1e-6
-
-
-@table_row
-class IntegratorFacts:
-    """Gain and law of an integrator."""
-
-    gain: float = column("gain")
-    leak: float | None = column("left of a command after a frame")
-    integrators: int | None = column("integrators")
-    zero_hz: float | None = column("corner of the zero", unit="Hz")
-    phase_margin_demand_deg: float | None = column("phase margin demanded", unit="deg")
-    modulus_margin_demand: float | None = column("modulus margin demanded")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,22 +120,27 @@ class IntegratorLaw:
             found["modulus_margin"] = 1 / hinf_norm(loop.output_sensitivity()).upper
         return found
 
-    def checks(self, loop: ClosedLoop) -> tuple[Check, ...]:
-        """Check the demands on a stable loop."""
-        how = {
-            "phase_margin_deg": ("phase margin", "each measurement broken in turn"),
-            "modulus_margin": ("modulus margin", "level sets on the symplectic pencil"),
-        }
-        found = self.margins(loop)
-        return tuple(
-            Check(
-                f"{how[name][0]} demanded over achieved, less 1",
-                least / found[name] - 1,
-                MARGIN_TOLERANCE,
-                how[name][1],
-            )
-            for name, least in self.demands.items()
-        )
-
 
 PURE = IntegratorLaw()
+
+
+def _margin_claim(name: str, margin: str, unit: str, how: str) -> Claim:
+    """Return the claim of a margin that the loop keeps."""
+
+    def checks(evidence: Evidence, demanded: float) -> Iterator[Check]:
+        design = evidence.design
+        achieved = design.law.margins(close_loop(design.hardware, design.controller))[name]
+        label = f"{margin} demanded over achieved, less 1"
+        yield Check(label, demanded / achieved - 1, MARGIN_TOLERANCE, how)
+
+    return Claim(name=name, heading=f"{margin} demanded", unit=unit, checks=checks)
+
+
+LAW_CLAIMS = (
+    Claim(name="gain", heading="gain"),
+    Claim(name="leak", heading="left of a command after a frame"),
+    Claim(name="integrators", heading="integrators"),
+    Claim(name="zero_hz", heading="corner of the zero", unit="Hz"),
+    _margin_claim("phase_margin_deg", "phase margin", "deg", "each measurement broken in turn"),
+    _margin_claim("modulus_margin", "modulus margin", "", LEVEL_SETS),
+)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.design.certificate import Certificate, Check, certify_loop
-from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
+from lbt_synth.design.certificate import Check
+from lbt_synth.design.claims import Claim, Evidence
+from lbt_synth.design.result import (
+    UNCERTIFIED,
+    Design,
+    RowTable,
+    SolverReport,
+    with_certificate,
+)
 from lbt_synth.design.shaping.channel import (
     Channel,
     SingleModeLoop,
@@ -28,14 +35,13 @@ from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import Column, column, nm_column, table_row
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     integer,
     number,
     require_instance,
-    set_fields,
 )
 
 _MOST_FUNCTIONS = 400
@@ -142,67 +148,126 @@ def shape(
     parameters = tuple(mode.parameter for mode in modes)
     status, rounds = modes[0].sequence.status, max(long.sequence.programmes for long in longs)
     design = ShapedDesign(
-        method="shaped",
-        certificate=UNCERTIFIED,
+        method="robust",
         solver=SolverReport(route="youla", status=status, iterations=rounds),
-        loop_hardware=hardware,
+        problem=hardware,
         specifications=specifications,
         parameters=parameters,
-        objective_nm=tuple(mode.objective_nm * (1 + _ROUNDED) for mode in modes),
+        claims={"objective_nm": tuple(mode.objective_nm * (1 + _ROUNDED) for mode in modes)},
         long_objective_nm=tuple(long.objective_nm for long in longs),
         long_functions=size,
     )
     return with_certificate(design, "Try more functions, or looser demands.")
 
 
-@table_row
-class RobustFacts:
-    """What a robust controller is, beside the limits over its bands."""
+def _check_objective(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator[Check]:
+    """Compare the objective of each mode with the one claimed, and the whole loop with its modes."""
+    design = evidence.design
+    for prefix, mode in design.distinct_modes():
+        loop = mode_loop(design.problem, design.parameters[mode])
+        try:
+            objective = float(np.sqrt(design.specifications[mode].objective.measured_nm2(loop)))
+        except UnstableLoopError:
+            objective = np.inf
+        above = objective / claimed[mode] - 1 if claimed[mode] > 0 else np.inf
+        below = claimed[mode] / objective - 1 if objective > 0 else np.inf
+        how, name = "closed loops in state space", f"{prefix}objective"
+        yield Check(f"{name} found over the one claimed, less 1", above, _RMS_TOLERANCE, how)
+        yield Check(f"{name} claimed over the one found, less 1", below, _CLAIM_TOLERANCE, how)
+    yield _decoupling_check(design)
 
-    states_per_mode: int = column("states of one mode, past commands included")
-    loss: float = column("objective above the long parameter's", unit="%", scale=100)
-    limit_nm: float = column("least worst residual over its bands, all modes", unit="nm")
-    above_limit_percent: float = column("residual at unit sensor gain above it", unit="%")
-    objective_nm: tuple[float, ...] = column(unit="nm")
-    long_objective_nm: tuple[float, ...] = column(unit="nm")
+
+def _decoupling_check(design: ShapedDesign) -> Check:
+    """Check that the whole loop rejects what the loops of the single modes reject."""
+    f = np.array(_TEST_HZ) * design.problem.frame_rate_hz
+    whole = close_loop(design.problem, design.controller).sensitivity(f)
+    single = np.zeros_like(whole)
+    for mode, parameter in enumerate(design.parameters):
+        loop = mode_loop(design.problem, parameter).at(1.0)
+        single[:, mode, mode] = loop.sensitivity(f)[:, 0, 0]
+    apart = float(np.max(np.abs(whole - single)))
+    how = f"sensitivity at {f.size} frequencies"
+    return Check("whole loop against its modes", apart, 1e-6, how)
+
+
+@table_row
+class DemandRow:
+    """A demand on a mode."""
+
+    demand: str = column("demand")
+    mode: int = column("mode")
+
+
+@table_row
+class TermRow:
+    """What a term of the objective leaves in the real loop."""
+
+    term: str = column("term")
+    mode: int = column("mode")
+    rms_nm: float = nm_column("residual", unit="nm rms")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShapedDesign(Design):
     """A controller shaped in the closed loop, mode by mode.
 
+    It claims the root of the objective of each mode [nm].
+
     Attributes
     ----------
-    loop_hardware : LoopHardware
+    problem : LoopHardware
         The loop.
     specifications : tuple of Specification
         One per mode.
     parameters : tuple of Controller
         Youla parameter of each mode, from its pseudo-open-loop measurement to its command.
-    objective_nm : tuple of float
-        Root of the objective of each mode that is claimed [nm].
     long_objective_nm : tuple of float
-        The same of the long parameter, before it was reduced [nm].
+        Objective of the long parameter, before it was reduced [nm]; the solver's word.
     long_functions : int
         Functions of the long parameter.
     """
 
-    controller: Controller = field(init=False)
-    loop_hardware: LoopHardware
+    CLAIMS: ClassVar[tuple[Claim, ...]] = (
+        Claim(name="objective_nm", unit="nm", checks=_check_objective),
+    )
+    DERIVED: ClassVar[tuple[Column, ...]] = (
+        Column(name="states_per_mode", heading="states of one mode, past commands included"),
+        Column(name="loss", heading="objective above the long parameter's", unit="%", scale=100),
+        Column(
+            name="limit_nm", heading="least worst residual over its bands, all modes", unit="nm"
+        ),
+        Column(
+            name="above_limit_percent", heading="residual at unit sensor gain above it", unit="%"
+        ),
+        Column(name="long_objective_nm", unit="nm"),
+    )
+
+    problem: LoopHardware
     specifications: tuple[Specification, ...]
     parameters: tuple[Controller, ...]
-    objective_nm: tuple[float, ...]
     long_objective_nm: tuple[float, ...]
     long_functions: int
 
     def __post_init__(self) -> None:
-        whole = controller_from_parameters(self.loop_hardware, self.parameters)
-        set_fields(self, controller=whole)
+        per_mode = self.specifications, self.parameters, self.objective_nm, self.long_objective_nm
+        if {len(part) for part in per_mode} != {self.problem.modes}:
+            raise DimensionError(
+                f"a design must have {self.problem.modes} specifications, parameters and claims, "
+                "one for each mode."
+            )
+        for spec in self.specifications:
+            require_instance(spec, Specification)
+            spec.require_fitting(self.problem)
+        Design.__post_init__(self)
+
+    def make_controller(self) -> Controller:
+        """Return the controller of the parameters of all modes."""
+        return controller_from_parameters(self.problem, self.parameters)
 
     @property
-    def hardware(self) -> LoopHardware | None:
-        """Loop that the design is for."""
-        return self.loop_hardware
+    def objective_nm(self) -> tuple[float, ...]:
+        """Root of the objective of each mode that is claimed [nm]."""
+        return tuple(self.claims.get("objective_nm", ()))
 
     @property
     def poles(self) -> ComplexArray:
@@ -225,9 +290,14 @@ class ShapedDesign(Design):
         ]
         return [keys.index(key) for key in keys]
 
+    def distinct_modes(self) -> list[tuple[str, int]]:
+        """Return the modes that differ, each with what its checks' names begin with."""
+        first, many = self.first_equal_modes, self.problem.modes > 1
+        return [(f"mode {mode + 1}: " * many, mode) for mode in sorted(set(first))]
+
     @property
     def _loops(self) -> list[SingleModeLoop]:
-        return [mode_loop(self.loop_hardware, parameter) for parameter in self.parameters]
+        return [mode_loop(self.problem, parameter) for parameter in self.parameters]
 
     @property
     def loss(self) -> float:
@@ -258,12 +328,14 @@ class ShapedDesign(Design):
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...]:
         """Return the demands that a controller violates, none where it couples the modes."""
-        return violated_demands(self.specifications, self.loop_hardware, controller) or ()
+        return violated_demands(self.specifications, self.problem, controller) or ()
 
-    def facts(self) -> RobustFacts:
+    def derived(self) -> dict[str, Any]:
         """Return what the controller is, beside the limits over its bands."""
-        limit_nm, above = specified_limit(self.specifications, self.loop_hardware, self.parameters)
-        return fill_row(RobustFacts, self, limit_nm=limit_nm, above_limit_percent=above)
+        limit_nm, above = specified_limit(self.specifications, self.problem, self.parameters)
+        named = {name: getattr(self, name) for name in ("states_per_mode", "loss")}
+        named["long_objective_nm"] = self.long_objective_nm
+        return {**named, "limit_nm": limit_nm, "above_limit_percent": above}
 
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
         """Residual of each term in the real loop: mode, what it is, [nm rms]."""
@@ -273,57 +345,39 @@ class ShapedDesign(Design):
             for leaf in leaves(spec.objective)
         )
 
-    def recertify(self) -> Certificate:
-        """Compute the certificate again from the matrices."""
-        claims = list(zip(self.specifications, self.parameters, self.objective_nm, strict=True))
-        found = {
-            first: _mode_checks(self.loop_hardware, *claims[first])
-            for first in set(self.first_equal_modes)
-        }
+    def tables(self) -> tuple[RowTable, ...]:
+        """Return the demands, and the residual of each term."""
+        demands = [DemandRow(demand=label, mode=mode + 1) for mode, label in self.demand_labels()]
+        terms = [
+            TermRow(term=text, mode=mode + 1, rms_nm=rms) for mode, text, rms in self.terms_nm()
+        ]
+        return (
+            RowTable(key="demands", title="Demands", rows=demands),
+            RowTable(key="terms", title="Residual of each term", rows=terms),
+        )
+
+    def notes(self) -> list[str]:
+        """Return a warning where the long parameter is not long enough."""
+        if not (self.is_reduced and self.loss < 0):
+            return []
+        return [
+            f"note: the long parameter is not long enough: one of {self.states_per_mode} states "
+            "is better. Try more functions, or another pole."
+        ]
+
+    def examine(self) -> Evidence:
+        """Compute whether each parameter is stable and its loop keeps its demands."""
         checks: list[Check] = []
-        for mode, first in enumerate(self.first_equal_modes):
-            prefix = f"mode {mode + 1}: " if len(claims) > 1 else ""
-            checks += [replace(c, name=prefix + c.name) for c in found[first]]
-        checks.append(certify_loop(self.loop_hardware, self.controller))
-        if checks[-1].passed:
-            checks.append(self._decoupling_check())
-        return replace(UNCERTIFIED, checks=tuple(checks))
-
-    def _decoupling_check(self) -> Check:
-        """Check that the whole loop rejects what the loops of the single modes reject."""
-        f = np.array(_TEST_HZ) * self.loop_hardware.frame_rate_hz
-        whole = close_loop(self.loop_hardware, self.controller).sensitivity(f)
-        single = np.zeros_like(whole)
-        for mode, loop in enumerate(self._loops):
-            single[:, mode, mode] = loop.at(1.0).sensitivity(f)[:, 0, 0]
-        apart = float(np.max(np.abs(whole - single)))
-        how = f"sensitivity at {f.size} frequencies"
-        return Check("whole loop against its modes", apart, 1e-6, how)
-
-
-def _mode_checks(
-    hardware: LoopHardware, spec: Specification, parameter: Controller, objective_nm: float
-) -> list[Check]:
-    """Check the parameter of one mode: stable, its demands met, its objective as claimed."""
-    radius = parameter.to_statespace().spectral_radius
-    stable = Check("spectral radius of the parameter", radius, 1 - 1e-9, "eigenvalues")
-    if not stable.passed:
-        return [stable]
-    loop = mode_loop(hardware, parameter)
-    checks = spec.checks(loop)
-    try:
-        found = float(np.sqrt(spec.objective.measured_nm2(loop)))
-    except UnstableLoopError:
-        found = np.inf
-    how = "closed loops in state space"
-    above = found / objective_nm - 1 if objective_nm > 0 else np.inf
-    below = objective_nm / found - 1 if found > 0 else np.inf
-    return [
-        stable,
-        *checks,
-        Check("objective found over the one claimed, less 1", above, _RMS_TOLERANCE, how),
-        Check("objective claimed over the one found, less 1", below, _CLAIM_TOLERANCE, how),
-    ]
+        for prefix, mode in self.distinct_modes():
+            parameter = self.parameters[mode]
+            radius = parameter.to_statespace().spectral_radius
+            name = f"{prefix}spectral radius of the parameter"
+            checks.append(Check(name, radius, 1 - 1e-9, "eigenvalues"))
+            if checks[-1].passed:
+                loop = mode_loop(self.problem, parameter)
+                demands = self.specifications[mode].checks(loop)
+                checks += [replace(check, name=prefix + check.name) for check in demands]
+        return Evidence(design=self, certificate=replace(UNCERTIFIED, checks=tuple(checks)))
 
 
 def require_separable(hardware: LoopHardware) -> None:

@@ -14,25 +14,25 @@ one mode, ``v = (N u)_i`` and the target ``z(k) = l x(k+1)``, which is phi_tot(k
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.certificate import (
     GAIN_TOLERANCE,
     VARIANCE_TOLERANCE,
-    Certificate,
     Check,
     certify_error,
     certify_filter,
-    certify_loop,
 )
+from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.result import (
-    UNCERTIFIED,
-    EstimatorDesign,
-    LqgFacts,
+    MODEL_LIMITS,
+    Design,
     SolverReport,
+    model_limits,
     with_certificate,
 )
 from lbt_synth.errors import DimensionError, InfeasibleError, ProblemError
@@ -43,14 +43,54 @@ from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.models.plant.tip_tilt import assemble
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number, set_fields
+from lbt_synth.storage.rows import Column
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number
 
 _ON_CIRCLE = 1e-6  # a zero this close to the unit circle leaves no stable regulator
 _SQUARINGS = 60
+Vector: TypeAlias = FloatArray  # which may be empty
+
+
+def _check_objective(evidence: Evidence, objective_nm: float) -> Iterator[Check]:
+    """Compare the cost of the real loop, by a Lyapunov equation, with the claimed one."""
+    design, rms = evidence.design, evidence.certificate.rms
+    residual, commands = loop_variances(design.problem, design.estimation, design.controller)
+    cost = residual + design.command_weight * commands
+    pairs = (
+        ("residual of the closed loop, against the error system", residual, rms**2),
+        ("objective of the closed loop, against the one claimed", cost, objective_nm**2),
+    )
+    for name, value, claimed in pairs:
+        apart = abs(value / claimed - 1) if claimed > 0 else value
+        how = "relative, Lyapunov equation of the whole loop"
+        yield Check(name, apart, VARIANCE_TOLERANCE, how)
+
+
+def _check_weight(evidence: Evidence, rho: float) -> Iterator[Check]:
+    """Check that a step of policy iteration from the cost of this law finds no better law."""
+    design = evidence.design
+    model, core = design.estimation, design.problem.hardware.mirror_system.core
+    n, c = model.n_states, core.n_states
+    whole = np.zeros((n + c, n + c))
+    whole[:n, :n], whole[n:, n:] = model.A, core.A
+    entry = np.concatenate([np.zeros(n), core.B])
+    worst = 0.0
+    for target, gain in zip(model.L, design.gain_state, strict=True):
+        law = np.concatenate([gain, -design.gain_mirror])
+        row = np.concatenate([target, -core.C])
+        closed = whole + np.outer(entry, law)
+        left = row - core.D * law
+        X = stationary_covariance(closed.T, np.outer(left, left) + rho * np.outer(law, law))
+        weight = core.D**2 + rho + entry @ X @ entry
+        better = (core.D * row - entry @ X @ whole) / weight
+        size = max(float(np.linalg.norm(better)), 1e-300)
+        worst = max(worst, float(np.linalg.norm(law - better)) / size)
+    how = "gains recomputed from a Lyapunov equation"
+    yield Check("distance from the least-cost regulator", worst, GAIN_TOLERANCE, how)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LqgDesign(EstimatorDesign):
+class LqgDesign(Design):
     """A Kalman filter, and a regulator that knows the mirror.
 
     The commands are ``N u(k) = gain_state x_hat(k+1|k) - N gain_mirror m(k)``, with x the
@@ -67,32 +107,54 @@ class LqgDesign(EstimatorDesign):
         From the predicted disturbance to the command of each mode.
     gain_mirror : (c,) ndarray
         From the states of the mirror's core to the command.
-    command_weight : float
-        Weight of the squared command beside the squared residual.
-    objective_nm : float
-        Root of the least objective, by the Riccati equations [nm].
     """
 
-    controller: Controller = field(init=False)
+    CLAIMS: ClassVar[tuple[Claim, ...]] = (
+        measured_claim("rms", "residual, rms"),
+        measured_claim("gamma", "residual, H-infinity norm"),
+        Claim(name="command_weight", heading="weight of the command", checks=_check_weight),
+        Claim(name="objective_nm", heading="root of the cost", unit="nm", checks=_check_objective),
+    )
+    DERIVED: ClassVar[tuple[Column, ...]] = MODEL_LIMITS
+    is_estimator: ClassVar[bool] = True
+
     problem: TipTiltPlant
     gain_predictor: FloatArray
     gain_state: FloatArray
-    gain_mirror: FloatArray
-    command_weight: float
-    objective_nm: float
+    gain_mirror: Vector
 
     def __post_init__(self) -> None:
+        model, mirror = self.estimation, self.problem.hardware.mirror_system.core
+        sizes = {
+            "gain_predictor": model.C.T.shape,
+            "gain_state": model.L.shape,
+            "gain_mirror": (mirror.n_states,),
+        }
+        for name, size in sizes.items():
+            if (shape := getattr(self, name).shape) != size:
+                raise DimensionError(
+                    f"{name} must be {size} to match the plant and the mirror; got {shape}."
+                )
+        Design.__post_init__(self)
+
+    def make_controller(self) -> Controller:
+        """Return the controller of the filter and the regulator."""
         gains = self.gain_predictor, self.gain_state, self.gain_mirror
-        set_fields(self, controller=lqg_controller(self.problem, *gains))
+        return lqg_controller(self.problem, *gains)
 
     @property
-    def knows_mirror(self) -> bool:
-        """True: the regulator knows the mirror."""
-        return True
+    def command_weight(self) -> float:
+        """Weight of the squared command beside the squared residual."""
+        return float(self.claims["command_weight"])
 
-    def facts(self) -> LqgFacts:
-        """Return what the controller leaves, beside what is possible."""
-        return self.model_facts(LqgFacts)
+    @property
+    def objective_nm(self) -> float:
+        """Root of the least objective, by the Riccati equations [nm]."""
+        return float(self.claims["objective_nm"])
+
+    def derived(self) -> dict[str, float | None]:
+        """Return residual and limit in the own model."""
+        return dict(model_limits(self))
 
     @property
     def estimation(self) -> TipTiltPlant:
@@ -157,56 +219,16 @@ class LqgDesign(EstimatorDesign):
         D = np.zeros((modes, B.shape[1]))
         return StateSpace(A=A, B=B, C=C, D=D, dt_s=own.dt_s)
 
-    def recertify(self) -> Certificate:
-        """Compute the certificate again from the matrices."""
+    def examine(self) -> Evidence:
+        """Compute the norms of the residual, and check the filter's gain."""
         certificate = certify_error(
             self.error_system(), stability="spectral radius of model, filter and mirror"
         )
         checks = list(certificate.checks)
         if checks[0].passed:
-            own = certify_filter(self.estimation, self.gain_predictor, least_variance=True)
-            checks += [c for c in own.checks if c.name.startswith("distance")]
-            checks.append(self._regulator_check())
-        checks.append(certify_loop(self.problem.hardware, self.controller))
-        if checks[-1].passed:
-            checks += self._cost_checks(certificate.rms)
-        return replace(certificate, checks=tuple(checks))
-
-    def _regulator_check(self) -> Check:
-        """Check that a step of policy iteration from the cost of this law finds no better law."""
-        core, rho = self.problem.hardware.mirror_system.core, self.command_weight
-        own = self.estimation
-        n, c = own.n_states, core.n_states
-        whole = np.zeros((n + c, n + c))
-        whole[:n, :n], whole[n:, n:] = own.A, core.A
-        entry = np.concatenate([np.zeros(n), core.B])
-        worst = 0.0
-        for target, gain in zip(own.L, self.gain_state, strict=True):
-            law = np.concatenate([gain, -self.gain_mirror])
-            row = np.concatenate([target, -core.C])
-            closed = whole + np.outer(entry, law)
-            left = row - core.D * law
-            X = stationary_covariance(closed.T, np.outer(left, left) + rho * np.outer(law, law))
-            weight = core.D**2 + rho + entry @ X @ entry
-            better = (core.D * row - entry @ X @ whole) / weight
-            size = max(float(np.linalg.norm(better)), 1e-300)
-            worst = max(worst, float(np.linalg.norm(law - better)) / size)
-        how = "gains recomputed from a Lyapunov equation"
-        return Check("distance from the least-cost regulator", worst, GAIN_TOLERANCE, how)
-
-    def _cost_checks(self, rms: float) -> list[Check]:
-        """Compare the cost of the real loop, by a Lyapunov equation, with the claimed one."""
-        residual, commands = loop_variances(self.problem, self.estimation, self.controller)
-        cost = residual + self.command_weight * commands
-        pairs = (
-            ("residual of the closed loop, against the error system", residual, rms**2),
-            ("objective of the closed loop, against the one claimed", cost, self.objective_nm**2),
-        )
-        how, checks = "relative, Lyapunov equation of the whole loop", []
-        for name, found, claimed in pairs:
-            apart = abs(found / claimed - 1) if claimed > 0 else found
-            checks.append(Check(name, apart, VARIANCE_TOLERANCE, how))
-        return checks
+            kalman = certify_filter(self.estimation, self.gain_predictor, least_variance=True)
+            checks += [check for check in kalman.checks if check.name.startswith("distance")]
+        return Evidence(design=self, certificate=replace(certificate, checks=tuple(checks)))
 
 
 def lqg_controller(
@@ -341,7 +363,6 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         cost += np.trace(stationary_covariance(estimation.A.T, rest) @ drive)
     design = LqgDesign(
         method="lqg",
-        certificate=UNCERTIFIED,
         solver=SolverReport(
             route="riccati",
             status=f"{solution.status}; mirror: {regulator.status}",
@@ -351,8 +372,7 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         gain_predictor=solution.gain_predictor,
         gain_state=frozen_copy(gains),
         gain_mirror=frozen_copy(regulator.gain_mirror),
-        command_weight=rho,
-        objective_nm=float(np.sqrt(max(float(cost), 0.0))),
+        claims={"command_weight": rho, "objective_nm": float(np.sqrt(max(float(cost), 0.0)))},
     )
     return with_certificate(
         design, "Try a small command_weight, such as 1e-4, or states of similar sizes."

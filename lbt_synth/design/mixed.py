@@ -122,7 +122,6 @@ def mixed(
     length = require_taps(taps)
     problem = problem.ahead(horizon)
     least, best = hinf(problem, route="riccati"), kalman(problem)
-    assert least.gamma_least is not None  # of an H-infinity design
     if rms is not None:
         bound = number(rms, "rms", above=0)
         if bound < best.rms * (1 - _SAME):
@@ -212,11 +211,9 @@ def _mixed_design(
     extended = problem.with_memory(taps)
     size, q = taps.shape[1], base.gain_predictor.shape[1]
     gain = _extend_gain(base.gain_predictor, size // q)
-    assert least.witness is not None
-    assert least.gamma_infeasible is not None
-    padding = np.zeros((size, least.witness.states.shape[1]))
-    states = frozen_copy(np.vstack([least.witness.states, padding]))
-    witness = replace(least.witness, states=states)
+    padding = np.zeros((size, least.proof.states.shape[1]))
+    states = frozen_copy(np.vstack([least.proof.states, padding]))
+    witness = replace(least.proof, states=states)
     proved = infeasible_level(extended, witness, kalman_riccati(extended).P)
     innovation_gain = np.vstack([base.gain_filter, np.zeros((size, q))])
     return filter_design(
@@ -278,7 +275,6 @@ def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     require_problem(problem)
     bound = number(gamma, "gamma", above=0)
     least = hinf(problem, route="riccati")
-    assert least.gamma_least is not None  # of an H-infinity design
     require_reachable(bound, least.gamma_least)
     gains = CentralFilters(problem, least).member(lambda norm, _: norm - bound)
     return filter_design(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate
-from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport
-from lbt_synth.linear import Controller, EstimationProblem
+from lbt_synth.design.result import Design, SolverReport
+from lbt_synth.linear import Controller, EstimationProblem, Witness
 from lbt_synth.models import (
     ARModel,
     FullStatePlant,
@@ -21,17 +21,18 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.plant.parts import PlantParts, held_frames
 from lbt_synth.models.plant.tip_tilt import assemble
-from lbt_synth.validation import FloatArray, integer, sequence, text
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number, sequence, text
 
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
 _SAME = 1e-9
 _CHECK = ("name", "value", "limit", "computed_by")
-_PROBLEMS: dict[str, type[EstimationProblem]] = {
+_PROBLEMS: dict[str, type[EstimationProblem | LoopHardware]] = {
     "problem": EstimationProblem,
     "plant": TipTiltPlant,
     "full plant": FullStatePlant,
+    "loop": LoopHardware,
 }
 
 
@@ -55,10 +56,11 @@ class DesignRecord:
 
     def common(self) -> dict[str, Any]:
         """Return what every design has, as arguments of its class; it is not certified yet."""
-        solver = self.meta["solver"]
+        solver, claims = self.meta["solver"], self.meta["claims"]
         return {
             "method": self.meta["method"],
-            "certificate": UNCERTIFIED,
+            "problem": self.problem(),
+            "claims": {name: _claimed(value, name) for name, value in claims.items()},
             "solver": SolverReport(
                 route=text(solver["route"], "route"),
                 status=text(solver["status"], "status"),
@@ -81,9 +83,11 @@ class DesignRecord:
             mirror=PositionLoop(**meta["mirror"]) if "mirror" in meta else None,
         )
 
-    def problem(self) -> EstimationProblem:
-        """Return the estimation problem; that of a plant is assembled from its parts."""
+    def problem(self) -> EstimationProblem | LoopHardware:
+        """Return what the design is for; a plant is assembled from its parts."""
         kind = _PROBLEMS[self.meta["problem"]]
+        if kind is LoopHardware:
+            return self.hardware()
         if kind is TipTiltPlant:
             return self._assembled_plant()
         fields: dict[str, Any] = {name: self.arrays[f"PLANT_{name}"] for name in "ABCDL"}
@@ -114,28 +118,118 @@ class DesignRecord:
         plant = assemble(parts)
         return plant.with_memory(memory) if memory.size else plant
 
-    def plant(self, reason: str) -> TipTiltPlant:
-        """Return the problem if it is a tip/tilt plant; TypeError with the reason if not."""
-        problem = self.problem()
-        if not isinstance(problem, TipTiltPlant):
-            raise TypeError(f"{reason} needs a plant")
-        return problem
+
+def _claimed(value: Any, name: str) -> float | tuple[float, ...]:
+    """Return a claim of a file: a number that is not negative, or one for each mode."""
+    if isinstance(value, list):
+        return tuple(number(part, name, at_least=0) for part in value)
+    number(value, name, at_least=0)
+    return value
 
 
-def record_common(design: Design) -> DesignRecord:
-    """Record what every design has: controller, certificate, solver and loop."""
+class _Codec(NamedTuple):
+    """How a field of a design stands in a record: packed under its name, and back."""
+
+    pack: Callable[[str, Any], DesignRecord]
+    unpack: Callable[[str, DesignRecord], Any]
+
+
+def _pack_array(name: str, array: FloatArray) -> DesignRecord:
+    """Record an array; an empty one, which FITS cannot hold, is left out."""
+    return DesignRecord({name.upper(): np.atleast_2d(array)} if array.size else {})
+
+
+def _pack_parameters(name: str, parameters: tuple[Controller, ...]) -> DesignRecord:
+    arrays = {
+        f"YOULA{mode + 1}_{letter}": getattr(parameter, letter)
+        for mode, parameter in enumerate(parameters)
+        for letter in "ABC"
+    }
+    return DesignRecord(arrays)
+
+
+def _unpack_parameters(name: str, record: DesignRecord) -> tuple[Controller, ...]:
+    modes = len(record.meta["specifications"])
+    direct = np.zeros((1, 1))
+    return tuple(record.controller(f"YOULA{mode + 1}_", D=direct) for mode in range(modes))
+
+
+def _pack_specifications(name: str, specifications: tuple[Any, ...]) -> DesignRecord:
+    from lbt_synth.design.shaping.specification import to_metadata
+
+    return DesignRecord(meta={name: [to_metadata(spec) for spec in specifications]})
+
+
+def _unpack_specifications(name: str, record: DesignRecord) -> tuple[Any, ...]:
+    from lbt_synth.design.shaping.specification import from_metadata
+
+    return tuple(from_metadata(spec) for spec in record.meta[name])
+
+
+def _pack_witness(name: str, witness: Witness | None) -> DesignRecord:
+    if witness is None:
+        return DesignRecord()
+    return DesignRecord({"WITNESS_X": witness.states, "WITNESS_W": witness.disturbances})
+
+
+def _unpack_witness(name: str, record: DesignRecord) -> Witness | None:
+    arrays = record.arrays
+    if "WITNESS_X" not in arrays:
+        return None
+    return Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
+
+
+_CODECS = {  # by the type of the field
+    "FloatArray": _Codec(_pack_array, lambda name, record: record.arrays[name.upper()]),
+    "Vector": _Codec(
+        _pack_array, lambda name, record: frozen_copy(np.ravel(record.arrays.get(name.upper(), [])))
+    ),
+    "Witness | None": _Codec(_pack_witness, _unpack_witness),
+    "tuple[Controller, ...]": _Codec(_pack_parameters, _unpack_parameters),
+    "tuple[Specification, ...]": _Codec(_pack_specifications, _unpack_specifications),
+    "tuple[float, ...]": _Codec(
+        lambda name, values: DesignRecord(meta={name: list(values)}),
+        lambda name, record: tuple(number(v, name, above=0) for v in record.meta[name]),
+    ),
+    "int": _Codec(
+        lambda name, value: DesignRecord(meta={name: value}),
+        lambda name, record: integer(record.meta[name], name),
+    ),
+}
+
+
+def _stored_fields(kind: type[Design]) -> Iterator[tuple[str, _Codec]]:
+    """Yield the fields that a kind of design has beyond those of every design."""
+    common = {part.name for part in fields(Design)}
+    return ((f.name, _CODECS[str(f.type)]) for f in fields(kind) if f.name not in common)
+
+
+def rebuild_design(kind: type[Design], record: DesignRecord) -> Design:
+    """Make a design of a kind from its record, without a certificate."""
+    stored = {name: codec.unpack(name, record) for name, codec in _stored_fields(kind)}
+    return kind(**record.common(), **stored)
+
+
+def record_design(design: Design) -> DesignRecord:
+    """Record a design: controller, problem, arrays, claims, certificate and solver."""
     arrays: Arrays = {name: getattr(design.controller, name) for name in "ABCD"}
+    claims = design.claims
     meta: Meta = {
         "method": design.method,
         "dt_s": design.controller.dt_s,
         "solver": asdict(design.solver),
-        "certificate": _pack_certificate(design.certificate),
+        "claims": {n: list(v) if isinstance(v, tuple) else v for n, v in claims.items()},
+        "certificate": certificate_record(design.certificate),
         "units": {"commands": "1", "measurements": "1", "phase": "1"},
         "assumptions": list(design.assumptions),
         "configuration": design.configuration,
     }
     record = DesignRecord(arrays, meta)
-    return record if design.hardware is None else record | record_hardware(design.hardware)
+    if design.hardware is not None:
+        record |= record_hardware(design.hardware)
+    for name, codec in _stored_fields(type(design)):
+        record |= codec.pack(name, getattr(design, name))
+    return record | record_problem(design.problem)
 
 
 def record_hardware(hardware: LoopHardware) -> DesignRecord:
@@ -156,8 +250,10 @@ def record_hardware(hardware: LoopHardware) -> DesignRecord:
     return DesignRecord({"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}, meta)
 
 
-def record_problem(problem: EstimationProblem) -> DesignRecord:
-    """Record an estimation problem, with the models that a plant is made of."""
+def record_problem(problem: EstimationProblem | LoopHardware) -> DesignRecord:
+    """Record an estimation problem, with the models that a plant is made of; or a loop alone."""
+    if isinstance(problem, LoopHardware):
+        return DesignRecord(meta={"problem": "loop"})
     arrays: Arrays = {f"PLANT_{name}": getattr(problem, name) for name in "ABCDL"}
     meta: Meta = {"problem": next(k for k, kind in _PROBLEMS.items() if type(problem) is kind)}
     if isinstance(problem, FullStatePlant):
@@ -173,12 +269,9 @@ def record_problem(problem: EstimationProblem) -> DesignRecord:
     return DesignRecord(arrays, meta)
 
 
-def _pack_certificate(certificate: Certificate) -> Meta:
-    return {
-        "gamma": None if math.isnan(certificate.gamma) else certificate.gamma,
-        "rms_per_output": certificate.rms_per_output.tolist(),
-        "checks": [{name: getattr(check, name) for name in _CHECK} for check in certificate.checks],
-    }
+def certificate_record(certificate: Certificate) -> list[Meta]:
+    """Return the checks of a certificate as plain metadata."""
+    return [{name: getattr(check, name) for name in _CHECK} for check in certificate.checks]
 
 
 def _require_own_loop(plant: FullStatePlant) -> None:

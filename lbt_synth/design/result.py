@@ -1,14 +1,16 @@
-"""Designs: the controller, its certificate, and how it was computed."""
+"""Designs: the controller, its claims and its certificate, and how it was computed."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from lbt_synth.design.certificate import Certificate
+from lbt_synth.design.certificate import Certificate, certify_loop
+from lbt_synth.design.claims import Claim, Evidence
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.state_space import sigma_sparkline
@@ -20,69 +22,32 @@ from lbt_synth.loop.least_residuals.residual_limit import (
     limit_or_nan,
 )
 from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
-from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
+from lbt_synth.storage.rows import Column, Facts, fact_table
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import ComplexArray
+from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
     from lbt_synth.design.shaping import VibrationBand
     from lbt_synth.loop.fusion.fused_loop import AnyLoop
 
-Facts = TypeVar("Facts")
-
-_LIMIT = "least residual of any linear controller in it"  # heading, below the residual
+LIMIT_HEADING = "least residual of any linear controller in it"  # below the residual
+_WHAT = (
+    Column(name="method", heading="method"),
+    Column(name="route", heading="route"),
+    Column(name="n_states", heading="states of the controller"),
+)
+_CERTIFICATE = Column(name="certificate", heading="certificate")
 _BRIEFLY = (
     *("certificate", "gain", "residual_nm", "limit_nm", "gamma"),
     *("modulus", "gain_low", "gain_high", "phase_deg"),
 )
-
-
-@table_row
-class DesignFacts:
-    """What every design has."""
-
-    method: str = column("method")
-    route: str = column("route")
-    n_states: int = column("states of the controller")
-
-
-@table_row
-class CertificateFacts:
-    """Whether a design passed its checks."""
-
-    certificate: str = column("certificate")
-
-
-@table_row
-class FilterFacts:
-    """What a filter achieves, beside what it was asked for and what is possible."""
-
-    rms: float = column("estimation error, rms", unit="nm")
-    gamma: float = column("estimation error, H-infinity norm", unit="nm")
-    residual_nm: float | None = column("residual in its model, rms", unit="nm")
-    limit_nm: float | None = column(_LIMIT, unit="nm")
-    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
-    rms_requested: float | None = column("rms asked for", unit="nm")
-    gamma_requested: float | None = column("bound asked for", unit="nm")
-    gamma_least: float | None = column(
-        "least norm of any filter, upper bound", unit="nm", format=".9g"
-    )
-    gamma_infeasible: float | None = column(
-        "least norm of any filter, lower bound", unit="nm", format=".9g"
-    )
-
-
-@table_row
-class LqgFacts:
-    """What an LQG controller leaves, beside what is possible."""
-
-    residual_nm: float = column("residual in its model, rms", unit="nm", key="rms")
-    gamma: float = column("residual, H-infinity norm", unit="nm")
-    limit_nm: float | None = column(_LIMIT, unit="nm")
-    above_limit_percent: float | None = column("residual above it", unit="%", format=".5f")
-    command_weight: float = column("weight of the command")
+MODEL_LIMITS = (
+    Column(name="residual_nm", heading="residual in its model, rms", unit="nm"),
+    Column(name="limit_nm", heading=LIMIT_HEADING, unit="nm"),
+    Column(name="above_limit_percent", heading="residual above it", unit="%", format=".5f"),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,17 +69,43 @@ class SolverReport:
     iterations: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowTable:
+    """A table that ``show`` prints of a design.
+
+    Attributes
+    ----------
+    key : str
+        Name in JSON.
+    title : str
+        Line above the table.
+    rows : sequence
+        Rows made with :func:`lbt_synth.storage.rows.table_row`, all of one type.
+    """
+
+    key: str
+    title: str
+    rows: Sequence[Any]
+
+
+UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Design(Summarised):
-    """A certified controller.
+class Design(Summarised, ABC):
+    """A certified controller, with what it claims.
 
     Attributes
     ----------
     method : str
         Name that the method of synthesis gives its designs.
+    problem : EstimationProblem or LoopHardware
+        What the controller is for: a plant, a bare estimation problem, or a loop alone.
     controller : Controller
         From y(k) to u(k), the known input included (new-state form). The designs of this package
         make it of their loop and gains; it cannot be given to them.
+    claims : mapping of str to number
+        What the design says of itself, by the names of its ``CLAIMS``.
     certificate : Certificate
         Checks that were passed.
     solver : SolverReport
@@ -125,17 +116,48 @@ class Design(Summarised):
         The configuration that it was made from, as JSON; empty if there was none.
     """
 
+    CLAIMS: ClassVar[tuple[Claim, ...]] = ()  # what a design of this kind may claim
+    DERIVED: ClassVar[tuple[Column, ...]] = ()  # numbers that follow, printed below the claims
+    is_estimator: ClassVar[bool] = False  # whether it has an estimation error
+
     method: str
-    controller: Controller
-    certificate: Certificate
+    problem: Any
+    controller: Controller = field(init=False)
+    claims: Mapping[str, Any] = field(default_factory=dict)
+    certificate: Certificate = UNCERTIFIED
     solver: SolverReport
     assumptions: tuple[str, ...] = ()
     configuration: str = ""
 
+    def __post_init__(self) -> None:
+        if unknown := self.claims.keys() - {claim.name for claim in self.CLAIMS}:
+            raise ProblemError(f"a design of {self.method} does not claim {min(unknown)}.")
+        set_fields(self, claims=dict(self.claims), controller=self.make_controller())
+
+    @abstractmethod
+    def make_controller(self) -> Controller:
+        """Return the controller of the problem, the arrays and the claims."""
+
+    @abstractmethod
+    def examine(self) -> Evidence:
+        """Compute what rests on no claim: stability first, then norms and gains."""
+
     @property
     def hardware(self) -> LoopHardware | None:
         """Loop that the design is for; None for a bare estimation problem."""
-        return None
+        if isinstance(self.problem, LoopHardware):
+            return self.problem
+        return getattr(self.problem, "hardware", None)
+
+    @property
+    def gamma(self) -> float:
+        """H-infinity norm of the estimation error; nan for a design without one."""
+        return float(self.claims.get("gamma", np.nan))
+
+    @property
+    def rms(self) -> float:
+        """Standard deviation of the estimation error over all outputs; nan without one."""
+        return float(self.claims.get("rms", np.nan))
 
     @property
     def knows_mirror(self) -> bool:
@@ -150,7 +172,7 @@ class Design(Summarised):
     @property
     def expected_residual_nm(self) -> float | None:
         """Residual that the design expects, rms of all modes; None if it was made for none."""
-        return None
+        return None if self.hardware is None or np.isnan(self.rms) else self.rms
 
     @property
     def vibration_bands(self) -> tuple[VibrationBand, ...]:
@@ -161,9 +183,37 @@ class Design(Summarised):
         """Return the demands on the design that a controller violates; None if it has none."""
         return None
 
-    def facts(self) -> Any:
-        """Return the numbers that this kind of design has, a row; None if there are none."""
-        return None
+    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
+        """System from w to the estimation error, of the design's own problem by default.
+
+        A design that is no estimator raises a ProblemError.
+        """
+        raise ProblemError(f"a design of {self.method} has no estimation error.")
+
+    def derived(self) -> Mapping[str, Any]:
+        """Return the numbers of ``DERIVED``."""
+        return {}
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return the arrays that the controller is made of, such as gains, by their names."""
+        named = {part.name: getattr(self, part.name) for part in fields(self)}
+        return {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+
+    def tables(self) -> tuple[RowTable, ...]:
+        """Return the tables that ``show`` prints below the facts."""
+        return ()
+
+    def notes(self) -> list[str]:
+        """Return warnings below the tables."""
+        return []
+
+    def facts(self) -> Facts:
+        """Return what the design is, what it claims, and the numbers that follow: a row."""
+        route = f"{self.solver.route} ({self.solver.status})"
+        what = {"method": self.method, "route": route, "n_states": self.controller.n_states}
+        what["certificate"] = self.certificate._brief()
+        columns = (*_WHAT, *self.CLAIMS, *self.DERIVED)
+        return Facts(columns, {**what, **self.claims, **self.derived()})
 
     def close(self, hardware: LoopHardware, *, sensor_gain: float = 1.0) -> AnyLoop:
         """Close a loop around the design, which is stable or not.
@@ -183,14 +233,16 @@ class Design(Summarised):
         return f"{self.method}{route}, {count_text(self.controller.n_states, 'state')}{loop}"
 
     def _summarise(self) -> Summary:
-        rows = self.facts(), CertificateFacts(certificate=self.certificate._brief())
+        facts = self.facts()
+        passed = Facts((_CERTIFICATE,), facts.values)
         notes = [f"assumes: {assumption}." for assumption in self.assumptions]
         if self.hardware is None:
-            return Summary(tables=[without_units(fact_table("Design", *rows))], notes=notes)
+            said = Facts((*self.CLAIMS, *self.DERIVED), facts.values)
+            return Summary(tables=[without_units(fact_table("Design", said, passed))], notes=notes)
         loop = close_loop(self.hardware, self)
         margins = [loop_margins(loop)] if loop.is_stable else []
         return Summary(
-            tables=[fact_table("Design", rows[0], *margins, rows[1], only=_BRIEFLY)],
+            tables=[fact_table("Design", facts, *margins, passed, only=_BRIEFLY)],
             notes=notes,
             curve=sigma_sparkline(loop.rejection(), REJECTION),
         )
@@ -211,67 +263,40 @@ class Design(Summarised):
         return self.controller.to_statespace().to_control()
 
     def recertify(self) -> Certificate:
-        """Compute the certificate again from the matrices.
+        """Compute the certificate again from the matrices, and check each claim.
 
         Returns
         -------
         Certificate
             Passed or not.
         """
-        return self.certificate
+        return self._conclude(self.examine())
+
+    def _conclude(self, evidence: Evidence) -> Certificate:
+        checks = list(evidence.certificate.checks)
+        if self.hardware is not None:
+            checks.append(certify_loop(self.hardware, self.controller))
+        if checks and checks[0].passed and checks[-1].passed:
+            for claim in self.CLAIMS:
+                if claim.name in self.claims:
+                    checks += claim.checks(evidence, self.claims[claim.name])
+        return replace(evidence.certificate, checks=tuple(checks))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EstimatorDesign(Design, ABC):
-    """A controller that applies an estimator of z."""
-
-    problem: EstimationProblem  # the problem (a plant, for a telescope)
-
-    @property
-    def gamma(self) -> float:
-        """Achieved H-infinity norm of the estimation error, recomputed."""
-        return self.certificate.gamma
-
-    @property
-    def rms(self) -> float:
-        """Standard deviation of the estimation error over all outputs, recomputed."""
-        return self.certificate.rms
-
-    @property
-    def hardware(self) -> LoopHardware | None:
-        """Loop that the design is for; None for a bare estimation problem."""
-        if isinstance(self.problem, TipTiltPlant | FullStatePlant):
-            return self.problem.hardware
-        return None
-
-    @property
-    def knows_mirror(self) -> bool:
-        """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
-        return False
-
-    @property
-    def expected_residual_nm(self) -> float | None:
-        """Standard deviation of the estimation error; None for a bare estimation problem."""
-        return None if self.hardware is None else self.rms
-
-    def model_facts(self, kind: type[Facts]) -> Facts:
-        """Return a row with residual and limit of the own model, None without a loop."""
-        names = ("residual_nm", "limit_nm", "above_limit_percent")
-        values = (None, None, None) if self.hardware is None else model_limit(self)
-        return fill_row(kind, self, **dict(zip(names, values, strict=True)))
-
-    @abstractmethod
-    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the estimation error."""
-
-
-UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))
 AnyDesign = TypeVar("AnyDesign", bound=Design)
 
 
 def with_certificate(design: AnyDesign, hint: str) -> AnyDesign:
-    """Return a design with its certificate; raise CertificateError with a hint if it fails."""
-    return replace(design, certificate=design.recertify().require(hint))
+    """Return a design with its certificate; raise CertificateError with a hint if it fails.
+
+    It claims the norms of its error as they are computed.
+    """
+    evidence = design.examine()
+    norms = {name: float(getattr(evidence.certificate, name)) for name in ("rms", "gamma")}
+    named = {claim.name for claim in design.CLAIMS}
+    claims = {name: norm for name, norm in norms.items() if name in named} | design.claims
+    claiming = replace(design, claims=claims)
+    return replace(claiming, certificate=claiming._conclude(evidence).require(hint))
 
 
 def require_hardware(design: Design, what: str) -> LoopHardware:
@@ -282,15 +307,15 @@ def require_hardware(design: Design, what: str) -> LoopHardware:
     raise ProblemError(f"{what} needs the design of a loop; got {got}.")
 
 
-def model_limit(design: EstimatorDesign) -> tuple[float, float, float]:
-    """Return a filter's residual in its own model, the limit there [nm rms], and how far above [%].
+def model_limits(design: Design) -> Mapping[str, float | None]:
+    """Return the values of ``MODEL_LIMITS``: residual in the own model, limit, and how far above.
 
-    What cannot be computed is nan. The residual is the estimation error where the mirror reaches
-    every command at once, or the design commands for its dynamics.
+    They are None without a loop, and what cannot be computed is nan. The residual is the estimation
+    error where the mirror reaches every command at once, or the design commands for its dynamics.
     """
     plant = design.problem
     if not isinstance(plant, TipTiltPlant | FullStatePlant):
-        return np.nan, np.nan, np.nan
+        return {}
     hardware, residual_nm = plant.hardware, design.rms
     settled = hardware.delay_frames % 1 == 0 and hardware.mirror is None
     if not (settled or design.knows_mirror):
@@ -299,7 +324,8 @@ def model_limit(design: EstimatorDesign) -> tuple[float, float, float]:
             loop = close_loop(hardware, design.controller)
             residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
-    return residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
+    values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
+    return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}
 
 
 def without_units(table: Table) -> Table:

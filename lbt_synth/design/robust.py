@@ -120,8 +120,7 @@ def robust(
             by_mode[key] = Specification(objective=Total(terms=terms), demands=(*fixed, *further))
         specifications.append(by_mode[key])
     path = plant.hardware
-    design = shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)
-    return replace(design, method="robust")
+    return shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)
 
 
 def _uncovered(

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design, ShapedDesign
-from lbt_synth.design.result import EstimatorDesign, require_hardware
+from lbt_synth.design.result import require_hardware
 from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.design.shaping.objectives import leaves
@@ -196,7 +196,7 @@ def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     drive = np.sqrt(1 - _POLE**2)
     slow = ARModel(coefficients=np.array([_POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
     sources, noise = [(slow, row) for row in np.eye(n)], _NOISE * np.eye(q)
-    if isinstance(design, EstimatorDesign) and isinstance(design.problem, TipTiltPlant):
+    if design.is_estimator and isinstance(design.problem, TipTiltPlant):
         plant = design.problem
         sources = list(zip(plant.turbulence, np.eye(n), strict=True))
         sources += [(v.ar_model(rate), np.asarray(v.direction)) for v in plant.vibrations]

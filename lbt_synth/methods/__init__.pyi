@@ -1,6 +1,4 @@
-from .method import Description as Description
 from .method import DesignInputs as DesignInputs
 from .method import Method as Method
-from .method import RowTable as RowTable
 from .method import Section as Section
 from .registry import method_named as method_named

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method, require_several_sensors
-from lbt_synth.methods.method import DesignInputs
+from lbt_synth.methods.filters import BOUNDS, BoundOptions, require_several_sensors
+from lbt_synth.methods.method import DesignInputs, Method
 
 if TYPE_CHECKING:
     from lbt_synth.design.filter_design import FilterDesign
@@ -33,11 +33,11 @@ def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign | FusedFi
     return hinf(inputs.plant, **options.bound(), horizon=options.horizon, route=options.route)
 
 
-METHOD = filter_method(
+METHOD = Method(
     name="hinf",
     title="H-infinity filter",
     label="H∞",
-    design_names=("hinf", "fused hinf"),
+    design="lbt_synth.design.filter_design:FilterDesign",
     options=HinfOptions,
     build=_build,
     exclusive=BOUNDS,

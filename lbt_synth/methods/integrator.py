@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from lbt_synth.methods.method import Description, DesignInputs, Method, Section
-from lbt_synth.validation import number
+from lbt_synth.methods.method import DesignInputs, Method, Section
 
 if TYPE_CHECKING:
     from lbt_synth.design.integrator import IntegratorDesign
-    from lbt_synth.design.integrator_law import IntegratorLaw
-    from lbt_synth.design.record import DesignRecord
 
 _SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides its gain
 
@@ -47,14 +44,9 @@ class IntegratorOptions(Section):
     )
 
 
-def _law(values: dict[str, Any]) -> IntegratorLaw:
-    from lbt_synth.design.integrator_law import IntegratorLaw
-
-    return IntegratorLaw(**values)
-
-
 def _build(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign:
     from lbt_synth.design.integrator import integrator, optimal_integrator
+    from lbt_synth.design.integrator_law import IntegratorLaw
 
     section: IntegratorOptions | None = inputs.method_section(METHOD.name)
     own = options.model_dump(exclude_unset=True)
@@ -63,33 +55,10 @@ def _build(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign
         usual = {name: value for name, value in usual.items() if name not in _SIZES}
     values = usual | own
     gain = values.pop("gain", None)
-    law = _law(values)
+    law = IntegratorLaw(**values)
     if gain is None:
         return optimal_integrator(inputs.hardware, inputs.truth, law=law)
     return integrator(inputs.hardware, gain=gain, law=law)
-
-
-def _pack(design: IntegratorDesign) -> DesignRecord:
-    from lbt_synth.design.record import DesignRecord
-
-    return DesignRecord(
-        meta={"integrator_gain": design.gain, "integrator_law": design.law.changes()}
-    )
-
-
-def _unpack(record: DesignRecord) -> IntegratorDesign:
-    from lbt_synth.design.integrator import IntegratorDesign
-
-    return IntegratorDesign(
-        **record.common(),
-        loop_hardware=record.hardware(),
-        gain=number(record.meta["integrator_gain"], "integrator_gain", above=0),
-        law=_law(record.meta["integrator_law"]),
-    )
-
-
-def _describe(design: IntegratorDesign) -> Description:
-    return Description(facts=design.facts())
 
 
 METHOD = Method(
@@ -99,9 +68,7 @@ METHOD = Method(
     options=IntegratorOptions,
     section=IntegratorOptions,
     build=_build,
-    pack=_pack,
-    unpack=_unpack,
-    describe=_describe,
+    design="lbt_synth.design.integrator:IntegratorDesign",
     estimator=False,
     reference_rank=0,
 )

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import Horizon, filter_method, require_several_sensors
-from lbt_synth.methods.method import DesignInputs, Section
+from lbt_synth.methods.filters import Horizon, require_several_sensors
+from lbt_synth.methods.method import DesignInputs, Method, Section
 
 if TYPE_CHECKING:
     from lbt_synth.design.filter_design import FilterDesign
@@ -32,11 +32,11 @@ def _build(inputs: DesignInputs, options: KalmanOptions) -> FilterDesign | Fused
     return kalman(inputs.plant, horizon=options.horizon, route=options.route)
 
 
-METHOD = filter_method(
+METHOD = Method(
     name="kalman",
     title="Kalman filter",
     label="Kalman",
-    design_names=("kalman", "fused kalman"),
+    design="lbt_synth.design.filter_design:FilterDesign",
     options=KalmanOptions,
     build=_build,
     batched=True,

@@ -6,18 +6,17 @@ no unknown keys.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
 if TYPE_CHECKING:
-    from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.result import Design
     from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
     from lbt_synth.models.fusion.plant import FusedPlant
-    from lbt_synth.validation import FloatArray
 
 
 class Section(BaseModel):
@@ -83,61 +82,6 @@ class DesignInputs(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RowTable:
-    """A table that ``show`` prints.
-
-    Attributes
-    ----------
-    key : str
-        Name in JSON.
-    title : str
-        Line above the table.
-    rows : sequence
-        Rows made with :func:`lbt_synth.storage.rows.table_row`, all of one type.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods import RowTable
-    >>> RowTable(key="terms", title="Residual of each term", rows=()).key
-    'terms'
-    """
-
-    key: str
-    title: str
-    rows: Sequence[Any]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Description:
-    """What ``show`` says of a design beyond what it says of every design.
-
-    Attributes
-    ----------
-    facts : object
-        A row made with :func:`lbt_synth.storage.rows.table_row`; None is not printed.
-    tables : sequence of RowTable
-        Tables below the facts.
-    notes : sequence of str
-        Warnings below the tables.
-    matrices : mapping of str to ndarray
-        What ``--matrices`` adds to the controller's.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.methods import method_named
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
-    >>> method_named("integrator").describe(slow).facts.gain
-    0.3
-    """
-
-    facts: Any
-    tables: Sequence[RowTable] = ()
-    notes: Sequence[str] = ()
-    matrices: Mapping[str, FloatArray] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
     """A method of synthesis, whole: all that the package knows of it stands here.
 
@@ -151,12 +95,8 @@ class Method:
         A :class:`Section`: each option with its description, limits and default.
     build : callable
         From :class:`DesignInputs` and the options to a certified design.
-    pack, unpack : callable
-        What a gain file holds beyond the controller; and the design of a whole record.
-    describe : callable
-        From a design to its :class:`Description`.
-    design_names : tuple of str
-        ``Design.method`` of its designs, where it is not the name.
+    design : str
+        The class of its designs, "module:class": its arrays, and its claims with their checks.
     section : type or None
         Section ``design.<name>`` of a configuration, a :class:`Section`.
     plant_section : callable or None
@@ -189,10 +129,7 @@ class Method:
     label: str
     options: type[Section]
     build: Callable[[DesignInputs, Any], Design]
-    pack: Callable[[Any], DesignRecord]
-    unpack: Callable[[DesignRecord], Design]
-    describe: Callable[[Any], Description]
-    design_names: tuple[str, ...] = ()
+    design: str
     section: type[Section] | None = None
     plant_section: Callable[[TipTiltPlant, tuple[float, float] | None], Section] | None = None
     exclusive: frozenset[str] = frozenset()
@@ -202,6 +139,12 @@ class Method:
     slow: bool = False
     reference_rank: int | None = None
     reference_options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> type[Design]:
+        """The class of its designs, imported."""
+        kind: type[Design] = resolve_name(self.design)
+        return kind
 
     @property
     def needs_options(self) -> bool:

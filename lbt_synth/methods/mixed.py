@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import BOUNDS, BoundOptions, filter_method, require_several_sensors
-from lbt_synth.methods.method import DesignInputs
+from lbt_synth.methods.filters import BOUNDS, BoundOptions, require_several_sensors
+from lbt_synth.methods.method import DesignInputs, Method
 
 if TYPE_CHECKING:
     from lbt_synth.design.filter_design import FilterDesign
@@ -40,11 +40,11 @@ def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign | FusedF
     return mixed(inputs.plant, **bound, taps=options.taps, horizon=options.horizon)
 
 
-METHOD = filter_method(
+METHOD = Method(
     name="mixed",
     title="mixed filter",
     label="mixed",
-    design_names=("mixed", "fused mixed"),
+    design="lbt_synth.design.filter_design:FilterDesign",
     options=MixedOptions,
     build=_build,
     exclusive=BOUNDS,

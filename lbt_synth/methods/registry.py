@@ -59,19 +59,6 @@ def method_named(name: str) -> Method:
     return methods[name]
 
 
-def method_of_design(name: str) -> Method:
-    """Return the method whose designs carry a name in ``Design.method``."""
-    method = _find_method_of_design(name)
-    if method is None:
-        raise ProblemError(f"no method of synthesis makes designs of the name {name!r}.")
-    return method
-
-
-def _find_method_of_design(name: str) -> Method | None:
-    found = (m for m in all_methods().values() if name in (m.design_names or (m.name,)))
-    return next(found, None)
-
-
 def option_names() -> list[str]:
     """Return the names of the options of all methods."""
     return sorted({name for m in all_methods().values() for name in m.options.model_fields})
@@ -79,14 +66,12 @@ def option_names() -> list[str]:
 
 def design_title(name: str) -> str:
     """Return what sentences call a design with a name in ``Design.method``, else the name."""
-    method = _find_method_of_design(name)
-    return name if method is None else method.title
+    return all_methods()[name].title if name in all_methods() else name
 
 
 def design_label(name: str) -> str:
     """Return what figures call a design with a name in ``Design.method``, else the name."""
-    method = _find_method_of_design(name)
-    return name if method is None else method.label
+    return all_methods()[name].label if name in all_methods() else name
 
 
 def record_methods() -> list[str]:

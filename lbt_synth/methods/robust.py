@@ -9,25 +9,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from lbt_synth.errors import ConfigError, ProblemError, name_key
-from lbt_synth.methods.method import (
-    Description,
-    DesignInputs,
-    Method,
-    RowTable,
-    Section,
-)
-from lbt_synth.methods.robust_section import (
-    Axis,
-    BandSection,
-    RobustSection,
-)
+from lbt_synth.methods.method import DesignInputs, Method, Section
+from lbt_synth.methods.robust_section import Axis, BandSection, RobustSection
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
-from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import number
 
 if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
-    from lbt_synth.design.record import DesignRecord
     from lbt_synth.design.shaping.specification import Demand
     from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 
@@ -38,23 +25,6 @@ _MOST_BANDS = 6  # around lines of a plant
 _BAND = 0.02  # half width of such a band, over its frequency
 _PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes longer
 _GAIN_BAND, _GAIN_MARGIN, _GAIN_FUNCTIONS = 0.003, 0.25, 60  # if only the gain is uncertain
-
-
-@table_row
-class DemandRow:
-    """One demand on one mode."""
-
-    demand: str = column("demand")
-    mode: int = column("mode")
-
-
-@table_row
-class TermRow:
-    """The residual of one term of the objective."""
-
-    term: str = column("term")
-    mode: int = column("mode")
-    rms_nm: float = column("residual", unit="nm rms")
 
 
 def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
@@ -244,87 +214,14 @@ def _axis(line: Vibration) -> Axis:
     return shaken[0] if len(shaken) == 1 else "both"
 
 
-def _pack(design: ShapedDesign) -> DesignRecord:
-    from lbt_synth.design.record import DesignRecord
-    from lbt_synth.design.shaping.specification import to_metadata
-
-    arrays = {
-        f"YOULA{mode + 1}_{name}": getattr(parameter, name)
-        for mode, parameter in enumerate(design.parameters)
-        for name in "ABC"
-    }
-    shaped = {
-        "specifications": [to_metadata(spec) for spec in design.specifications],
-        "objective_nm": list(design.objective_nm),
-        "long_objective_nm": list(design.long_objective_nm),
-        "long_functions": design.long_functions,
-    }
-    return DesignRecord(arrays, {"shaped": shaped})
-
-
-def _unpack(record: DesignRecord) -> ShapedDesign:
-    from lbt_synth.design.loop_shaping import ShapedDesign
-    from lbt_synth.design.shaping import Specification
-    from lbt_synth.design.shaping.specification import from_metadata
-
-    hardware, shaped = record.hardware(), record.meta["shaped"]
-    parameters = tuple(
-        record.controller(f"YOULA{mode + 1}_", D=np.zeros((1, 1))) for mode in range(hardware.modes)
-    )
-    specifications = tuple(from_metadata(spec) for spec in shaped["specifications"])
-    if not all(isinstance(spec, Specification) for spec in specifications):
-        raise ValueError("what it holds as specifications are none")
-    for spec in specifications:
-        spec.require_fitting(hardware)
-    objective, long = (
-        tuple(number(v, name, above=0) for v in shaped[name])
-        for name in ("objective_nm", "long_objective_nm")
-    )
-    if {len(specifications), len(objective), len(long)} != {hardware.modes}:
-        raise ValueError(
-            f"it must have {hardware.modes} specifications and claims, one for each mode"
-        )
-    return ShapedDesign(
-        **record.common(),
-        loop_hardware=hardware,
-        specifications=specifications,
-        parameters=parameters,
-        objective_nm=objective,
-        long_objective_nm=long,
-        long_functions=int(shaped["long_functions"]),
-    )
-
-
-def _describe(design: ShapedDesign) -> Description:
-    notes = []
-    if design.is_reduced and design.loss < 0:
-        notes.append(
-            f"note: the long parameter is not long enough: one of {design.states_per_mode} states "
-            "is better. Try more functions, or another pole."
-        )
-    demands = [DemandRow(demand=label, mode=m + 1) for m, label in design.demand_labels()]
-    terms = [TermRow(term=text, mode=m + 1, rms_nm=rms) for m, text, rms in design.terms_nm()]
-    return Description(
-        facts=design.facts(),
-        tables=(
-            RowTable(key="demands", title="Demands", rows=demands),
-            RowTable(key="terms", title="Residual of each term", rows=terms),
-        ),
-        notes=notes,
-    )
-
-
 METHOD = Method(
     name="robust",
     title="robust controller",
     label="robust",
-    design_names=("robust", "shaped"),
     estimator=False,
     options=Section,
     section=RobustSection,
     plant_section=_plant_section,
     build=_build,
-    describe=_describe,
-    pack=_pack,
-    unpack=_unpack,
+    design="lbt_synth.design.loop_shaping:ShapedDesign",
 )

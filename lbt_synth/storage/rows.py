@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
@@ -91,12 +91,31 @@ def table_row(kind: type[Row]) -> type[Row]:
     return made
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Facts:
+    """A row whose columns are data; what has no value is None."""
+
+    columns: tuple[Column, ...]
+    values: Mapping[str, Any]
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the value of a column."""
+        if any(column.name == name for column in self.columns):
+            return self.values.get(name)
+        raise AttributeError(f"there is no column {name!r}")
+
+
 def columns(kind: Any) -> tuple[Column, ...]:
     """Return the columns of a row or a row type, in the order of its fields."""
+    named = (
+        [(each, each.name) for each in kind.columns]
+        if isinstance(kind, Facts)
+        else [(field.metadata.get("column"), field.name) for field in dataclasses.fields(kind)]
+    )
     return tuple(
-        dataclasses.replace(given, name=field.name, key=given.key or field.name)
-        for field in dataclasses.fields(kind)
-        if (given := field.metadata.get("column"))
+        dataclasses.replace(given, name=name, key=given.key or name)
+        for given, name in named
+        if given
     )
 
 

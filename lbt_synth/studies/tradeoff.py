@@ -114,7 +114,6 @@ def _points(
     problem: EstimationProblem, count: int, families: tuple[str, ...], taps: int
 ) -> Iterator[TradeoffPoint]:
     least, best = hinf(problem, route="riccati"), kalman(problem)
-    assert least.gamma_least is not None  # of an H-infinity design
     spread = max(best.gamma / least.gamma_least, 1.0)
     for i, share in enumerate(np.linspace(0, 1, count) ** _CROWDING):
         level = least.gamma_least * float(spread**share)

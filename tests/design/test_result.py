@@ -10,7 +10,6 @@ import pytest
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.methods.registry import method_of_design
 
 AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
 
@@ -32,7 +31,7 @@ def values(text):
 
 
 def test_a_printed_design_has_at_most_ten_lines_and_its_facts(design):
-    shown, own = values(str(design)), method_of_design(design.method).describe(design).facts
+    shown, own = values(str(design)), design.facts()
     margins = lbt.loop_margins(lbt.close_loop(design.hardware, design))
     assert 8 <= len(str(design).splitlines()) <= 10
     assert shown["residual in its model, rms"] == [f"{own.residual_nm:.6g}", "nm"]
@@ -53,7 +52,7 @@ def test_a_design_whose_loop_is_unstable_is_shown_without_margins(design):
     slow = replace(design.problem, hardware=replace(design.hardware, delay_frames=9.0))
     loop = lbt.close_loop(slow.hardware, lbt.integrator(design.hardware, gain=0.9))
     assert not loop.is_stable
-    unstable = replace(lbt.integrator(design.hardware, gain=0.9), loop_hardware=slow.hardware)
+    unstable = replace(lbt.integrator(design.hardware, gain=0.9), problem=slow.hardware)
     assert set(values(str(unstable))) == {"gain", "certificate"}
 
 

@@ -47,7 +47,10 @@ def test_no_witness_proves_too_much(seed, n, r):
 def test_a_forged_claim_is_found_out(axis_plant):
     design = lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
     assert design.recertify().passed
-    forged = dataclasses.replace(design, gamma_infeasible=1.001 * design.gamma_infeasible)
+    forged = dataclasses.replace(
+        design,
+        claims={**design.claims, "gamma_infeasible": 1.001 * design.gamma_infeasible},
+    )
     failed = [check.name for check in forged.recertify().checks if not check.passed]
     assert failed == ["infeasible level over the level proved, less 1"]
     with pytest.raises(lbt.errors.DimensionError, match="a witness must have 4 rows of states"):

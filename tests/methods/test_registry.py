@@ -19,7 +19,6 @@ from lbt_synth.methods import method_named, registry
 from lbt_synth.methods.registry import (
     all_methods,
     design_label,
-    method_of_design,
     reference_methods,
 )
 
@@ -41,15 +40,12 @@ def leaky(tmp_path, monkeypatch):
 def test_methods_by_name(leaky):
     assert tuple(name for name in all_methods() if name != "leaky") == BUILT_IN
     assert leaky.title == leaky_method.METHOD.title
-    assert method_of_design("shaped") is method_named("robust")
     assert [m.name for m in reference_methods()] == ["integrator", "kalman", "hinf"]
     assert [m.name for m in reference_methods(estimators_only=True)] == ["kalman", "hinf"]
     assert leaky.needs_options
     assert not method_named("mixed").needs_options
     with pytest.raises(lbt.errors.ProblemError, match=r"got 'kalmann'. Did you mean kalman\?"):
         method_named("kalmann")
-    with pytest.raises(lbt.errors.ProblemError, match="no method of synthesis makes designs"):
-        method_of_design("magic")
 
 
 def test_labels(leaky, config):
@@ -87,7 +83,7 @@ def test_every_command_takes_a_method_of_the_folder(leaky, tmp_path, capsys, mon
     shown = json.loads(out)
     assert (status, shown["leak_per_s"], shown["gain"]) == (0, 5.0, 0.3)
     assert shown["leak"][1] == {"after_s": 0.1, "left": pytest.approx(np.exp(-0.5))}
-    assert shown["matrices"]["forgets"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))
+    assert shown["matrices"]["A"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))
     assert run(capsys, "verify", gain)[0] == 0
     assert run(capsys, "sigma", gain, "-o", "sigma.png")[0] == 0
     status, out, _ = run(capsys, "simulate", small, gain, "--frames", "400", "--cases", "1")

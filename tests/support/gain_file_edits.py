@@ -172,7 +172,7 @@ def changes(value, rng):
         yield from (("no number", float("nan")), ("no number", float("inf")))
         yield from (("type", str(value)), ("type", True), ("type", [value]), ("type", {}))
     elif isinstance(value, str):
-        words = ("kalman", "hinf", "mixed", "integrator", "lqg", "shaped", "plant")
+        words = ("kalman", "hinf", "mixed", "integrator", "lqg", "robust", "plant")
         yield from (("word", word) for word in (*words, value + " x", value[:-1], "", "\ud800"))
         yield from (("type", 3), ("type", [value]), ("type", {value: 1}))
     elif isinstance(value, list):
@@ -326,7 +326,7 @@ def judge(edit, folder, commands=COMMANDS):
     changed = {k[0] for k in own.keys() | found.keys() if differ(own.get(k), found.get(k))}
     if not changed:
         return "no other design"
-    promise = edit.place[:3] == ("meta", "shaped", "specifications")
+    promise = edit.place[:2] == ("meta", "specifications")
     if promise and found and changed <= {"terms", "limit_nm", "above_limit_percent"}:
         return "another claim that holds"
     return f"certified by {', '.join(taken)}"

@@ -1,20 +1,15 @@
 """A method of synthesis that the package does not have, whole in one file: a leaky integrator."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, field, replace
-
 import numpy as np
 from pydantic import Field
 
-from lbt_synth.design import Design, SolverReport, certify_loop
-from lbt_synth.design.record import DesignRecord
-from lbt_synth.design.result import UNCERTIFIED, with_certificate
+from lbt_synth.design import Design, SolverReport
+from lbt_synth.design.certificate import Check
+from lbt_synth.design.claims import Claim, Evidence
+from lbt_synth.design.result import UNCERTIFIED, RowTable, with_certificate
 from lbt_synth.linear import Controller
-from lbt_synth.methods import Description, Method, RowTable, Section
-from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import set_fields
+from lbt_synth.methods import Method, Section
+from lbt_synth.storage.rows import Column, Facts
 
 
 class LeakyOptions(Section):
@@ -24,81 +19,50 @@ class LeakyOptions(Section):
     leak_per_s: float = Field(gt=0, description="part of the command lost [1/s]", examples=[5])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+def check_leak(evidence, leak_per_s):
+    """Check that the controller forgets as fast as it claims."""
+    design = evidence.design
+    apart = design.controller.A[0, 0] / np.exp(-leak_per_s * design.problem.dt_s) - 1
+    yield Check("leak, against the one claimed", abs(apart), 1e-9, "eigenvalue")
+
+
 class LeakyDesign(Design):
     """An integrator that forgets."""
 
-    controller: Controller = field(init=False)
-    loop_hardware: LoopHardware
-    gain: float
-    leak_per_s: float
+    CLAIMS = (
+        Claim(name="gain", heading="gain"),
+        Claim(name="leak_per_s", heading="leak", unit="1/s", checks=check_leak),
+    )
 
-    def __post_init__(self):
-        hardware = self.loop_hardware
-        back = np.linalg.pinv(hardware.sensor @ hardware.influence)
-        each = np.eye(hardware.modes)
-        controller = Controller(
-            A=np.exp(-self.leak_per_s * hardware.dt_s) * each,
-            B=self.gain * back,
-            C=each,
-            D=np.zeros((hardware.modes, back.shape[1])),
-            dt_s=hardware.dt_s,
-        )
-        set_fields(self, controller=controller)
+    def make_controller(self):
+        """Return the controller of the claims."""
+        path, claims = self.problem, self.claims
+        back, each = np.linalg.pinv(path.sensor @ path.influence), np.eye(path.modes)
+        A, D = np.exp(-claims["leak_per_s"] * path.dt_s) * each, np.zeros_like(back)
+        return Controller(A=A, B=claims["gain"] * back, C=each, D=D, dt_s=path.dt_s)
 
-    @property
-    def hardware(self):
-        """The loop."""
-        return self.loop_hardware
+    def examine(self):
+        """Compute nothing but the loop."""
+        return Evidence(design=self, certificate=UNCERTIFIED)
 
-    def recertify(self):
-        """Check the loop again."""
-        return replace(UNCERTIFIED, checks=(certify_loop(self.loop_hardware, self.controller),))
+    def tables(self):
+        """Return what is left of a command."""
+        after, left = Column(name="after_s", heading="after"), Column(name="left", heading="left")
+        decay = -self.claims["leak_per_s"]
+        rows = [Facts((after, left), {"after_s": t, "left": np.exp(decay * t)}) for t in (0.01, 0.1)]
+        return (RowTable(key="leak", title="What is left", rows=rows),)
 
-
-@table_row
-class LeakyFacts:
-    """What it is."""
-
-    gain: float = column("gain")
-    leak_per_s: float = column("leak", unit="1/s")
-
-
-@table_row
-class LeakRow:
-    """What is left."""
-
-    after_s: float = column("after", unit="s")
-    left: float = column("left", unit="%", scale=100, format=".1f")
+    def notes(self):
+        """Return a warning."""
+        return ["note: this integrator forgets."]
 
 
 def build(inputs, options):
     """Design it."""
-    design = LeakyDesign(
-        method="leaky",
-        certificate=UNCERTIFIED,
-        solver=SolverReport(route="closed form", status="given", iterations=0),
-        loop_hardware=inputs.hardware,
-        gain=options.gain,
-        leak_per_s=options.leak_per_s,
-    )
+    solver = SolverReport(route="closed form", status="given", iterations=0)
+    claims = options.model_dump()
+    design = LeakyDesign(method="leaky", problem=inputs.hardware, claims=claims, solver=solver)
     return with_certificate(design, "Lower the gain.")
-
-
-def unpack(record):
-    """Read it from a gain file."""
-    return LeakyDesign(**record.common(), loop_hardware=record.hardware(), **record.meta["leaky"])
-
-
-def describe(design):
-    """Say what it is."""
-    rows = [LeakRow(after_s=t, left=float(np.exp(-design.leak_per_s * t))) for t in (0.01, 0.1)]
-    return Description(
-        facts=LeakyFacts(gain=design.gain, leak_per_s=design.leak_per_s),
-        tables=[RowTable(key="leak", title="What is left", rows=rows)],
-        notes=["note: this integrator forgets."],
-        matrices={"forgets": design.controller.A},
-    )
 
 
 METHOD = Method(
@@ -107,9 +71,7 @@ METHOD = Method(
     label="leaky",
     options=LeakyOptions,
     build=build,
-    pack=lambda d: DesignRecord(meta={"leaky": {"gain": d.gain, "leak_per_s": d.leak_per_s}}),
-    unpack=unpack,
-    describe=describe,
+    design="lbt_synth.methods.leaky:LeakyDesign",
     estimator=False,
     configurable=frozenset({"gain"}),
 )

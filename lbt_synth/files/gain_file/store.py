@@ -14,11 +14,16 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Design
-from lbt_synth.design.record import DesignRecord, Meta, record_common
-from lbt_synth.design.result import EstimatorDesign
+from lbt_synth.design.record import (
+    DesignRecord,
+    Meta,
+    certificate_record,
+    rebuild_design,
+    record_design,
+)
 from lbt_synth.errors import CertificateError, GainFileError, OutputError, SchemaVersionError
 from lbt_synth.files.file_checks import FileKind
-from lbt_synth.methods.registry import method_of_design
+from lbt_synth.methods.registry import method_named
 from lbt_synth.storage.array_file import (
     digest,
     fits_bytes,
@@ -32,7 +37,7 @@ from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import agree, frozen_copy, number, real_array, text
 
 SCHEMA = "lbt_synth gain file"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 CONVENTION = (
     "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
     "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1), or the "
@@ -59,9 +64,11 @@ def write_cards(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
     if design.hardware is not None:
         cards["RATE_HZ"] = (design.hardware.frame_rate_hz, "[Hz] frame rate")
         cards["DELAY"] = (design.hardware.delay_frames, "[frames] total delay")
-    if isinstance(design, EstimatorDesign):
-        cards["RMS"] = (design.rms, "estimation error, standard deviation")
-        cards["GAMMA"] = (design.gamma, "estimation error, H-infinity norm")
+    cards |= {
+        claim.name.upper(): (design.claims[claim.name], claim.heading)
+        for claim in design.CLAIMS
+        if claim.name in ("rms", "gamma") and claim.name in design.claims
+    }
     cards["SHA256"] = (meta["digest"], "")
     return cards
 
@@ -143,12 +150,13 @@ def _record_design(design: Design, version: str) -> DesignRecord:
             "convention": CONVENTION,
         }
     )
-    return header | record_common(design) | method_of_design(design.method).pack(design)
+    return header | record_design(design)
 
 
 def _rebuild(record: DesignRecord) -> Design:
     """Rebuild the design of a record from its plant, loop and gains, without a certificate."""
-    return method_of_design(text(record.meta["method"], "method")).unpack(record)
+    method = method_named(text(record.meta["method"], "method"))
+    return rebuild_design(method.kind, record)
 
 
 def load_gain(path: str | os.PathLike[str]) -> Design:
@@ -213,8 +221,7 @@ def read_design(path: str | os.PathLike[str]) -> tuple[Design, str]:
         require_agreement(found, _record_design(design, version))
         design = replace(design, certificate=design.recertify())
         if design.certificate.passed:
-            own = record_common(design).meta["certificate"]
-            require_certificate(meta["certificate"], own)
+            require_certificate(meta["certificate"], certificate_record(design.certificate))
             if ending == ".fits":
                 cards = {key: value for key, (value, _) in write_cards(design, meta).items()}
                 require_same(read_cards(io.BytesIO(content), cards), cards, "header")
@@ -242,20 +249,18 @@ def require_agreement(found: DesignRecord, expected: DesignRecord) -> None:
             require_same(found.meta[key], value, key)
 
 
-def require_certificate(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Refuse a certificate with other norms, checks or limits than the one computed again.
+def require_certificate(stored: list[dict[str, Any]], computed: list[dict[str, Any]]) -> None:
+    """Refuse a certificate with other checks or limits than the one computed again.
 
     The values of the checks are rounding to a large part, and are not compared.
     """
-    for key in ("gamma", "rms_per_output"):
-        require_same(found[key], expected[key], f"certificate.{key}")
-    checks, own = ({c["name"]: c for c in cert["checks"]} for cert in (found, expected))
-    if unclaimed := checks.keys() - own.keys():
+    checks, again = ({check["name"]: check for check in part} for part in (stored, computed))
+    if unclaimed := checks.keys() - again.keys():
         raise ValueError(f"the design does not claim what was checked: {min(unclaimed)}")
-    if missing := own.keys() - checks.keys():
+    if missing := again.keys() - checks.keys():
         raise ValueError(f"the certificate lacks a check of the design: {min(missing)}")
     for name in checks:
-        require_same(checks[name]["limit"], own[name]["limit"], f"the limit of '{name}'")
+        require_same(checks[name]["limit"], again[name]["limit"], f"the limit of '{name}'")
         number(checks[name]["value"], f"the value of '{name}'")
 
 

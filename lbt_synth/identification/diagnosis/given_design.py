@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.comparison import PredictionRow
@@ -78,7 +77,7 @@ def given_design_row(
     if loop.is_stable:
         low, high = stable_sensor_gains(model.hardware, controller)
         stable = f"{low * nominal:.3g} to {high * nominal:.3g}"
-    promised = design.rms if isinstance(design, EstimatorDesign) else np.nan
+    promised = design.rms
     return GivenDesignRow(
         design=name,
         method=design_title(design.method),

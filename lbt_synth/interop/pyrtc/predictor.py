@@ -11,7 +11,7 @@ from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import design_from_record, loop_record
 from lbt_synth.interop.pyrtc.pol_filter import pol_filter
-from lbt_synth.methods.registry import method_of_design, record_methods
+from lbt_synth.methods.registry import record_methods
 from lbt_synth.validation import FloatArray, integer, number
 
 _FITTED_NM = 100.0  # rms of a series that is identified
@@ -102,7 +102,7 @@ class GainFilePredictor:
             delay_frames=self.horizon,
             unit="nm",
         )
-        method = method_of_design(self._design.method).name
+        method = self._design.method
         known = method if method in record_methods() else None
         self._take(design_from_record(record, method=known).design)
         self.fitted = True

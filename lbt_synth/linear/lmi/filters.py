@@ -41,7 +41,6 @@ class LmiSolution:
     gain_filter: FloatArray  # (n, q), in closed form from P
     status: str  # as reported by the solver; the design is certified without it
     iterations: int
-    witness: Witness | None = None  # the dual solution of the least gamma
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,7 +60,6 @@ class BalancedProblem:
         run: tuple[str, int],
         *,
         gamma: float = np.inf,
-        witness: Witness | None = None,
     ) -> LmiSolution:
         """Bring a covariance, and the gains of an information matrix, to the original states."""
         try:
@@ -78,7 +76,6 @@ class BalancedProblem:
             gain_filter=frozen_copy(self.basis @ filtering @ self.measurement_scale),
             status=run[0],
             iterations=run[1],
-            witness=witness,
         )
 
     def witness(self, moments: FloatArray, basis: FloatArray) -> Witness:
@@ -135,7 +132,7 @@ def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: fl
 
 def least_gamma_lmi(
     problem: EstimationProblem, *, coordinates: FloatArray, scale: float
-) -> LmiSolution:
+) -> tuple[LmiSolution, Witness]:
     """Find the least gamma, and a filter that reaches it; the dual solution is its witness."""
     scaled = balance(problem, coordinates, scale)
     basis, parts = _invisible_basis(scaled.problem)
@@ -144,8 +141,8 @@ def least_gamma_lmi(
     run = solve(cp.Minimize(level), [dissipation, storage])
     require_optimum(run, "the least gamma's semidefinite programme", _ADVICE)
     moments = np.where(parts[:, None] == parts, dissipation.dual_value, 0.0)
-    witness = scaled.witness(moments, basis)
-    return _unpack(scaled, P.value / level.value, float(level.value), run, witness=witness)
+    solution = _unpack(scaled, P.value / level.value, float(level.value), run)
+    return solution, scaled.witness(moments, basis)
 
 
 def hinf_lmi(
@@ -208,11 +205,11 @@ def _invisible_basis(problem: EstimationProblem) -> tuple[FloatArray, IntArray]:
 
 
 def _unpack(
-    scaled: BalancedProblem, P: FloatArray, level: float, run: tuple[str, int], **more: Any
+    scaled: BalancedProblem, P: FloatArray, level: float, run: tuple[str, int]
 ) -> LmiSolution:
     """Turn ``P / gamma^2`` into a filter in the problem's coordinates; the level is gamma^2."""
     storage = (P + P.T) / 2
     information = storage - scaled.problem.L.T @ scaled.problem.L / level
     gamma = float(np.sqrt(level) * scaled.output_scale)
     P = np.asarray(np.linalg.inv(storage), dtype=np.float64)
-    return scaled.solution(P, information, run, gamma=gamma, **more)
+    return scaled.solution(P, information, run, gamma=gamma)

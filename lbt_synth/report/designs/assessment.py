@@ -8,7 +8,6 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
-from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.interop import frame_cost
 from lbt_synth.interop.arithmetic_cost import FrameCost
@@ -123,8 +122,8 @@ def assess_design(
         spectral_radius=loop.spectral_radius,
         loop_poles=loop.system.poles,
         controller_poles=np.linalg.eigvals(design.controller.A).astype(np.complex128),
-        gamma=design.gamma if isinstance(design, EstimatorDesign) else float("nan"),
-        estimation_rms=design.rms if isinstance(design, EstimatorDesign) else float("nan"),
+        gamma=design.gamma,
+        estimation_rms=design.rms,
         budget=budget,
         strehl=float("nan") if budget is None else strehl(budget, config.imaging),
         margins=margins,
@@ -137,7 +136,7 @@ def assess_design(
         certificate_error=complaint,
         cost=frame_cost(design),
         error_norms=largest_singular_values(design.error_system(), frequency_hz)
-        if isinstance(design, EstimatorDesign)
+        if design.is_estimator
         else None,
         rejection=rejection,
         noise_transfer=noise_transfer,

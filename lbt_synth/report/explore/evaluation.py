@@ -8,7 +8,6 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.linear import hinf_norm, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop
@@ -70,7 +69,7 @@ def loop_curves(design: Design, config: Config) -> LoopCurves:
     return LoopCurves(
         frequency_hz=grid,
         error_nm=largest_singular_values(design.error_system(), grid)
-        if isinstance(design, EstimatorDesign)
+        if design.is_estimator
         else None,
         rejection=spectral_norms(response[:, :n, :n]) if stable else nothing,
         noise_transfer=spectral_norms(response[:, :n, n:]) if stable else nothing,

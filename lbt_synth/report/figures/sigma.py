@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from lbt_synth.design import Design
-from lbt_synth.design.result import EstimatorDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import largest_singular_values
 from lbt_synth.loop import close_loop
@@ -86,7 +85,7 @@ def sigma_figure(
     }
     panels: list[Panel] = []
     if errors:
-        estimators = [each for each in designs.values() if isinstance(each, EstimatorDesign)]
+        estimators = [each for each in designs.values() if each.is_estimator]
         physical = all(design.hardware is not None for design in estimators)
         unit = "nm" if physical and not unit_weights else "-"
         panels.append(frequency_panel("disturbances to error", unit, errors, rules))
@@ -104,7 +103,7 @@ def sigma_curves(
     for name, design in designs.items():
         f, error = frequency_grid(1 / design.controller.dt_s, lines_hz), None
         rejection = noise = None
-        if isinstance(design, EstimatorDesign):
+        if design.is_estimator:
             problem = design.problem
             system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
             error = largest_singular_values(system, f)
@@ -119,7 +118,7 @@ def _vibration_frequencies(designs: Iterable[Design]) -> list[float]:
     found = {
         line.frequency_hz
         for design in designs
-        if isinstance(design, EstimatorDesign) and isinstance(design.problem, TipTiltPlant)
+        if design.is_estimator and isinstance(design.problem, TipTiltPlant)
         for line in design.problem.vibrations
     }
     return sorted(found)
