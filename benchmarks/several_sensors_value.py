@@ -67,7 +67,7 @@ def fused_tip_nm(air: str, ratio: float, damping: float) -> float:
     """Return what the Kalman filter of both sensors leaves of tip."""
     config = load(air, ratio, damping)
     plant = config.fused_plant
-    controller = plant.controller(lbt.linear.periodic_kalman(plant).gains)
+    controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
     return tip_nm(config, close_fused_loop(config.hardware, plant.suite, controller))
 
 

@@ -6,8 +6,6 @@ from .infeasibility_proof import Witness as Witness
 from .infeasibility_proof import infeasible_level as infeasible_level
 from .norms import hinf_norm as hinf_norm
 from .norms import largest_singular_values as largest_singular_values
-from .periodic.problem import PeriodicProblem as PeriodicProblem
-from .periodic.riccati import periodic_kalman as periodic_kalman
 from .riccati.dare import solve_dare as solve_dare
 from .riccati.filtering import gamma_riccati as gamma_riccati
 from .riccati.filtering import kalman_riccati as kalman_riccati

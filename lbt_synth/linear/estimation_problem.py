@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
-from lbt_synth.linear.matrix_functions import nearest_powers_of_two
+from lbt_synth.linear.matrix_functions import nearest_powers_of_two, transpose
 from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
 from lbt_synth.validation import (
+    BoolArray,
     FloatArray,
-    definite,
     frozen_copy,
     integer,
     matrix,
+    read_only,
     set_fields,
     suggest_part,
 )
 
 LONGEST_HORIZON = 100  # samples
+_NOISE_FREE = 1e-9  # singular value of readings whose noise is of size one that counts as zero
 
 
 def require_problem(problem: object) -> None:
-    """Refuse anything but an estimation problem."""
+    """Refuse anything but an estimation problem of one phase, in which all is read."""
     if not isinstance(problem, EstimationProblem):
         hint = suggest_part(problem, EstimationProblem)
         hint = hint or " Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
         raise ProblemError(
             f"expected an EstimationProblem, such as a plant; got {type(problem).__name__}.{hint}"
         )
+    if not problem.read.all():
+        raise ProblemError(
+            "every measurement must be read in every sample; got a problem with a period of "
+            f"{problem.period}. Try fused_kalman, fused_hinf or fused_mixed for the plant of "
+            "several sensors, or kalman_riccati."
+        )
+    problem._require_one_phase("this design", "kalman_riccati, or gamma_riccati")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,25 +51,30 @@ class EstimationProblem(LinearSystem):
     for the H-infinity filter any signal of unit energy; B and D hold the
     weights. B D' need not be zero.
 
+    Each matrix but L may be a stack of one matrix per phase, such as (N, n, n): the sample k has
+    those of the phase k mod N. Not all measurements need be read in every phase.
+
     Parameters
     ----------
-    A : (n, n) array_like
+    A : (n, n) or (N, n, n) array_like
         State matrix.
-    B : (n, p) array_like
+    B : (n, p) or (N, n, p) array_like
         Disturbance to state.
-    C : (q, n) array_like
+    C : (q, n) or (N, q, n) array_like
         State to measurement.
-    D : (q, p) array_like
-        Disturbance to measurement; ``D D'`` must be positive definite.
+    D : (q, p) or (N, q, p) array_like
+        Disturbance to measurement; ``D D'`` must be positive definite over what is read together.
     L : (l, n) array_like
         State to the signal that is estimated.
+    read : (N, q) bool array_like, optional
+        Which measurements are read at each phase; by default all. It alone may have the period.
     dt_s : float, optional
         Sampling period [s]; 1 when the samples have no physical rate.
 
     Raises
     ------
     DimensionError
-        If sizes clash.
+        If sizes clash, or no measurement is ever read.
     NonFiniteError
         If an entry is NaN or infinite.
     DefinitenessError
@@ -74,47 +88,102 @@ class EstimationProblem(LinearSystem):
     ... )
     >>> round(lbt.kalman(walk).rms ** 2, 6)  # the golden ratio
     1.618034
+
+    The same walk, which its sensor sees in every second sample:
+
+    >>> from dataclasses import replace
+    >>> replace(walk, read=[[True], [False]]).period
+    2
     """
 
     L: FloatArray
+    read: BoolArray = field(default=None)  # type: ignore[assignment]  # (N, q)
 
     def __post_init__(self) -> None:
         LinearSystem.__post_init__(self)
         L = matrix(self.L, "L", cols=(self.n_states, f"to match A {self.A.shape}"))
-        set_fields(self, L=L)
-        try:
-            definite(self.D @ self.D.T, "D D'")
-        except DefinitenessError as error:
-            raise DefinitenessError(
-                f"{error} Every measurement needs noise of its own: add a column to D."
-            ) from error
+        q = self.n_measurements
+        given = np.full((1, q), True) if self.read is None else self.read
+        read = np.array(given, dtype=np.bool_, ndmin=2)
+        if len(read) > 1:  # the schedule alone may have the period
+            self._set_phases(len(read), A=self.A, B=self.B, C=self.C, D=self.D)
+        if read.shape not in ((1, q), (self.period, q)) or not read.any():
+            raise DimensionError(
+                f"read must be {(self.period, q)} truth values, some of them true; got "
+                f"{read.shape}."
+            )
+        read = np.broadcast_to(read, (self.period, q)).copy()
+        set_fields(self, L=L, read=read_only(read))
+        self._require_noise()
+
+    def _require_noise(self) -> None:
+        """Refuse readings of which some combination is free of noise, whatever their units."""
+        for t in range(self.period):
+            D = self.read_parts(t)[3]
+            sizes = np.maximum(np.linalg.norm(D, axis=1, keepdims=True), 1e-300)
+            if np.linalg.matrix_rank(D / sizes, tol=_NOISE_FREE) < len(D):
+                where = f" at phase {t}" if self.period > 1 else ""
+                raise DefinitenessError(
+                    f"D D' of the measurements read{where} is singular. Every measurement needs "
+                    "noise of its own: add a column to D."
+                )
 
     def _shown_system(self) -> tuple[StateSpace, str]:
         """Return the system from w to the estimated signal."""
-        D = np.zeros((len(self.L), self.B.shape[1]))
+        D = np.zeros((len(self.L), self.B.shape[-1]))
         system = StateSpace(A=self.A, B=self.B, C=self.L, D=D, dt_s=self.dt_s)
         return system, "largest singular value from w to z"
 
     @property
+    def n_measurements(self) -> int:
+        """Number of measurements q, read or not."""
+        return int(self.C.shape[-2])
+
+    @property
     def Q(self) -> FloatArray:
-        """Covariance of the process noise, ``B B'`` (n, n)."""
-        return frozen_copy(self.B @ self.B.T)
+        """Covariance of the process noise, ``B B'`` (n, n) or (N, n, n)."""
+        return frozen_copy(self.B @ transpose(self.B))
 
     @property
     def R(self) -> FloatArray:
-        """Covariance of the measurement noise, ``D D'`` (q, q)."""
-        return frozen_copy(self.D @ self.D.T)
+        """Covariance of the measurement noise, ``D D'`` (q, q) or (N, q, q)."""
+        return frozen_copy(self.D @ transpose(self.D))
 
     @property
     def S(self) -> FloatArray:
-        """Cross-covariance of process and measurement noise, ``B D'`` (n, q)."""
-        return frozen_copy(self.B @ self.D.T)
+        """Cross-covariance of process and measurement noise, ``B D'`` (n, q) or (N, n, q)."""
+        return frozen_copy(self.B @ transpose(self.D))
+
+    def read_parts(self, t: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return A, B, and the rows of C and D that are read at a phase, t mod N."""
+        phase = t % self.period
+        A, B, C, D = (stack[phase] for stack in self.stacks())
+        rows = self.read[phase]
+        return (A, B, C, D) if rows.all() else (A, B, C[rows], D[rows])
+
+    def phase(self, t: int) -> EstimationProblem:
+        """Return the problem of a phase, with the measurements that are read in it.
+
+        Where nothing is read, there is a measurement of nothing but noise.
+        """
+        A, B, C, D = self.read_parts(t)
+        if len(C) == 0:
+            B, C = np.pad(B, ((0, 0), (0, 1))), np.zeros((1, self.n_states))
+            D = np.eye(1, B.shape[1], B.shape[1] - 1)
+        return EstimationProblem(A=A, B=B, C=C, D=D, L=self.L, dt_s=self.dt_s)
+
+    def restricted(self, measurements: BoolArray) -> EstimationProblem:
+        """Return the problem without the measurements that are not marked, (q,)."""
+        A, B, C, D = self.A, self.B, self.C, self.D
+        read = self.read & measurements
+        return EstimationProblem(A=A, B=B, C=C, D=D, L=self.L, read=read, dt_s=self.dt_s)
 
     def error_system(self, gain_predictor: FloatArray) -> StateSpace:
         """System ``(A - gain C, B - gain D, L, 0)`` from w to a predictor's error ``z - z_hat``.
 
-        The gain (n, q) is that of ``x_hat(k+1) = A x_hat(k) + gain (y(k) - C x_hat(k))``; one of
-        another size raises a DimensionError.
+        The gain (n, q), or one for each phase (N, n, q), is that of ``x_hat(k+1) = A x_hat(k) +
+        gain (y(k) - C x_hat(k))``; one of another size raises a DimensionError. What is not read
+        has no gain.
 
         Examples
         --------
@@ -124,7 +193,7 @@ class EstimationProblem(LinearSystem):
         0.5
         """
         gain = self._checked_gain(gain_predictor)
-        D = np.zeros((len(self.L), self.B.shape[1]))
+        D = np.zeros((len(self.L), self.B.shape[-1]))
         return StateSpace(
             A=self.A - gain @ self.C, B=self.B - gain @ self.D, C=self.L, D=D, dt_s=self.dt_s
         )
@@ -142,10 +211,12 @@ class EstimationProblem(LinearSystem):
         >>> p.with_unit_weights().B.tolist()
         [[1.0, 0.0]]
         """
+        self._require_one_phase("a scaling of disturbances", "phase(t).with_unit_weights()")
         size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
         size = np.where(size > 0, size, 1.0)
-        A, C, L = self.A, self.C, self.L
-        return EstimationProblem(A=A, B=self.B / size, C=C, D=self.D / size, L=L, dt_s=self.dt_s)
+        A, C, L, read = self.A, self.C, self.L, self.read
+        B, D = self.B / size, self.D / size
+        return EstimationProblem(A=A, B=B, C=C, D=D, L=L, read=read, dt_s=self.dt_s)
 
     def ahead(self, frames: int) -> EstimationProblem:
         """Problem whose one-step prediction is the estimate of ``z(k + frames)`` from y up to k.
@@ -169,7 +240,8 @@ class EstimationProblem(LinearSystem):
         ------
         ProblemError
             If ``frames`` is no integer, or is 2 or more while ``B D'`` is not zero: part of
-            the noise would act on the states before it is measured.
+            the noise would act on the states before it is measured. If it is not 1 while the
+            period is longer than a sample.
 
         Examples
         --------
@@ -181,6 +253,7 @@ class EstimationProblem(LinearSystem):
         steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON, at_most=LONGEST_HORIZON)
         if steps == 1:
             return self
+        self._require_one_phase(f"an estimate {steps} samples ahead", "horizon=1")
         if steps > 1:
             size = np.linalg.norm(self.B, 2) * np.linalg.norm(self.D, 2)
             if np.linalg.norm(self.S, 2) > 1e-12 * size:
@@ -203,6 +276,7 @@ class EstimationProblem(LinearSystem):
             C=last if steps > 1 else C,
             D=self.D,
             L=L if steps > 1 else last,
+            read=self.read,
             dt_s=self.dt_s,
         )
 
@@ -221,6 +295,7 @@ class EstimationProblem(LinearSystem):
         >>> walk.with_memory([[0.3, 0.1]]).n_states
         3
         """
+        self._require_one_phase("a filter with a memory", "one without")
         weights = matrix(taps, "taps", rows=(len(self.L), f"to match L {self.L.shape}"))
         q, size = self.C.shape[0], weights.shape[1]
         if size == 0 or size % q:
@@ -244,7 +319,7 @@ class EstimationProblem(LinearSystem):
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.
 
-        The predictor gain is (n, q); one of another size raises a DimensionError.
+        The predictor gain is (n, q) or (N, n, q); one of another size raises a DimensionError.
 
         Examples
         --------
@@ -258,26 +333,35 @@ class EstimationProblem(LinearSystem):
         return Controller(A=A, B=gain, C=self.L, D=D, dt_s=self.dt_s)
 
     def _checked_gain(self, gain_predictor: FloatArray) -> FloatArray:
-        return matrix(
+        """Return gains (n, q), or (N, n, q) of a longer period, zero for what is not read."""
+        gain = matrix(
             gain_predictor,
             "gain_predictor",
-            rows=(self.A.shape[0], f"to match A {self.A.shape}"),
-            cols=(self.C.shape[0], f"to match C {self.C.shape}"),
+            rows=(self.n_states, f"to match A {self.A.shape}"),
+            cols=(self.n_measurements, f"to match C {self.C.shape}"),
+            stacked=True,
         )
+        if gain.ndim > 2 and gain.shape[:-2] != (self.period,):
+            raise DimensionError(
+                f"gain_predictor must be one matrix, or one for each of {self.period} phases; got "
+                f"{gain.shape}."
+            )
+        if not self.read.all():
+            gain = gain * self.read[:, None, :]
+        return gain[0] if self.period == 1 and gain.ndim > 2 else gain
 
 
-def decorrelate(problem: EstimationProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ``A_s = A - S R^-1 C``, ``B_s`` with ``B_s D' = 0``, and ``S R^-1``.
+def decorrelate(
+    problem: EstimationProblem, t: int = 0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``A_s = A - S R^-1 C``, ``B_s`` with ``B_s D' = 0``, and ``S R^-1``, of a phase.
 
     Feeding the measurement into the state equation removes the correlation of process and
     measurement noise. A filter gain for (A_s, B_s) plus ``S R^-1`` is a gain for (A, B).
     """
-    injection = np.linalg.solve(problem.R, problem.S.T).T
-    return (
-        frozen_copy(problem.A - injection @ problem.C),
-        frozen_copy(problem.B - injection @ problem.D),
-        frozen_copy(injection),
-    )
+    A, B, C, D = problem.read_parts(t)
+    injection = np.linalg.solve(D @ D.T, (B @ D.T).T).T
+    return frozen_copy(A - injection @ C), frozen_copy(B - injection @ D), frozen_copy(injection)
 
 
 def filter_gains(
@@ -294,8 +378,12 @@ def filter_gains(
 
 
 def error_units(covariance: FloatArray) -> FloatArray:
-    """Units (n, 1) in which errors of this covariance have size one: powers of two, to be exact."""
-    spread = np.sqrt(np.diag(covariance))
+    """Units (n, 1) in which errors of this covariance have size one: powers of two, to be exact.
+
+    Of a covariance per phase, (N, n, n), the largest counts.
+    """
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    spread = np.sqrt(variances.reshape(-1, variances.shape[-1]).max(axis=0))
     usable = (spread > 1e-150) & (spread < 1e150)
     return nearest_powers_of_two(np.where(usable, spread, 1.0))[:, None]
 
@@ -308,5 +396,6 @@ def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationPro
         C=problem.C * units.T,
         D=problem.D,
         L=problem.L * units.T,
+        read=problem.read,
         dt_s=problem.dt_s,
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.periodic.system import PeriodicController
 from lbt_synth.linear.state_space import Controller
 from lbt_synth.validation import suggest_part
 
@@ -22,7 +21,7 @@ class HasController(Protocol):
 def as_controller(given: Controller | HasController, *, others: str = "") -> Controller:
     """Return a controller, or that of a design; refuse anything else."""
     found = given if isinstance(given, Controller) else getattr(given, "controller", None)
-    if isinstance(found, PeriodicController):
+    if isinstance(found, Controller) and found.period > 1:
         raise ProblemError(
             "this needs a controller of the loop's own sensor; got one of several sensors. "
             "simulate, limits, show, verify and export to C take it."

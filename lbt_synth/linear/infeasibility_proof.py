@@ -10,11 +10,13 @@ second moments of the states. Then, whatever the filter,
 
 by weak duality with the linear matrix inequality of the filter, of whose dual the moments are
 a point. If rounding breaks the "at least", the price of the shortfall is added to the denominator.
+
+With a longer period there are pairs at each phase, and successors have at least the moments of the
+states of the next phase. A witness begins at phase 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -22,6 +24,7 @@ import numpy as np
 from scipy.linalg import eigh, null_space
 from scipy.sparse.csgraph import connected_components
 
+from lbt_synth.errors import DimensionError
 from lbt_synth.linear.estimation_problem import (
     EstimationProblem,
     decorrelate,
@@ -41,14 +44,26 @@ _STRAYED = 1e-9  # share of the successors that may lie where no filter has an e
 class Witness:
     """Pairs of states and disturbances that no measurement shows."""
 
-    states: FloatArray  # (n, r): states x of the problem
-    disturbances: FloatArray  # (p, r): the disturbance w of each state
+    states: FloatArray  # (n, r), or (N, n, r) of each phase: states x of the problem
+    disturbances: FloatArray  # (p, r) or (N, p, r): the disturbance w of each state
 
     def __post_init__(self) -> None:
-        states = matrix(self.states, "states")
-        columns = (states.shape[1], f"to match the states {states.shape}")
-        disturbances = matrix(self.disturbances, "disturbances", cols=columns)
+        states = matrix(self.states, "states", stacked=True)
+        columns = (states.shape[-1], f"to match the states {states.shape}")
+        disturbances = matrix(self.disturbances, "disturbances", cols=columns, stacked=True)
+        if states.ndim > 3 or disturbances.shape[:-2] != states.shape[:-2]:
+            raise DimensionError(
+                f"states and disturbances must have the same phases; got {states.shape} and "
+                f"{disturbances.shape}."
+            )
+        if len(states) == 1 and states.ndim == 3:
+            states, disturbances = states[0], disturbances[0]
         set_fields(self, states=states, disturbances=disturbances)
+
+    @property
+    def period(self) -> int:
+        """Number of phases N; 1 for a problem that is constant."""
+        return len(self.states) if self.states.ndim == 3 else 1
 
 
 def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: FloatArray) -> float:
@@ -60,7 +75,7 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
         The problem.
     witness : Witness
         The disturbances; the part that the measurements would show is removed first.
-    covariance : (n, n) ndarray
+    covariance : (n, n) or (N, n, n) ndarray
         Least covariance of the prediction error (Kalman), which bounds the storage matrix
         of every filter, ``P <= gamma^2 covariance^-1``; it weighs the shortfall by rounding.
 
@@ -68,6 +83,11 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
     -------
     float
         The level; 0 if the witness proves nothing.
+
+    Raises
+    ------
+    DimensionError
+        If witness and problem do not have the same period.
 
     Examples
     --------
@@ -81,44 +101,54 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
     >>> infeasible_level(p, push, np.eye(1))
     1.0
     """
-    return infeasible_periodic_level([problem], [witness], [covariance])
-
-
-def infeasible_periodic_level(
-    phases: Sequence[EstimationProblem],
-    witnesses: Sequence[Witness],
-    covariances: Sequence[FloatArray],
-) -> float:
-    """Level of gamma below which a witness for each phase of a period proves that no filter exists.
-
-    Successors of the states of a phase must have the moments of the states of the next one; a
-    problem of one rate has one phase. Arguments and result as of :func:`infeasible_level`.
-    """
-    spaces = [whitening_coordinates(covariance) for covariance in covariances]
-    states = [
-        basis @ (inverse @ witness.states)  # in the space of a filter's error
-        for witness, (basis, inverse) in zip(witnesses, spaces, strict=True)
+    if witness.period != problem.period:
+        raise DimensionError(
+            f"the witness must have the period of the problem, {problem.period}; got "
+            f"{witness.period}."
+        )
+    covariances = covariance.reshape(-1, *covariance.shape[-2:])
+    starts = witness.states.reshape(-1, *witness.states.shape[-2:])
+    disturbances = witness.disturbances.reshape(-1, *witness.disturbances.shape[-2:])
+    spaces = [whitening_coordinates(own) for own in covariances]
+    states = [  # in the space of a filter's error
+        basis @ (inverse @ x) for x, (basis, inverse) in zip(starts, spaces, strict=True)
     ]
     gained = spent = 0.0
-    for t, (problem, x, witness) in enumerate(zip(phases, states, witnesses, strict=True)):
-        onward = (t + 1) % len(phases)
-        (basis, inverse), covariance, then = spaces[onward], covariances[onward], states[onward]
-        w = witness.disturbances
-        w = w - problem.D.T @ np.linalg.solve(problem.R, problem.C @ x + problem.D @ w)
-        after = problem.A @ x + problem.B @ w
-        deviation = np.sqrt(np.diag(covariance))
-        scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
-        scale = np.where(scale > 0, scale, 1.0)
-        own, own_then = inverse @ after, inverse @ then  # squares would double their rounding
-        strayed = np.linalg.norm((after - basis @ own) / scale)
-        if strayed > _STRAYED * np.linalg.norm(after / scale):
+    for t, (x, w) in enumerate(zip(states, disturbances, strict=True)):
+        A, B, C, D = problem.read_parts(t)
+        w = w - D.T @ np.linalg.solve(D @ D.T, C @ x + D @ w)
+        after, onward = A @ x + B @ w, (t + 1) % problem.period
+        pair = _gain_of_step(problem.L, after, states[onward], spaces[onward], covariances[onward])
+        if pair is None:
             return 0.0
-        # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
-        values, vectors = np.linalg.eigh(own @ own.T - own_then @ own_then.T)
-        growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
-        gained += float(np.sum((problem.L @ then) ** 2) + np.sum((problem.L @ growth_root) ** 2))
-        spent += float(np.sum(w**2)) - float(values[values < 0].sum())
+        gained, spent = gained + pair[0], spent + float(np.sum(w**2)) + pair[1]
     return float(np.sqrt(gained / spent)) if spent > 0 else 0.0
+
+
+def _gain_of_step(
+    L: FloatArray,
+    after: FloatArray,
+    then: FloatArray,
+    space: tuple[FloatArray, FloatArray],
+    covariance: FloatArray,
+) -> tuple[float, float] | None:
+    """Return power of z after a step, and price of the shortfall; None where successors stray.
+
+    The states of the next phase are ``then``, and there is the space of a filter's error.
+    """
+    basis, inverse = space
+    deviation = np.sqrt(np.diag(covariance))
+    scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
+    scale = np.where(scale > 0, scale, 1.0)
+    own, own_then = inverse @ after, inverse @ then  # squares would double their rounding
+    strayed = np.linalg.norm((after - basis @ own) / scale)
+    if strayed > _STRAYED * np.linalg.norm(after / scale):
+        return None
+    # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
+    values, vectors = np.linalg.eigh(own @ own.T - own_then @ own_then.T)
+    growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+    gained = float(np.sum((L @ then) ** 2) + np.sum((L @ growth_root) ** 2))
+    return gained, -float(values[values < 0].sum())
 
 
 def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -154,68 +184,67 @@ def worst_invisible_disturbance(
 ) -> Witness:
     """Return the disturbance that proves most against levels below gamma.
 
-    Two kinds are tried: the burst of :func:`worst_invisible_bursts`, and a sinusoid at the
-    frequency of the slowest pole of its recursion, for problems in which a steady oscillation
-    limits gamma. P and covariance are (n, n).
+    Two kinds are tried: a burst, and, with a period of 1, a sinusoid at the frequency of the
+    slowest pole of its recursion, for problems in which a steady oscillation limits gamma. P and
+    covariance are (n, n) or (N, n, n).
     """
     units = error_units(covariance)
     problem = scale_states(problem, units)
     P, covariance = P / units / units.T, covariance / units / units.T
-    candidates = worst_invisible_bursts([problem], [P], gamma)
-    poles = np.linalg.eigvals(_backward(problem, P, gamma)[0])
-    slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
-    candidates += [_sinusoid(problem, float(np.angle(pole))) for pole in slow]
+    candidates = [_worst_burst(problem, P, gamma)]
+    if problem.period == 1:
+        poles = np.linalg.eigvals(_backward(problem, 0, P, gamma)[0])
+        slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
+        candidates += [_sinusoid(problem, float(np.angle(pole))) for pole in slow]
     best = max(candidates, key=lambda witness: infeasible_level(problem, witness, covariance))
     return replace(best, states=units * best.states)
 
 
-def worst_invisible_bursts(
-    phases: Sequence[EstimationProblem], P: Sequence[FloatArray], gamma: float
-) -> list[Witness]:
-    """Return the witness of each phase of a burst that ends where ``gamma^2 I - L P L'`` is least.
+def _worst_burst(problem: EstimationProblem, P: FloatArray, gamma: float) -> Witness:
+    """Return the witness of a burst that ends where ``gamma^2 I - L P L'`` is least.
 
     With the costate p, ``p(j) = (I + W P)^-1 A' p(j+1)``, ``x(j) = P p(j)``, ``w(j) = B' p(j+1)``
     is the worst past that leads there.
     """
-    count = len(phases)
-    top = [np.linalg.eigh(each.L @ S @ each.L.T) for each, S in zip(phases, P, strict=True)]
+    N, L, phases = problem.period, problem.L, P.reshape(-1, *P.shape[-2:])
+    top = [np.linalg.eigh(L @ own @ L.T) for own in phases]
     last = int(np.argmax([values[-1] for values, _ in top]))
-    end = phases[last].L.T @ top[last][1][:, -1]
-    steps = [_backward(problem, S, gamma) for problem, S in zip(phases, P, strict=True)]
-    order = [(last + k) % count for k in range(count)]
+    end = L.T @ top[last][1][:, -1]
+    steps = [_backward(problem, t, own, gamma) for t, own in enumerate(phases)]
+    order = [(last + k) % N for k in range(N)]
     around = reduce(np.matmul, (steps[t][0] for t in order))
     costates = stationary_root(around, end[:, None])  # of the phase where the burst ends
     if not np.all(np.isfinite(costates)):  # a recursion that rounding makes unstable
         costates = end[:, None]
-    witnesses: dict[int, Witness] = {}
+    states: dict[int, FloatArray] = {}
+    disturbances: dict[int, FloatArray] = {}
     for t in reversed(order):
-        backward, B = steps[t]
+        (backward, B), (_, _, C, D) = steps[t], problem.read_parts(t)
         before = backward @ costates
-        witnesses[t] = _hide(phases[t], P[t] @ before, B.T @ costates)
+        states[t] = phases[t] @ before
+        hiding = -D.T @ np.linalg.solve(D @ D.T, C @ states[t])
+        disturbances[t] = B.T @ costates + hiding
         costates = before
-    return [witnesses[t] for t in range(count)]
+    return Witness(
+        states=np.stack([states[t] for t in range(N)]),
+        disturbances=np.stack([disturbances[t] for t in range(N)]),
+    )
 
 
 def _backward(
-    problem: EstimationProblem, P: FloatArray, gamma: float
+    problem: EstimationProblem, t: int, P: FloatArray, gamma: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``(I + W P)^-1 A'`` of the costates' recursion, and B, without correlation."""
-    A, B, _ = decorrelate(problem)
-    C, L = problem.C, problem.L
-    W = C.T @ np.linalg.solve(problem.R, C) - L.T @ L / gamma**2
+    (_, _, C, D), L = problem.read_parts(t), problem.L
+    A, B, _ = decorrelate(problem, t)
+    W = C.T @ np.linalg.solve(D @ D.T, C) - L.T @ L / gamma**2
     backward = np.linalg.solve(np.eye(len(A)) + W @ P, A.T)
     return np.asarray(backward, dtype=np.float64), B
 
 
-def _hide(problem: EstimationProblem, states: FloatArray, disturbances: FloatArray) -> Witness:
-    """Return the witness whose added measurement noise hides the states."""
-    hiding = -problem.D.T @ np.linalg.solve(problem.R, problem.C @ states)
-    return Witness(states=states, disturbances=disturbances + hiding)
-
-
 def _sinusoid(problem: EstimationProblem, angle: float) -> Witness:
     """Return the invisible sinusoid of one frequency that has the most z for its w."""
-    A, B, C, D, L = problem.A, problem.B, problem.C, problem.D, problem.L
+    (A, B, C, D), L = problem.read_parts(0), problem.L
     n = len(A)
     # e^(j angle) x = A x + B w and C x + D w = 0
     steady = np.block([[np.exp(1j * angle) * np.eye(n) - A, -B], [C, D]])

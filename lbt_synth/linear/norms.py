@@ -46,6 +46,9 @@ class HinfNorm:
 def hinf_norm(system: Any) -> HinfNorm:
     """Largest singular value of a stable discrete-time system over all frequencies.
 
+    The norm of a system with a longer period is that of the system over a period, and the
+    frequency of its peak is at most half of one per period.
+
     Parameters
     ----------
     system : StateSpace, control.StateSpace or tuple (A, B, C, D)
@@ -80,6 +83,7 @@ def hinf_norm(system: Any) -> HinfNorm:
             f"{radius:.9g}. An unstable system has no finite norm.",
             spectral_radius=radius,
         )
+    G = G if G.period == 1 else G.lifted_compactly()
     found = [_peak(part.balanced(), 0.0, np.pi) for part in independent_parts(G)]
     return max(found, key=float)
 

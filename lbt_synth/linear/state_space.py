@@ -3,6 +3,11 @@
 :class:`StateSpace` is the textbook form ``y(k) = C x(k) + D u(k)``.
 :class:`Controller` is the form of real-time computers: the state is updated first, and the
 output is read from the *new* state, ``u(k) = C x(k+1) + D y(k)``.
+
+The matrices may repeat with a period of N samples, as those of sensors that are read at several
+rates do: each is then a stack (N, ...), one matrix for each phase t = k mod N.
+S. Bittanti, P. Colaneri, "Periodic Systems: Filtering and Control", Springer (2009),
+doi:10.1007/978-1-84800-911-0.
 """
 
 from __future__ import annotations
@@ -15,7 +20,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.linear.matrix_functions import complex_schur, solve_stack
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.matrix_functions import complex_schur, solve_stack, transpose
 from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
@@ -32,6 +38,7 @@ from lbt_synth.validation import (
 )
 
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
+_PHASE_CHUNK = 2_000_000  # and that of all phases
 
 
 @table_row
@@ -47,7 +54,7 @@ class SystemFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LinearSystem(Summarised):
-    """Four matrices of matching sizes, and a sampling period."""
+    """Four matrices of matching sizes, or four for each phase of a period; a sampling period."""
 
     A: FloatArray
     B: FloatArray
@@ -56,34 +63,76 @@ class LinearSystem(Summarised):
     dt_s: float = 1.0
 
     def __post_init__(self) -> None:
-        A = square(self.A, "A")
-        why = f"to match A {A.shape}"
-        B = matrix(self.B, "B", rows=(len(A), why))
-        C = matrix(self.C, "C", cols=(len(A), why))
-        rows, cols = (len(C), f"to match C {C.shape}"), (B.shape[1], f"to match B {B.shape}")
-        D = matrix(self.D, "D", rows=rows, cols=cols)
-        set_fields(self, A=A, B=B, C=C, D=D, dt_s=number(self.dt_s, "dt_s", above=0))
+        A = square(self.A, "A", stacked=True)
+        n, why = A.shape[-1], f"to match A {A.shape}"
+        B = matrix(self.B, "B", rows=(n, why), stacked=True)
+        C = matrix(self.C, "C", cols=(n, why), stacked=True)
+        rows, cols = (C.shape[-2], f"to match C {C.shape}"), (B.shape[-1], f"to match B {B.shape}")
+        D = matrix(self.D, "D", rows=rows, cols=cols, stacked=True)
+        set_fields(self, dt_s=number(self.dt_s, "dt_s", above=0))
+        self._set_phases(1, A=A, B=B, C=C, D=D)
+
+    def _set_phases(self, period: int, **parts: FloatArray) -> None:
+        """Set matrices, (n, m) for one phase, (N, n, m) for more; one of all phases is repeated."""
+        stacks = {name: part.reshape(-1, *part.shape[-2:]) for name, part in parts.items()}
+        period = max(period, *(len(stack) for stack in stacks.values()))
+        for name, stack in stacks.items():
+            if parts[name].ndim > 3 or len(stack) not in (1, period):
+                raise DimensionError(
+                    f"{name} must be one matrix, or one for each of {period} phases; got "
+                    f"{parts[name].shape}."
+                )
+            whole = np.broadcast_to(stack, (period, *stack.shape[1:]))
+            set_fields(self, **{name: stack[0] if period == 1 else whole})
 
     @property
     def n_states(self) -> int:
         """Number of states."""
-        return int(self.A.shape[0])
+        return int(self.A.shape[-1])
+
+    @property
+    def period(self) -> int:
+        """Number of phases N after which the matrices repeat; 1 where they are constant."""
+        return len(self.A) if self.A.ndim == 3 else 1
+
+    @property
+    def monodromy(self) -> FloatArray:
+        """Transition over a period, from phase 0 to the next phase 0, (n, n)."""
+        first, *others = self.stacks()[0]
+        for A in others:
+            first = A @ first
+        return first
+
+    def stacks(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return A, B, C and D as stacks (N, ...), of one matrix where the period is 1."""
+        if self.period > 1:
+            return self.A, self.B, self.C, self.D
+        return self.A[None], self.B[None], self.C[None], self.D[None]
+
+    def _require_one_phase(self, what: str, instead: str) -> None:
+        if self.period > 1:
+            raise ProblemError(
+                f"{what} needs a period of 1; got one of {self.period} samples. Try {instead}."
+            )
 
     def _brief(self) -> str:
         rate = "" if self.dt_s == 1 else f", {1 / self.dt_s:.6g} Hz"
-        sizes = zip((self.n_states, *self.D.shape[::-1]), ("state", "input", "output"), strict=True)
-        return ", ".join(count_text(*size) for size in sizes) + rate
+        phases = "" if self.period == 1 else f", period {self.period}"
+        outputs, inputs = self.D.shape[-2:]
+        sizes = zip((self.n_states, inputs, outputs), ("state", "input", "output"), strict=True)
+        return ", ".join(count_text(*size) for size in sizes) + rate + phases
 
     def _summarise(self) -> Summary:
         facts = SystemFacts(
             n_states=self.n_states,
-            inputs=self.D.shape[1],
-            outputs=self.D.shape[0],
+            inputs=self.D.shape[-1],
+            outputs=self.D.shape[-2],
             frame_rate_hz=None if self.dt_s == 1 else 1 / self.dt_s,
-            spectral_radius=float(np.max(np.abs(np.linalg.eigvals(self.A)))),
+            spectral_radius=float(np.max(np.abs(np.linalg.eigvals(self.monodromy)))),
         )
         system, caption = self._shown_system()
-        return Summary(tables=[fact_table("System", facts)], curve=sigma_sparkline(system, caption))
+        curve = sigma_sparkline(system.lifted(), caption)
+        return Summary(tables=[fact_table("System", facts)], curve=curve)
 
     def _shown_system(self) -> tuple[StateSpace, str]:
         """Return the system of the sparkline, and what its largest singular value is."""
@@ -95,15 +144,18 @@ class LinearSystem(Summarised):
 class StateSpace(LinearSystem):
     """Discrete-time system ``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``.
 
+    Each matrix may be a stack of one matrix per phase, such as (N, n, n): with a period of N
+    samples, the sample k has the matrices of the phase k mod N.
+
     Parameters
     ----------
-    A : (n, n) array_like
+    A : (n, n) or (N, n, n) array_like
         State matrix.
-    B : (n, m) array_like
+    B : (n, m) or (N, n, m) array_like
         Input matrix.
-    C : (p, n) array_like
+    C : (p, n) or (N, p, n) array_like
         Output matrix.
-    D : (p, m) array_like
+    D : (p, m) or (N, p, m) array_like
         Feedthrough matrix.
     dt_s : float, optional
         Sampling period [s]; 1 when the samples have no physical rate.
@@ -148,6 +200,7 @@ class StateSpace(LinearSystem):
         >>> lag.to_control().dt
         0.01
         """
+        self._require_one_phase("a system of python-control", "lifted().to_control()")
         return control_system(self.A, self.B, self.C, self.D, self.dt_s)
 
     def balanced(self) -> StateSpace:
@@ -162,6 +215,7 @@ class StateSpace(LinearSystem):
         >>> float(lag.balanced().B[0, 0])
         1.0
         """
+        self._require_one_phase("balancing", "lifted().balanced()")
         n = self.n_states
         scale = max(float(np.abs(self.A).max()), 1e-300)
         entry, leaving = np.linalg.norm(self.B, axis=1), np.linalg.norm(self.C, axis=0)
@@ -178,13 +232,92 @@ class StateSpace(LinearSystem):
 
     @property
     def poles(self) -> ComplexArray:
-        """Eigenvalues of A, (n,)."""
-        return np.linalg.eigvals(self.A).astype(np.complex128)
+        """Eigenvalues of A, or of the transition over a longer period, (n,)."""
+        return np.linalg.eigvals(self.monodromy).astype(np.complex128)
 
     @property
     def spectral_radius(self) -> float:
-        """Largest modulus of the poles."""
+        """Largest modulus of the poles: over a period, not over a sample."""
         return float(np.max(np.abs(self.poles)))
+
+    @property
+    def radius_per_frame(self) -> float:
+        """The spectral radius of a period as a factor per sample."""
+        return float(self.spectral_radius ** (1 / self.period))
+
+    def phase(self, t: int) -> StateSpace:
+        """Return the system of a phase, t mod N, as if it were that of all."""
+        A, B, C, D = (stack[t % self.period] for stack in self.stacks())
+        return StateSpace(A=A, B=B, C=C, D=D, dt_s=self.dt_s)
+
+    def lifted(self) -> StateSpace:
+        """Return the system over a period: inputs and outputs of all phases side by side.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> turns = lbt.linear.StateSpace(A=[[[0.5]], [[1.5]]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+        >>> turns.lifted().A.tolist(), turns.lifted().D.tolist()
+        ([[0.75]], [[0.0, 0.0], [1.0, 0.0]])
+        """
+        if self.period == 1:
+            return self
+        (N, p, m), n = self.D.shape, self.n_states
+        reach, inputs = np.eye(n), np.zeros((n, N * m))
+        C, D = np.zeros((N * p, n)), np.zeros((N * p, N * m))
+        for t in range(N):
+            rows, columns = slice(t * p, (t + 1) * p), slice(t * m, (t + 1) * m)
+            C[rows], D[rows] = self.C[t] @ reach, self.C[t] @ inputs
+            D[rows, columns] = self.D[t]
+            reach, inputs = self.A[t] @ reach, self.A[t] @ inputs
+            inputs[:, columns] = self.B[t]
+        return StateSpace(A=reach, B=inputs, C=C, D=D, dt_s=N * self.dt_s)
+
+    def lifted_compactly(self) -> StateSpace:
+        """Return the lifted system with its inputs turned so that few remain.
+
+        Norm and variances are the same, as white noise is turned to white noise.
+        """
+        system = self.lifted()
+        turned = np.linalg.qr(np.vstack([system.B, system.D]).T)[1].T
+        return replace(system, B=turned[: self.n_states], D=turned[self.n_states :])
+
+    def covariances(self) -> FloatArray:
+        """Return the stationary covariance of x at each phase, for white u of unit variance."""
+        transitions, inputs, _, _ = self.stacks()
+        drives = inputs @ transpose(inputs)
+        whole = np.zeros_like(drives[0])  # of what a period adds
+        for A, drive in zip(transitions, drives, strict=True):
+            whole = A @ whole @ A.T + drive
+        out, P = np.empty_like(transitions), stationary_covariance(self.monodromy, whole)
+        for t, (A, drive) in enumerate(zip(transitions, drives, strict=True)):
+            out[t] = P
+            P = A @ P @ A.T + drive
+        return out
+
+    def output_covariances(self) -> FloatArray:
+        """Return the stationary covariance of y at each phase, for white u, (N, p, p)."""
+        _, _, C, D = self.stacks()
+        return np.asarray(C @ self.covariances() @ transpose(C) + D @ transpose(D))
+
+    def phase_response(self, frequency_hz: ArrayLike) -> ComplexArray:
+        """Complex amplitude of y at each phase for the input ``exp(2 pi i f k dt)``, (f, N, p, m).
+
+        The output is this amplitude times the input's own ``exp``: for one phase it is the
+        transfer matrix. Its mean square over the phases is the mean power of the output.
+        """
+        frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
+        z = np.exp(2j * np.pi * frequency * self.dt_s)
+        (p, m), N, whole = self.D.shape[-2:], self.period, self.lifted()
+        schur = complex_schur(whole.A)
+        step = max(1, _PHASE_CHUNK // (N * max(p, self.n_states)))
+        out = np.empty((z.size, N, p, m), dtype=np.complex128)
+        for j in range(m):  # the input of a period is one of its columns times z^0, z^1, ...
+            column = replace(whole, B=whole.B[:, j::m], D=whole.D[:, j::m])
+            for start in range(0, z.size, step):
+                part = slice(start, start + step)
+                out[part, :, :, j] = _repeating_response(column, schur, z[part], N)
+        return out
 
     def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Transfer matrix ``D + C (zI - A)^-1 B`` at ``z = exp(2 pi i f dt)``.
@@ -202,7 +335,8 @@ class StateSpace(LinearSystem):
         Raises
         ------
         ProblemError
-            If a frequency is not finite, or is that of a pole on the unit circle.
+            If a frequency is not finite, or is that of a pole on the unit circle, or if the period
+            is longer than a sample.
 
         Examples
         --------
@@ -211,6 +345,7 @@ class StateSpace(LinearSystem):
         >>> complex(delay.frequency_response([1.0])[0, 0, 0].round(12))
         -1j
         """
+        self._require_one_phase("a transfer matrix", "phase_response(...), or lifted()")
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         # a few points are solved one by one, which is more accurate next to a pole
@@ -282,23 +417,38 @@ def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     return out
 
 
+def _repeating_response(
+    whole: StateSpace, schur: tuple[ComplexArray, ComplexArray], z: ComplexArray, N: int
+) -> ComplexArray:
+    """Return y(t) z^-t of each phase for the input z^k of a system over a period, (f, N, p)."""
+    T, U = schur
+    turns = z[:, None] ** np.arange(N)
+    x = (turns @ whole.B.T) @ U.conj()  # the state at phase 0 repeats as z^N: solve for it
+    for i in range(whole.n_states - 1, -1, -1):
+        x[:, i] = (x[:, i] + x[:, i + 1 :] @ T[i, i + 1 :]) / (z**N - T[i, i])
+    out = (x @ U.T) @ whole.C.T + turns @ whole.D.T
+    return np.asarray(out.reshape(len(z), N, -1) / turns[:, :, None])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Controller(LinearSystem):
     """Controller in new-state form: ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
 
+    As in :class:`StateSpace`, each matrix may be a stack of one matrix per phase.
+
     Parameters
     ----------
-    A : (n, n) array_like
+    A : (n, n) or (N, n, n) array_like
         State matrix.
-    B : (n, q) array_like
+    B : (n, q) or (N, n, q) array_like
         Input matrix; y(k) has q measurements.
-    C : (m, n) array_like
+    C : (m, n) or (N, m, n) array_like
         Output matrix, applied to the state *after* its update.
-    D : (m, q) array_like
+    D : (m, q) or (N, m, q) array_like
         Feedthrough matrix.
     dt_s : float, optional
         Sampling period [s].
-    applied : (n, m) array_like, optional
+    applied : (n, m) or (N, n, m) array_like, optional
         How the last command enters the new state, where A has it as ``applied C``: what
         :func:`estimator_form` takes out of A again.
 
@@ -323,8 +473,18 @@ class Controller(LinearSystem):
     def __post_init__(self) -> None:
         LinearSystem.__post_init__(self)
         if self.applied is not None:
-            rows, cols = (self.n_states, "to match A"), (len(self.C), "to match C")
-            set_fields(self, applied=matrix(self.applied, "applied", rows=rows, cols=cols))
+            rows, cols = (self.n_states, "to match A"), (self.C.shape[-2], "to match C")
+            applied = matrix(self.applied, "applied", rows=rows, cols=cols, stacked=True)
+            parts = {name: getattr(self, name) for name in "ABCD"}
+            self._set_phases(1, **parts, applied=applied)
+
+    def phase(self, t: int) -> Controller:
+        """Return the controller of a phase, t mod N, as if it were that of all."""
+        A, B, C, D = (stack[t % self.period] for stack in self.stacks())
+        applied = self.applied
+        if applied is not None and self.period > 1:
+            applied = applied[t % self.period]
+        return Controller(A=A, B=B, C=C, D=D, dt_s=self.dt_s, applied=applied)
 
     def to_statespace(self) -> StateSpace:
         """Return the same input-output map in the textbook (current-state) form."""
@@ -350,14 +510,15 @@ class RunningController:
 
     controller: Controller
     state: FloatArray = field(init=False)
+    phase: int = field(init=False)  # of the next sample
     form = "plain"
 
     def __post_init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Set the state to zero."""
-        self.state = np.zeros(self.controller.n_states)
+        """Set the state to zero; the next sample is the first of a period."""
+        self.state, self.phase = np.zeros(self.controller.n_states), 0
 
     def step(self, y: ArrayLike) -> FloatArray:
         """Take the measurements y(k), (q,), and return the command u(k), (m,).
@@ -367,11 +528,14 @@ class RunningController:
         """
         k = self.controller
         measured = np.asarray(y, dtype=np.float64)
-        if measured.shape != (k.B.shape[1],):
+        if measured.shape != (k.B.shape[-1],):
             raise DimensionError(
-                f"y must have shape ({k.B.shape[1]},) to match B {k.B.shape}; got {measured.shape}."
+                f"y must have shape ({k.B.shape[-1]},) to match B {k.B.shape}; got "
+                f"{measured.shape}."
             )
         if not np.isfinite(measured).all():
             raise NonFiniteError(f"y must be finite; got {measured}. Hold the last command.")
-        self.state = k.A @ self.state + k.B @ measured
-        return k.C @ self.state + k.D @ measured
+        A, B, C, D = (stack[self.phase] for stack in k.stacks())
+        self.state = A @ self.state + B @ measured
+        self.phase = (self.phase + 1) % k.period
+        return C @ self.state + D @ measured

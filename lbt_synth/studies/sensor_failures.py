@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.design.fusion.fused_filter import FusedFilter
-from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, Simulation, residual_budget
 from lbt_synth.loop.fusion.fused_loop import FusedLoop, close_fused_loop
 from lbt_synth.loop.fusion.simulation import Drop, Segment, run_segments, simulate_fused
@@ -110,7 +110,7 @@ def run_failures(
 
 def _segment_loop(
     design: FusedFilter,
-    filters: Mapping[frozenset[str], PeriodicController],
+    filters: Mapping[frozenset[str], Controller],
     config: Config,
     truth: Truth,
     segment: Segment,

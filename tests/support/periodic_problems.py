@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lbt_synth.linear import EstimationProblem, PeriodicProblem
+from lbt_synth.linear import EstimationProblem, StateSpace
 
 
 def random_periodic_problem(seed, *, varying=True, radius=1.1):
@@ -18,7 +18,7 @@ def random_periodic_problem(seed, *, varying=True, radius=1.1):
     read = rng.random((N, q)) < 0.4
     read[0] = True
     units = 10.0 ** rng.uniform(-5, 2, (q, 1))
-    return PeriodicProblem(
+    return EstimationProblem(
         A=A,
         B=rng.standard_normal((1, n, n + q)),
         C=units * rng.standard_normal((1, q, n)),
@@ -41,7 +41,8 @@ def lifted_problem(problem):
     Its one-step predictor knows the measurements of whole periods only, so its covariance is that
     of the periodic problem's filter at phase 0.
     """
-    system, rows = problem.lifted(), problem.read.reshape(-1)
+    parts = {name: getattr(problem, name) for name in "ABCD"}
+    system, rows = StateSpace(**parts, dt_s=problem.dt_s).lifted(), problem.read.reshape(-1)
     size = np.linalg.norm(problem.D, axis=2).reshape(-1, 1)[rows]
     C, D = system.C[rows] / size, system.D[rows] / size
     return EstimationProblem(A=system.A, B=system.B, C=C, D=D, L=problem.L, dt_s=system.dt_s)

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.periodic.riccati import periodic_kalman
+from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
 from lbt_synth.loop.fusion.fused_loop import (
     FusedLoop,
     close_fused_loop,
@@ -68,7 +68,13 @@ def fallback_gains(plant: FusedPlant, missing: tuple[str, ...]) -> FloatArray:
     remaining = ~plant.unit_rows(missing)
     if not np.any(plant.read & remaining):
         return frozen_copy(np.zeros((plant.period, plant.n_states, plant.n_measurements)))
-    return periodic_kalman(plant.restricted(remaining)).gains
+    return stacked_gains(kalman_riccati(plant.restricted(remaining)))
+
+
+def stacked_gains(solution: FilterRiccati) -> FloatArray:
+    """Return the predictor gains of a solution with an axis of phases, (N, n, q)."""
+    gains = solution.gain_predictor
+    return gains.reshape(-1, *gains.shape[-2:])
 
 
 def make_fallbacks(plant: FusedPlant) -> tuple[Fallback, ...]:

@@ -19,21 +19,20 @@ from lbt_synth.design.certificate import (
     bound_check,
     certify_error,
 )
-from lbt_synth.design.fusion.failures import Fallback, failed_loop, make_fallbacks
+from lbt_synth.design.fusion.failures import Fallback, failed_loop, make_fallbacks, stacked_gains
 from lbt_synth.design.hinf import checked_bounds, require_reachable
 from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError
-from lbt_synth.linear import hinf_norm
+from lbt_synth.linear import Controller, StateSpace, hinf_norm, infeasible_level
+from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
 from lbt_synth.linear.matrix_functions import relative_distance
-from lbt_synth.linear.periodic.riccati import (
-    PeriodicRiccati,
-    kalman_gain,
-    least_periodic_gamma,
-    periodic_hinf,
-    periodic_kalman,
-    proved_periodic_gamma,
+from lbt_synth.linear.riccati.filtering import (
+    FilterRiccati,
+    gamma_riccati,
+    kalman_riccati,
+    least_gamma,
 )
-from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
+from lbt_synth.linear.riccati.periodic import kalman_gain
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.fusion.fused_loop import (
     FusedLoop,
@@ -103,7 +102,7 @@ class FusedFilter(Design):
         Level of the central filter that just meets the bound, of a mixed design.
     """
 
-    controller: PeriodicController = field(init=False)  # type: ignore[assignment]
+    controller: Controller = field(init=False)  # type: ignore[assignment]
     problem: FusedPlant
     gains: FloatArray
     fallbacks: tuple[Fallback, ...] = ()
@@ -138,8 +137,7 @@ class FusedFilter(Design):
     @property
     def poles(self) -> ComplexArray:
         """Poles of the estimation error over a period, (n,)."""
-        error = self.problem.error_system(self.gains)
-        return np.linalg.eigvals(error.monodromy).astype(np.complex128)
+        return self.problem.error_system(self.gains).poles
 
     def close(self, hardware: LoopHardware, *, sensor_gain: float = 1.0) -> FusedLoop:
         """Close a loop around the design, whose sensors are those that it was made for.
@@ -160,7 +158,7 @@ class FusedFilter(Design):
         return self.close(self.loop_hardware, sensor_gain=sensor_gain)
 
     @property
-    def controllers(self) -> dict[frozenset[str], PeriodicController]:
+    def controllers(self) -> dict[frozenset[str], Controller]:
         """The controller for each set of sensors and channels that are not read, none included."""
         own = {frozenset(f.missing): self.problem.controller(f.gains) for f in self.fallbacks}
         return {frozenset(): self.controller, **own}
@@ -224,23 +222,26 @@ class FusedFilter(Design):
         ]
 
     def _bound_checks(self, certificate: Certificate, bound: float) -> list[Check]:
-        checks = [bound_check(certificate.gamma, bound)]
-        start = periodic_kalman(self.problem)
+        checks, problem = [bound_check(certificate.gamma, bound)], self.problem
+        start = kalman_riccati(problem)
         if self.gamma_least is not None:
             meets = [
-                periodic_hinf(self.problem, self.gamma_least * (1 + side), start) is not None
+                gamma_riccati(problem, self.gamma_least * (1 + side), start=start) is not None
                 for side in (-NORM_TOLERANCE, NORM_TOLERANCE)
             ]
             off = 0.0 if meets == [False, True] else np.inf
             how = "gamma-Riccati equation on both sides"
             checks.append(Check("least norm of any filter, error", off, NORM_TOLERANCE, how))
-            proved = proved_periodic_gamma(self.problem, start, self.gamma_least)
+            least = gamma_riccati(problem, self.gamma_least, start=start)
+            proved = proved_level(problem, start, least, self.gamma_least)
             above = (self.gamma_infeasible or 0.0) / max(proved, 1e-300) - 1
             name, how = "infeasible level over the level proved, less 1", BY_DISTURBANCES
             checks.append(Check(name, above, INFEASIBLE_TOLERANCE, how))
         level = self.gamma_central or bound
-        central = periodic_hinf(self.problem, level, start)
-        apart = np.inf if central is None else relative_distance(self.gains, central.gains)
+        central = gamma_riccati(problem, level, start=start)
+        apart = np.inf
+        if central is not None:
+            apart = relative_distance(self.gains, stacked_gains(central))
         name, how = "distance from its Riccati filter", "relative"
         checks.append(Check(name, apart, 1e-5, how))
         return checks
@@ -306,7 +307,7 @@ def fused_kalman(plant: FusedPlant) -> FusedFilter:
     True
     """
     require_instance(plant, FusedPlant, "plant")
-    return make_design(plant, periodic_kalman(plant))
+    return make_design(plant, kalman_riccati(plant))
 
 
 def fused_hinf(
@@ -417,7 +418,7 @@ class Level:
     bound: float
     least: float
     infeasible: float | None  # that no filter reaches; None where nothing is proved
-    start: PeriodicRiccati  # the Kalman filter
+    start: FilterRiccati  # the Kalman filter
     kalman: float  # its norm
 
     @property
@@ -436,28 +437,38 @@ def find_level(plant: FusedPlant, gamma: float | None, gamma_ratio: float | None
     gamma, gamma_ratio = checked_bounds(
         gamma, gamma_ratio, far_above="the filter is the Kalman filter"
     )
-    start = periodic_kalman(plant)
+    start = kalman_riccati(plant)
     norm = error_norm(plant, start)
-    least = least_periodic_gamma(plant, start, norm)
+    _, least, solution = least_gamma(plant, lower=0.0, upper=norm, start=start)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1.2)
     require_reachable(requested, least)
     return Level(
         bound=max(requested, least),
         least=least,
-        infeasible=proved_periodic_gamma(plant, start, least) or None,
+        infeasible=proved_level(plant, start, solution, least) or None,
         start=start,
         kalman=norm,
     )
 
 
-def error_norm(plant: FusedPlant, solution: PeriodicRiccati) -> float:
+def proved_level(
+    plant: FusedPlant, start: FilterRiccati, solution: FilterRiccati | None, level: float
+) -> float:
+    """Return what the worst disturbance against a solution's level proves; 0 if there is none."""
+    if solution is None:
+        return 0.0
+    witness = worst_invisible_disturbance(plant, solution.P, level, start.P)
+    return infeasible_level(plant, witness, start.P)
+
+
+def error_norm(plant: FusedPlant, solution: FilterRiccati) -> float:
     """Return the norm of a filter's estimation error over a period."""
-    return hinf_norm(plant.error_system(solution.gains).lifted_compactly()).upper
+    return hinf_norm(plant.error_system(solution.gain_predictor)).upper
 
 
-def central_filter(plant: FusedPlant, gamma: float, start: PeriodicRiccati) -> PeriodicRiccati:
+def central_filter(plant: FusedPlant, gamma: float, start: FilterRiccati) -> FilterRiccati:
     """Return the central filter of a level; InfeasibleError if there is none."""
-    found = periodic_hinf(plant, gamma, start)
+    found = gamma_riccati(plant, gamma, start=start)
     if found is None:
         raise InfeasibleError(
             f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
@@ -467,14 +478,16 @@ def central_filter(plant: FusedPlant, gamma: float, start: PeriodicRiccati) -> P
     return found
 
 
-def make_design(plant: FusedPlant, solution: PeriodicRiccati, **claims: Any) -> FusedFilter:
+def make_design(plant: FusedPlant, solution: FilterRiccati, **claims: Any) -> FusedFilter:
     """Make a design with its fall-backs, and certify it; CertificateError if it fails."""
     design = FusedFilter(
         method=fused_name(claims),
         certificate=UNCERTIFIED,
-        solver=SolverReport(route="riccati", status="cyclic doubling", iterations=solution.steps),
+        solver=SolverReport(
+            route="riccati", status=solution.status, iterations=solution.iterations
+        ),
         problem=plant,
-        gains=solution.gains,
+        gains=stacked_gains(solution),
         fallbacks=make_fallbacks(plant),
         **claims,
     )
@@ -500,7 +513,7 @@ def dwell_frames(
     return (max(periods) + 2) * plant.period - 2 if len(periods) == len(filters) else None
 
 
-def _periods(error: PeriodicSystem, root: FloatArray) -> int | None:
+def _periods(error: StateSpace, root: FloatArray) -> int | None:
     """Return after how many whole periods an error has shrunk, wherever in a period it begins."""
     inverse, each = np.linalg.inv(root), np.eye(len(root))
 
@@ -509,7 +522,8 @@ def _periods(error: PeriodicSystem, root: FloatArray) -> int | None:
 
     before = after = 1.0  # of the parts of a period at both ends
     head = tail = each
-    for A, last in zip(error.A[:-1], error.A[:0:-1], strict=True):
+    transitions = error.stacks()[0]
+    for A, last in zip(transitions[:-1], transitions[:0:-1], strict=True):
         head, tail = A @ head, tail @ last
         after, before = max(after, size(head)), max(before, size(tail))
     allowed, period = 1 / (before * after), error.monodromy

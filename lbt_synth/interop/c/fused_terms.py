@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import Check, FusedFilter
 from lbt_synth.interop.c.source_text import round_to_single
 from lbt_synth.interop.export_checks import FRAMES
-from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.fusion.fused_loop import close_fused_loop, fused_model_budget
 from lbt_synth.loop.fusion.simulation import Drop, simulate_fused
@@ -55,17 +55,17 @@ class FusedTerms:
             gains={some: round_to_single({"gains": K})["gains"] for some, K in self.gains.items()},
         )
 
-    def controller(self, missing: frozenset[str] = frozenset()) -> PeriodicController:
+    def controller(self, missing: frozenset[str] = frozenset()) -> Controller:
         """Return the controller that the terms make where its own commands are applied."""
         K = np.zeros((*self.transition.shape[:2], self.read.shape[1]))
         K[:, : self.gains[missing].shape[1]] = self.gains[missing]
         whole = self.transition + K @ self.innovation
         A, applied = np.split(whole, [whole.shape[1]], axis=2)
-        return PeriodicController(
+        return Controller(
             A=A + applied @ self.command,
             B=K,
-            C=self.command[None],
-            D=np.zeros((1, len(self.command), K.shape[2])),
+            C=self.command,
+            D=np.zeros((len(self.command), K.shape[2])),
             dt_s=self.dt_s,
         )
 
@@ -77,12 +77,12 @@ def fused_terms(design: FusedFilter) -> FusedTerms:
     transition = np.zeros((plant.period, s, s + m))
     transition[:, :n, :n] = plant.A
     transition[:, n:, n:] = np.concatenate([plant.A_known, plant.B_known], axis=2)
-    predicted = np.concatenate([plant.C, plant.C_known, plant.D_known], axis=2)
+    predicted = np.concatenate([plant.stacks()[2], plant.C_known, plant.D_known], axis=2)
     fallbacks = {frozenset(each.missing): each.gains for each in design.fallbacks}
     return FusedTerms(
         transition=transition,
         innovation=-predicted,
-        command=design.controller.C[0],
+        command=design.controller.phase(0).C,
         gains={frozenset(): design.gains, **fallbacks},
         read=plant.read,
         rows=plant.suite.rows(plant.own.hardware),
@@ -187,9 +187,7 @@ def prove_fused(design: FusedFilter, terms: FusedTerms) -> tuple[Check, ...]:
     """
     n, how = terms.transition.shape[1], "eigenvalues of the monodromy, per frame"
     alone = (terms.transition + terms.controller().B @ terms.innovation)[:, :, :n]
-    still = PeriodicSystem(
-        A=alone, B=np.zeros((1, n, 0)), C=np.zeros((1, 0, n)), D=np.zeros((1, 0, 0))
-    )
+    still = StateSpace(A=alone, B=np.zeros((n, 0)), C=np.zeros((0, n)), D=np.zeros((0, 0)))
     limit = 1 - STABILITY_MARGIN
     name = "spectral radius of the estimator alone"
     checks = [Check(name, still.radius_per_frame, limit, how)]

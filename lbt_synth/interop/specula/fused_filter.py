@@ -11,7 +11,7 @@ import numpy as np
 
 from lbt_synth.design import FusedFilter
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.linear import Controller
 from lbt_synth.loop.fusion.simulation import draw_others
 from lbt_synth.loop.simulation.disturbances import draw_parts
 from lbt_synth.models import LoopHardware, Truth
@@ -22,7 +22,7 @@ from lbt_synth.validation import FloatArray
 class AccompaniedFilter:
     """A filter of several sensors to step with the pyramid alone: it has the other readings."""
 
-    controller: PeriodicController
+    controller: Controller
     others: FloatArray  # readings of the other sensors in each frame, (frames, q)
     hardware: LoopHardware  # that the filter is designed for
 
@@ -31,7 +31,7 @@ class AccompaniedFilter:
 
     def reset(self) -> None:
         """Return to the first frame, with all states zero."""
-        self._frame, self._state = 0, np.zeros(self.controller.n_states)
+        self._frame, self._running = 0, self.controller.start()
 
     def step(self, y: FloatArray) -> FloatArray:
         """Take the measurements of the loop's own sensor in the next frame, return the commands."""
@@ -40,11 +40,9 @@ class AccompaniedFilter:
                 f"the other sensors have readings for {len(self.others)} frames; a frame more was "
                 "asked for. Give the set-up that makes the controller the frames of the run."
             )
-        now = self.controller.phase(self._frame)
         measured = np.concatenate([y, self.others[self._frame]])
-        self._state = now.A @ self._state + now.B @ measured
         self._frame += 1
-        return np.asarray(now.C @ self._state + now.D @ measured)
+        return self._running.step(measured)
 
 
 def unread_sensors(design: FusedFilter) -> tuple[str, ...]:

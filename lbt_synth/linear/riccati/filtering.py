@@ -1,5 +1,8 @@
 """Solve the Riccati equations of the Kalman and the H-infinity predictor; find the least gamma.
 
+Measurements that are not read are left out, and have no gain. Problems with a longer period are
+solved in :mod:`lbt_synth.linear.riccati.periodic`.
+
 B. Hassibi, A. H. Sayed, T. Kailath, "Indefinite-Quadratic Estimation and
 Control", SIAM (1999), doi:10.1137/1.9781611970760, chapter 4 (a-priori filter).
 """
@@ -24,21 +27,24 @@ from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.validation import BoolArray, FloatArray, frozen_copy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterRiccati:
-    """A solved filter equation."""
+    """A solved filter equation; with a longer period its matrices have an axis of phases."""
 
-    # (n, n): covariance of the prediction error (Kalman), or its H-infinity counterpart
+    # (n, n) or (N, n, n): covariance of the prediction error (Kalman), or its H-infinity
+    # counterpart
     P: FloatArray
-    # (n, q): gains of the measurement and the time update together, and of the measurement update
-    # alone
+    # (n, q) or (N, n, q): gains of the measurement and the time update together, and of the
+    # measurement update alone; zero for what is not read
     gain_predictor: FloatArray
     gain_filter: FloatArray
-    residual: float  # relative residual of the equation
-    iterations: int  # number of doublings
+    # relative residual of the equation; with a longer period, relative change of P in the last
+    # step, or over a period
+    residual: float
+    iterations: int  # number of doublings; with a longer period, of Newton steps after them
     status: str  # the route that gave P
 
 
@@ -62,7 +68,7 @@ def require_detectable(problem: EstimationProblem) -> None:
 
 
 def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
-    """Solve ``P = A P A' + Q - (A P C' + S)(R + C P C')^-1 (C P A' + S')``.
+    """Solve ``P = A P A' + Q - (A P C' + S)(R + C P C')^-1 (C P A' + S')``, for all phases.
 
     ``lbt_synth.design.kalman`` returns the same filter as a certified design.
 
@@ -90,6 +96,12 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     >>> round(float(lbt.linear.kalman_riccati(p).P[0, 0]), 12)
     1.61803398875
     """
+    if problem.period > 1:
+        from lbt_synth.linear.riccati.periodic import periodic_kalman
+
+        return periodic_kalman(problem)
+    if not problem.read.all():
+        return _scatter_gains(kalman_riccati(problem.phase(0)), problem.read[0])
     require_detectable(problem)
     dare = solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R, problem.S)
     innovation = problem.R + problem.C @ dare.X @ problem.C.T
@@ -102,6 +114,20 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
         iterations=dare.iterations,
         status=dare.route,
     )
+
+
+def _scatter_gains(solution: FilterRiccati, rows: BoolArray) -> FilterRiccati:
+    """Return the solution with gains of all measurements, zero for those that are not read."""
+    gains = np.zeros((2, len(solution.P), len(rows)))
+    gains[:, :, rows] = solution.gain_predictor, solution.gain_filter
+    predictor, filtering = (frozen_copy(gain) for gain in gains)
+    return replace(solution, gain_predictor=predictor, gain_filter=filtering)
+
+
+def _gather_gains(solution: FilterRiccati, rows: BoolArray) -> FilterRiccati:
+    """Return the solution with the gains of what is read."""
+    predictor, filtering = solution.gain_predictor[:, rows], solution.gain_filter[:, rows]
+    return replace(solution, gain_predictor=predictor, gain_filter=filtering)
 
 
 _RESIDUAL_LIMIT = 1e-9
@@ -260,7 +286,16 @@ def gamma_riccati(
     >>> lbt.linear.gamma_riccati(p, 1.0) is None, lbt.linear.gamma_riccati(p, 2.5) is None
     (True, False)
     """
-    equation = GammaEquation(problem, kalman_riccati(problem) if start is None else start)
+    start = kalman_riccati(problem) if start is None else start
+    if problem.period > 1:
+        from lbt_synth.linear.riccati.periodic import periodic_hinf
+
+        return periodic_hinf(problem, gamma, start)
+    if not problem.read.all():
+        rows = problem.read[0]
+        solution = gamma_riccati(problem.phase(0), gamma, start=_gather_gains(start, rows))
+        return None if solution is None else _scatter_gains(solution, rows)
+    equation = GammaEquation(problem, start)
     return equation.solution(gamma, equation.trial(gamma))
 
 
@@ -269,9 +304,26 @@ def least_gamma(
 ) -> tuple[float, float, FilterRiccati]:
     """Bracket the least gamma, at which ``gamma^2 I - L P L'`` stops being positive.
 
-    Returns the ends of the bracket, and the filter at the upper one.
+    Returns the ends of the bracket, and the filter at the upper one. The bracket is 1e-11 wide,
+    relative; with a longer period 1e-9.
     """
-    equation = GammaEquation(problem, kalman_riccati(problem) if start is None else start)
+    start = kalman_riccati(problem) if start is None else start
+    if problem.period > 1:
+        from lbt_synth.linear.riccati.periodic import least_periodic_gamma
+
+        return least_periodic_gamma(problem, lower, upper, start)
+    if problem.read.all():
+        return _search_level(GammaEquation(problem, start), lower, upper)
+    rows = problem.read[0]
+    equation = GammaEquation(problem.phase(0), _gather_gains(start, rows))
+    lower, upper, solution = _search_level(equation, lower, upper)
+    return lower, upper, _scatter_gains(solution, rows)
+
+
+def _search_level(
+    equation: GammaEquation, lower: float, upper: float
+) -> tuple[float, float, FilterRiccati]:
+    """Bracket the least level that an equation meets; return also the filter at the upper end."""
     met: dict[float, LevelTrial] = {}
 
     def slack(gamma: float) -> float:

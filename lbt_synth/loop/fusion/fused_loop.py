@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from lbt_synth.errors import ProblemError, UnstableLoopError
-from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.quadrature import adaptive_integral, panel_edges
 from lbt_synth.loop.closed_loop import (
     STABILITY_MARGIN,
@@ -37,10 +37,10 @@ class FusedLoop:
     """A loop around the controller of several sensors."""
 
     # from ``[phi_tot (n), added to each reading (q)]`` to ``[phi_res (n), u (m), y (q)]``
-    system: PeriodicSystem
+    system: StateSpace
     hardware: LoopHardware  # mirror, delay and own sensor
     suite: SensorSuite  # the other sensors
-    controller: PeriodicController  # the controller
+    controller: Controller  # the controller
     sensor_gain: float  # real gain of the loop's own sensor, relative to its matrix
     blind: tuple[str, ...] = ()  # sensors and channels whose readings are zero, or frozen
 
@@ -76,7 +76,7 @@ AnyLoop: TypeAlias = ClosedLoop | FusedLoop
 def close_fused_loop(
     hardware: LoopHardware,
     suite: SensorSuite,
-    controller: PeriodicController,
+    controller: Controller,
     *,
     sensor_gain: float = 1.0,
     blind: tuple[str, ...] = (),
@@ -90,7 +90,7 @@ def close_fused_loop(
     gain, period = number(sensor_gain, "sensor_gain", above=0), suite.period(hardware)
     rows = suite.rows(hardware)
     n, m, q = hardware.modes, hardware.n_commands, max(own.stop for own in rows.values())
-    shape = (controller.period, *controller.D.shape[1:])
+    shape = (controller.period, *controller.D.shape[-2:])
     if shape != (period, m, q) or not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
         raise ProblemError(
             f"the controller must map {q} measurements to {m} commands in a period of {period} "
@@ -98,7 +98,7 @@ def close_fused_loop(
             f"{shape[0]} at {1 / controller.dt_s:.6g} Hz."
         )
     exposures = [own_exposure(hardware), *suite_exposures(suite, hardware)]
-    held, k = memory(exposures, n, period, hardware.dt_s), controller.to_statespace()
+    held, k = memory(exposures, n, period), controller.to_statespace()
     mirror = hardware.mirror_system.whole
     A_m, B_m, C_m = mirror.repeated(m)
     position, direct = hardware.influence @ C_m, mirror.D * hardware.influence
@@ -129,7 +129,7 @@ def close_fused_loop(
     D = np.zeros((period, n + m + q, n + q))
     D[:, :n], D[:, n : n + m, n:], D[:, n + m :, n:] = entry, k.D, np.eye(q)
     C = np.concatenate([residual, command, measured], axis=1)
-    system = PeriodicSystem(A=A, B=B, C=C, D=D, dt_s=hardware.dt_s)
+    system = StateSpace(A=A, B=B, C=C, D=D, dt_s=hardware.dt_s)
     return FusedLoop(
         controller=controller,
         system=system,
@@ -141,14 +141,14 @@ def close_fused_loop(
 
 
 def fused_radii_by_gain(
-    hardware: LoopHardware, suite: SensorSuite, controller: PeriodicController
+    hardware: LoopHardware, suite: SensorSuite, controller: Controller
 ) -> Callable[[FloatArray], FloatArray]:
     """Return the function from gains of the own sensor (g,) to spectral radii over a period (g,).
 
     Each phase of a loop is affine in this gain, so that two loops give all.
     """
     one, two = (
-        close_fused_loop(hardware, suite, controller, sensor_gain=gain).system.A
+        close_fused_loop(hardware, suite, controller, sensor_gain=gain).system.stacks()[0]
         for gain in (1.0, 2.0)
     )
     return affine_radii(2 * one - two, two - one)
@@ -228,7 +228,7 @@ def line_entry(
             newest, taps = sensor.taps(motion[channel], frequency_hz, hardware)
             columns.append((n + rows[channel].start, newest + 1, taps))
     width = max([2, *(first + len(taps) for _, first, taps in columns)])
-    entry = np.zeros((loop.system.B.shape[2], width))
+    entry = np.zeros((loop.system.B.shape[-1], width))
     entry[:n, 1] = direction
     for row, first, taps in columns:
         entry[row, first : first + len(taps)] = taps
@@ -247,8 +247,7 @@ def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray
         return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
 
     rate = loop.hardware.frame_rate_hz
-    poles = np.linalg.eigvals(loop.system.monodromy).astype(np.complex128)
-    N = loop.system.period  # a pole of the period shows at each of its roots
+    poles, N = loop.system.poles, loop.system.period  # a pole of the period shows at each of its roots
     turns = np.exp(2j * np.pi * np.arange(N) / N)
     roots = (np.abs(poles) ** (1 / N) * np.exp(1j * np.angle(poles) / N))[:, None] * turns
     edges = [panel_edges(roots, rate), breakpoints_below(spectrum, rate / 2)]
@@ -261,11 +260,11 @@ def _line_response(loop: FusedLoop, entry: FloatArray, frequency_hz: FloatArray)
     used = np.flatnonzero(np.any(entry != 0, axis=1))
     turned = np.exp(-angle[:, None] * (np.arange(entry.shape[1]) - 1)) @ entry[used].T
     s, n = loop.system, loop.hardware.modes
-    residual = replace(s, B=s.B[:, :, used], C=s.C[:, :n], D=s.D[:, :n, used])
-    return np.asarray(np.einsum("ftij,fj->fti", residual.frequency_response(frequency_hz), turned))
+    residual = replace(s, B=s.B[..., used], C=s.C[..., :n, :], D=s.D[..., :n, used])
+    return np.asarray(np.einsum("ftij,fj->fti", residual.phase_response(frequency_hz), turned))
 
 
-def _ar_system(loop: FusedLoop, model: ARModel, entry: FloatArray) -> PeriodicSystem:
+def _ar_system(loop: FusedLoop, model: ARModel, entry: FloatArray) -> StateSpace:
     """Return the system from the white drive of a process to all outputs of a loop."""
     s, order = loop.system, max(model.order, entry.shape[1])
     samples = np.zeros((entry.shape[0], order))
@@ -273,25 +272,25 @@ def _ar_system(loop: FusedLoop, model: ARModel, entry: FloatArray) -> PeriodicSy
     chain = np.eye(order, k=-1)
     chain[0, : model.order] = model.coefficients
     size = s.n_states + order
-    A, B = np.zeros((s.period, size, size)), np.zeros((1, size, 1))
+    A, B = np.zeros((s.period, size, size)), np.zeros((size, 1))
     A[:, : s.n_states, : s.n_states], A[:, : s.n_states, s.n_states :] = s.A, s.B @ samples
     A[:, s.n_states :, s.n_states :] = chain
-    B[0, s.n_states] = model.driving_rms_nm
-    C = np.concatenate([s.C, s.D @ samples], axis=2)
-    return PeriodicSystem(A=A, B=B, C=C, D=np.zeros((1, C.shape[1], 1)), dt_s=s.dt_s)
+    B[s.n_states] = model.driving_rms_nm
+    C = np.concatenate([s.C, s.D @ samples], axis=-1)
+    return StateSpace(A=A, B=B, C=C, D=np.zeros((C.shape[-2], 1)), dt_s=s.dt_s)
 
 
-def _noise_system(loop: FusedLoop, own: FloatArray) -> PeriodicSystem:
+def _noise_system(loop: FusedLoop, own: FloatArray) -> StateSpace:
     """Return the system from white noise to all outputs of a loop."""
     n, s = loop.hardware.modes, loop.system
     noise = loop.suite.noise_factor(own, n)
     noise[loop.suite.marked(loop.blind, loop.hardware)] = 0.0
-    return PeriodicSystem(
-        A=s.A, B=s.B[:, :, n:] @ noise, C=s.C, D=s.D[:, :, n:] @ noise, dt_s=s.dt_s
+    return StateSpace(
+        A=s.A, B=s.B[..., n:] @ noise, C=s.C, D=s.D[..., n:] @ noise, dt_s=s.dt_s
     )
 
 
-def residual_power(loop: FusedLoop, system: PeriodicSystem) -> FloatArray:
+def residual_power(loop: FusedLoop, system: StateSpace) -> FloatArray:
     """Return the residual's covariance from white noise to a loop's outputs, mean over phases."""
     n = loop.hardware.modes
     return np.asarray(np.mean(system.output_covariances()[:, :n, :n], axis=0))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_noise, draw_parts
 from lbt_synth.loop.simulation.run import Simulation, record_run
 from lbt_synth.models import LoopHardware, Truth
@@ -53,7 +53,7 @@ class Drop:
 
 
 def simulate_fused(
-    filters: Mapping[frozenset[str], PeriodicController],
+    filters: Mapping[frozenset[str], Controller],
     suite: SensorSuite,
     truth: Truth,
     *,
@@ -176,7 +176,7 @@ def run_segments(drops: Sequence[Drop], duration_s: float) -> tuple[Segment, ...
 
 
 def _run(
-    filters: Mapping[frozenset[str], PeriodicController],
+    filters: Mapping[frozenset[str], Controller],
     suite: SensorSuite,
     hardware: LoopHardware,
     total: FloatArray,
@@ -189,29 +189,29 @@ def _run(
     m, rows, read = hardware.n_commands, suite.rows(hardware), suite.read(hardware)
     period, taps = len(read), hardware.mirror_taps
     exposures = [own_exposure(hardware), *suite_exposures(suite, hardware)]
-    held = memory(exposures, n, period, hardware.dt_s)
+    held = memory(exposures, n, period)
     seen = held.C.copy()
     seen[:, : hardware.n_measurements] *= sensor_gain
     x = np.zeros((filters[frozenset()].n_states, cases))
     state, y = np.zeros((held.n_states, cases)), np.zeros((added.shape[2], cases))
     commands = np.zeros((len(taps), m, cases))
     out = np.zeros((cases, frames, n + m + len(y)))
-    own: PeriodicController = filters[frozenset()]
+    A, B, C, D = filters[frozenset()].stacks()
     wrong: Mapping[str, str] = {}
     for k in range(frames):
         if k in events:
             missing, wrong = events[k].missing, events[k].wrong
             if frozenset(missing) not in filters:
                 raise ProblemError(f"there is no filter without {', '.join(missing)}.")
-            own = filters[frozenset(missing)]
+            A, B, C, D = filters[frozenset(missing)].stacks()
         t, last = k % period, y.copy()
         y[read[t]] = added[:, k, read[t]].T
         y[: seen.shape[1]][read[t, : seen.shape[1]]] += (seen[t] @ state)[read[t, : seen.shape[1]]]
         for unit, reading in wrong.items():
             y[rows[unit]] = last[rows[unit]] if reading == "frozen" else 0.0
-        x = own.A[t] @ x + own.B[t] @ y
+        x = A[t] @ x + B[t] @ y
         commands[1:] = commands[:-1].copy()
-        commands[0] = own.C[t] @ x + own.D[t] @ y
+        commands[0] = C[t] @ x + D[t] @ y
         residual = total[:, k].T - hardware.influence @ np.tensordot(taps, commands, 1)
         state = held.A[t] @ state + held.B[t] @ residual
         out[:, k] = np.concatenate([residual, commands[0], y]).T

@@ -11,9 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError
-from lbt_synth.linear.periodic.problem import PeriodicProblem
-from lbt_synth.linear.periodic.system import PeriodicController, PeriodicSystem
+from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.models.fusion.sensors import (
     Motions,
     SensorSuite,
@@ -24,7 +22,7 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.parts import held_frames
 from lbt_synth.models.plant.tip_tilt import TipTiltPlant
 from lbt_synth.storage.rows import fact_table
-from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import BoolArray, FloatArray, require_instance
 
@@ -55,7 +53,21 @@ def suite_exposures(suite: SensorSuite, hardware: LoopHardware) -> list[Exposure
     ]
 
 
-def memory(exposures: list[Exposure], modes: int, period: int, dt_s: float) -> PeriodicSystem:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Memory:
+    """System from a signal to the readings of sensors, of samples before, at each phase."""
+
+    A: FloatArray  # (N, h, h); nothing is remembered where there is no sensor, h = 0
+    B: FloatArray  # (N, h, n)
+    C: FloatArray  # (N, q, h)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[2])
+
+
+def memory(exposures: list[Exposure], modes: int, period: int) -> Memory:
     """Return the system from a signal s(k) (n,) to the readings in frame k, of s before k.
 
     An exposure ends in frame e with the mean of the frames since the last end; the sum of a period
@@ -71,8 +83,7 @@ def memory(exposures: list[Exposure], modes: int, period: int, dt_s: float) -> P
     for (a, b, c), n, q in zip(blocks, states, rows, strict=True):
         A[:, x : x + n, x : x + n], B[:, x : x + n], C[:, y : y + q, x : x + n] = a, b, c
         x, y = x + n, y + q
-    D = np.zeros((period, sum(rows), modes))
-    return PeriodicSystem(A=A, B=B, C=C, D=D, dt_s=dt_s)
+    return Memory(A=A, B=B, C=C)
 
 
 def _exposure_memory(
@@ -103,7 +114,7 @@ def _exposure_memory(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FusedPlant(PeriodicProblem, Summarised):
+class FusedPlant(EstimationProblem):
     """A plant whose total phase is measured by several sensors; made by :func:`fused_plant`."""
 
     own: TipTiltPlant  # the plant of the loop's own sensor
@@ -127,30 +138,28 @@ class FusedPlant(PeriodicProblem, Summarised):
         """Return which measurements some sensors or channels give, (q,)."""
         return self.suite.marked(units, self.own.hardware)
 
-    def controller(self, gains: FloatArray) -> PeriodicController:
+    def controller(self, gain_predictor: FloatArray) -> Controller:
         """Return the controller from all measurements to u(k), in new-state form.
 
         Its states are the estimates of the plant's states, and the known ones. Entries of a
         measurement that is not read do not matter: their gains are zero.
 
-        Shapes: gains (N, n, q).
+        Shapes: gain_predictor (N, n, q), or (n, q).
         """
-        shape = (self.period, self.n_states, self.n_measurements)
-        if np.shape(gains) != shape:
-            raise DimensionError(f"gains must be {shape}; got {np.shape(gains)}.")
-        used = np.asarray(gains) * self.read[:, None, :]
+        used = self._checked_gain(gain_predictor)
         to_command = np.zeros((self.own.hardware.n_commands, self.n_states + self.n_known))
         to_command[:, : self.n_states] = self.own.hardware.projector @ self.L
         n, size = self.n_states, self.n_states + self.n_known
-        A, B = np.zeros((self.period, size, size)), np.zeros((self.period, size, shape[2]))
+        A = np.zeros((self.period, size, size))
+        B = np.zeros((self.period, size, self.n_measurements))
         A[:, :n, :n], A[:, :n, n:] = self.A - used @ self.C, -used @ self.C_known
         A[:, n:, n:], B[:, :n] = self.A_known, used
         applied = np.concatenate([-used @ self.D_known, self.B_known], axis=1)
-        return PeriodicController(
+        return Controller(
             A=A + applied @ to_command,
             B=B,
-            C=to_command[None],
-            D=np.zeros((1, len(to_command), shape[2])),
+            C=to_command,
+            D=np.zeros((len(to_command), self.n_measurements)),
             dt_s=self.dt_s,
         )
 
@@ -213,8 +222,8 @@ def fused_plant(own: TipTiltPlant, suite: SensorSuite, motions: Motions = ()) ->
     readings = _channel_readings(own, suite, motions, ahead)
     exposures = suite_exposures(suite, hardware)
     late = [replace(each, age_frames=each.age_frames + ahead) for each in exposures]
-    waiting = memory(late, hardware.modes, period, own.dt_s)
-    corrections = memory(exposures, hardware.modes, period, own.dt_s)
+    waiting = memory(late, hardware.modes, period)
+    corrections = memory(exposures, hardware.modes, period)
     total = own.A[_newest_total(own)]  # total(k) from x(k): it is that held in x(k+1)
 
     lags, w = readings.A.shape[0] - n0, waiting.n_states
@@ -235,9 +244,9 @@ def fused_plant(own: TipTiltPlant, suite: SensorSuite, motions: Motions = ()) ->
     A_known, B_known, C_known, D_known = _known_part(own, corrections, q2)
     return FusedPlant(
         A=A,
-        B=B[None],
+        B=B,
         C=C,
-        D=D[None],
+        D=D,
         L=L,
         read=suite.read(hardware),
         dt_s=own.dt_s,
@@ -308,7 +317,7 @@ def _channel_readings(
 
 
 def _known_part(
-    own: TipTiltPlant, waiting: PeriodicSystem, channels: int
+    own: TipTiltPlant, waiting: Memory, channels: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return A, B, C, D of the known states: those of the mirror, and its corrections that wait.
 

@@ -20,7 +20,7 @@ from lbt_synth.design.fusion.failures import (
     make_fallbacks,
 )
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import periodic_kalman
+from lbt_synth.linear import kalman_riccati
 from lbt_synth.loop.fusion.fused_loop import fused_model_budget, model_readings
 
 
@@ -40,7 +40,7 @@ def test_every_set_of_sensors_may_fail():
 
 def test_rows_are_what_runs_leave():
     plant = example_plant((FAST, SLOW))
-    gains, fallbacks = periodic_kalman(plant).gains, make_fallbacks(plant)
+    gains, fallbacks = kalman_riccati(plant).gain_predictor, make_fallbacks(plant)
     rows = failure_rows(plant, gains, fallbacks)
     assert " ".join(row.missing for row in rows[:5]) == "wavefront truth m1 m2 wavefront + truth"
     for row, fallback in zip(rows[:4], fallbacks, strict=False):
@@ -55,7 +55,7 @@ def test_rows_are_what_runs_leave():
 
 def test_a_reading_that_stays_leaves_an_offset():
     plant = example_plant((FAST, SLOW))
-    gains, fallbacks = periodic_kalman(plant).gains, make_fallbacks(plant)
+    gains, fallbacks = kalman_riccati(plant).gain_predictor, make_fallbacks(plant)
     controller = plant.controller(gains)
     readings = model_readings(failed_loop(plant, gains, ()), plant)
     for row, fallback in list(zip(failure_rows(plant, gains, fallbacks), fallbacks, strict=True))[
@@ -72,7 +72,7 @@ def test_a_reading_that_stays_leaves_an_offset():
 
 def test_readings_are_residual_and_noise():
     plant = example_plant((FAST,))
-    loop = failed_loop(plant, periodic_kalman(plant).gains, ())
+    loop = failed_loop(plant, kalman_riccati(plant).gain_predictor, ())
     readings = model_readings(loop, plant)
     left = fused_model_budget(loop, plant).total_nm2
     np.testing.assert_allclose(readings[:2, :2], left + 75**2 * np.eye(2), rtol=1e-9)
@@ -99,7 +99,7 @@ def test_what_is_missing_is_not_used():
     assert gains[:, :, ~marked].any()
     alone = example_plant((FAST,))  # nothing but the other sensors
     assert fallback_gains(plant, ("truth",))[0][: alone.n_states, :2] == pytest.approx(
-        periodic_kalman(alone).gains[0][:, :2], rel=1e-7, abs=1e-9
+        kalman_riccati(alone).gain_predictor[0][:, :2], rel=1e-7, abs=1e-9
     )
 
 
@@ -118,7 +118,7 @@ def test_without_any_reading_the_mirror_stays():
 def test_a_failure_that_must_be_seen():
     # the estimator of an unstable controller believes readings of zero
     plant = example_plant((SLOW,), noise_nm=15)
-    rows = failure_rows(plant, periodic_kalman(plant).gains, make_fallbacks(plant))
+    rows = failure_rows(plant, kalman_riccati(plant).gain_predictor, make_fallbacks(plant))
     for row in rows:
         assert row.must_switch == (row.unseen_radius >= 1)
         assert (row.zero_nm is None) == (row.frozen_nm is None) == row.must_switch

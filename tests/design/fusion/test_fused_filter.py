@@ -12,7 +12,7 @@ from lbt_synth.design.fusion import fused_filter
 from lbt_synth.design.fusion.failures import make_fallbacks
 from lbt_synth.design.fusion.fused_filter import dwell_frames
 from lbt_synth.errors import CertificateError, InfeasibleError, LbtSynthError, ProblemError
-from lbt_synth.linear import periodic_kalman
+from lbt_synth.linear import kalman_riccati
 from lbt_synth.models import Accelerometer, WavefrontSensor
 
 
@@ -34,7 +34,7 @@ def failed(design):
 def test_a_certified_filter(kalman):
     assert kalman.certificate.passed
     plant = kalman.problem
-    P = lbt.linear.periodic_kalman(plant).P
+    P = lbt.linear.kalman_riccati(plant).P
     per_output = np.mean([np.diag(plant.L @ one @ plant.L.T) for one in P], axis=0)
     np.testing.assert_allclose(kalman.certificate.rms_per_output**2, per_output, rtol=1e-9)
     assert kalman.rms == pytest.approx(np.sqrt(per_output.sum()))
@@ -99,16 +99,16 @@ def test_a_bound_that_is_not_met(hinf):
     found = failed(replace(hinf, gamma_requested=0.99 * hinf.gamma))
     norm = "norm of the estimation error over its bound, less 1"
     assert found == {norm, "distance from its Riccati filter"}
-    kalman = lbt.linear.periodic_kalman(hinf.problem).gains
+    kalman = lbt.linear.kalman_riccati(hinf.problem).gain_predictor
     assert "distance from its Riccati filter" in failed(replace(hinf, gains=kalman))
 
 
 def test_a_design_that_fails_is_not_returned(monkeypatch):
 
-    solve = fused_filter.periodic_kalman
+    solve = fused_filter.kalman_riccati
     monkeypatch.setattr(
         fused_filter,
-        "periodic_kalman",
+        "kalman_riccati",
         lambda plant: replace(solve(plant), gains=1.01 * solve(plant).gains),
     )
     with pytest.raises(CertificateError, match="failed its certificate"):
@@ -209,7 +209,7 @@ def growth_per_frame(plant, turns):
 
 
 def designed(plant):
-    return periodic_kalman(plant).gains, make_fallbacks(plant)
+    return kalman_riccati(plant).gain_predictor, make_fallbacks(plant)
 
 
 def test_stable_filters_that_take_turns_may_diverge():
@@ -239,7 +239,7 @@ def test_filters_that_stay_do_not_diverge(sensors):
 
 def test_a_single_filter_is_its_own_proof():
     plant = example_plant((FAST,))
-    gains = periodic_kalman(plant).gains
+    gains = kalman_riccati(plant).gain_predictor
     assert dwell_frames(plant, gains, ()) < 100
 
 

@@ -10,7 +10,7 @@ from support.small_telescope import BRIGHT, PATH, SETUP, needs_specula
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop.specula.fused_filter import AccompaniedFilter, accompany_filter
-from lbt_synth.linear.periodic.system import PeriodicController
+from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
@@ -85,7 +85,7 @@ def test_channels_follow_the_motions_that_shake_the_telescope():
 def test_steps_are_those_of_the_filter_of_all_readings():
     rng = np.random.default_rng(0)
     parts = {"A": (2, 3, 3), "B": (2, 3, 3), "C": (2, 2, 3), "D": (2, 2, 3)}
-    controller = PeriodicController(**{n: rng.standard_normal(s) for n, s in parts.items()})
+    controller = Controller(**{n: rng.standard_normal(s) for n, s in parts.items()})
     others = rng.standard_normal((4, 1))
     own = AccompaniedFilter(controller=controller, others=others, hardware=PATH)
     y = rng.standard_normal((4, 2))

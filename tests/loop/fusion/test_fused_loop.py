@@ -17,7 +17,7 @@ from support.fused_loops import (
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, UnstableLoopError
-from lbt_synth.linear import periodic_kalman
+from lbt_synth.linear import kalman_riccati
 from lbt_synth.loop.fusion.fused_loop import (
     close_fused_loop,
     fused_budget,
@@ -42,7 +42,7 @@ AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, fra
 
 def closed(plant, **facts):
     """Return the controller of the Kalman filter, and its loop."""
-    controller = plant.controller(periodic_kalman(plant).gains)
+    controller = plant.controller(kalman_riccati(plant).gain_predictor)
     hardware = plant.own.hardware
     return controller, close_fused_loop(hardware, plant.suite, controller, **facts)
 
@@ -51,7 +51,7 @@ def closed(plant, **facts):
 @pytest.mark.parametrize("sensors", [(FAST,), (SLOW,), (FAST, SLOW), (SELDOM,)])
 def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
     plant = example_plant(sensors, delay_frames=delay)
-    P = periodic_kalman(plant).P
+    P = kalman_riccati(plant).P
     _, loop = closed(plant)
     rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
     assert fused_model_budget(loop, plant).rms_nm == pytest.approx(rms, rel=1e-9)

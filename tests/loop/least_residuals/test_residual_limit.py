@@ -301,7 +301,7 @@ def fused_variances(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=
     suite = lbt.models.SensorSuite(sensors=tuple(sensors))
     motions = tuple(moves for _, moves in lines)
     plant = lbt.models.fused_plant(own, suite, motions)
-    controller = plant.controller(lbt.linear.periodic_kalman(plant).gains)
+    controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
     loop = close_fused_loop(own.hardware, suite, controller)
     truth = lbt.Truth(
         turbulence=slow,

@@ -31,7 +31,7 @@ def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
     signal = np.random.default_rng(0).standard_normal((200, 2))
     response = np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]])
     exposure = Exposure(response=response, age_frames=float(age), period=period)
-    held, compared = memory([exposure], 2, common, 1e-3), 0
+    held, compared = memory([exposure], 2, common), 0
     x = np.zeros(held.n_states)
     for k, s in enumerate(signal):
         t = k % common
@@ -49,8 +49,8 @@ def test_sensors_side_by_side():
     slow = WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
     exposures = [own_exposure(path), *suite_exposures(SensorSuite(sensors=(slow,)), path)]
     assert [(e.age_frames, e.period) for e in exposures] == [(1.0, 1), (6.5, 4)]
-    both = memory(exposures, 2, 4, path.dt_s)
-    alone = [memory([each], 2, 4, path.dt_s) for each in exposures]
+    both = memory(exposures, 2, 4)
+    alone = [memory([each], 2, 4) for each in exposures]
     assert both.n_states == sum(each.n_states for each in alone)
     n = alone[0].n_states
     np.testing.assert_array_equal(both.A[:, n:, n:], alone[1].A)
@@ -66,15 +66,15 @@ def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
     )
     plant = example_plant((fast,), motions=({}, {}), delay_frames=delay)
     alone, n = lbt.kalman(plant.own), plant.own.n_states
-    solution = lbt.linear.periodic_kalman(plant)
+    solution = lbt.linear.kalman_riccati(plant)
     assert plant.period == 2
-    for P, gains in zip(solution.P, solution.gains, strict=True):
+    for P, gains in zip(solution.P, solution.gain_predictor, strict=True):
         assert relative_distance(gains[:n, :2], alone.gain_predictor) < 1e-9
         assert not gains[:, 2:].any()
         power = np.trace(plant.L @ P @ plant.L.T)
         assert power == pytest.approx(alone.rms**2, rel=1e-9)
     # and so does its controller
-    own, fused = alone.controller, plant.controller(solution.gains)
+    own, fused = alone.controller, plant.controller(solution.gain_predictor)
     y = np.random.default_rng(0).standard_normal((50, 3))
     states, commands = [np.zeros(own.n_states), np.zeros(fused.n_states)], np.zeros((2, 50, 2))
     for k in range(50):

@@ -7,17 +7,14 @@ the period then gives the solution of every phase. Nothing grows with the period
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
 
 from lbt_synth.errors import InfeasibleError, NumericalError
-from lbt_synth.linear.estimation_problem import EstimationProblem, error_units, scale_states
-from lbt_synth.linear.infeasibility_proof import infeasible_periodic_level, worst_invisible_bursts
+from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
 from lbt_synth.linear.matrix_functions import is_stable, relative_distance, symmetrise
-from lbt_synth.linear.periodic.problem import PeriodicProblem
-from lbt_synth.linear.riccati.filtering import require_detectable
+from lbt_synth.linear.riccati.filtering import FilterRiccati, require_detectable
 from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.linear.riccati.solvability import weight_root
 from lbt_synth.validation import FloatArray, frozen_copy
@@ -30,19 +27,7 @@ _GAMMA_TOLERANCE = 1e-9
 Triple = tuple[FloatArray, FloatArray, FloatArray]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PeriodicRiccati:
-    """Solution of a periodic filter equation."""
-
-    # (N, n, n): covariance of the prediction error at each phase (Kalman), or its H-infinity
-    # counterpart
-    P: FloatArray
-    gains: FloatArray  # (N, n, q): predictor gains; zero for measurements that are not read
-    residual: float  # relative change of P in the last Newton step
-    steps: int  # Newton steps made after the doubling, each a Lyapunov equation
-
-
-def join_triples(first: Triple, then: Triple) -> Triple:
+def _join_triples(first: Triple, then: Triple) -> Triple:
     """Return the triple of two samples of the recursion, one after the other."""
     (A1, G1, H1), (A2, G2, H2) = first, then
     identity = np.eye(len(A1))
@@ -51,46 +36,18 @@ def join_triples(first: Triple, then: Triple) -> Triple:
     return left @ A1, symmetrise(G1 + A1.T @ right), symmetrise(H2 + left @ H1 @ A2.T)
 
 
-def fixed_point(triple: Triple) -> FloatArray:
+def _fixed_point(triple: Triple) -> FloatArray:
     """Return the stabilising solution of the recursion of a triple; nan if there is none."""
     A, G, H = triple
     with np.errstate(all="ignore"):
         return np.asarray(doubling(A.T[None], G[None], H[None])[0][0])
 
 
-def periodic_kalman(problem: PeriodicProblem) -> PeriodicRiccati:
-    """Solve the periodic Riccati equation of the Kalman predictor.
-
-    Parameters
-    ----------
-    problem : PeriodicProblem
-        The problem.
-
-    Returns
-    -------
-    PeriodicRiccati
-        Covariances and predictor gains of every phase.
-
-    Raises
-    ------
-    DetectabilityError
-        If no stable filter exists; the message names the mode of a period.
-    NumericalError
-        If the equation was not solved.
-
-    Examples
-    --------
-    >>> from lbt_synth.linear.periodic.problem import PeriodicProblem
-    >>> from lbt_synth.linear.periodic.riccati import periodic_kalman
-    >>> walk = PeriodicProblem(
-    ...     A=[[[1.0]]], B=[[[1.0, 0.0]]], C=[[[1.0]]], D=[[[0.0, 1.0]]], L=[[1.0]], read=[[True]]
-    ... )
-    >>> round(float(periodic_kalman(walk).P[0, 0, 0]), 9)
-    1.618033989
-    """
-    whole = reduce(join_triples, (_kalman_triple(problem, t) for t in range(problem.period)))
+def periodic_kalman(problem: EstimationProblem) -> FilterRiccati:
+    """Solve the equation of the Kalman predictor, as ``kalman_riccati`` of any period does."""
+    whole = reduce(_join_triples, (_kalman_triple(problem, t) for t in range(problem.period)))
     require_detectable(_problem_of_triple(whole))
-    P = fixed_point(whole)
+    P = _fixed_point(whole)
     if not np.isfinite(P).all():
         raise NumericalError(
             "the periodic Riccati equation was not solved: the doubling did not converge. Scale "
@@ -98,10 +55,11 @@ def periodic_kalman(problem: PeriodicProblem) -> PeriodicRiccati:
             status="doubling",
         )
     covariances, change, steps = _sweep(problem, P), np.inf, 0
-    gains = np.zeros((problem.period, problem.n_states, problem.n_measurements))
+    gains = np.zeros((2, problem.period, problem.n_states, problem.n_measurements))
     while steps < _NEWTON_STEPS:
-        gains = np.stack([kalman_gain(problem, t, P) for t, P in enumerate(covariances)])
-        error = problem.error_system(gains)
+        for t, P in enumerate(covariances):
+            gains[:, t] = _kalman_gains(problem, t, P)
+        error = problem.error_system(gains[0])
         if not error.spectral_radius < 1:
             break
         refined = error.covariances()
@@ -116,12 +74,22 @@ def periodic_kalman(problem: PeriodicProblem) -> PeriodicRiccati:
             status="residual",
             residual=change,
         )
-    return PeriodicRiccati(
-        P=frozen_copy(covariances), gains=frozen_copy(gains), residual=change, steps=steps
+    return _solution(covariances, gains, change, steps)
+
+
+def _solution(P: FloatArray, gains: FloatArray, residual: float, steps: int) -> FilterRiccati:
+    """Return the solution of gains of predictor and filter, (2, N, n, q)."""
+    return FilterRiccati(
+        P=frozen_copy(P),
+        gain_predictor=frozen_copy(gains[0]),
+        gain_filter=frozen_copy(gains[1]),
+        residual=residual,
+        iterations=steps,
+        status="cyclic doubling",
     )
 
 
-def _sweep(problem: PeriodicProblem, P: FloatArray) -> FloatArray:
+def _sweep(problem: EstimationProblem, P: FloatArray) -> FloatArray:
     """Return the covariances of all phases from that of phase 0, (N, n, n), in Joseph's form."""
     out = np.empty_like(problem.A)
     for t in range(problem.period):
@@ -132,25 +100,26 @@ def _sweep(problem: PeriodicProblem, P: FloatArray) -> FloatArray:
     return out
 
 
-def kalman_gain(problem: PeriodicProblem, t: int, P: FloatArray) -> FloatArray:
+def kalman_gain(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
     """Return the predictor gain (n, q) of a phase for the covariance of its prediction error."""
-    A, B, C, D = problem.parts(t)
-    gain = np.zeros((problem.n_states, problem.n_measurements))
-    if len(C):
-        innovation = C @ P @ C.T + D @ D.T
-        gain[:, problem.read[t]] = np.linalg.solve(innovation, (A @ P @ C.T + B @ D.T).T).T
-    return gain
+    return _kalman_gains(problem, t, P)[0]
 
 
-def _kalman_triple(problem: PeriodicProblem, t: int) -> Triple:
+def _kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
+    """Return the gains of predictor and filter (2, n, q) at a phase."""
+    A, B, C, D = problem.read_parts(t)
+    innovation = C @ P @ C.T + D @ D.T
+    out, rows = np.zeros((2, problem.n_states, problem.n_measurements)), problem.read[t]
+    out[0][:, rows] = np.linalg.solve(innovation, (A @ P @ C.T + B @ D.T).T).T
+    out[1][:, rows] = np.linalg.solve(innovation, C @ P).T
+    return out
+
+
+def _kalman_triple(problem: EstimationProblem, t: int) -> Triple:
     """Return one sample of the Kalman recursion, with process and measurement noise separated."""
-    A, B, C, D = problem.parts(t)
-    if len(C) == 0:
-        return A, np.zeros_like(A), B @ B.T
-    R = D @ D.T
-    injection = np.linalg.solve(R, D @ B.T).T
-    A_s, B_s = A - injection @ C, B - injection @ D
-    return A_s, symmetrise(C.T @ np.linalg.solve(R, C)), B_s @ B_s.T
+    _, _, C, D = problem.read_parts(t)
+    A, B, _ = decorrelate(problem, t)
+    return A, symmetrise(C.T @ np.linalg.solve(D @ D.T, C)), B @ B.T
 
 
 def _problem_of_triple(triple: Triple) -> EstimationProblem:
@@ -162,13 +131,13 @@ def _problem_of_triple(triple: Triple) -> EstimationProblem:
 
 
 def periodic_hinf(
-    problem: PeriodicProblem, gamma: float, start: PeriodicRiccati
-) -> PeriodicRiccati | None:
+    problem: EstimationProblem, gamma: float, start: FilterRiccati
+) -> FilterRiccati | None:
     """Solve the gamma-Riccati equation of the central H-infinity predictor of a level.
 
-    As for a filter of one rate, the excess over the Kalman filter's covariance is solved for (see
-    ``riccati.filtering.GammaEquation``), phase by phase, from the Kalman filter's solution. None
-    where no filter meets the level, of the norm of the error over all samples.
+    As with a period of 1, the excess over the Kalman filter's covariance is solved for (see
+    ``GammaEquation``), phase by phase, from the Kalman filter's solution. None where no filter
+    meets the level, of the norm of the error over all samples.
     """
     triples = []
     for t in range(problem.period):
@@ -176,9 +145,9 @@ def periodic_hinf(
         if triple is None:
             return None
         triples.append(triple)
-    X = fixed_point(reduce(join_triples, triples))
+    X = _fixed_point(reduce(_join_triples, triples))
     L, identity = problem.L, np.eye(problem.n_states)
-    P, gains = np.empty_like(problem.A), np.zeros_like(start.gains)
+    P, gains = np.empty_like(problem.A), np.zeros((2, *start.gain_predictor.shape))
     transition = identity
     for t, (A1, G1, H1) in enumerate(triples):
         if not np.isfinite(X).all():
@@ -188,17 +157,18 @@ def periodic_hinf(
         slack = 1 - float(np.linalg.eigvalsh(L @ P[t] @ L.T)[-1]) / gamma**2
         if spectrum[0] < -1e-9 * abs(spectrum[-1]) or slack <= 0:
             return None
-        gains[t] = _central_gain(problem, t, gamma, P[t])
+        gains[:, t] = _central_gains(problem, t, gamma, P[t])
         onward = np.linalg.solve((identity + X @ G1).T, A1.T).T
         transition = onward @ transition
         X = symmetrise(onward @ X @ A1.T + H1)
-    if not is_stable(transition) or not problem.error_system(gains).spectral_radius < 1:
+    if not is_stable(transition) or not problem.error_system(gains[0]).spectral_radius < 1:
         return None
-    residual = relative_distance(start.P[0] + X, P[0])
-    return PeriodicRiccati(P=frozen_copy(P), gains=frozen_copy(gains), residual=residual, steps=0)
+    return _solution(P, gains, relative_distance(start.P[0] + X, P[0]), 0)
 
 
-def _excess_triple(problem: PeriodicProblem, t: int, gamma: float, P: FloatArray) -> Triple | None:
+def _excess_triple(
+    problem: EstimationProblem, t: int, gamma: float, P: FloatArray
+) -> Triple | None:
     """Return one sample of the recursion of the excess over the Kalman covariance.
 
     None where the level is not met even by the filtered estimate.
@@ -217,48 +187,32 @@ def _excess_triple(problem: PeriodicProblem, t: int, gamma: float, P: FloatArray
     return A1, symmetrise(G1), symmetrise(H1)
 
 
-def _central_gain(problem: PeriodicProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:
-    """Predictor gain (n, q) of the central filter at a phase."""
-    A, B, C, D = problem.parts(t)
-    gain = np.zeros((problem.n_states, problem.n_measurements))
-    if len(C) == 0:
-        return gain
-    R = D @ D.T
-    injection = np.linalg.solve(R, D @ B.T).T
+def _central_gains(problem: EstimationProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:
+    """Return the gains of predictor and filter (2, n, q) of the central filter at a phase."""
+    _, _, C, D = problem.read_parts(t)
+    A, _, injection = decorrelate(problem, t)
     outputs = np.vstack([C, problem.L / gamma])
     innovations = outputs @ P @ outputs.T
-    innovations[: len(C), : len(C)] += R
+    innovations[: len(C), : len(C)] += D @ D.T
     innovations[len(C) :, len(C) :] -= np.eye(len(problem.L))
-    own = np.linalg.solve(innovations, outputs @ P)[: len(C)].T
-    gain[:, problem.read[t]] = (A - injection @ C) @ own + injection
-    return gain
+    gain_filter = np.linalg.solve(innovations, outputs @ P)[: len(C)].T
+    out, rows = np.zeros((2, problem.n_states, problem.n_measurements)), problem.read[t]
+    out[0][:, rows], out[1][:, rows] = A @ gain_filter + injection, gain_filter
+    return out
 
 
-def proved_periodic_gamma(problem: PeriodicProblem, start: PeriodicRiccati, level: float) -> float:
-    """Return a level of gamma that no filter reaches, proved by disturbances that none can see.
+def least_periodic_gamma(
+    problem: EstimationProblem, lower: float, upper: float, start: FilterRiccati
+) -> tuple[float, float, FilterRiccati]:
+    """Bracket the least gamma that the equation meets to 1e-9; return also the filter there.
 
-    The worst of a level that is met, next to the least one; 0 if the equation does not meet it.
+    The upper level is one that is met, such as the norm of the Kalman filter's error.
     """
-    met = periodic_hinf(problem, level, start)
-    if met is None:
-        return 0.0
-    units = error_units(start.P.max(axis=0))
-    both = units * units.T
-    phases = [scale_states(problem.phase(t), units) for t in range(problem.period)]
-    bursts = worst_invisible_bursts(phases, list(met.P / both), level)
-    return infeasible_periodic_level(phases, bursts, list(start.P / both))
-
-
-def least_periodic_gamma(problem: PeriodicProblem, start: PeriodicRiccati, upper: float) -> float:
-    """Return the least gamma that the equation meets, to 1e-9.
-
-    ``upper`` is a level that is met, such as the norm of the Kalman filter's error.
-    """
-    lower = float(
-        np.sqrt(max(np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[-1] for P in start.P))
-    )
+    powers = (np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[-1] for P in start.P)
+    lower = max(lower, float(np.sqrt(max(*powers, 0.0))))
     for _ in range(60):  # met in exact arithmetic
-        if periodic_hinf(problem, upper, start) is not None:
+        solution = periodic_hinf(problem, upper, start)
+        if solution is not None:
             break
         upper *= 1.001
     else:
@@ -270,8 +224,9 @@ def least_periodic_gamma(problem: PeriodicProblem, start: PeriodicRiccati, upper
     lower = min(lower, upper)
     while upper - lower > _GAMMA_TOLERANCE * upper:
         middle = (lower + upper) / 2
-        if periodic_hinf(problem, middle, start) is None:
+        trial = periodic_hinf(problem, middle, start)
+        if trial is None:
             lower = middle
         else:
-            upper = middle
-    return upper
+            upper, solution = middle, trial
+    return lower, upper, solution
