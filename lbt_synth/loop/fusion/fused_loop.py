@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
@@ -19,14 +18,17 @@ from lbt_synth.loop.closed_loop import (
     require_loop_rate,
 )
 from lbt_synth.loop.residual import ResidualBudget, require_true_gain
-from lbt_synth.models import ARModel, LoopHardware, Spectrum, Truth, Vibration
-from lbt_synth.models.fusion.plant import FusedPlant, memory, own_exposure, suite_exposures
-from lbt_synth.models.fusion.sensors import (
-    OWN_SENSOR,
-    Motion,
-    SensorSuite,
-    checked_motions,
+from lbt_synth.models import (
+    ARModel,
+    LoopHardware,
+    SinusoidalVibration,
+    Spectrum,
+    Truth,
+    Vibration,
 )
+from lbt_synth.models.fusion.plant import FusedPlant, memory, own_exposure, suite_exposures
+from lbt_synth.models.fusion.seen_vibration import seen_vibration
+from lbt_synth.models.fusion.sensors import OWN_SENSOR, Motion, SensorSuite, checked_motions
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number
@@ -176,13 +178,12 @@ def model_readings(loop: FusedLoop, plant: FusedPlant) -> FloatArray:
 
     A plant's model is the truth. In that frame every sensor is read.
     """
-    own, rate, each = plant.own, plant.own.hardware.frame_rate_hz, np.eye(loop.hardware.modes)
+    own = plant.own
     systems = [_noise_system(loop, own.parts().noise_factor)]
-    for direction, model in zip(each, own.turbulence, strict=True):
-        systems.append(_ar_system(loop, model, line_entry(loop, direction)))
+    for mode, model in enumerate(own.turbulence):
+        systems.append(_driven_system(loop, _ar_process(model), _entry(loop, mode)))
     for line, motion in zip(own.vibrations, plant.motions, strict=True):
-        entry = line_entry(loop, np.array(line.direction), motion, line.frequency_hz)
-        systems.append(_ar_system(loop, line.ar_model(rate), entry))
+        systems.append(_shaken_system(loop, line, motion))
     first = -plant.n_measurements
     return np.asarray(sum(s.output_covariances()[0, first:, first:] for s in systems))
 
@@ -193,15 +194,15 @@ def _budget(loop: FusedLoop, truth: Truth, noise_factor: FloatArray) -> Residual
     turbulence, vibration = np.zeros((2, n, n))
     for spectrum, modes in truth.turbulence_groups(n):
         for mode in modes:
-            turbulence += _power(loop, spectrum, line_entry(loop, np.eye(n)[mode]))
+            turbulence += _power(loop, spectrum, _entry(loop, mode))
     lines = stationary_vibrations(truth.vibrations)
     moving = checked_motions(truth.motions, loop.suite, len(lines))
     amplitudes: list[ComplexArray] = []
     for line, motion in zip(lines, moving, strict=True):
-        entry = line_entry(loop, checked_direction(line, hardware), motion, line.frequency_hz)
         if isinstance(line, Vibration):
-            vibration += _power(loop, line.ar_model(hardware.frame_rate_hz), entry)
+            vibration += residual_power(loop, _shaken_system(loop, line, motion))
         else:
+            entry = _sinusoid_entry(loop, line, motion)
             response = _line_response(loop, entry, np.array([line.frequency_hz]))[0]
             # what repeats with the period turns one sinusoid into several
             amplitudes += list(line.amplitude_nm * np.fft.fft(response, axis=0) / len(response))
@@ -213,33 +214,50 @@ def _budget(loop: FusedLoop, truth: Truth, noise_factor: FloatArray) -> Residual
     )
 
 
-def line_entry(
-    loop: FusedLoop,
-    direction: FloatArray,
-    motion: Mapping[str, Motion] = MappingProxyType({}),
-    frequency_hz: float = 0.0,
-) -> FloatArray:
-    """Return how the samples v(k+1), v(k), v(k-1), ... of a process enter a loop, (n + q, t)."""
-    hardware, suite, n = loop.hardware, loop.suite, loop.hardware.modes
-    rows = suite.rows(hardware)
-    columns: list[tuple[int, int, FloatArray]] = []
-    for sensor in suite.accelerometers:
-        for channel in motion.keys() & set(sensor.channels) - set(loop.blind):
-            newest, taps = sensor.taps(motion[channel], frequency_hz, hardware)
-            columns.append((n + rows[channel].start, newest + 1, taps))
-    width = max([2, *(first + len(taps) for _, first, taps in columns)])
-    entry = np.zeros((loop.system.B.shape[-1], width))
-    entry[:n, 1] = direction
-    for row, first, taps in columns:
-        entry[row, first : first + len(taps)] = taps
+def _entry(loop: FusedLoop, mode: int) -> FloatArray:
+    """Return how the phase of a mode enters a loop, (n + q, 1)."""
+    return np.eye(loop.system.B.shape[-1], 1, -mode)
+
+
+def _moved_rows(loop: FusedLoop, motion: Mapping[str, Motion]) -> list[tuple[int, str]]:
+    """Return the inputs of a loop at which channels read a line, and the channels, in order."""
+    rows, n = loop.suite.rows(loop.hardware), loop.hardware.modes
+    return [(n + rows[name].start, name) for name in loop.suite.channels if name in motion]
+
+
+def _shaken_system(
+    loop: FusedLoop, line: Vibration, motion: Mapping[str, Motion]
+) -> StateSpace:
+    """Return the system from the white drive of a line to all outputs of a loop."""
+    hardware, moved = loop.hardware, _moved_rows(loop, motion)
+    entry = np.zeros((loop.system.B.shape[-1], 1 + len(moved)))
+    entry[: hardware.modes, 0] = checked_direction(line, hardware)
+    for column, (row, name) in enumerate(moved, start=1):
+        entry[row, column] = name not in loop.blind
+    if not moved:
+        return _driven_system(loop, _ar_process(line.ar_model(hardware.frame_rate_hz)), entry)
+    seen = seen_vibration(line, motion, loop.suite.accelerometers, hardware)
+    return _driven_system(loop, seen, entry)
+
+
+def _sinusoid_entry(
+    loop: FusedLoop, line: SinusoidalVibration, motion: Mapping[str, Motion]
+) -> ComplexArray:
+    """Return how a sinusoid of unit amplitude enters a loop, (n + q, 1)."""
+    hardware, entry = loop.hardware, np.zeros((loop.system.B.shape[-1], 1), dtype=np.complex128)
+    entry[: hardware.modes, 0] = checked_direction(line, hardware)
+    of_channel = {name: sensor for sensor in loop.suite.accelerometers for name in sensor.channels}
+    for row, name in _moved_rows(loop, motion):
+        if name not in loop.blind:
+            entry[row] = of_channel[name].swing(motion[name], line.frequency_hz, hardware)
     return entry
 
 
 def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray:
-    """Return the residual's covariance for a process whose samples enter as given, (n, n)."""
+    """Return the residual's covariance for a spectrum that enters as given, (n, n)."""
     if isinstance(spectrum, ARModel):
         require_loop_rate(spectrum.frame_rate_hz, loop.hardware)
-        return residual_power(loop, _ar_system(loop, spectrum, entry))
+        return residual_power(loop, _driven_system(loop, _ar_process(spectrum), entry))
 
     def density(frequency: FloatArray) -> FloatArray:
         response = _line_response(loop, entry, frequency)
@@ -254,30 +272,35 @@ def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray
     return adaptive_integral(density, np.unique(np.concatenate(edges)))
 
 
-def _line_response(loop: FusedLoop, entry: FloatArray, frequency_hz: FloatArray) -> ComplexArray:
-    """Return the residual at each phase for a process ``exp(2 pi i f k dt)``, (f, N, n)."""
-    angle = 2j * np.pi * np.asarray(frequency_hz) * loop.hardware.dt_s
-    used = np.flatnonzero(np.any(entry != 0, axis=1))
-    turned = np.exp(-angle[:, None] * (np.arange(entry.shape[1]) - 1)) @ entry[used].T
+def _line_response(
+    loop: FusedLoop, entry: FloatArray | ComplexArray, frequency_hz: FloatArray
+) -> ComplexArray:
+    """Return the residual at each phase for ``exp(2 pi i f k dt)`` that enters so, (f, N, n)."""
+    used = np.flatnonzero(entry[:, 0])
     s, n = loop.system, loop.hardware.modes
     residual = replace(s, B=s.B[..., used], C=s.C[..., :n, :], D=s.D[..., :n, used])
-    return np.asarray(np.einsum("ftij,fj->fti", residual.phase_response(frequency_hz), turned))
+    return np.asarray(residual.phase_response(frequency_hz) @ entry[used, 0])
 
 
-def _ar_system(loop: FusedLoop, model: ARModel, entry: FloatArray) -> StateSpace:
-    """Return the system from the white drive of a process to all outputs of a loop."""
-    s, order = loop.system, max(model.order, entry.shape[1])
-    samples = np.zeros((entry.shape[0], order))
-    samples[:, : entry.shape[1]] = entry
-    chain = np.eye(order, k=-1)
-    chain[0, : model.order] = model.coefficients
-    size = s.n_states + order
-    A, B = np.zeros((s.period, size, size)), np.zeros((size, 1))
-    A[:, : s.n_states, : s.n_states], A[:, : s.n_states, s.n_states :] = s.A, s.B @ samples
-    A[:, s.n_states :, s.n_states :] = chain
-    B[s.n_states] = model.driving_rms_nm
-    C = np.concatenate([s.C, s.D @ samples], axis=-1)
-    return StateSpace(A=A, B=B, C=C, D=np.zeros((C.shape[-2], 1)), dt_s=s.dt_s)
+def _ar_process(model: ARModel) -> StateSpace:
+    """Return the system from white noise to a process."""
+    drive, output = np.zeros((2, model.order, 1))
+    drive[0], output[0] = model.driving_rms_nm, 1.0
+    return StateSpace(A=model.companion, B=drive, C=output.T, D=np.zeros((1, 1)))
+
+
+def _driven_system(loop: FusedLoop, process: StateSpace, entry: FloatArray) -> StateSpace:
+    """Return the system from the drive of a process to all outputs of a loop that it enters."""
+    s = loop.system
+    phases = np.arange(s.period) % process.period
+    process_A, process_B, process_C = (stack[phases] for stack in process.stacks()[:3])
+    samples = entry @ process_C
+    size, n = s.n_states + process.n_states, s.n_states
+    A, B = np.zeros((s.period, size, size)), np.zeros((s.period, size, process.B.shape[-1]))
+    A[:, :n, :n], A[:, :n, n:], A[:, n:, n:] = s.A, s.B @ samples, process_A
+    B[:, n:] = process_B
+    C = np.concatenate([np.broadcast_to(s.C, (s.period, *s.C.shape[-2:])), s.D @ samples], axis=2)
+    return StateSpace(A=A, B=B, C=C, D=np.zeros((C.shape[1], B.shape[2])), dt_s=s.dt_s)
 
 
 def _noise_system(loop: FusedLoop, own: FloatArray) -> StateSpace:

@@ -1,8 +1,9 @@
 """The plant that several sensors see: the loop's own plant, with what the others remember.
 
-The state is that of :class:`TipTiltPlant`, then older samples of the vibrations that accelerometers
-see, then the sums and waiting readings of the wavefront sensors. The measurements are those of the
-loop's own sensor, of the other wavefront sensors, and of the channels, in this order.
+The state is that of :class:`TipTiltPlant` without the vibrations that accelerometers see, then that
+of these (:class:`SeenVibration`), then the sums and waiting readings of the wavefront sensors. The
+measurements are those of the loop's own sensor, of the other wavefront sensors, and of the
+channels, in this order.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.linear import Controller, EstimationProblem
+from lbt_synth.linear import Controller, EstimationProblem, StateSpace
+from lbt_synth.models.fusion.seen_vibration import seen_vibration
 from lbt_synth.models.fusion.sensors import (
     Motions,
     SensorSuite,
@@ -210,44 +212,41 @@ def fused_plant(own: TipTiltPlant, suite: SensorSuite, motions: Motions = ()) ->
     ... )
     >>> plant = fused_plant(own, SensorSuite(sensors=(mirror,)), ({"m1": Motion(size=2)},))
     >>> plant.period, plant.n_states, plant.n_measurements
-    (1, 4, 2)
+    (1, 6, 2)
     """
     require_instance(own, TipTiltPlant, "own")
     require_instance(suite, SensorSuite, "suite")
     hardware = own.hardware
     motions = checked_motions(motions or ({},) * len(own.vibrations), suite, len(own.vibrations))
-    period, n0 = suite.period(hardware), own.n_states
+    period = suite.period(hardware)
     # the plant's state is that of the frame in which u(k) acts: older readings by so many frames
     ahead = held_frames(hardware) - 1
-    readings = _channel_readings(own, suite, motions, ahead)
     exposures = suite_exposures(suite, hardware)
     late = [replace(each, age_frames=each.age_frames + ahead) for each in exposures]
     waiting = memory(late, hardware.modes, period)
     corrections = memory(exposures, hardware.modes, period)
+    shaken = _shaken_plant(own, suite, motions, ahead)
     total = own.A[_newest_total(own)]  # total(k) from x(k): it is that held in x(k+1)
 
-    lags, w = readings.A.shape[0] - n0, waiting.n_states
-    size = n0 + lags + w
-    A = np.zeros((period, size, size))
-    A[:, : n0 + lags, : n0 + lags], A[:, n0 + lags :, n0 + lags :] = readings.A, waiting.A
-    A[:, n0 + lags :, :n0] = waiting.B @ total
-    q0, q1, q2 = len(own.C), waiting.C.shape[1], len(readings.C)
-    C = np.zeros((period, q0 + q1 + q2, size))
-    C[:, :q0, :n0], C[:, q0 : q0 + q1, n0 + lags :] = own.C, waiting.C
-    C[:, q0 + q1 :, : n0 + lags] = readings.C
+    n, w = shaken.A.shape[1], waiting.n_states
+    to_own = np.hstack([shaken.to_own, np.zeros((own.n_states, w))])
+    A = np.zeros((period, n + w, n + w))
+    A[:, :n, :n], A[:, n:, n:] = shaken.A, waiting.A
+    A[:, n:] += waiting.B @ (total @ to_own)
+    q0, q1, q2 = len(own.C), waiting.C.shape[1], len(shaken.C)
+    C = np.zeros((period, q0 + q1 + q2, n + w))
+    C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = own.C @ to_own, waiting.C, shaken.C
     noise = suite.noise_factor(own.parts().noise_factor, hardware.modes)
-    drives = own.B.shape[1] - q0
-    B, D = np.zeros((size, drives + len(noise))), np.zeros((len(noise), drives + len(noise)))
-    B[:n0, :drives], D[:, drives:] = own.B[:, :drives], noise
-    D[q0 + q1 :, : len(own.vibrations)] = readings.drive
-    L = np.hstack([own.L, np.zeros((len(own.L), size - n0))])
+    drives = shaken.B.shape[1]
+    B, D = np.zeros((n + w, drives + len(noise))), np.zeros((len(noise), drives + len(noise)))
+    B[:n, :drives], D[:, drives:] = shaken.B, noise
     A_known, B_known, C_known, D_known = _known_part(own, corrections, q2)
     return FusedPlant(
         A=A,
         B=B,
         C=C,
         D=D,
-        L=L,
+        L=own.L @ to_own,
         read=suite.read(hardware),
         dt_s=own.dt_s,
         own=own,
@@ -268,52 +267,46 @@ def _newest_total(own: TipTiltPlant) -> slice:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ChannelReadings:
-    """The plant's transition with older samples of the vibrations, and what channels read."""
+class _ShakenPlant:
+    """A plant whose vibrations are those that accelerometers see, where they see them."""
 
-    A: FloatArray  # (n0 + lags, n0 + lags)
-    C: FloatArray  # (c, n0 + lags)
-    drive: FloatArray  # (c, p): from the drives of the vibrations, where the newest is ahead
+    A: FloatArray  # (N, n, n)
+    B: FloatArray  # (n, w): from white noise, without that of sensors
+    C: FloatArray  # (c, n): what channels read
+    to_own: FloatArray  # (n0, n): to the states of the loop's own plant, older samples left out
 
 
-def _channel_readings(
+def _shaken_plant(
     own: TipTiltPlant, suite: SensorSuite, motions: Motions, ahead: int
-) -> _ChannelReadings:
-    p, n0 = len(own.vibrations), own.n_states
-    taps: dict[tuple[int, int], tuple[int, FloatArray]] = {}
-    oldest = [1] * p  # age of the oldest sample of each vibration that is a state
-    row = 0
-    for sensor in suite.accelerometers:
-        for channel in sensor.channels:
-            for j, line in enumerate(own.vibrations):
-                if channel not in motions[j]:
-                    continue
-                newest, weights = sensor.taps(
-                    motions[j][channel], line.frequency_hz, own.hardware, ahead=ahead
-                )
-                taps[row, j] = newest, weights
-                oldest[j] = max(oldest[j], newest + len(weights) - 1)
-            row += 1
-    where = {(j, age): age * p + j for j in range(p) for age in (0, 1)}
-    size = n0
-    for j in range(p):
-        for age in range(2, oldest[j] + 1):
-            where[j, age] = size
-            size += 1
-    A = np.zeros((size, size))
-    A[:n0, :n0] = own.A
-    for (j, age), state in where.items():
-        if age >= 2:
-            A[state, where[j, age - 1]] = 1.0
-    C, drive = np.zeros((row, size)), np.zeros((row, p))
-    for (channel_row, j), (newest, weights) in taps.items():
-        for age, weight in enumerate(weights, start=newest):
-            if age < 0:  # the sample to come
-                C[channel_row] += weight * A[j]
-                drive[channel_row] += weight * own.B[j, :p]
-            else:
-                C[channel_row, where[j, age]] += weight
-    return _ChannelReadings(A=A, C=C, drive=drive)
+) -> _ShakenPlant:
+    p, q0, period = len(own.vibrations), len(own.C), suite.period(own.hardware)
+    seen = [j for j, motion in enumerate(motions) if motion]
+    lines = [
+        seen_vibration(
+            own.vibrations[j], motions[j], suite.accelerometers, own.hardware, ahead=ahead
+        )
+        for j in seen
+    ]
+    kept = np.delete(np.arange(own.n_states), [*seen, *(p + j for j in seen)])
+    drives = np.delete(np.arange(own.B.shape[1] - q0), seen)
+    size, width = len(kept) + sum(s.n_states for s in lines), len(drives)
+    to_own, C = np.zeros((own.n_states, size)), np.zeros((len(suite.channels), size))
+    to_own[kept, : len(kept)] = np.eye(len(kept))
+    A = np.zeros((period, size, size))
+    B = np.zeros((size, width + sum(s.B.shape[-1] for s in lines)))
+    B[: len(kept), :width] = own.B[np.ix_(kept, drives)]
+    row = len(kept)
+    for j, line in zip(seen, lines, strict=True):
+        line_A, line_B, line_C, _ = line.stacks()
+        states, moved = slice(row, row + line.n_states), line.B.shape[-1]
+        A[:, states, states] = line_A[np.arange(period) % line.period]
+        B[states, width : width + moved] = line_B[0]
+        to_own[j, states] = line_C[0, 0]
+        channels = [i for i, name in enumerate(suite.channels) if name in motions[j]]
+        C[channels, states] = line_C[0, 1:]
+        row, width = states.stop, width + moved
+    A[:, : len(kept)] = own.A[kept] @ to_own
+    return _ShakenPlant(A=A, B=B, C=C, to_own=to_own)
 
 
 def _known_part(

@@ -23,7 +23,6 @@ from lbt_synth.validation import (
     FloatArray,
     Positive,
     check_fields,
-    frozen_copy,
     matrix,
     set_fields,
 )
@@ -127,23 +126,16 @@ class WavefrontSensor:
 
     def age_frames(self, hardware: LoopHardware) -> float:
         """Age of the oldest frame that a reading averages [frames of the loop]."""
-        period = period_frames(self, hardware)
-        age = _age(self, hardware, period)
-        if age - period + 1 < 1 - _WHOLE:
-            least = (period + hardware.delay_frames - 1) / period
-            raise ProblemError(
-                f"the delay of sensor {self.name} must be at least {least:.4g} of its frames, so "
-                f"that its exposure has ended when it is read; got {self.delay_frames:g}."
-            )
-        return age
+        return _age(self, hardware, least=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Accelerometer:
     """Channels that measure the acceleration of structures which vibrate.
 
-    Channel c reads ``a_c = 1e-9 sum_j F_cj v_j''`` [m/s^2], with ``v_j''`` the second difference of
-    vibration j [nm] over the squared frame period, and F_cj its :class:`Motion` with the channel.
+    Channel c reads ``a_c = 1e-9 sum_j F_cj a_j`` [m/s^2], with ``a_j`` the mean acceleration of
+    vibration j [nm/s^2] over the period that the reading measures, and F_cj its :class:`Motion`
+    with the channel.
 
     Parameters
     ----------
@@ -152,7 +144,7 @@ class Accelerometer:
     rate_hz : float
         Readings per second [Hz]; the loop's frame rate is a whole multiple of it.
     delay_frames : float
-        Total delay in its own periods.
+        Total delay in its own periods, at least 1.
     channels : tuple of str
         Names of the channels.
     noise_m_s2 : float, (c,) or (c, c) array_like
@@ -178,7 +170,7 @@ class Accelerometer:
 
     name: str
     rate_hz: Positive
-    delay_frames: Annotated[float, ("above", 0), ("at_most", LONGEST_DELAY)]
+    delay_frames: Annotated[float, ("at_least", 1), ("at_most", LONGEST_DELAY)]
     channels: tuple[str, ...]
     noise_m_s2: float | FloatArray
     highpass_hz: Positive | None = None
@@ -201,33 +193,25 @@ class Accelerometer:
         return noise_factor(self.noise_m_s2, len(self.channels))
 
     def age_frames(self, hardware: LoopHardware) -> float:
-        """Age of a reading [frames of the loop]."""
-        age = _age(self, hardware, period_frames(self, hardware))
-        if age < -_WHOLE:
-            raise ProblemError(
-                f"the delay of {self.name} must be at least that of the commands, "
-                f"{hardware.delay_frames - 1:g} frames of the loop; got {self.delay_frames:g} of "
-                "its own."
-            )
-        return max(age, 0.0)
+        """Age of the oldest frame that a reading averages [frames of the loop]."""
+        return _age(self, hardware, least=0)
 
-    def band(self, frequency_hz: float) -> complex:
-        """Response of the channels' high pass at a frequency."""
-        if self.highpass_hz is None:
-            return 1.0 + 0.0j
-        ratio = 1j * frequency_hz / self.highpass_hz
-        return complex(ratio / (1 + ratio))
+    def factor(self, motion: Motion, frequency_hz: float) -> complex:
+        """Response of a channel at a frequency: its motion, and the high pass of all channels."""
+        band = 1.0 if self.highpass_hz is None else 1 / (1 - 1j * self.highpass_hz / frequency_hz)
+        return complex(motion.factor * band)
 
-    def taps(
-        self, motion: Motion, frequency_hz: float, hardware: LoopHardware, *, ahead: int = 0
-    ) -> tuple[int, FloatArray]:
-        """Return :func:`acceleration_taps` of a channel that moves with a vibration.
+    def swing(self, motion: Motion, frequency_hz: float, hardware: LoopHardware) -> complex:
+        """Reading of a sinusoid in a frame, over its mean position in that frame [m/s^2 per nm].
 
-        Ages count from ``ahead`` frames after that of the reading.
+        The mean acceleration of a frame is ``-w^2`` times the mean position; a reading is the mean
+        of its frames.
         """
-        factor = motion.factor * self.band(frequency_hz)
-        age = self.age_frames(hardware) + ahead
-        return acceleration_taps(factor, frequency_hz, hardware.frame_rate_hz, age)
+        turn, period = 2 * np.pi * frequency_hz * hardware.dt_s, period_frames(self, hardware)
+        ages = self.age_frames(hardware) - np.arange(period)
+        size = -1e-9 * (2 * np.pi * frequency_hz) ** 2
+        mean = np.mean(np.exp(-1j * turn * ages))
+        return complex(size * self.factor(motion, frequency_hz) * mean)
 
 
 Sensor: TypeAlias = WavefrontSensor | Accelerometer
@@ -247,8 +231,16 @@ def period_frames(sensor: Sensor, hardware: LoopHardware) -> int:
     return period
 
 
-def _age(sensor: Sensor, hardware: LoopHardware, period: int) -> float:
-    age = sensor.delay_frames * period - (hardware.delay_frames - 1)
+def _age(sensor: Sensor, hardware: LoopHardware, *, least: int) -> float:
+    """Return the age of the oldest frame that a reading averages; the newest is at least so old."""
+    period, late = period_frames(sensor, hardware), hardware.delay_frames - 1
+    age = sensor.delay_frames * period - late
+    if age - period + 1 < least - _WHOLE:
+        raise ProblemError(
+            f"the delay of sensor {sensor.name} must be at least "
+            f"{(period + late + least - 1) / period:.4g} of its frames, so that its exposure has "
+            f"ended when it is read; got {sensor.delay_frames:g}."
+        )
     return float(round(age)) if abs(age - round(age)) < _WHOLE * period else age
 
 
@@ -348,27 +340,6 @@ class SensorSuite:
             for unit in sensor.units:
                 out[:: period_frames(sensor, hardware), rows[unit]] = True
         return out
-
-
-def acceleration_taps(
-    factor: complex, frequency_hz: float, frame_rate_hz: float, age_frames: float
-) -> tuple[int, FloatArray]:
-    """Return the age of the newest sample, and the weights of samples in a channel's reading.
-
-    The reading is the second difference ``age_frames`` ago, times a complex factor that two
-    successive samples realise exactly at the vibration's frequency; so is a fraction of a frame.
-    The age is -1 for the frame to come; the weights (t,) [m/s^2 per nm] are those of the newest
-    sample and of those before.
-    """
-    angle = 2 * np.pi * frequency_hz / frame_rate_hz
-    whole = int(np.floor(age_frames + _WHOLE))
-    late = factor * np.exp(-1j * angle * (age_frames - whole))
-    older = -late.imag / np.sin(angle)
-    pair = np.array([late.real - older * np.cos(angle), older])
-    if abs(older) < 1e-12 * abs(late):
-        pair = pair[:1]
-    second = np.array([1.0, -2.0, 1.0]) * frame_rate_hz**2 * 1e-9
-    return whole - 1, frozen_copy(np.convolve(pair, second))
 
 
 def checked_motions(motions: Motions, suite: SensorSuite, lines: int) -> Motions:

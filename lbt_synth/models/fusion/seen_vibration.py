@@ -1,0 +1,229 @@
+"""A vibration that accelerometers see: a continuous oscillator, in frames and in readings.
+
+The oscillator is ``x'' + 2 zeta w0 x' + w0^2 x = white force``, sampled exactly: C. F. Van Loan,
+IEEE Trans. Autom. Control 23, 395 (1978), doi:10.1109/TAC.1978.1101743. Frame k is the time from
+k T to (k + 1) T. The total phase of a frame holds the mean position over it, a reading the mean
+acceleration over the accelerometer's own exposure: the difference of the velocities at its ends
+over its length. Nothing that is read comes later than the end of the exposure.
+
+A channel's complex factor F acts as ``Re(F) a + Im(F) (j a)``. At the line's frequency w an
+acceleration is ``a = j w v``, so that ``j a = -w v``, and its mean is the difference of positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import expm
+
+from lbt_synth.linear import StateSpace
+from lbt_synth.linear.matrix_functions import symmetrise
+from lbt_synth.models.fusion.sensors import Accelerometer, Motion, period_frames
+from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.models.vibration import Vibration, require_below_nyquist
+from lbt_synth.validation import FloatArray, frozen_copy, set_fields
+
+_DIGITS = 9  # of a part of a frame
+_PARALLEL = 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenVibration(StateSpace):
+    """System from white noise to the mean position in a frame [nm], and readings [m/s^2].
+
+    The first states are the mean position in the newest frame, then position and velocity over w0
+    at its end. The first three inputs drive these, whatever channels there are.
+    """
+
+    still: FloatArray  # (n, 2): state after a rest at a position and a velocity
+
+    def __post_init__(self) -> None:
+        StateSpace.__post_init__(self)
+        set_fields(self, still=frozen_copy(self.still))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Exposure:
+    """The exposures of an accelerometer to a line.
+
+    An end of an exposure counts by ``basis @ [position, velocity]``; the readings are the weights
+    times the difference of two ends.
+    """
+
+    period: int  # frames from one end to the next
+    age: int  # whole frames from that in which the newest exposure ends to that of the state
+    part: float  # of its frame that has passed when an exposure ends
+    basis: FloatArray  # (r, 2): what counts of position and velocity
+    weights: FloatArray  # (c, r)
+
+    @property
+    def waits(self) -> bool:
+        """Whether an end is remembered by the frame in which it is read first."""
+        return bool(self.age % self.period)
+
+    @property
+    def remembered(self) -> int:
+        """Number of ends that are states."""
+        return self.age // self.period + 1 + self.waits
+
+
+def seen_vibration(
+    line: Vibration,
+    motion: Mapping[str, Motion],
+    accelerometers: Sequence[Accelerometer],
+    hardware: LoopHardware,
+    *,
+    ahead: int = 0,
+) -> SeenVibration:
+    """Return a line and what each channel that it moves reads of it, in the channels' order.
+
+    Parameters
+    ----------
+    line : Vibration
+        The line, whose rms is that of the oscillator's position.
+    motion : mapping
+        :class:`Motion` of each channel that the line moves.
+    accelerometers : sequence of Accelerometer
+        The instruments.
+    hardware : LoopHardware
+        The loop.
+    ahead : int, optional
+        Frames by which the newest frame of the state comes after that of the readings.
+
+    Returns
+    -------
+    SeenVibration
+        The process, of the common period of the accelerometers that see the line.
+
+    Raises
+    ------
+    ProblemError
+        If the line is not below the Nyquist frequency, or a delay is too short.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> from lbt_synth.models.fusion.seen_vibration import seen_vibration
+    >>> line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
+    >>> mirror = lbt.models.Accelerometer(
+    ...     name="mirror", rate_hz=800, delay_frames=1, channels=("m1",), noise_m_s2=1e-3
+    ... )
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> seen = seen_vibration(line, {"m1": lbt.models.Motion(size=1)}, (mirror,), path)
+    >>> position_nm, reading_m_s2 = np.sqrt(np.diag(seen.output_covariances()[0]))
+    >>> round(float(position_nm), 2), round(float(reading_m_s2), 4)
+    (495.36, 0.0743)
+    """
+    require_below_nyquist(line.frequency_hz, hardware.frame_rate_hz)
+    exposures = [
+        _exposure(line, motion, sensor, hardware, ahead)
+        for sensor in accelerometers
+        if motion.keys() & set(sensor.channels)
+    ]
+    parts = sorted({1.0, *(exposure.part for exposure in exposures)})
+    frame = _frame_map(line, hardware.dt_s, parts)
+    ends = [frame[1 + parts.index(exposure.part)] for exposure in exposures]
+    within = [
+        exposure.basis @ end
+        for exposure, end in zip(exposures, ends, strict=True)
+        if exposure.part < 1
+    ]
+    driven = np.vstack([frame[0], frame[-1], *within])
+    size = len(driven) + sum(exposure.remembered * len(exposure.basis) for exposure in exposures)
+    period = int(np.lcm.reduce([1, *(exposure.period for exposure in exposures)]))
+    A = np.zeros((period, size, size))
+    B, still = np.zeros((size, driven.shape[1] - 2)), np.zeros((size, 2))
+    A[:, : len(driven), 1:3], B[: len(driven)] = driven[:, :2], driven[:, 2:]
+    C, still[1:3] = [np.eye(1, size)], np.eye(2)
+    place, row = 3, len(driven)  # of ends within a frame, of ends that are remembered
+    for exposure in exposures:
+        r = len(exposure.basis)
+        newest = np.zeros((r, size))
+        if exposure.part < 1:
+            newest[:, place : place + r], still[place : place + r] = np.eye(r), exposure.basis
+            place += r
+        else:
+            newest[:, 1:3] = exposure.basis
+        rows = slice(row, row + exposure.remembered * r)
+        stored = np.eye(size)[rows]
+        both = np.vstack([newest, stored])
+        for t in range(period):
+            A[t, rows] = stored if (t + exposure.age) % exposure.period else both[:-r]
+        still[rows] = np.tile(exposure.basis, (exposure.remembered, 1))
+        newer, older = (stored if exposure.waits else both).reshape(-1, r, size)[-2:]
+        C.append(exposure.weights @ (newer - older))
+        row = rows.stop
+    output = np.vstack(C)
+    return SeenVibration(
+        A=A,
+        B=B,
+        C=output,
+        D=np.zeros((len(output), B.shape[1])),
+        dt_s=hardware.dt_s,
+        still=still,
+    )
+
+
+def _exposure(
+    line: Vibration,
+    motion: Mapping[str, Motion],
+    sensor: Accelerometer,
+    hardware: LoopHardware,
+    ahead: int,
+) -> _Exposure:
+    """Return the exposures of an accelerometer that sees a line."""
+    period, frequency_hz = period_frames(sensor, hardware), line.frequency_hz
+    newest = sensor.age_frames(hardware) - period + 1 + ahead
+    age = int(np.floor(newest + 10.0**-_DIGITS))
+    factors = np.array(
+        [sensor.factor(motion[name], frequency_hz) for name in sensor.channels if name in motion]
+    )
+    # velocities are over w0, so that an acceleration is w0 times their difference
+    scale = 2e-9 * np.pi * frequency_hz / (period * hardware.dt_s)
+    left, sizes, right = np.linalg.svd(scale * np.stack([-factors.imag, factors.real], axis=1))
+    r = int(np.sum(sizes > _PARALLEL * sizes[0]))
+    return _Exposure(
+        period=period,
+        age=age,
+        part=1.0 - round(max(newest - age, 0.0), _DIGITS),
+        basis=right[:r],
+        weights=left[:, :r] * sizes[:r],
+    )
+
+
+def _frame_map(line: Vibration, dt_s: float, parts: Sequence[float]) -> list[FloatArray]:
+    """Return the maps to the mean position, (1, 2 + 3 m), and to the m ends of parts, (2, 2 + 3 m).
+
+    They are from position and velocity over w0 at the begin of a frame, and white noise.
+    """
+    angle, m = 2 * np.pi * line.frequency_hz * dt_s, len(parts)
+    ends, now = [], np.eye(3, 2 + 3 * m)  # position, velocity, integral of the position
+    now[2] = 0.0
+    for i, (start, end) in enumerate(pairwise([0.0, *parts])):
+        length = end - start
+        transition, factor = _sampled(angle * length, line.damping)
+        units = np.array([1.0, 1 / (angle * length), length])
+        now = (units[:, None] * transition / units) @ now
+        drive = line.rms_nm * np.sqrt(4 * line.damping * (angle * length) ** 3)
+        now[:, 2 + 3 * i : 5 + 3 * i] += drive * units[:, None] * factor
+        ends.append(now[:2])
+    # the noise is turned so that its first three parts give the whole frame, whatever its parts
+    turn, root = np.linalg.qr(now[:, 2:].T, mode="complete")
+    turn[:, :3] *= np.sign(np.diag(root))
+    return [np.hstack([place[:, :2], place[:, 2:] @ turn]) for place in (now[2:], *ends)]
+
+
+def _sampled(angle: float, damping: float) -> tuple[FloatArray, FloatArray]:
+    """Return transition and root of the noise of [x, x', integral of x] over a unit of time.
+
+    The oscillator has the angular frequency ``angle``, the force a unit density.
+    """
+    rates = np.array([[0.0, 1.0, 0.0], [-(angle**2), -2 * damping * angle, 0.0], [1.0, 0.0, 0.0]])
+    whole = np.zeros((6, 6))
+    whole[:3, :3], whole[3:, 3:], whole[1, 4] = -rates, rates.T, 1.0
+    both = expm(whole)
+    transition = both[3:, 3:].T
+    return transition, np.linalg.cholesky(symmetrise(transition @ both[:3, 3:]))

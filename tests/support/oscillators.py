@@ -1,0 +1,65 @@
+"""Continuous oscillators, shaken by kicks within each frame, without the package's sampling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+STEPS = 64  # of a frame, with four kicks each
+
+
+@dataclass(frozen=True)
+class KickedOscillator:
+    """An oscillator over a frame: its state is position and velocity over w0 at the end of a frame.
+
+    A force is white where its kicks are at the nodes of a Gauss rule, whose weights are their
+    powers: what covariances integrate is smooth between the ends of steps.
+    """
+
+    angle: float  # w0 T
+    damping: float
+    rms_nm: float
+
+    @property
+    def _rates(self) -> np.ndarray:
+        return self.angle * np.array([[0.0, 1.0], [-1.0, -2 * self.damping]])
+
+    def _over(self, time: float) -> np.ndarray:
+        return expm(self._rates * time)
+
+    def _integral(self, time: float) -> np.ndarray:
+        return np.linalg.solve(self._rates, self._over(time) - np.eye(2))[0]
+
+    @property
+    def kicks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times in a frame, and sizes."""
+        nodes, weights = np.polynomial.legendre.leggauss(4)
+        times = (np.arange(STEPS)[:, None] + (nodes + 1) / 2) / STEPS
+        powers = 4 * self.damping * self.angle * self.rms_nm**2 * weights / (2 * STEPS)
+        return times.ravel(), np.sqrt(np.tile(powers, STEPS))
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the maps (2, 2), (2, kicks) to the state at a time of a frame."""
+        times, sizes = self.kicks
+        late = [self._over(time - s)[:, 1] if s < time else np.zeros(2) for s in times]
+        return self._over(time), np.array(late).T * sizes
+
+    def mean(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the maps (2,), (kicks,) to the mean position in a frame."""
+        times, sizes = self.kicks
+        return self._integral(1.0), np.array([self._integral(1 - s)[1] for s in times]) * sizes
+
+    def chain(self, part: float, remembered: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return A, B of [state at the end (2), mean position, the one before, states at a part].
+
+        The states at a part of a frame are that of the newest frame and the older ones.
+        """
+        size = 4 + 2 * remembered
+        (over, kicked), (mean, mean_kicked) = self.at(1.0), self.mean()
+        A, B = np.zeros((size, size)), np.zeros((size, kicked.shape[1]))
+        A[:2, :2], B[:2], A[2, :2], B[2], A[3, 2] = over, kicked, mean, mean_kicked, 1.0
+        A[4:6, :2], B[4:6] = self.at(part)
+        A[6:, 4:-2] = np.eye(size - 6)
+        return A, B
