@@ -85,7 +85,8 @@ def line_bands(
         f = frequency[inside]
         own = [lines[j] for j in group]
         gain, unseen = _wiener(model, lines, shapes[inside], f)
-        second = -NM * (2 * rate * np.sin(np.pi * f / rate)) ** 2
+        # the mean acceleration over a frame, of the mean position in it
+        swing = -NM * (2 * np.pi * f) ** 2
         reach = [_reach(line, resolution, _CORE_HALF_WIDTHS, _CORE_BINS) for line in own]
         centres = np.array([line.frequency_hz for line in own])
         out.append(
@@ -93,9 +94,9 @@ def line_bands(
                 lines=tuple(group),
                 angle=2 * np.pi * f / rate,
                 readings=a[inside],
-                expected=second[:, None] * np.einsum("fja,fa->fj", gain, z[inside]),
-                moved=second[:, None, None] * gain * step[inside, None],
-                unseen=second[:, None, None] ** 2 * unseen,
+                expected=swing[:, None] * np.einsum("fja,fa->fj", gain, z[inside]),
+                moved=swing[:, None, None] * gain * step[inside, None],
+                unseen=swing[:, None, None] ** 2 * unseen,
                 core=np.abs(f[:, None] - centres) <= reach,
                 follows=(np.diff(inside) == 1) & follows[inside[:-1]],
             )

@@ -106,7 +106,7 @@ class AccelerometerTransfers:
 
     def loop_age(self, delay_frames: float) -> int:
         """Return the age of a reading in a loop of some delay: 1 where the clocks hide it."""
-        known = self.age_frames >= 0 and 0 < self.age_frames + delay_frames - 1 <= LONGEST_DELAY
+        known = self.age_frames >= 0 and 1 <= self.age_frames + delay_frames - 1 <= LONGEST_DELAY
         return self.age_frames if known else 1
 
     @property
@@ -147,10 +147,11 @@ def accelerometer_transfers(
 
     A channel c reads, in frame k of the loop,
 
-    ``a_c(k) = 1e-9 sum_j F_cj (v_j(k-g+1) - 2 v_j(k-g) + v_j(k-g-1)) f_s^2 + noise``
+    ``a_c(k) = 1e-9 sum_j F_cj a_j(k-g) + noise``
 
-    with v_j the line j [nm of wavefront], g the age of the reading, and F_cj a complex factor at
-    the line's frequency, whose size is the motion and whose angle the phase. In a band around each
+    with a_j(k) the mean acceleration of the line j [nm/s^2 of wavefront] over frame k, which is
+    ``-(2 pi f)^2`` times the mean position in it, g the age of the reading, and F_cj a complex
+    factor, whose size is the motion and whose angle the phase. In a band around each
     line, the factors maximise the likelihood of the channel given the wavefront: what the
     wavefront's noise leaves open of the line, by the spectra of the model, is a second noise that
     grows with the factor, so noise of the wavefront does not bias it (errors in variables).
@@ -192,7 +193,7 @@ def accelerometer_transfers(
     >>> drive = line.driving_rms_nm * rng.standard_normal(20_002)
     >>> v = lfilter([1], [1, *-line.coefficients], drive)
     >>> z = v[1:-1] + 5 * rng.standard_normal(20_000)
-    >>> a = 2 * 1e-9 * 1000**2 * np.diff(v, 2) + 1e-3 * rng.standard_normal(20_000)
+    >>> a = -2 * 1e-9 * (2 * np.pi * 31) ** 2 * v[1:-1] + 1e-3 * rng.standard_normal(20_000)
     >>> record = lbt.identification.loop_record(z, frame_rate_hz=1000, unit="nm")
     >>> found = lbt.identification.accelerometer_transfers(lbt.identify(record), record, a)
     >>> round(found.transfers[0].motion_nm_per_nm, 1), found.channels[0].verdict

@@ -71,10 +71,11 @@ def accompany_filter(
             " Give sensors, and accelerometers of each vibration, in the configuration."
         )
     missing = frozenset(unread_sensors(design))
-    rng, size = np.random.default_rng(seed), {"frames": settle_frames + frames, "cases": 1}
-    _, motions = draw_parts(shaken, hardware, rng=rng, zero_frame=settle_frames, **size)
+    size = {"frames": settle_frames + frames, "cases": 1, "zero_frame": settle_frames}
+    rng, oscillators = np.random.default_rng(seed), range(len(shaken.vibrations))
+    _, lines = draw_parts(shaken, hardware, rng=rng, oscillators=oscillators, **size)
     (own_rng,) = rng.spawn(1)
-    others = draw_others(shaken, hardware, design.problem.suite, motions, own_rng, **size)
+    others = draw_others(shaken, hardware, design.problem.suite, lines, own_rng, **size)
     return AccompaniedFilter(
         controller=design.controllers[missing], others=others[0], hardware=hardware
     )

@@ -247,6 +247,7 @@ has; got FilterDesign.
         cases=1,
         rng=np.random.default_rng(seed),
         zero_frame=settle,
+        oscillators=range(len(shaken.vibrations)),  # as accelerometers see them
     )[0]
     if calibration is None:
         calibration = calibrate(system, cache=cache)

@@ -9,17 +9,24 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller
-from lbt_synth.loop.simulation.disturbances import draw_noise, draw_parts
+from lbt_synth.loop.simulation.disturbances import (
+    DrawnLine,
+    draw_noise,
+    draw_parts,
+    run_oscillator,
+)
 from lbt_synth.loop.simulation.run import Simulation, record_run
-from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
 from lbt_synth.models.fusion.plant import memory, own_exposure, suite_exposures
+from lbt_synth.models.fusion.seen_vibration import seen_vibration
 from lbt_synth.models.fusion.sensors import (
     Accelerometer,
     Motion,
     SensorSuite,
     checked_motions,
+    period_frames,
 )
-from lbt_synth.models.vibration import DriftingVibration, TrueVibration, checked_direction
+from lbt_synth.models.vibration import DriftingVibration, checked_direction
 from lbt_synth.validation import FloatArray, choice, integer, number
 
 READINGS = ("missing", "zero", "frozen")
@@ -75,13 +82,13 @@ def simulate_fused(
     settle = integer(settle_frames, "settle_frames", at_least=0)
     rng, noise_rng, other_rng = np.random.default_rng(seed).spawn(3)
     size = {"frames": settle + frames, "cases": cases}
-    total, motions = draw_parts(truth, hardware, rng=rng, zero_frame=settle, **size)
+    seen = [j for j, motion in enumerate(truth.motions) if motion]
+    total, lines = draw_parts(truth, hardware, rng=rng, zero_frame=settle, oscillators=seen, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
-    added = np.concatenate(
-        [noise, draw_others(truth, hardware, suite, motions, other_rng, **size)], axis=2
-    )
-    for line, motion in zip(truth.vibrations, motions, strict=True):
-        total += motion[:, :, None] * checked_direction(line, hardware)
+    others = draw_others(truth, hardware, suite, lines, other_rng, zero_frame=settle, **size)
+    added = np.concatenate([noise, others], axis=2)
+    for vibration, line in zip(truth.vibrations, lines, strict=True):
+        total += line.motion[:, :, None] * checked_direction(vibration, hardware)
     for drop in drops:
         if drop.unit not in suite.units:
             raise ProblemError(
@@ -100,49 +107,68 @@ def draw_others(
     truth: Truth,
     hardware: LoopHardware,
     suite: SensorSuite,
-    motions: list[FloatArray],
+    lines: Sequence[DrawnLine],
     rng: np.random.Generator,
     *,
     frames: int,
     cases: int,
+    zero_frame: int,
 ) -> FloatArray:
     """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q).
 
-    What a wavefront sensor reads of the residual is no part of them.
+    What a wavefront sensor reads of the residual is no part of them. The lines are those of
+    :func:`draw_parts`, whose time 0 is frame ``zero_frame``.
     """
-    parts = []
-    moving = checked_motions(truth.motions, suite, len(motions))
-    for sensor in suite.sensors:
-        factor = sensor.noise_factor(hardware.modes)
-        drawn = rng.standard_normal((cases, frames, len(factor))) @ factor.T
-        if isinstance(sensor, Accelerometer):
-            for line, motion, own in zip(truth.vibrations, motions, moving, strict=True):
-                for i, channel in enumerate(sensor.channels):
-                    if channel in own:
-                        drawn[:, :, i] += _acceleration(
-                            sensor, hardware, line, motion, own[channel]
-                        )
-        parts.append(drawn)
-    return np.concatenate(parts, axis=2)
+    factors = [sensor.noise_factor(hardware.modes) for sensor in suite.sensors]
+    drawn = [rng.standard_normal((cases, frames, len(factor))) @ factor.T for factor in factors]
+    out = np.concatenate(drawn, axis=2)
+    moving = checked_motions(truth.motions, suite, len(lines))
+    first = out.shape[2] - len(suite.channels)  # column of the first channel
+    for vibration, line, moved in zip(truth.vibrations, lines, moving, strict=True):
+        seen = [first + i for i, name in enumerate(suite.channels) if name in moved]
+        if isinstance(vibration, Vibration) and seen:
+            process = seen_vibration(vibration, moved, suite.accelerometers, hardware)
+            inner = rng.standard_normal((cases, 1 + frames, process.B.shape[2] - 3))
+            drive = np.concatenate([line.drive, inner], axis=2)
+            out[:, :, seen] += run_oscillator(process, vibration, drive)[:, :, 1:]
+        elif seen:
+            time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
+            readings = [
+                _acceleration(sensor, hardware, vibration, line.motion, moved[name], time_s)
+                for sensor in suite.accelerometers
+                for name in sensor.channels
+                if name in moved
+            ]
+            out[:, :, seen] += np.stack(readings, axis=2)
+    return out
 
 
 def _acceleration(
     sensor: Accelerometer,
     hardware: LoopHardware,
-    line: TrueVibration,
+    line: SinusoidalVibration | DriftingVibration,
     motion: FloatArray,
     moved: Motion,
+    time_s: FloatArray,
 ) -> FloatArray:
-    """Return what a channel reads of a vibration, (cases, frames) [m/s^2]."""
-    frequency_hz = line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
-    newest, taps = sensor.taps(moved, frequency_hz, hardware)
-    frames, before = motion.shape[1], max(newest + len(taps) - 1, 0)
-    # beyond its ends the motion counts as still: the first readings are in the settling
-    still = np.pad(motion, ((0, 0), (before, 1)), mode="edge")
-    out = np.zeros(motion.shape)
-    for lag, tap in enumerate(taps, start=newest):
-        out += tap * still[:, before - lag : before - lag + frames]
-    return out
+    """Return what a channel reads of a sinusoid, (cases, frames) [m/s^2].
+
+    A line that drifts counts with its frequency of the moment. That of one with a damping is an
+    approximation, good for a narrow line: its mean acceleration is not only ``-w^2`` times its mean
+    position.
+    """
+    if isinstance(line, DriftingVibration):
+        frequency_hz = line.frequency_hz_at(time_s)
+    else:
+        frequency_hz = np.full(len(time_s), line.frequency_hz)
+    turn = 2 * np.pi * frequency_hz * hardware.dt_s
+    # whole frames of the age are a delay; what is left of it turns the phase, by two frames
+    newest = int(sensor.age_frames(hardware) - period_frames(sensor, hardware) + 1)
+    swing = sensor.swing(moved, frequency_hz, hardware) * np.exp(1j * turn * newest)
+    # beyond its begin the motion counts as still: the first readings are in the settling
+    padded = np.pad(motion, ((0, 0), (newest + 1, 0)), mode="edge")[:, : motion.shape[1] + 1]
+    late, later = padded[:, 1:], padded[:, :-1]
+    return np.asarray(swing.real * late - swing.imag * (later - np.cos(turn) * late) / np.sin(turn))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

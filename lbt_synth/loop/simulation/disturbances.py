@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.fft import irfft, next_fast_len
 
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, DriftingVibration, LoopHardware, Spectrum, Truth, Vibration
+from lbt_synth.models.fusion.seen_vibration import SeenVibration, seen_vibration
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray
 
 # A spectrum is drawn over this many times the wanted frames, which hides the series' period.
 _PERIODS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnLine:
+    """A vibration of a run."""
+
+    motion: FloatArray  # (cases, frames): mean position in each frame [nm]
+    # (cases, 1 + frames, 3): of an oscillator, unit white noise of the state before the first
+    # frame, and of each frame
+    drive: FloatArray | None = None
 
 
 def draw_disturbance(
@@ -24,18 +38,26 @@ def draw_disturbance(
     cases: int,
     rng: np.random.Generator,
     zero_frame: int = 0,
+    oscillators: Collection[int] = (),
 ) -> FloatArray:
     """Draw the total phase, (cases, frames, n) [nm].
 
     Each part has its own random stream: a truth with one more vibration keeps its turbulence.
     So has each mode where the modes have different spectra. Time 0 of a vibration that drifts is
-    frame ``zero_frame``.
+    frame ``zero_frame``. The resonances at some places among the vibrations are continuous
+    ``oscillators``, as accelerometers see them; the others are AR2 processes.
     """
-    total, motions = draw_parts(
-        truth, hardware, frames=frames, cases=cases, rng=rng, zero_frame=zero_frame
+    total, lines = draw_parts(
+        truth,
+        hardware,
+        frames=frames,
+        cases=cases,
+        rng=rng,
+        zero_frame=zero_frame,
+        oscillators=oscillators,
     )
-    for vibration, motion in zip(truth.vibrations, motions, strict=True):
-        total += motion[:, :, None] * checked_direction(vibration, hardware)
+    for vibration, line in zip(truth.vibrations, lines, strict=True):
+        total += line.motion[:, :, None] * checked_direction(vibration, hardware)
     return total
 
 
@@ -47,11 +69,12 @@ def draw_parts(
     cases: int,
     rng: np.random.Generator,
     zero_frame: int = 0,
-) -> tuple[FloatArray, list[FloatArray]]:
-    """Draw the turbulence, (cases, frames, n), and each vibration, (cases, frames) [nm]."""
+    oscillators: Collection[int] = (),
+) -> tuple[FloatArray, list[DrawnLine]]:
+    """Draw the turbulence, (cases, frames, n) [nm], and each vibration."""
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
-    total, motions = np.zeros((cases, frames, n)), []
+    total, lines = np.zeros((cases, frames, n)), []
     spectra = truth.turbulence_per_mode(n)
     if truth.is_uniform and spectra[0] is not None:
         drawn = _draw(spectra[0], hardware, frames, cases * n, turbulence_rng)
@@ -60,8 +83,14 @@ def draw_parts(
         for mode, (own, mode_rng) in enumerate(zip(spectra, turbulence_rng.spawn(n), strict=True)):
             if own is not None:
                 total[:, :, mode] += _draw(own, hardware, frames, cases, mode_rng)
-    for vibration, line_rng in zip(truth.vibrations, line_rngs, strict=True):
+    for j, (vibration, line_rng) in enumerate(zip(truth.vibrations, line_rngs, strict=True)):
         checked_direction(vibration, hardware)
+        if isinstance(vibration, Vibration) and j in oscillators:
+            alone = seen_vibration(vibration, {}, (), hardware)
+            drive = line_rng.standard_normal((cases, 1 + frames, alone.B.shape[2]))
+            motion = run_oscillator(alone, vibration, drive)[:, :, 0]
+            lines.append(DrawnLine(motion=motion, drive=drive))
+            continue
         if isinstance(vibration, Vibration):
             model = vibration.ar_model(hardware.frame_rate_hz)
             motion = _draw_ar(model, frames, cases, line_rng)
@@ -72,8 +101,23 @@ def draw_parts(
             turns = vibration.frequency_hz / hardware.frame_rate_hz * np.arange(frames)
             phase = line_rng.uniform(0, 2 * np.pi, (cases, 1))
             motion = vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase)
-        motions.append(motion)
-    return total, motions
+        lines.append(DrawnLine(motion=motion))
+    return total, lines
+
+
+def run_oscillator(seen: SeenVibration, line: Vibration, drive: FloatArray) -> FloatArray:
+    """Return mean positions and readings of a line, (cases, frames, 1 + c).
+
+    The drive is (cases, 1 + frames, inputs), as that of a :class:`DrawnLine`. Exposures that begin
+    before the first frame see the oscillator at rest there.
+    """
+    state = line.rms_nm * seen.still @ drive[:, 0, :2].T
+    out = np.empty((drive.shape[1] - 1, seen.C.shape[1], len(drive)))
+    for k, white in enumerate(drive[:, 1:].transpose(1, 2, 0)):
+        before = (k - 1) % seen.period
+        state = seen.A[before] @ state + seen.B[before] @ white
+        out[k] = seen.C[k % seen.period] @ state
+    return np.asarray(out.transpose(2, 0, 1))
 
 
 def draw_noise(

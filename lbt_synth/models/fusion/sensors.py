@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields
 from typing import Annotated, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import DimensionError, ProblemError
@@ -20,6 +21,7 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.parts import noise_factor
 from lbt_synth.validation import (
     BoolArray,
+    ComplexArray,
     FloatArray,
     Positive,
     check_fields,
@@ -196,22 +198,23 @@ class Accelerometer:
         """Age of the oldest frame that a reading averages [frames of the loop]."""
         return _age(self, hardware, least=0)
 
-    def factor(self, motion: Motion, frequency_hz: float) -> complex:
-        """Response of a channel at a frequency: its motion, and the high pass of all channels."""
-        band = 1.0 if self.highpass_hz is None else 1 / (1 - 1j * self.highpass_hz / frequency_hz)
-        return complex(motion.factor * band)
+    def factor(self, motion: Motion, frequency_hz: ArrayLike) -> ComplexArray:
+        """Return a channel's response at frequencies: its motion, and the high pass."""
+        corner = 0.0 if self.highpass_hz is None else self.highpass_hz
+        return np.asarray(motion.factor / (1 - 1j * corner / np.asarray(frequency_hz)))
 
-    def swing(self, motion: Motion, frequency_hz: float, hardware: LoopHardware) -> complex:
-        """Reading of a sinusoid in a frame, over its mean position in that frame [m/s^2 per nm].
+    def swing(
+        self, motion: Motion, frequency_hz: ArrayLike, hardware: LoopHardware
+    ) -> ComplexArray:
+        """Return the reading of a sinusoid over its mean position in a frame [m/s^2 per nm].
 
         The mean acceleration of a frame is ``-w^2`` times the mean position; a reading is the mean
         of its frames.
         """
-        turn, period = 2 * np.pi * frequency_hz * hardware.dt_s, period_frames(self, hardware)
-        ages = self.age_frames(hardware) - np.arange(period)
-        size = -1e-9 * (2 * np.pi * frequency_hz) ** 2
-        mean = np.mean(np.exp(-1j * turn * ages))
-        return complex(size * self.factor(motion, frequency_hz) * mean)
+        w = 2 * np.pi * np.asarray(frequency_hz)
+        ages = self.age_frames(hardware) - np.arange(period_frames(self, hardware))
+        mean = np.mean(np.exp(-1j * hardware.dt_s * np.multiply.outer(w, ages)), axis=-1)
+        return np.asarray(-1e-9 * w**2 * self.factor(motion, frequency_hz) * mean)
 
 
 Sensor: TypeAlias = WavefrontSensor | Accelerometer
