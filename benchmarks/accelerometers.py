@@ -180,14 +180,14 @@ def loss(seed: int, frames: int) -> float:
         path = lbt.config.save_config(Path(folder) / "model.yaml", settings, comments=comments)
         config = lbt.load_config(path)
     best, own = true_plant(it, found.channels[0].channel, found.channels[1].channel), config.plant
-    kalman = lbt.linear.periodic_kalman
-    least = close(best, best.controller(kalman(best).gains), best.suite)
+    kalman = lbt.linear.kalman_riccati
+    least = close(best, best.controller(kalman(best).gain_predictor), best.suite)
     if config.fused_plant is None:
         loop = lbt.close_loop(best.own.hardware, lbt.kalman(own).controller)
     else:
         plant = config.fused_plant
         read = true_plant(it, *plant.suite.channels)
-        loop = close(best, plant.controller(kalman(plant).gains), read.suite)
+        loop = close(best, plant.controller(kalman(plant).gain_predictor), read.suite)
     truth = replace(it.truth, motions=best.motions)
     if config.fused_plant is not None:
         truth = replace(it.truth, motions=read.motions)

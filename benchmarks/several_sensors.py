@@ -14,20 +14,19 @@ import time
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.linear.periodic.riccati import least_periodic_gamma, proved_periodic_gamma
+from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
+from lbt_synth.linear.riccati.filtering import FilterRiccati, least_gamma
 
 sys.path.insert(0, "tests")
 from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
-
-from lbt_synth.linear.periodic.riccati import PeriodicRiccati
 
 CASES, LONGEST_SETTLING = 200, 20_000
 SETTLED = 1e-6  # what is left of the first error
 
 
 def score(
-    problem: lbt.linear.PeriodicProblem,
-    solution: PeriodicRiccati,
+    problem: lbt.linear.EstimationProblem,
+    solution: FilterRiccati,
     frames: int,
     seed: int,
 ) -> float | None:
@@ -36,7 +35,7 @@ def score(
     The plant and its filter run beside each other; no matrix of the error is formed. None if the
     error settles too slowly.
     """
-    gains = solution.gains
+    gains = solution.gain_predictor
     radius = problem.error_system(gains).radius_per_frame
     settle = int(np.ceil(np.log(SETTLED) / np.log(radius)))
     if settle > LONGEST_SETTLING:
@@ -48,13 +47,13 @@ def score(
     last = first + -(-per_case // period) * period
     for k in range(last):
         t = k % period
-        A, read = problem.A[t], problem.read[t]
+        (A, B, C, D), read = (each[t] for each in problem.stacks()), problem.read[t]
         if k >= first:
             powers += np.sum((problem.L @ (x - estimate)) ** 2, axis=0)
-        w = rng.standard_normal((problem.B.shape[2], CASES))
-        y = problem.C[t] @ x + problem.D[t] @ w
-        innovation = np.where(read[:, None], y - problem.C[t] @ estimate, 0.0)
-        x, estimate = A @ x + problem.B[t] @ w, A @ estimate + gains[t] @ innovation
+        w = rng.standard_normal((B.shape[1], CASES))
+        y = C @ x + D @ w
+        innovation = np.where(read[:, None], y - C @ estimate, 0.0)
+        x, estimate = A @ x + B @ w, A @ estimate + gains[t] @ innovation
         if k % 50 == 0:  # the error does not depend on x: an unstable plant must not overflow
             x, estimate = x - estimate, 0.0 * estimate
     powers /= last - first
@@ -62,11 +61,12 @@ def score(
     return float((powers.mean() - exact) / (powers.std(ddof=1) / np.sqrt(CASES)))
 
 
-def bracket(problem: lbt.linear.PeriodicProblem, solution: PeriodicRiccati) -> float:
+def bracket(problem: lbt.linear.EstimationProblem, solution: FilterRiccati) -> float:
     """Return how far the least gamma is above what is proved that no filter reaches, relative."""
-    norm = lbt.hinf_norm(problem.error_system(solution.gains).lifted_compactly()).upper
-    least = least_periodic_gamma(problem, solution, norm)
-    return 1 - proved_periodic_gamma(problem, solution, least) / least
+    norm = lbt.hinf_norm(problem.error_system(solution.gain_predictor)).upper
+    _, least, met = least_gamma(problem, lower=0.0, upper=norm, start=solution)
+    witness = worst_invisible_disturbance(problem, met.P, least, solution.P)
+    return 1 - lbt.linear.infeasible_level(problem, witness, solution.P) / least
 
 
 def main() -> None:
@@ -78,7 +78,7 @@ def main() -> None:
     apart, open_by, scores, start = [], [], {}, time.process_time()
     for seed in range(given.plants):
         problem = random_periodic_problem(seed)
-        solution = lbt.linear.periodic_kalman(problem)
+        solution = lbt.linear.kalman_riccati(problem)
         lifted = lbt.linear.kalman_riccati(lifted_problem(problem))
         apart.append(relative_distance(solution.P[0], lifted.P))
         open_by.append(bracket(problem, solution))
@@ -88,7 +88,7 @@ def main() -> None:
     minutes, z = (time.process_time() - start) / 60, np.array(list(scores.values()))
     worst = max(scores, key=lambda seed: abs(scores[seed]))
     problem = random_periodic_problem(worst)
-    again = score(problem, lbt.linear.periodic_kalman(problem), given.frames, worst + given.plants)
+    again = score(problem, lbt.linear.kalman_riccati(problem), given.frames, worst + given.plants)
     print("| what | figure |\n|---|---:|")
     print(f"| random plants | {given.plants} |")
     print(f"| covariance against the lifted problem, worst relative | {max(apart):.1e} |")

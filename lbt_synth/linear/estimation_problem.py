@@ -97,7 +97,7 @@ class EstimationProblem(LinearSystem):
     """
 
     L: FloatArray
-    read: BoolArray = field(default=None)  # type: ignore[assignment]  # (N, q)
+    read: BoolArray = field(default=None)  # type: ignore[arg-type]  # (N, q)
 
     def __post_init__(self) -> None:
         LinearSystem.__post_init__(self)

@@ -98,10 +98,10 @@ class LinearSystem(Summarised):
     @property
     def monodromy(self) -> FloatArray:
         """Transition over a period, from phase 0 to the next phase 0, (n, n)."""
-        first, *others = self.stacks()[0]
+        out, *others = self.stacks()[0]
         for A in others:
-            first = A @ first
-        return first
+            out = A @ out
+        return np.asarray(out)
 
     def stacks(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return A, B, C and D as stacks (N, ...), of one matrix where the period is 1."""
@@ -538,4 +538,4 @@ class RunningController:
         A, B, C, D = (stack[self.phase] for stack in k.stacks())
         self.state = A @ self.state + B @ measured
         self.phase = (self.phase + 1) % k.period
-        return C @ self.state + D @ measured
+        return np.asarray(C @ self.state + D @ measured)

@@ -91,3 +91,13 @@ def test_claims_need_a_proof_and_must_fit_the_filter(axis_plant):
         Witness(states=[[np.nan]], disturbances=[[1.0]])
     with pytest.raises(lbt.errors.ProblemError, match="level must be at least 0"):
         lbt.design.certify_infeasible(axis_plant, -5.0, design.witness)
+
+
+def test_a_witness_has_the_period_of_its_problem(axis_plant):
+    states, disturbances = np.ones((2, 4, 1)), np.ones((2, axis_plant.B.shape[1], 1))
+    witness = Witness(states=states, disturbances=disturbances)
+    with pytest.raises(lbt.errors.DimensionError, match="period of the problem, 1; got 2"):
+        lbt.linear.infeasible_level(axis_plant, witness, np.eye(4))
+    with pytest.raises(lbt.errors.DimensionError, match="must have the same phases"):
+        Witness(states=states, disturbances=disturbances[0])
+    assert Witness(states=states[:1], disturbances=disturbances[:1]).states.shape == (4, 1)

@@ -1,4 +1,4 @@
-"""Frequency responses, and the way to python-control and back."""
+"""Frequency responses, the way to python-control and back, and systems with a period."""
 
 import control
 import numpy as np
@@ -6,9 +6,11 @@ import pytest
 import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
+from support.periodic_problems import relative_distance
 from support.systems import random_system
 
 import lbt_synth as lbt
+from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.state_space import balancing_scales
 
 
@@ -97,3 +99,153 @@ def test_a_measurement_that_is_not_finite_is_refused_and_leaves_the_state(bad):
 def test_states_of_very_different_sizes_are_balanced_without_a_warning():
     state, outside = balancing_scales(np.array([[0.5]]), np.array([1e60]), np.array([1e-60]))
     assert 0.1e60 < state / outside < 10e60
+
+
+def random_stack(seed=0, *, period=5, n=3, m=2, p=2, kind=lbt.linear.StateSpace):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((period, n, n))
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    rest = [rng.standard_normal((period, *size)) for size in ((n, m), (p, n), (p, m))]
+    return kind(A=A, B=rest[0], C=rest[1], D=rest[2], dt_s=0.01)
+
+
+def steps(system, inputs):
+    """Return the outputs for inputs (frames, m), from rest."""
+    x, out = np.zeros(system.n_states), []
+    for k, w in enumerate(inputs):
+        t = k % system.period
+        out.append(system.C[t] @ x + system.D[t] @ w)
+        x = system.A[t] @ x + system.B[t] @ w
+    return np.array(out)
+
+
+@pytest.mark.parametrize("kind", ["lifted", "lifted_compactly"])
+def test_lifted_systems_have_the_norm_and_the_variance(kind):
+    system = random_stack()
+    lifted = getattr(system, kind)()
+    P = stationary_covariance(lifted.A, lifted.B @ lifted.B.T)
+    outputs = np.diag(lifted.C @ P @ lifted.C.T + lifted.D @ lifted.D.T).reshape(5, 2)
+    own = np.array([np.diag(one) for one in system.output_covariances()])
+    np.testing.assert_allclose(outputs, own, rtol=1e-10)
+    # a long run as one matrix has almost the norm of an endless one
+    stepped = np.array([steps(system, w.reshape(-1, 2)).ravel() for w in np.eye(160)]).T
+    norm = np.linalg.norm(stepped, 2)
+    assert norm == pytest.approx(float(lbt.hinf_norm(lifted)), rel=5e-3)
+    assert float(lbt.hinf_norm(system)) == pytest.approx(float(lbt.hinf_norm(lifted)), rel=1e-9)
+    assert norm < float(lbt.hinf_norm(lifted))
+
+
+def test_the_lifted_system_is_the_system():
+    system, rng = random_stack(), np.random.default_rng(1)
+    inputs = rng.standard_normal((40, 2))
+    lifted, x, out = system.lifted(), np.zeros(3), []
+    for w in inputs.reshape(8, 10):
+        out.append(lifted.C @ x + lifted.D @ w)
+        x = lifted.A @ x + lifted.B @ w
+    np.testing.assert_allclose(np.ravel(out), steps(system, inputs).ravel(), atol=1e-12)
+    assert lifted.dt_s == pytest.approx(0.05)
+
+
+def test_few_inputs_remain():
+    assert random_stack(m=30).lifted_compactly().B.shape == (3, 13)
+
+
+def test_covariances_are_those_of_a_long_recursion():
+    system = random_stack()
+    P = np.zeros((3, 3))
+    for k in range(2000):
+        t = k % 5
+        P = system.A[t] @ P @ system.A[t].T + system.B[t] @ system.B[t].T
+    assert relative_distance(system.covariances()[0], P) < 1e-12
+
+
+def test_the_frequency_response_is_what_a_sinusoid_leaves():
+    system, frequency_hz = random_stack(), 7.3
+    wave = np.exp(2j * np.pi * frequency_hz * 0.01 * np.arange(600))
+    for column in range(2):
+        left = steps(system, wave[:, None] * np.eye(2)[column])[-5:] / wave[-5:, None]
+        response = system.phase_response([frequency_hz])[0, :, :, column]
+        np.testing.assert_allclose(left, response, rtol=1e-9)
+
+
+def test_the_radius_of_a_period_and_of_a_frame():
+    system = lbt.linear.StateSpace(
+        A=[[[0.5]], [[3.0]], [[0.1]]], B=[[[1.0]]], C=[[[1.0]]], D=[[[0.0]]], dt_s=1.0
+    )
+    assert system.spectral_radius == pytest.approx(0.15)
+    assert system.radius_per_frame == pytest.approx(0.15 ** (1 / 3))
+
+
+def test_a_controller_reads_its_new_state():
+    controller = random_stack(kind=lbt.Controller)
+    inputs, x, out = np.random.default_rng(3).standard_normal((20, 2)), np.zeros(3), []
+    for k, y in enumerate(inputs):
+        own = controller.phase(k)
+        x = own.A @ x + own.B @ y
+        out.append(own.C @ x + own.D @ y)
+    np.testing.assert_allclose(steps(controller.to_statespace(), inputs), out, atol=1e-12)
+    run = controller.start()
+    for _ in range(2):
+        np.testing.assert_allclose([run.step(y) for y in inputs[:7]], out[:7], atol=1e-12)
+        run.reset()
+
+
+def test_a_period_of_one_sample_is_none():
+    whole = random_stack(period=1)
+    assert (whole.period, whole.A.shape, whole.lifted()) == (1, (3, 3), whole)
+    given = lbt.Controller(A=[[[0.5]]], B=1.0, C=1.0, D=0.0, applied=[[[0.1]]])
+    assert given.applied.shape == given.A.shape == (1, 1)
+    frequency_hz = np.linspace(0, 50, 7)
+    response = whole.phase_response(frequency_hz)[:, 0]
+    np.testing.assert_allclose(response, whole.frequency_response(frequency_hz), rtol=1e-10)
+
+
+def test_what_is_applied_may_alone_have_a_period():
+    given = lbt.Controller(A=0.5, B=1.0, C=1.0, D=0.0, applied=[[[0.1]], [[0.2]]])
+    assert (given.period, given.A.shape) == (2, (2, 1, 1))
+    assert [given.phase(t).applied.item() for t in (0, 1, 2)] == [0.1, 0.2, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (
+            lambda s: s.frequency_response(1.0),
+            r"period of 1; got one of 5.*phase_response\(\.\.\.\)",
+        ),
+        (lambda s: s.to_control(), r"got one of 5 samples\. Try lifted\(\)\.to_control\(\)"),
+        (lambda s: s.balanced(), r"got one of 5 samples\. Try lifted\(\)\.balanced\(\)"),
+        (
+            lambda s: lbt.close_loop(
+                lbt.LoopHardware(frame_rate_hz=100, delay_frames=2, modes=2),
+                lbt.Controller(A=s.A, B=s.B, C=s.C, D=s.D, dt_s=s.dt_s),
+            ),
+            "got one of several sensors",
+        ),
+    ],
+)
+def test_what_a_longer_period_does_not_have(call, words):
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        call(random_stack())
+
+
+def test_a_summary_of_a_period():
+    system = random_stack()
+    assert "3 states, 2 inputs, 2 outputs, 100 Hz, period 5" in repr(system)
+    assert "largest singular value" in system._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"A": np.ones((1, 2, 1))}, r"A must be square; got \(1, 2, 1\)"),
+        ({"C": np.ones((1, 1, 2))}, r"C must have 1 column to match A"),
+        ({"A": np.ones((2, 1, 1)), "B": np.ones((3, 1, 1))}, r"one for each of 3 phases; got \(2"),
+        ({"A": np.ones((1, 1, 1, 1))}, r"A must be one matrix, or one for each"),
+        ({"A": np.ones((0, 1, 1))}, r"A must be one matrix, or one for each"),
+    ],
+)
+def test_sizes_that_clash(changes, words):
+    one = {name: [[1.0]] for name in "ABCD"}
+    with pytest.raises(lbt.errors.DimensionError, match=words):
+        lbt.linear.StateSpace(**(one | changes))

@@ -145,7 +145,7 @@ def failure_rows(
 def _offset_nm(loop: FusedLoop, readings: FloatArray) -> float:
     """Return what readings (q, q) that stay for ever leave of themselves [nm rms]."""
     n, rows = loop.hardware.modes, loop.suite.marked(loop.blind, loop.hardware)
-    response = np.real(loop.system.frequency_response(0.0)[0, :, :n, n:][:, :, rows])
+    response = np.real(loop.system.phase_response(0.0)[0, :, :n, n:][:, :, rows])
     power = np.einsum("tij,jk,tik->t", response, readings[np.ix_(rows, rows)], response)
     return float(np.sqrt(np.mean(power)))
 

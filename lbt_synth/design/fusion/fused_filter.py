@@ -102,7 +102,7 @@ class FusedFilter(Design):
         Level of the central filter that just meets the bound, of a mixed design.
     """
 
-    controller: Controller = field(init=False)  # type: ignore[assignment]
+    controller: Controller = field(init=False)
     problem: FusedPlant
     gains: FloatArray
     fallbacks: tuple[Fallback, ...] = ()

@@ -102,7 +102,7 @@ def _sweep(problem: EstimationProblem, P: FloatArray) -> FloatArray:
 
 def kalman_gain(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
     """Return the predictor gain (n, q) of a phase for the covariance of its prediction error."""
-    return _kalman_gains(problem, t, P)[0]
+    return np.asarray(_kalman_gains(problem, t, P)[0])
 
 
 def _kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:

@@ -265,7 +265,8 @@ def _power(loop: FusedLoop, spectrum: Spectrum, entry: FloatArray) -> FloatArray
         return np.asarray(spectrum.psd(frequency)[:, None, None] * power)
 
     rate = loop.hardware.frame_rate_hz
-    poles, N = loop.system.poles, loop.system.period  # a pole of the period shows at each of its roots
+    poles, N = loop.system.poles, loop.system.period
+    # a pole of the period shows at each of its roots
     turns = np.exp(2j * np.pi * np.arange(N) / N)
     roots = (np.abs(poles) ** (1 / N) * np.exp(1j * np.angle(poles) / N))[:, None] * turns
     edges = [panel_edges(roots, rate), breakpoints_below(spectrum, rate / 2)]
@@ -308,9 +309,7 @@ def _noise_system(loop: FusedLoop, own: FloatArray) -> StateSpace:
     n, s = loop.hardware.modes, loop.system
     noise = loop.suite.noise_factor(own, n)
     noise[loop.suite.marked(loop.blind, loop.hardware)] = 0.0
-    return StateSpace(
-        A=s.A, B=s.B[..., n:] @ noise, C=s.C, D=s.D[..., n:] @ noise, dt_s=s.dt_s
-    )
+    return StateSpace(A=s.A, B=s.B[..., n:] @ noise, C=s.C, D=s.D[..., n:] @ noise, dt_s=s.dt_s)
 
 
 def residual_power(loop: FusedLoop, system: StateSpace) -> FloatArray:

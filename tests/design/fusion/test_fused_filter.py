@@ -109,7 +109,7 @@ def test_a_design_that_fails_is_not_returned(monkeypatch):
     monkeypatch.setattr(
         fused_filter,
         "kalman_riccati",
-        lambda plant: replace(solve(plant), gains=1.01 * solve(plant).gains),
+        lambda plant: replace(solve(plant), gain_predictor=1.01 * solve(plant).gain_predictor),
     )
     with pytest.raises(CertificateError, match="failed its certificate"):
         fused_kalman(example_plant((SLOW,)))
@@ -197,7 +197,7 @@ EARLY = replace(SLOW, delay_frames=1.25)  # its sums are empty when a period beg
 
 def growth_per_frame(plant, turns):
     """Return what a cycle of turns (gains, frames) makes of the error, per frame."""
-    errors = [(plant.error_system(gains).A, frames) for gains, frames in turns]
+    errors = [(plant.error_system(gains).stacks()[0], frames) for gains, frames in turns]
     cycle, phase, total = np.eye(plant.n_states), 0, 0
     for _ in range(plant.period):  # the cycle may end in the midst of a period
         for A, frames in errors:

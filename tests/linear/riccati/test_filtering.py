@@ -1,5 +1,7 @@
 """The Riccati equations of the predictors, against SLICOT and scipy; the least gamma."""
 
+from dataclasses import replace
+
 import cvxpy as cp
 import mpmath
 import numpy as np
@@ -38,6 +40,26 @@ def test_kalman_riccati_against_slycot(axis_plant):
     p = axis_plant
     X = slycot.sb02od(4, 1, p.A.T, p.C.T, p.Q, p.R, "D")[0]
     assert np.allclose(kalman_riccati(p).P, X, rtol=1e-6, atol=1e-6 * np.abs(X).max())
+
+
+def test_a_measurement_that_is_not_read_is_left_out():
+    """Filters and least gamma are those of the others; its own gains are zero."""
+    problem = random_problem(np.random.default_rng(1), 4, 3, l=2)
+    partial = replace(problem, read=[[True, False, True]])
+    rows = [0, 2]
+    less = replace(problem, C=problem.C[rows], D=problem.D[rows], read=None)
+    upper = lbt.hinf_norm(less.error_system(kalman_riccati(less).gain_predictor)).upper
+    level, some, others = (least_gamma(p, lower=0.1, upper=upper) for p in (problem, partial, less))
+    assert some[:2] == others[:2]
+    assert level[1] < some[1]
+    pairs = [(some[2], others[2])]
+    pairs += [(f(partial), f(less)) for f in (kalman_riccati, lambda p: gamma_riccati(p, upper))]
+    for masked, own in pairs:
+        np.testing.assert_array_equal(masked.P, own.P)
+        np.testing.assert_array_equal(masked.gain_predictor[:, rows], own.gain_predictor)
+        np.testing.assert_array_equal(masked.gain_filter[:, rows], own.gain_filter)
+        assert not masked.gain_predictor[:, 1].any()
+    assert gamma_riccati(partial, 0.5 * some[0]) is None
 
 
 def test_gamma_riccati_tends_to_the_kalman_filter(axis_plant):

@@ -51,7 +51,7 @@ def closed(plant, **facts):
 @pytest.mark.parametrize("sensors", [(FAST,), (SLOW,), (FAST, SLOW), (SELDOM,)])
 def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
     plant = example_plant(sensors, delay_frames=delay)
-    P = kalman_riccati(plant).P
+    P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
     _, loop = closed(plant)
     rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
     assert fused_model_budget(loop, plant).rms_nm == pytest.approx(rms, rel=1e-9)

@@ -100,10 +100,10 @@ def test_an_accelerometer_without_an_age_sees_the_drive():
         name="mirror", rate_hz=1000, delay_frames=1, channels=("m1",), noise_m_s2=1e-3
     )
     plant = example_plant((fast,))
-    drive = plant.D[0, 2, 0]
+    drive = plant.D[2, 0]
     rms = LINES[0].ar_model(1000).driving_rms_nm
     assert drive == pytest.approx(2.0 * 1e-9 * 1e6 * rms)
-    assert (plant.B @ plant.D.transpose(0, 2, 1))[0, 0, 2] == pytest.approx(rms * drive)
+    assert plant.S[0, 2] == pytest.approx(rms * drive)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,11 @@ def test_an_accelerometer_without_an_age_sees_the_drive():
             DimensionError,
             "one mapping per vibration",
         ),
-        (lambda: example_plant().controller(np.zeros((1, 2, 3))), DimensionError, "gains must be"),
+        (
+            lambda: example_plant().controller(np.zeros((1, 2, 3))),
+            DimensionError,
+            "gain_predictor must",
+        ),
         (lambda: example_plant().unit_rows(("m9",)), ProblemError, "called 'm9'"),
         (
             lambda: example_plant(delay_frames=4, sensors=(FAST,)),

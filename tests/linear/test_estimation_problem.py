@@ -1,0 +1,117 @@
+"""Problems of sensors that are not read in every sample, and what they refuse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
+
+import lbt_synth as lbt
+from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
+from lbt_synth.linear import EstimationProblem, kalman_riccati
+
+WALK = {
+    "A": [[[1.0]]],
+    "B": [[[1.0, 0.0, 0.0]]],
+    "C": [[[1.0], [1.0]]],
+    "D": [[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]],
+    "L": [[1.0]],
+    "read": [[True, False], [True, True]],
+}
+
+
+def test_the_schedule_alone_may_have_a_period():
+    problem = EstimationProblem(**WALK)
+    assert problem.period == 2
+    assert problem.A.shape == (2, 1, 1)
+    assert problem.n_measurements == 2
+    assert [len(problem.read_parts(t)[2]) for t in range(2)] == [1, 2]
+
+
+def test_a_measurement_that_is_left_out_is_not_read():
+    problem = EstimationProblem(**WALK).restricted(np.array([False, True]))
+    assert problem.read.tolist() == [[False, False], [False, True]]
+    with pytest.raises(DimensionError, match="some of them true"):
+        problem.restricted(np.array([True, False]))
+
+
+def test_gains_of_what_is_not_read_do_nothing():
+    problem = EstimationProblem(**WALK)
+    gains = np.full((2, 1, 2), 0.3)
+    error = problem.error_system(gains)
+    np.testing.assert_allclose(error.A.ravel(), [0.7, 0.4])
+    np.testing.assert_allclose(error.B[0], [[1.0, -0.3, 0.0]])
+    same = problem.error_system(gains[0])  # one gain for all phases
+    np.testing.assert_array_equal(same.A, error.A)
+    with pytest.raises(DimensionError, match=r"one for each of 2 phases; got \(3, 1, 2\)"):
+        problem.error_system(np.ones((3, 1, 2)))
+
+
+def test_the_controller_of_a_period_predicts():
+    problem = EstimationProblem(**WALK)
+    gains = kalman_riccati(problem).gain_predictor
+    run, estimate = problem.controller(gains).start(), 0.0
+    for k, y in enumerate(np.random.default_rng(0).standard_normal((7, 2))):
+        estimate += float(gains[k % 2, 0] @ (y - estimate))
+        assert run.step(y)[0] == pytest.approx(estimate, rel=1e-12)
+
+
+def test_a_problem_of_one_phase_in_which_all_is_read():
+    one = EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    stack = EstimationProblem(A=[[[0.9]]], B=[[[1.0, 0.0]]], C=[[[1.0]]], D=[[[0.0, 1.0]]], L=1.0)
+    assert (one.period, one.read.tolist()) == (1, [[True]])
+    assert all(getattr(stack, name).ndim == 2 for name in "ABCD")
+    assert one.error_system(np.array([[[0.4]]])).A.tolist() == [[0.5]]
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda p: p.ahead(0), "an estimate 0 samples ahead needs a period of 1; got one of 2"),
+        (lambda p: p.with_memory([[1.0, 1.0]]), "a filter with a memory needs a period of 1"),
+        (lambda p: p.with_unit_weights(), "a scaling of disturbances needs a period of 1"),
+        (lbt.kalman, "every measurement must be read in every sample.*Try fused_kalman"),
+        (lambda p: lbt.hinf(replace(p, read=[[True, True]])), "this design needs a period of 1"),
+    ],
+)
+def test_what_a_longer_period_does_not_have(call, words):
+    with pytest.raises(ProblemError, match=words):
+        call(EstimationProblem(**WALK))
+
+
+@pytest.mark.parametrize("factor", [1e-12, 1e9])
+def test_the_unit_of_a_measurement_does_not_matter(factor):
+    units = np.array([[1.0], [factor]])
+    C, D = (np.asarray(WALK[name]) * units for name in "CD")
+    own = kalman_riccati(EstimationProblem(**WALK))
+    other = EstimationProblem(**(WALK | {"C": C, "D": D}))
+    solved = kalman_riccati(other)
+    assert relative_distance(solved.P, own.P) < 1e-12
+    assert relative_distance(solved.gain_predictor * units[:, 0], own.gain_predictor) < 1e-12
+    assert relative_distance(kalman_riccati(lifted_problem(other)).P, own.P[0]) < 1e-12
+
+
+def test_the_problem_over_a_period_has_the_readings_of_a_period():
+    problem = random_periodic_problem(3)
+    lifted = lifted_problem(problem)
+    assert len(lifted.C) == problem.read.sum()
+    np.testing.assert_allclose(lifted.A, problem.monodromy)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"read": [[True]]}, DimensionError, r"read must be \(1, 2\) truth values"),
+        ({"read": [[False, False]]}, DimensionError, "some of them true"),
+        ({"L": [[1.0, 1.0]]}, DimensionError, r"L must have 1 column to match A"),
+        (
+            {"D": [[[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]]},
+            DefinitenessError,
+            "read at phase 1 is singular.*needs noise of its own",
+        ),
+        ({"D": np.zeros((1, 2, 3))}, DefinitenessError, "read at phase 0 is singular"),
+    ],
+)
+def test_problems_that_are_none(changes, error, words):
+    with pytest.raises(error, match=words):
+        EstimationProblem(**(WALK | changes))
