@@ -111,12 +111,13 @@ def run_oscillator(seen: SeenVibration, line: Vibration, drive: FloatArray) -> F
     The drive is (cases, 1 + frames, inputs), as that of a :class:`DrawnLine`. Exposures that begin
     before the first frame see the oscillator at rest there.
     """
+    A, B, C, _ = seen.stacks()
     state = line.rms_nm * seen.still @ drive[:, 0, :2].T
-    out = np.empty((drive.shape[1] - 1, seen.C.shape[1], len(drive)))
+    out = np.empty((drive.shape[1] - 1, C.shape[1], len(drive)))
     for k, white in enumerate(drive[:, 1:].transpose(1, 2, 0)):
         before = (k - 1) % seen.period
-        state = seen.A[before] @ state + seen.B[before] @ white
-        out[k] = seen.C[k % seen.period] @ state
+        state = A[before] @ state + B[before] @ white
+        out[k] = C[k % seen.period] @ state
     return np.asarray(out.transpose(2, 0, 1))
 
 
