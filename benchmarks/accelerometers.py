@@ -25,7 +25,7 @@ from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.loop.fusion.fused_loop import close_fused_loop
-from lbt_synth.models.fusion.plant import FusedPlant
+from lbt_synth.models.plant.readings import FusedPlant
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0

@@ -27,7 +27,7 @@ from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
-from lbt_synth.models.fusion.plant import FusedPlant
+from lbt_synth.models.plant.readings import FusedPlant
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.summaries import Summarised, Summary

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from lbt_synth.config.section import Section
 from lbt_synth.methods import quantities as q
-from lbt_synth.models.fusion.sensors import OWN_SENSOR
+from lbt_synth.models.sensor_suite import OWN_SENSOR
 
 
 class PyramidSection(Section):

@@ -15,8 +15,8 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.config.sensor_sections import OtherSensorSection
 from lbt_synth.errors import name_key
 from lbt_synth.models import TipTiltPlant, Vibration
-from lbt_synth.models.fusion.plant import FusedPlant, fused_plant
-from lbt_synth.models.fusion.sensors import (
+from lbt_synth.models.plant.readings import FusedPlant, fused_plant
+from lbt_synth.models.sensor_suite import (
     Accelerometer,
     Motion,
     Motions,

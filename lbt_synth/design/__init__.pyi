@@ -5,13 +5,9 @@ from .certificate import Check as Check
 from .certificate import certify_filter as certify_filter
 from .certificate import certify_infeasible as certify_infeasible
 from .certificate import certify_loop as certify_loop
+from .fallbacks import FailureRow as FailureRow
+from .fallbacks import failure_rows as failure_rows
 from .filter_design import FilterDesign as FilterDesign
-from .fusion.failures import FailureRow as FailureRow
-from .fusion.failures import failure_rows as failure_rows
-from .fusion.fused_filter import FusedFilter as FusedFilter
-from .fusion.fused_filter import fused_hinf as fused_hinf
-from .fusion.fused_filter import fused_kalman as fused_kalman
-from .fusion.fused_filter import fused_mixed as fused_mixed
 from .hinf import hinf as hinf
 from .integrator import integrator as integrator
 from .integrator import integrator_gain_limit as integrator_gain_limit

@@ -19,7 +19,8 @@ from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.linear.norms import HinfNorm
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop import close_loop
+from lbt_synth.linear.riccati.periodic import kalman_gain
+from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, row_table
@@ -170,21 +171,34 @@ def certify_filter(
     >>> lbt.design.certify_filter(p, [[0.7]], least_variance=True).passed
     False
     """
-    certificate, norm, P = _examine_error(problem.error_system(gain_predictor))
+    error, period = problem.error_system(gain_predictor), problem.period
+    name = "spectral radius of the filter" + " over a period" * (period > 1)
+    whole = error if period == 1 else error.lifted_compactly()
+    certificate, norm, P = _examine_error(whole, name)
     if norm is None or P is None:
         return certificate
-    gain = np.asarray(gain_predictor)
     checks = list(certificate.checks)
     if gamma is not None:
         checks.append(bound_check(norm.upper, gamma))
     if least_variance:
-        innovation = problem.R + problem.C @ P @ problem.C.T
-        optimal = np.linalg.solve(innovation, (problem.A @ P @ problem.C.T + problem.S).T).T
-        size = float(np.linalg.norm(optimal, 2))
-        distance = float(np.linalg.norm(gain - optimal, 2)) / size if size > 0 else 0.0
+        covariances = P[None] if period == 1 else error.covariances()
+        distance = variance_distance(problem, gain_predictor, covariances)
         how = "gain recomputed from the Lyapunov covariance"
         checks.append(Check("distance from the least-variance gain", distance, GAIN_TOLERANCE, how))
-    return replace(certificate, checks=tuple(checks))
+    powers = certificate.rms_per_output.reshape(period, -1) ** 2  # of all phases, one by one
+    rms = frozen_copy(np.sqrt(powers.mean(axis=0)))
+    return replace(certificate, checks=tuple(checks), rms_per_output=rms)
+
+
+def variance_distance(
+    problem: EstimationProblem, gain_predictor: FloatArray, covariances: FloatArray
+) -> float:
+    """Return how far gains are from those that error covariances (N, n, n) make, relative."""
+    optimal = np.stack([kalman_gain(problem, t, P) for t, P in enumerate(covariances)])
+    gains = np.reshape(gain_predictor, optimal.shape)
+    size = float(np.max(np.linalg.norm(optimal, 2, axis=(1, 2))))
+    apart = float(np.max(np.linalg.norm(gains - optimal, 2, axis=(1, 2))))
+    return apart / size if size > 0 else apart
 
 
 def bound_check(norm: float, bound: float) -> Check:
@@ -208,7 +222,7 @@ def _examine_error(
     error: StateSpace, stability: str = "spectral radius of the filter"
 ) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
     """Return the certificate of an error, with its norm and covariance if it is stable."""
-    stable = _stability_check(stability, error.spectral_radius)
+    stable = _radius_check(stability, error.spectral_radius)
     if not stable.passed:
         infinite = frozen_copy(np.full(len(error.C), np.inf))
         return Certificate(checks=(stable,), gamma=np.inf, rms_per_output=infinite), None, None
@@ -308,10 +322,10 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
             "expected a Witness, such as that of an H-infinity design; got "
             f"{type(witness).__name__}."
         )
-    x, w = witness.states, witness.disturbances
-    if x.shape[:1] != (problem.n_states,) or w.shape != (problem.B.shape[1], *x.shape[1:]):
+    x, w, sizes = witness.states, witness.disturbances, problem.B.shape[-2:]
+    if (x.shape[-2], w.shape[-2]) != sizes:
         raise DimensionError(
-            f"a witness must have {problem.n_states} rows of states, {problem.B.shape[1]} rows of "
+            f"a witness must have {sizes[0]} rows of states, {sizes[1]} rows of "
             f"disturbances and as many columns in both; got {x.shape} and {w.shape}."
         )
     claimed = number(level, "level", at_least=0)
@@ -350,10 +364,13 @@ def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
     ... ).passed
     False
     """
-    return _stability_check(
-        "spectral radius of the closed loop", close_loop(hardware, controller).spectral_radius
-    )
+    return stability_check("spectral radius of the closed loop", close_loop(hardware, controller))
 
 
-def _stability_check(name: str, radius: float) -> Check:
+def stability_check(name: str, loop: ClosedLoop) -> Check:
+    """Check the largest modulus of a loop's poles, per frame."""
+    return _radius_check(name, loop.radius_per_frame)
+
+
+def _radius_check(name: str, radius: float) -> Check:
     return Check(name, radius, 1 - STABILITY_MARGIN, "eigenvalues")

@@ -21,23 +21,33 @@ from lbt_synth.design.certificate import (
     certify_infeasible,
 )
 from lbt_synth.design.claims import Claim, Evidence, measured_claim
+from lbt_synth.design.fallbacks import (
+    Fallback,
+    dwell_frames,
+    failure_rows,
+    fallback_checks,
+    make_fallbacks,
+    reads_several,
+)
 from lbt_synth.design.result import (
     MODEL_LIMITS,
     Design,
+    RowTable,
     SolverReport,
     model_limits,
     with_certificate,
 )
-from lbt_synth.errors import NumericalError
+from lbt_synth.errors import DimensionError, NumericalError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
 from lbt_synth.linear.estimation_problem import decorrelate
 from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.riccati.filtering import (
     FilterRiccati,
-    GammaEquation,
     gamma_riccati,
     kalman_riccati,
+    meets_level,
 )
+from lbt_synth.loop import stable_sensor_gains
 from lbt_synth.storage.rows import Column
 from lbt_synth.validation import ComplexArray, FloatArray, matrix, set_fields
 
@@ -69,9 +79,8 @@ def _check_rms_bound(evidence: Evidence, bound: float) -> Iterator[Check]:
 
 def _check_least(evidence: Evidence, least: float) -> Iterator[Check]:
     """Check the least norm on both sides: the level above is met, the level below is not."""
-    equation = GammaEquation(evidence.design.problem, evidence.kalman)
-    sides = (-NORM_TOLERANCE, NORM_TOLERANCE)
-    meets = [equation.trial(least * (1 + side)).P is not None for side in sides]
+    problem, sides = evidence.design.problem, (-NORM_TOLERANCE, NORM_TOLERANCE)
+    meets = [meets_level(problem, least * (1 + side), evidence.kalman) for side in sides]
     off = 0.0 if meets == [False, True] else np.inf
     how = "gamma-Riccati equation on both sides"
     yield Check("least norm of any filter, error", off, NORM_TOLERANCE, how)
@@ -129,26 +138,51 @@ class FilterDesign(Design):
     witness : Witness or None
         Disturbances that no measurement shows: the proof that no filter reaches
         ``gamma_infeasible``.
+    fallbacks : tuple of Fallback
+        Where the loop has other sensors beside its own: the filter of the remaining ones, for each
+        set of sensors and channels that may fail.
+
+    The gains are (N, n, q) where the sensors have a common period of N frames.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
         *(RMS, GAMMA, RMS_REQUESTED, GAMMA_REQUESTED, GAMMA_LEAST, GAMMA_INFEASIBLE),
     )
-    DERIVED: ClassVar[tuple[Column, ...]] = MODEL_LIMITS
+    DERIVED: ClassVar[tuple[Column, ...]] = (
+        *MODEL_LIMITS,
+        Column(name="sensors", heading="sensors and channels"),
+        Column(name="period", heading="common period", unit="frames"),
+        Column(name="loop_radius", heading="spectral radius of the loop, over a period"),
+        Column(name="gain_low", heading="stable sensor gains, from", format=".4g"),
+        Column(name="gain_high", heading="stable sensor gains, to", format=".4g"),
+        Column(
+            name="dwell_frames",
+            heading="stable if sensors fail or return no sooner than after",
+            unit="frames",
+            help="Whatever the order: a proof, where the plant is its model; sooner may be stable",
+        ),
+    )
     is_estimator: ClassVar[bool] = True
 
     problem: EstimationProblem
     gain_predictor: FloatArray
     gain_filter: FloatArray
     witness: Witness | None = None
+    fallbacks: tuple[Fallback, ...] = ()
 
     def __post_init__(self) -> None:
         problem = self.problem
         sizes = {
             "rows": (problem.n_states, f"to match A {problem.A.shape}"),
-            "cols": (len(problem.C), f"to match C {problem.C.shape}"),
+            "cols": (problem.n_measurements, f"to match C {problem.C.shape}"),
         }
-        set_fields(self, gain_filter=matrix(self.gain_filter, "gain_filter", **sizes))
+        gain_filter = matrix(self.gain_filter, "gain_filter", **sizes, stacked=True)
+        if gain_filter.shape != np.shape(self.gain_predictor):
+            raise DimensionError(
+                f"gain_filter must be {np.shape(self.gain_predictor)}, as the predictor gain; got "
+                f"{gain_filter.shape}."
+            )
+        set_fields(self, gain_filter=gain_filter)
         Design.__post_init__(self)
 
     def make_controller(self) -> Controller:
@@ -178,8 +212,10 @@ class FilterDesign(Design):
     @property
     def proof(self) -> Witness:
         """The witness; without one, no disturbance at all, which proves nothing."""
-        n, p = self.problem.B.shape
-        nothing = Witness(states=np.zeros((n, 1)), disturbances=np.zeros((p, 1)))
+        (n, p), N = self.problem.B.shape[-2:], self.problem.period
+        shapes = [(N, n, 1), (N, p, 1)] if N > 1 else [(n, 1), (p, 1)]
+        states, disturbances = (np.zeros(shape) for shape in shapes)
+        nothing = Witness(states=states, disturbances=disturbances)
         return self.witness or nothing
 
     @property
@@ -207,9 +243,49 @@ class FilterDesign(Design):
         """
         return (problem or self.problem).error_system(self.gain_predictor)
 
-    def derived(self) -> dict[str, float | None]:
-        """Return residual and limit in the filter's own model."""
-        return dict(model_limits(self))
+    def derived(self) -> dict[str, Any]:
+        """Return residual and limit in the own model, or what holds with several sensors."""
+        plant = self.problem
+        if not reads_several(plant):
+            return dict(model_limits(self))
+        low, high = stable_sensor_gains(plant.hardware, self.controller)
+        return {
+            "sensors": ", ".join(plant.hardware.suite.units),
+            "period": plant.period,
+            "loop_radius": self.close(plant.hardware).spectral_radius,
+            "gain_low": low,
+            "gain_high": high,
+            "dwell_frames": dwell_frames(plant, self.gain_predictor, self.fallbacks),
+        }
+
+    @property
+    def controllers(self) -> dict[frozenset[str], Controller]:
+        """The controller for each set of sensors and channels that are not read, none included."""
+        others = {f.missing: self.problem.controller(f.gains) for f in self.fallbacks}
+        return {frozenset(missing): k for missing, k in {(): self.controller, **others}.items()}
+
+    def tables(self) -> tuple[RowTable, ...]:
+        """Return what becomes of the loop when sensors fail."""
+        if not reads_several(self.problem):
+            return ()
+        rows = failure_rows(self.problem, self.gain_predictor, self.fallbacks)
+        return (RowTable(key="failures", title="When sensors fail", rows=rows),)
+
+    def notes(self) -> list[str]:
+        """Return what the table of failures says, and which failures the loop has to see."""
+        if not self.tables():
+            return []
+        unseen = [row.missing for row in self.tables()[0].rows if row.must_switch]
+        warning = (
+            f"note: unstable if these fail unseen: {'; '.join(unseen)}. The computer of the loop "
+            "has to see such a failure, and take the fall-back filter."
+        )
+        return [
+            "unseen: the readings are zero, or frozen, and the filter believes them: a reading "
+            "that stays leaves an offset, which counts to the residual. Not read: the fall-back "
+            "filter of this file for the remaining sensors, with the same state.",
+            *[warning] * bool(unseen),
+        ]
 
     @property
     def estimator(self) -> Controller:
@@ -229,6 +305,8 @@ class FilterDesign(Design):
             return Evidence(design=self, certificate=certificate)
         kalman = kalman_riccati(self.problem)
         checks = [*certificate.checks, self._gain_check()]
+        if reads_several(self.problem):
+            checks += fallback_checks(self.problem, self.fallbacks)
         if least:
             distance = _distance(self, kalman)
             checks.append(Check(ORIGIN, distance, ORIGIN_TOLERANCE, "relative"))
@@ -237,19 +315,28 @@ class FilterDesign(Design):
 
     def _gain_check(self) -> Check:
         """Check that the two gains are of one filter, in the states that go on."""
-        A, _, injection = decorrelate(self.problem)
-        goes_on = np.any(A != 0, axis=1)  # not so the newest innovation of a mixed filter
-        apart = (A @ self.gain_filter + injection - self.gain_predictor)[goes_on]
+        problem, apart = self.problem, 0.0
+        shape = (problem.period, problem.n_states, problem.n_measurements)
+        gains = zip(
+            *(np.reshape(g, shape) for g in (self.gain_predictor, self.gain_filter)), strict=True
+        )
+        for t, (predictor, filtering) in enumerate(gains):
+            A, _, injection = decorrelate(problem, t)
+            rows, goes_on = problem.read[t], np.any(A != 0, axis=1)  # not so an innovation's memory
+            made = A @ filtering[:, rows] + injection
+            off = (made - predictor[:, rows])[goes_on]
+            apart = max(apart, float(np.max(np.abs(off), initial=0.0)))
         size = max(float(np.max(np.abs(self.gain_predictor), initial=0.0)), 1e-300)
-        value = float(np.max(np.abs(apart), initial=0.0)) / size
+        value = apart / size
         how = "A times the filter gain, relative"
         return Check("predictor gain against the filter gain", value, GAIN_TOLERANCE, how)
 
 
 def _distance(design: FilterDesign, origin: FilterRiccati) -> float:
     """Return how far both gains of a filter are from those of a Riccati equation, relative."""
-    gains = np.vstack([design.gain_predictor, design.gain_filter])
-    return relative_distance(gains, np.vstack([origin.gain_predictor, origin.gain_filter]))
+    gains = np.concatenate([design.gain_predictor, design.gain_filter], axis=-2)
+    other = np.concatenate([origin.gain_predictor, origin.gain_filter], axis=-2)
+    return relative_distance(gains, other)
 
 
 def filter_design(
@@ -270,6 +357,7 @@ def filter_design(
         gain_predictor=gain_predictor,
         gain_filter=gain_filter,
         witness=witness,
+        fallbacks=make_fallbacks(problem),
         claims={name: value for name, value in claims.items() if value is not None},
     )
     return with_certificate(design, "Try the other route, or scale the states to similar sizes.")

@@ -101,7 +101,9 @@ def hinf(
     )
     problem = problem.ahead(horizon)
     start = kalman_riccati(problem)
-    if route is None and len(problem.A) <= _LARGEST_LMI:
+    if route == "lmi":
+        problem.require_one_phase("the inequality", "route='riccati'")
+    if route is None and problem.n_states <= _LARGEST_LMI and problem.reads_all:
         try:
             return _design(problem, start, "lmi", gamma, gamma_ratio)
         except (NumericalError, CertificateError):  # noise far below the signal

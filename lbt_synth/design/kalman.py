@@ -59,6 +59,7 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     solution = kalman_riccati(problem)
     gains: FilterRiccati | LmiSolution = solution
     if route == "sdp":
+        problem.require_one_phase("the semidefinite programme", "route='riccati'")
         from lbt_synth.linear.lmi.filters import kalman_sdp
 
         scale = error_scale(problem, solution.P)
@@ -74,5 +75,5 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
 
 def error_scale(problem: EstimationProblem, P: FloatArray) -> float:
     """Return the standard deviation of the error in its worst direction, or 1 if it is zero."""
-    worst = float(np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[-1])
+    worst = float(np.max(np.linalg.eigvalsh(problem.L @ P @ problem.L.T)[..., -1]))
     return float(np.sqrt(worst)) if worst > 0 else 1.0

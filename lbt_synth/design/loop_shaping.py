@@ -161,7 +161,7 @@ def shape(
 
 
 def _check_objective(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator[Check]:
-    """Compare the objective of each mode with the one claimed, and the whole loop with its modes."""
+    """Compare the objective of each mode with the one claimed, the whole loop with its modes."""
     design = evidence.design
     for prefix, mode in design.distinct_modes():
         loop = mode_loop(design.problem, design.parameters[mode])

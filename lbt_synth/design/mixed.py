@@ -25,7 +25,6 @@ from lbt_synth.linear import (
     largest_singular_values,
 )
 from lbt_synth.linear.estimation_problem import require_problem
-from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -44,6 +43,7 @@ _EXCESS = 4e-7  # by which the norm may exceed its bound; the certificate allows
 _ROOM = 2e-7  # by which the bound at the frequencies is tightened
 _SAME = 1e-9
 _MOST_TAPS = 64
+_TAPS = 16
 _EDGE = 1e-5  # this close to the least gamma, its own filter is returned
 
 
@@ -53,7 +53,7 @@ def mixed(
     gamma: float | None = None,
     gamma_ratio: float | None = None,
     rms: float | None = None,
-    taps: int = 16,
+    taps: int = _TAPS,
     horizon: int = 1,
 ) -> FilterDesign:
     """Design the filter of least variance under a bound on its norm, or the reverse.
@@ -61,8 +61,9 @@ def mixed(
     A base, the central H-infinity filter that just meets the bound, is completed with an
     impulse response on its innovations. All stable filters are of this kind, and the
     best impulse response is a convex programme: more taps come closer to the best of all
-    linear filters. The norm is bounded on frequencies that are added to until it holds
-    between them too.
+    linear filters. Where sensors have a longer common period than a frame, it is the base alone:
+    the best among central filters, not among all. The norm is bounded on frequencies that are added
+    to until it holds between them too.
 
     Parameters
     ----------
@@ -121,6 +122,8 @@ def mixed(
         )
     length = require_taps(taps)
     problem = problem.ahead(horizon)
+    if length != _TAPS:
+        problem.require_one_phase("an impulse response on the innovations", "to leave out taps")
     least, best = hinf(problem, route="riccati"), kalman(problem)
     if rms is not None:
         bound = number(rms, "rms", above=0)
@@ -153,6 +156,10 @@ def mixed(
             return programme.minimize_variance(bound * (1 - _ROOM), grid)
 
     base = CentralFilters(problem, least).member(measure)
+    if not problem.reads_all:  # no impulse response: the least variance among central filters
+        return _central_design(
+            base, least, method="mixed", gamma_requested=gamma, rms_requested=rms
+        )
     impulse, solver = _complete_base(problem, base, length, solve)
     claims = {"solver": solver, "gamma_requested": gamma, "rms_requested": rms}
     return _mixed_design(problem, base, impulse, least, **claims)
@@ -277,16 +284,23 @@ def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     least = hinf(problem, route="riccati")
     require_reachable(bound, least.gamma_least)
     gains = CentralFilters(problem, least).member(lambda norm, _: norm - bound)
+    return _central_design(gains, least, method="hinf", gamma_requested=bound * (1 + _SLACK))
+
+
+def _central_design(
+    gains: FilterDesign | FilterRiccati, least: FilterDesign, *, method: str, **bounds: float | None
+) -> FilterDesign:
+    """Make the design of a central filter that reaches its bound."""
     return filter_design(
-        problem,
+        least.problem,
         gains.gain_predictor,
         gains.gain_filter,
-        method="hinf",
+        method=method,
         solver=SolverReport(route="riccati", status="norm reached", iterations=0),
-        gamma_requested=bound * (1 + _SLACK),
         gamma_least=least.gamma_least,
         gamma_infeasible=least.gamma_infeasible,
         witness=least.witness,
+        **bounds,
     )
 
 
@@ -310,8 +324,8 @@ class CentralFilters:
             solution = gamma_riccati(self.problem, level, start=self.start) if decades else None
             if solution is not None:
                 error = self.problem.error_system(solution.gain_predictor)
-                covariance = stationary_covariance(error.A, error.B @ error.B.T)
-                variance = float(np.trace(error.C @ covariance @ error.C.T))
+                mean = np.mean(error.output_covariances(), axis=0)
+                variance = float(np.trace(mean))
                 gains[decades] = solution
                 found[decades] = measure(float(hinf_norm(error)), float(np.sqrt(variance)))
             return found.get(decades, found[0.0])

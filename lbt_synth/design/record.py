@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate
+from lbt_synth.design.fallbacks import Fallback
 from lbt_synth.design.result import Design, SolverReport
 from lbt_synth.linear import Controller, EstimationProblem, Witness
 from lbt_synth.models import (
@@ -21,12 +22,29 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.plant.parts import PlantParts, held_frames
 from lbt_synth.models.plant.tip_tilt import assemble
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number, sequence, text
+from lbt_synth.models.sensor_suite import (
+    Accelerometer,
+    Motion,
+    Sensor,
+    SensorSuite,
+    WavefrontSensor,
+)
+from lbt_synth.validation import (
+    FloatArray,
+    float_array,
+    frozen_copy,
+    integer,
+    number,
+    sequence,
+    text,
+)
 
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
 _SAME = 1e-9
+_SENSORS: dict[str, type[Sensor]] = {"wavefront": WavefrontSensor, "accelerometer": Accelerometer}
+_SENSOR_ARRAYS = ("noise_nm", "sensor_matrix", "noise_m_s2")
 _CHECK = ("name", "value", "limit", "computed_by")
 _PROBLEMS: dict[str, type[EstimationProblem | LoopHardware]] = {
     "problem": EstimationProblem,
@@ -81,6 +99,7 @@ class DesignRecord:
             sensor_matrix=self.arrays["SENSOR"],
             influence_matrix=self.arrays["INFLUENCE"],
             mirror=PositionLoop(**meta["mirror"]) if "mirror" in meta else None,
+            suite=SensorSuite(sensors=tuple(_unpack_sensor(part) for part in meta["sensors"])),
         )
 
     def problem(self) -> EstimationProblem | LoopHardware:
@@ -112,10 +131,14 @@ class DesignRecord:
                 Vibration(**{**line, "direction": tuple(line["direction"])})
                 for line in meta["vibrations"]
             ),
-            noise_factor=self.arrays["PLANT_D"][:, -hardware.n_measurements :],
+            noise_factor=self.arrays["NOISE"],
+            motions=tuple(
+                {name: Motion(**motion) for name, motion in moved.items()}
+                for moved in meta["motions"]
+            ),
         )
-        memory = self.arrays["PLANT_L"][:, parts.size :]
         plant = assemble(parts)
+        memory = self.arrays["PLANT_L"][:, plant.n_states :]
         return plant.with_memory(memory) if memory.size else plant
 
 
@@ -179,12 +202,29 @@ def _unpack_witness(name: str, record: DesignRecord) -> Witness | None:
     return Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
 
 
+def _pack_fallbacks(name: str, fallbacks: tuple[Fallback, ...]) -> DesignRecord:
+    arrays = {name.upper(): np.stack([f.gains for f in fallbacks])} if fallbacks else {}
+    return DesignRecord(arrays, {name: [list(fallback.missing) for fallback in fallbacks]})
+
+
+def _unpack_fallbacks(name: str, record: DesignRecord) -> tuple[Fallback, ...]:
+    missing = record.meta[name]
+    gains = record.arrays[name.upper()] if missing else ()
+    if len(gains) != len(missing):
+        raise ValueError(f"{name.upper()} must be {len(missing)} filters; got {len(gains)}")
+    return tuple(
+        Fallback(missing=tuple(sensors), gains=frozen_copy(gain))
+        for sensors, gain in zip(missing, gains, strict=True)
+    )
+
+
 _CODECS = {  # by the type of the field
     "FloatArray": _Codec(_pack_array, lambda name, record: record.arrays[name.upper()]),
     "Vector": _Codec(
         _pack_array, lambda name, record: frozen_copy(np.ravel(record.arrays.get(name.upper(), [])))
     ),
     "Witness | None": _Codec(_pack_witness, _unpack_witness),
+    "tuple[Fallback, ...]": _Codec(_pack_fallbacks, _unpack_fallbacks),
     "tuple[Controller, ...]": _Codec(_pack_parameters, _unpack_parameters),
     "tuple[Specification, ...]": _Codec(_pack_specifications, _unpack_specifications),
     "tuple[float, ...]": _Codec(
@@ -245,6 +285,7 @@ def record_hardware(hardware: LoopHardware) -> DesignRecord:
             "phase": "nm rms wavefront",
         },
     }
+    meta["sensors"] = [_pack_sensor(sensor) for sensor in hardware.suite.sensors]
     if hardware.mirror is not None:
         meta["mirror"] = asdict(hardware.mirror)
     return DesignRecord({"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}, meta)
@@ -266,7 +307,30 @@ def record_problem(problem: EstimationProblem | LoopHardware) -> DesignRecord:
         meta["vibrations"] = [
             {**asdict(line), "direction": list(line.direction)} for line in problem.vibrations
         ]
+        meta["motions"] = [
+            {name: asdict(motion) for name, motion in moved.items()} for moved in problem.motions
+        ]
+        arrays["NOISE"] = problem.own_noise_factor
     return DesignRecord(arrays, meta)
+
+
+def _pack_sensor(sensor: Sensor) -> Meta:
+    packed: Meta = {"kind": next(name for name, kind in _SENSORS.items() if type(sensor) is kind)}
+    for name, value in asdict(sensor).items():
+        if value is not None:
+            packed[name] = list(value) if name == "channels" else np.asarray(value).tolist()
+    return packed
+
+
+def _unpack_sensor(packed: Meta) -> Sensor:
+    values = dict(packed)
+    kind = _SENSORS[values.pop("kind")]
+    for name in _SENSOR_ARRAYS:
+        if isinstance(values.get(name), list):
+            values[name] = float_array(values[name], name)
+    if "channels" in values:
+        values["channels"] = tuple(values["channels"])
+    return kind(**values)
 
 
 def certificate_record(certificate: Certificate) -> list[Meta]:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from lbt_synth.design.certificate import Certificate, certify_loop
+from lbt_synth.design.certificate import Certificate, stability_check
 from lbt_synth.design.claims import Claim, Evidence
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.state_space import sigma_sparkline
-from lbt_synth.loop import close_loop, loop_margins, model_budget
-from lbt_synth.loop.closed_loop import REJECTION
+from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, model_budget
+from lbt_synth.loop.closed_loop import REJECTION, reads_others
 from lbt_synth.loop.least_residuals.residual_limit import (
     above_percent,
     least_model_residual,
@@ -30,7 +30,6 @@ from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
     from lbt_synth.design.shaping import VibrationBand
-    from lbt_synth.loop.fusion.fused_loop import AnyLoop
 
 LIMIT_HEADING = "least residual of any linear controller in it"  # below the residual
 _WHAT = (
@@ -165,11 +164,6 @@ class Design(Summarised, ABC):
         return True
 
     @property
-    def several_sensors(self) -> bool:
-        """Whether the design reads other sensors beside the loop's own, by a periodic filter."""
-        return False
-
-    @property
     def expected_residual_nm(self) -> float | None:
         """Residual that the design expects, rms of all modes; None if it was made for none."""
         return None if self.hardware is None or np.isnan(self.rms) else self.rms
@@ -215,17 +209,26 @@ class Design(Summarised, ABC):
         columns = (*_WHAT, *self.CLAIMS, *self.DERIVED)
         return Facts(columns, {**what, **self.claims, **self.derived()})
 
-    def close(self, hardware: LoopHardware, *, sensor_gain: float = 1.0) -> AnyLoop:
-        """Close a loop around the design, which is stable or not.
+    def close(self, hardware: LoopHardware, *, sensor_gain: float = 1.0) -> ClosedLoop:
+        """Close a loop around the design, which is stable or not; with the sensors that it reads.
 
         Parameters
         ----------
         hardware : LoopHardware
             Sensor, mirror and delay.
         sensor_gain : float, optional
-            Real sensor gain relative to the sensor matrix.
+            Real gain of the loop's own sensor relative to its matrix.
         """
+        if self.hardware is not None and self.other_sensors:
+            hardware = replace(hardware, suite=self.hardware.suite)
         return close_loop(hardware, self, sensor_gain=sensor_gain)
+
+    @property
+    def other_sensors(self) -> tuple[str, ...]:
+        """Sensors and channels that the design reads beside the loop's own sensor."""
+        if self.hardware is None or not reads_others(self.hardware, self.controller):
+            return ()
+        return self.hardware.suite.units[1:]
 
     def _brief(self) -> str:
         loop = "" if self.hardware is None else f", {self.hardware._brief()}"
@@ -240,11 +243,11 @@ class Design(Summarised, ABC):
             said = Facts((*self.CLAIMS, *self.DERIVED), facts.values)
             return Summary(tables=[without_units(fact_table("Design", said, passed))], notes=notes)
         loop = close_loop(self.hardware, self)
-        margins = [loop_margins(loop)] if loop.is_stable else []
+        margins = [loop_margins(loop)] if loop.is_stable and not self.other_sensors else []
         return Summary(
             tables=[fact_table("Design", facts, *margins, passed, only=_BRIEFLY)],
             notes=notes,
-            curve=sigma_sparkline(loop.rejection(), REJECTION),
+            curve=sigma_sparkline(loop.rejection().lifted(), REJECTION),
         )
 
     @property
@@ -275,7 +278,8 @@ class Design(Summarised, ABC):
     def _conclude(self, evidence: Evidence) -> Certificate:
         checks = list(evidence.certificate.checks)
         if self.hardware is not None:
-            checks.append(certify_loop(self.hardware, self.controller))
+            loop = self.close(self.hardware)
+            checks.append(stability_check("spectral radius of the closed loop", loop))
         if checks and checks[0].passed and checks[-1].passed:
             for claim in self.CLAIMS:
                 if claim.name in self.claims:

@@ -26,20 +26,13 @@ _NOISE_FREE = 1e-9  # singular value of readings whose noise is of size one that
 
 
 def require_problem(problem: object) -> None:
-    """Refuse anything but an estimation problem of one phase, in which all is read."""
+    """Refuse anything but an estimation problem."""
     if not isinstance(problem, EstimationProblem):
         hint = suggest_part(problem, EstimationProblem)
         hint = hint or " Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
         raise ProblemError(
             f"expected an EstimationProblem, such as a plant; got {type(problem).__name__}.{hint}"
         )
-    if not problem.read.all():
-        raise ProblemError(
-            "every measurement must be read in every sample; got a problem with a period of "
-            f"{problem.period}. Try fused_kalman, fused_hinf or fused_mixed for the plant of "
-            "several sensors, or kalman_riccati."
-        )
-    problem._require_one_phase("this design", "kalman_riccati, or gamma_riccati")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -140,6 +133,11 @@ class EstimationProblem(LinearSystem):
         return int(self.C.shape[-2])
 
     @property
+    def reads_all(self) -> bool:
+        """Whether every measurement is read in every sample, by the same matrices."""
+        return self.period == 1 and bool(self.read.all())
+
+    @property
     def Q(self) -> FloatArray:
         """Covariance of the process noise, ``B B'`` (n, n) or (N, n, n)."""
         return frozen_copy(self.B @ transpose(self.B))
@@ -211,7 +209,7 @@ class EstimationProblem(LinearSystem):
         >>> p.with_unit_weights().B.tolist()
         [[1.0, 0.0]]
         """
-        self._require_one_phase("a scaling of disturbances", "phase(t).with_unit_weights()")
+        self.require_one_phase("a scaling of disturbances", "phase(t).with_unit_weights()")
         size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
         size = np.where(size > 0, size, 1.0)
         A, C, L, read = self.A, self.C, self.L, self.read
@@ -253,7 +251,7 @@ class EstimationProblem(LinearSystem):
         steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON, at_most=LONGEST_HORIZON)
         if steps == 1:
             return self
-        self._require_one_phase(f"an estimate {steps} samples ahead", "horizon=1")
+        self.require_one_phase(f"an estimate {steps} samples ahead", "horizon=1")
         if steps > 1:
             size = np.linalg.norm(self.B, 2) * np.linalg.norm(self.D, 2)
             if np.linalg.norm(self.S, 2) > 1e-12 * size:
@@ -295,7 +293,7 @@ class EstimationProblem(LinearSystem):
         >>> walk.with_memory([[0.3, 0.1]]).n_states
         3
         """
-        self._require_one_phase("a filter with a memory", "one without")
+        self.require_one_phase("a filter with a memory", "one without")
         weights = matrix(taps, "taps", rows=(len(self.L), f"to match L {self.L.shape}"))
         q, size = self.C.shape[0], weights.shape[1]
         if size == 0 or size % q:

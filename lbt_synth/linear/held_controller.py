@@ -18,10 +18,12 @@ class HasController(Protocol):
         ...
 
 
-def as_controller(given: Controller | HasController, *, others: str = "") -> Controller:
+def as_controller(
+    given: Controller | HasController, *, others: str = "", any_period: bool = False
+) -> Controller:
     """Return a controller, or that of a design; refuse anything else."""
     found = given if isinstance(given, Controller) else getattr(given, "controller", None)
-    if isinstance(found, Controller) and found.period > 1:
+    if isinstance(found, Controller) and found.period > 1 and not any_period:
         raise ProblemError(
             "this needs a controller of the loop's own sensor; got one of several sensors. "
             "simulate, limits, show, verify and export to C take it."

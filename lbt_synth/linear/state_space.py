@@ -109,7 +109,8 @@ class LinearSystem(Summarised):
             return self.A, self.B, self.C, self.D
         return self.A[None], self.B[None], self.C[None], self.D[None]
 
-    def _require_one_phase(self, what: str, instead: str) -> None:
+    def require_one_phase(self, what: str, instead: str) -> None:
+        """Refuse a longer period than a sample: say what needs one, and what to try."""
         if self.period > 1:
             raise ProblemError(
                 f"{what} needs a period of 1; got one of {self.period} samples. Try {instead}."
@@ -200,7 +201,7 @@ class StateSpace(LinearSystem):
         >>> lag.to_control().dt
         0.01
         """
-        self._require_one_phase("a system of python-control", "lifted().to_control()")
+        self.require_one_phase("a system of python-control", "lifted().to_control()")
         return control_system(self.A, self.B, self.C, self.D, self.dt_s)
 
     def balanced(self) -> StateSpace:
@@ -215,7 +216,7 @@ class StateSpace(LinearSystem):
         >>> float(lag.balanced().B[0, 0])
         1.0
         """
-        self._require_one_phase("balancing", "lifted().balanced()")
+        self.require_one_phase("balancing", "lifted().balanced()")
         n = self.n_states
         scale = max(float(np.abs(self.A).max()), 1e-300)
         entry, leaving = np.linalg.norm(self.B, axis=1), np.linalg.norm(self.C, axis=0)
@@ -345,7 +346,7 @@ class StateSpace(LinearSystem):
         >>> complex(delay.frequency_response([1.0])[0, 0, 0].round(12))
         -1j
         """
-        self._require_one_phase("a transfer matrix", "phase_response(...), or lifted()")
+        self.require_one_phase("a transfer matrix", "phase_response(...), or lifted()")
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         # a few points are solved one by one, which is more accurate next to a pole

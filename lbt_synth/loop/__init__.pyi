@@ -9,7 +9,6 @@ from .ensemble.evaluation import ensemble_residuals as ensemble_residuals
 from .ensemble.loop_ensemble import EnsembleVibration as EnsembleVibration
 from .ensemble.loop_ensemble import LoopEnsemble as LoopEnsemble
 from .least_residuals.band_limit import least_worst_residual as least_worst_residual
-from .least_residuals.residual_limit import least_fused_residual as least_fused_residual
 from .least_residuals.residual_limit import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins

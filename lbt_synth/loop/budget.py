@@ -17,20 +17,20 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.linear.quadrature import adaptive_integral, panel_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
-from lbt_synth.loop.fusion.fused_loop import AnyLoop, FusedLoop, fused_budget
 from lbt_synth.loop.residual import ResidualBudget, require_true_gain
+from lbt_synth.loop.sensor_budget import budget_of_sensors
 from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
-def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
+def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     """Exact stationary residual of a loop under a truth.
 
     Parameters
     ----------
-    loop : ClosedLoop or FusedLoop
+    loop : ClosedLoop
         The loop; its sensor gain must be the truth's.
     truth : Truth
         Disturbances.
@@ -61,12 +61,12 @@ def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
     >>> round(budget.noise_nm**2, 9)
     3.0
     """
-    if isinstance(loop, FusedLoop):
-        return fused_budget(loop, truth)
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     require_true_gain(loop.sensor_gain, truth)
-    n = loop.hardware.modes
+    n, noise_nm = loop.hardware.modes, truth.noise_per_measurement(loop.hardware.n_measurements)
+    if loop.reads_others:
+        return budget_of_sensors(loop, truth, np.diag(noise_nm))
     turbulence = np.zeros((n, n))
     for spectrum, modes in truth.turbulence_groups(n):
         if isinstance(spectrum, ARModel):
@@ -84,7 +84,6 @@ def residual_budget(loop: AnyLoop, truth: Truth) -> ResidualBudget:
         else:
             response = loop.sensitivity([vibration.frequency_hz])[0]
             lines.append(vibration.amplitude_nm * response @ direction)
-    noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
     return _make_budget(loop, turbulence, np.diag(noise_nm), random_vibration, lines)
 
 
@@ -142,15 +141,19 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
 def plant_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
     """Return what a plant's disturbances and noise leave in any loop, at its own sensor gain."""
     loop.require_stable()
-    one = loop.hardware
-    n, q = one.modes, one.n_measurements
+    one, n, noise_factor = loop.hardware, loop.hardware.modes, plant.own_noise_factor
+    if loop.reads_others:
+        model = Truth(
+            turbulence=plant.turbulence, vibrations=plant.vibrations, motions=plant.motions
+        )
+        return budget_of_sensors(loop, model, noise_factor)
     turbulence, vibration = np.zeros((2, n, n))
-    for model, direction in zip(plant.turbulence, np.eye(n), strict=True):
-        turbulence += ar_covariance(loop, model, direction[None])
+    for process, direction in zip(plant.turbulence, np.eye(n), strict=True):
+        turbulence += ar_covariance(loop, process, direction[None])
     for line in plant.vibrations:
         direction = checked_direction(line, one)
         vibration += ar_covariance(loop, line.ar_model(one.frame_rate_hz), direction[None])
-    return _make_budget(loop, turbulence, plant.D[:, -q:], vibration, [])
+    return _make_budget(loop, turbulence, noise_factor, vibration, [])
 
 
 def _make_budget(

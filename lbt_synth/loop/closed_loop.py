@@ -15,6 +15,8 @@ from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
+from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
+from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance
@@ -37,7 +39,8 @@ class ClosedLoopFacts:
 class ClosedLoop(Summarised):
     """Closed loop from ``[phi_tot (n), noise (q)]`` to ``[phi_res (n), u (m), y (q)]``.
 
-    Made by :func:`close_loop`.
+    Made by :func:`close_loop`. The measurements are those that the controller reads: of the loop's
+    own sensor, or of all.
 
     Attributes
     ----------
@@ -48,13 +51,16 @@ class ClosedLoop(Summarised):
     controller : Controller
         The controller.
     sensor_gain : float
-        Real sensor gain relative to the sensor matrix.
+        Real gain of the loop's own sensor relative to its matrix.
+    blind : tuple of str
+        Sensors and channels whose readings are zero, or frozen.
     """
 
     system: StateSpace
     hardware: LoopHardware
     controller: Controller
     sensor_gain: float
+    blind: tuple[str, ...] = ()
 
     def _brief(self) -> str:
         return f"{self.hardware._brief()}, sensor gain {self.sensor_gain:.4g}"
@@ -63,23 +69,28 @@ class ClosedLoop(Summarised):
         facts = self.hardware.facts(), fill_row(ClosedLoopFacts, self)
         return Summary(
             tables=[fact_table("Loop", *facts)],
-            curve=sigma_sparkline(self.rejection(), REJECTION),
+            curve=sigma_sparkline(self.rejection().lifted(), REJECTION),
         )
 
     @property
+    def reads_others(self) -> bool:
+        """Whether the controller reads other sensors beside the loop's own."""
+        return reads_others(self.hardware, self.controller)
+
+    @property
     def spectral_radius(self) -> float:
-        """Largest modulus of the closed loop's poles."""
+        """Largest modulus of the closed loop's poles: of a period."""
         return self.system.spectral_radius
 
     @property
     def radius_per_frame(self) -> float:
-        """The same: what the slowest mode keeps from one frame to the next."""
-        return self.spectral_radius
+        """What the slowest mode keeps from one frame to the next."""
+        return self.system.radius_per_frame
 
     @property
     def is_stable(self) -> bool:
-        """Whether every pole lies inside the unit circle, by more than 1e-9."""
-        return self.spectral_radius < 1 - STABILITY_MARGIN
+        """Whether every pole lies inside the unit circle, by more than 1e-9 per frame."""
+        return self.radius_per_frame < 1 - STABILITY_MARGIN
 
     def require_stable(self) -> None:
         """Raise if the loop is unstable or marginally stable.
@@ -90,7 +101,7 @@ class ClosedLoop(Summarised):
             With the spectral radius.
         """
         if not self.is_stable:
-            radius = self.spectral_radius
+            radius = self.radius_per_frame
             word = "a marginally stable" if radius < 1 + STABILITY_MARGIN else "an unstable"
             raise UnstableLoopError(
                 f"the closed loop must be stable; got {word} one (spectral radius "
@@ -131,13 +142,21 @@ class ClosedLoop(Summarised):
 
     def _subsystem(self, outputs: slice, inputs: slice) -> StateSpace:
         s = self.system
-        return replace(s, B=s.B[:, inputs], C=s.C[outputs], D=s.D[outputs, inputs])
+        B, C, D = s.B[..., inputs], s.C[..., outputs, :], s.D[..., outputs, inputs]
+        return replace(s, B=B, C=C, D=D)
 
 
 def close_loop(
-    hardware: LoopHardware, controller: Controller | HasController, *, sensor_gain: float = 1.0
+    hardware: LoopHardware,
+    controller: Controller | HasController,
+    *,
+    sensor_gain: float = 1.0,
+    blind: tuple[str, ...] = (),
 ) -> ClosedLoop:
     """Close the loop of :class:`LoopHardware` around a controller.
+
+    A controller of the measurements of all sensors closes the loop of all, with their common
+    period; one of the loop's own sensor leaves the others unread.
 
     Parameters
     ----------
@@ -146,7 +165,9 @@ def close_loop(
     controller : Controller or Design
         From y(k) to u(k), or a design that holds it.
     sensor_gain : float, optional
-        Real sensor gain relative to the sensor matrix.
+        Real gain of the loop's own sensor relative to its matrix.
+    blind : tuple of str, optional
+        Sensors and channels whose readings do not follow the phase: they are zero, or frozen.
 
     Returns
     -------
@@ -168,18 +189,84 @@ def close_loop(
     """
     require_instance(hardware, LoopHardware, "hardware")
     gain = number(sensor_gain, "sensor_gain", above=0)
-    own = as_controller(controller)
-    A0, A1, B, C0, C1, D = checked_loop_matrices(hardware, own)
-    system = StateSpace(A=A0 + gain * A1, B=B, C=C0 + gain * C1, D=D, dt_s=hardware.dt_s)
-    return ClosedLoop(system=system, hardware=hardware, controller=own, sensor_gain=gain)
+    several = bool(hardware.suite.sensors)
+    plain = as_controller(controller, any_period=several)
+    if reads_others(hardware, plain):
+        system = _system_of_sensors(hardware, plain, gain, tuple(blind))
+    else:
+        A0, A1, B, C0, C1, D = checked_loop_matrices(hardware, plain)
+        system = StateSpace(A=A0 + gain * A1, B=B, C=C0 + gain * C1, D=D, dt_s=hardware.dt_s)
+    return ClosedLoop(
+        system=system, hardware=hardware, controller=plain, sensor_gain=gain, blind=tuple(blind)
+    )
+
+
+def reads_others(hardware: LoopHardware, controller: Controller) -> bool:
+    """Return whether a controller reads other sensors beside the loop's own."""
+    return bool(hardware.suite.sensors) and controller.D.shape[-1] != hardware.n_measurements
+
+
+def _system_of_sensors(
+    hardware: LoopHardware, controller: Controller, gain: float, blind: tuple[str, ...]
+) -> StateSpace:
+    """Close the loop of all sensors; the gain is that of the loop's own."""
+    suite, period, q = hardware.suite, hardware.period, hardware.n_readings
+    n, m, rows = hardware.modes, hardware.n_commands, suite.rows(hardware)
+    shape = (controller.period, *controller.D.shape[-2:])
+    if shape != (period, m, q) or not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
+        raise ProblemError(
+            f"the controller must map {q} measurements to {m} commands in a period of {period} "
+            f"frames at {hardware.frame_rate_hz:.6g} Hz; got {shape[2]} to {shape[1]} in "
+            f"{shape[0]} at {1 / controller.dt_s:.6g} Hz."
+        )
+    exposures = [own_exposure(hardware), *other_exposures(hardware)]
+    held, k = memory(exposures, n, period), controller.to_statespace()
+    mirror = hardware.mirror_system.whole
+    A_m, B_m, C_m = mirror.repeated(m)
+    position, direct = hardware.influence @ C_m, mirror.D * hardware.influence
+    nk, nv, nh = k.n_states, len(A_m), held.n_states
+    x, v, h = slice(nk), slice(nk, nk + nv), slice(nk + nv, nk + nv + nh)
+    size = nk + nv + nh
+    # y = measured s + e, u = command s + k.D e, phi_res = phi_tot + residual s - direct k.D e
+    measured, command = np.zeros((period, q, size)), np.zeros((period, m, size))
+    measured[:, : held.C.shape[1], h] = held.C
+    measured[:, rows[OWN_SENSOR]] *= gain
+    measured[:, suite.marked(blind, hardware)] = 0.0
+    command[:, :, x] = k.C
+    command += k.D @ measured
+    residual = -direct @ command
+    residual[:, :, v] -= position
+    entry = np.zeros((period, n, n + q))
+    entry[:, :, :n], entry[:, :, n:] = np.eye(n), -direct @ k.D
+    A, B = np.zeros((period, size, size)), np.zeros((period, size, n + q))
+    A[:, x] = k.B @ measured
+    A[:, x, x] += k.A
+    B[:, x, n:] = k.B
+    A[:, v] = B_m @ command
+    A[:, v, v] += A_m
+    B[:, v, n:] = B_m @ k.D
+    A[:, h] = held.B @ residual
+    A[:, h, h] += held.A
+    B[:, h] = held.B @ entry
+    D = np.zeros((period, n + m + q, n + q))
+    D[:, :n], D[:, n : n + m, n:], D[:, n + m :, n:] = entry, k.D, np.eye(q)
+    C = np.concatenate([residual, command, measured], axis=1)
+    return StateSpace(A=A, B=B, C=C, D=D, dt_s=hardware.dt_s)
 
 
 def radii_by_gain(
     hardware: LoopHardware, controller: Controller | HasController
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
-    A0, A1, *_ = checked_loop_matrices(hardware, as_controller(controller))
-    return affine_radii(A0[None], A1[None])
+    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,).
+
+    Each phase of a loop is affine in the gain of the own sensor: two loops give all.
+    """
+    plain = as_controller(controller, any_period=bool(hardware.suite.sensors))
+    if not reads_others(hardware, plain):
+        A0, A1, *_ = checked_loop_matrices(hardware, plain)
+        return affine_radii(A0[None], A1[None])
+    one, two = (_system_of_sensors(hardware, plain, g, ()).stacks()[0] for g in (1.0, 2.0))
+    return affine_radii(2 * one - two, two - one)
 
 
 def affine_radii(A0: FloatArray, A1: FloatArray) -> Callable[[FloatArray], FloatArray]:

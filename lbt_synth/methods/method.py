@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 if TYPE_CHECKING:
     from lbt_synth.design.result import Design
     from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
-    from lbt_synth.models.fusion.plant import FusedPlant
+    from lbt_synth.models.plant.readings import FusedPlant
 
 
 class Section(BaseModel):

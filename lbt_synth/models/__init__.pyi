@@ -1,9 +1,5 @@
 from .ar_model import ARModel as ARModel
 from .fusion.plant import fused_plant as fused_plant
-from .fusion.sensors import Accelerometer as Accelerometer
-from .fusion.sensors import Motion as Motion
-from .fusion.sensors import SensorSuite as SensorSuite
-from .fusion.sensors import WavefrontSensor as WavefrontSensor
 from .loop_hardware import LoopHardware as LoopHardware
 from .mirror.position_loop import PositionLoop as PositionLoop
 from .plant.frequency_prior import spread_plant as spread_plant
@@ -14,6 +10,10 @@ from .sensor import illuminated_subapertures as illuminated_subapertures
 from .sensor import nm_per_mas as nm_per_mas
 from .sensor import pyramid_modal_noise_nm as pyramid_modal_noise_nm
 from .sensor import pyramid_tilt_noise_nm as pyramid_tilt_noise_nm
+from .sensor_suite import Accelerometer as Accelerometer
+from .sensor_suite import Motion as Motion
+from .sensor_suite import SensorSuite as SensorSuite
+from .sensor_suite import WavefrontSensor as WavefrontSensor
 from .spectra import Spectrum as Spectrum
 from .spectra import SumSpectrum as SumSpectrum
 from .spectra import TabulatedSpectrum as TabulatedSpectrum

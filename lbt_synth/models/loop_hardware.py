@@ -10,6 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_system
 from lbt_synth.models.mirror.position_loop import PositionLoop
+from lbt_synth.models.sensor_suite import OWN_SENSOR_ALONE, SensorSuite
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.words import count_text
@@ -60,6 +61,8 @@ class LoopHardware(Summarised):
     mirror : PositionLoop, optional
         Dynamics of the mirror, the same for all commands; a mirror that settles at once by
         default.
+    suite : SensorSuite, optional
+        Sensors beside the loop's own; none by default.
 
     Raises
     ------
@@ -92,6 +95,7 @@ class LoopHardware(Summarised):
     influence_matrix: FloatArray | None = None
     modes: int = 2
     mirror: PositionLoop | None = None
+    suite: SensorSuite = OWN_SENSOR_ALONE
 
     def __post_init__(self) -> None:
         sensor, influence = self.sensor_matrix, self.influence_matrix
@@ -138,8 +142,22 @@ class LoopHardware(Summarised):
 
     @property
     def n_measurements(self) -> int:
-        """Number of measurements q."""
+        """Number of measurements q of the loop's own sensor."""
         return int(self.sensor.shape[0])
+
+    @property
+    def n_readings(self) -> int:
+        """Number of measurements of all sensors."""
+        return max(rows.stop for rows in self.suite.rows(self).values())
+
+    @property
+    def period(self) -> int:
+        """Common period of all sensors [frames]."""
+        return self.suite.period(self)
+
+    def own_sensor_alone(self) -> LoopHardware:
+        """Return the loop without its other sensors."""
+        return replace(self, suite=OWN_SENSOR_ALONE) if self.suite.sensors else self
 
     def facts(self) -> LoopFacts:
         """Return what tables say of the loop."""
@@ -172,7 +190,9 @@ class LoopHardware(Summarised):
 
     def single_mode(self) -> LoopHardware:
         """Return the hardware of one mode: the same delay and mirror, unit sensor and influence."""
-        return replace(self, sensor_matrix=None, influence_matrix=None, modes=1)
+        return replace(
+            self, sensor_matrix=None, influence_matrix=None, modes=1, suite=OWN_SENSOR_ALONE
+        )
 
 
 def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.disturbance_facts import disturbance_facts
-from lbt_synth.models.fusion.sensors import Motions
+from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration import DriftingVibration, TrueVibration, stationary_vibrations
 from lbt_synth.storage.rows import fact_table

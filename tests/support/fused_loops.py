@@ -5,8 +5,8 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.models.fusion.plant import fused_plant
-from lbt_synth.models.fusion.sensors import Accelerometer, Motion, SensorSuite, WavefrontSensor
+from lbt_synth.models.plant.readings import fused_plant
+from lbt_synth.models.sensor_suite import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 RATE_HZ = 1000.0
 AIR = lbt.models.ARModel(coefficients=[0.95], driving_rms_nm=60, frame_rate_hz=RATE_HZ)

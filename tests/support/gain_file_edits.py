@@ -20,8 +20,8 @@ import lbt_synth as lbt
 from lbt_synth.cli.main import main
 from lbt_synth.design.fusion.fused_filter import fused_hinf, fused_kalman
 from lbt_synth.files.gain_file.store import _READERS
-from lbt_synth.models.fusion.plant import fused_plant
-from lbt_synth.models.fusion.sensors import Accelerometer, Motion, SensorSuite, WavefrontSensor
+from lbt_synth.models.plant.readings import fused_plant
+from lbt_synth.models.sensor_suite import Accelerometer, Motion, SensorSuite, WavefrontSensor
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes
 
 ENDINGS = ("fits", "npz")

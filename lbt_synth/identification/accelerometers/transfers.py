@@ -23,7 +23,7 @@ from lbt_synth.identification.accelerometers.readings import as_columns, fill_mi
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.records.faults import find_saturated
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.models.fusion.sensors import LONGEST_DELAY
+from lbt_synth.models.sensor_suite import LONGEST_DELAY
 from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import Table
 from lbt_synth.validation import FloatArray, number

@@ -21,7 +21,7 @@ from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.loop.simulation.run import SteppedController, step_controller
 from lbt_synth.models import Truth
-from lbt_synth.models.fusion.sensors import Motions
+from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.vibration import TrueVibration
 from lbt_synth.validation import (
     FloatArray,

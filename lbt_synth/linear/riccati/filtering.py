@@ -299,6 +299,15 @@ def gamma_riccati(
     return equation.solution(gamma, equation.trial(gamma))
 
 
+def meets_level(problem: EstimationProblem, gamma: float, start: FilterRiccati) -> bool:
+    """Return whether a filter meets a level of gamma; ``start`` is the Kalman filter's solution."""
+    if problem.period > 1:
+        return gamma_riccati(problem, gamma, start=start) is not None
+    rows = problem.read[0]
+    equation = GammaEquation(problem.phase(0), _gather_gains(start, rows))
+    return equation.trial(gamma).P is not None
+
+
 def least_gamma(
     problem: EstimationProblem, *, lower: float, upper: float, start: FilterRiccati | None = None
 ) -> tuple[float, float, FilterRiccati]:

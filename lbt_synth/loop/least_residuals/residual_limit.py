@@ -21,8 +21,7 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.fusion.plant import suite_exposures
-from lbt_synth.models.fusion.sensors import SensorSuite
+from lbt_synth.models.plant.readings import other_exposures
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
@@ -63,6 +62,11 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     small as one likes) and are left out; see :func:`least_worst_residual` for one whose
     frequency is not known. Random vibrations count with their spectra.
 
+    With other sensors beside the loop's own it is the least residual of a loop that knows more:
+    each wavefront sensor reads each frame of its exposures at once, with as much noise as gives the
+    mean its own; accelerometers know all vibrations in advance. A sensor that reads each frame at
+    the loop's own delay loses nothing by that, a slow or late one a little.
+
     Parameters
     ----------
     hardware : LoopHardware
@@ -79,7 +83,7 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     ------
     ProblemError
         If a mode is not seen or not reached, the modes do not decouple, or a disturbance does
-        not fit the loop.
+        not fit the loop; also where an exposure of another sensor ends within a frame.
     NumericalError
         If an integral over a spectrum does not settle.
 
@@ -94,57 +98,20 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     >>> round(float(limit.variance_nm2[0]), 8)  # 2^2 (1 + 0.5^2)
     5.0
     """
+    require_instance(hardware, LoopHardware)
+    if hardware.suite.sensors:
+        return _limit_of_sensors(hardware, truth)
     return _residual_limit(*truth_modes(hardware, truth))
 
 
-def least_fused_residual(hardware: LoopHardware, truth: Truth, suite: SensorSuite) -> ResidualLimit:
-    """Residual below which no linear controller of several sensors comes.
-
-    It is the least residual of a loop that knows more: each wavefront sensor reads each frame of
-    its exposures at once, with as much noise as gives the mean its own; accelerometers know all
-    vibrations in advance. A sensor that reads each frame at the loop's own delay loses nothing by
-    that, a slow or late one a little.
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        Mirror, delay and own sensor.
-    truth : Truth
-        Disturbances, noise and gain of the own sensor.
-    suite : SensorSuite
-        The other sensors.
-
-    Returns
-    -------
-    ResidualLimit
-        A bound along each direction.
-
-    Raises
-    ------
-    ProblemError
-        As :func:`least_residual`; also where an exposure ends within a frame of the loop.
-    NumericalError
-        If an integral over a spectrum does not settle.
-
-    Examples
-    --------
-    Two equal sensors are one of half the variance:
-
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=9.0, frame_rate_hz=800)
-    >>> twin = lbt.models.WavefrontSensor(name="twin", rate_hz=800, delay_frames=2, noise_nm=10)
-    >>> suite = lbt.models.SensorSuite(sensors=(twin,))
-    >>> both = lbt.loop.least_fused_residual(path, lbt.Truth(turbulence=slow, noise_nm=10), suite)
-    >>> one = lbt.loop.least_residual(path, lbt.Truth(turbulence=slow, noise_nm=10 / 2**0.5))
-    >>> abs(both.rms_nm - one.rms_nm) < 1e-9
-    True
-    """
+def _limit_of_sensors(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
+    """Return the limit of the loop that knows more than that of several sensors."""
+    suite = hardware.suite
     if suite.accelerometers:
         truth = replace(truth, vibrations=(), motions=(), frequency_errors_hz=None)
     noise = truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain
     sensor, blocks = [hardware.sensor], [np.diag(noise**2)]
-    for other, seen in zip(suite.wavefront, suite_exposures(suite, hardware), strict=True):
+    for other, seen in zip(suite.wavefront, other_exposures(hardware), strict=True):
         if seen.age_frames % 1:
             raise ProblemError(
                 f"no limit is known where an exposure of sensor {other.name} ends within a frame "
@@ -155,7 +122,7 @@ def least_fused_residual(hardware: LoopHardware, truth: Truth, suite: SensorSuit
         blocks.append(seen.period * factor @ factor.T)
     if not noise.any():  # nothing adds to a sensor without noise
         sensor, blocks = sensor[:1], blocks[:1]
-    every = replace(hardware, sensor_matrix=np.vstack(sensor))
+    every = replace(hardware.own_sensor_alone(), sensor_matrix=np.vstack(sensor))
     return _residual_limit(*truth_modes(every, truth, noise_nm2=block_diag(*blocks)))
 
 

@@ -11,7 +11,7 @@ from scipy.fft import irfft, next_fast_len
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, DriftingVibration, LoopHardware, Spectrum, Truth, Vibration
-from lbt_synth.models.fusion.seen_vibration import SeenVibration, seen_vibration
+from lbt_synth.models.plant.seen_vibration import SeenVibration, seen_vibration
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray

@@ -45,7 +45,7 @@ class FullStatePlant(EstimationProblem):
         to_command = self.hardware.projector @ self.L
         applied = self.B_known - gain @ self.D_known
         A = self.A - gain @ self.C + applied @ to_command
-        D = np.zeros((to_command.shape[0], gain.shape[1]))
+        D = np.zeros((to_command.shape[0], gain.shape[-1]))
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
@@ -54,8 +54,8 @@ class FullStatePlant(EstimationProblem):
         The predictor gain is over the full state, (n, q).
         """
         gain = self._checked_gain(gain_predictor)
-        B = np.hstack([gain, self.B_known - gain @ self.D_known])
-        D = np.zeros((self.L.shape[0], B.shape[1]))
+        B = np.concatenate([gain, self.B_known - gain @ self.D_known], axis=-1)
+        D = np.zeros((self.L.shape[0], B.shape[-1]))
         return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
 
     def ahead(self, frames: int) -> EstimationProblem:
@@ -87,6 +87,7 @@ class FullStatePlant(EstimationProblem):
         The first (n + l + q, n + p + l) maps ``[x(k), w(k), z_hat(k)]`` to
         ``[x(k+1), z_hat(k) - z(k), y(k)]``; the second holds the columns of the known input u(k-1).
         """
+        self.require_one_phase("the generalised plant", "that of a phase")
         n, p = self.B.shape
         outputs, q = self.L.shape[0], self.C.shape[0]
         plant = np.block(

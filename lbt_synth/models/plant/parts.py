@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.models.sensor_suite import Motions, checked_motions
 from lbt_synth.models.vibration import Vibration, checked_direction
-from lbt_synth.validation import FloatArray, definite, frozen_copy, one_or_each
+from lbt_synth.validation import FloatArray, set_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -21,7 +21,8 @@ class PlantParts:
     hardware: LoopHardware  # with the sensor gain that the design assumes in its sensor matrix
     turbulence: tuple[ARModel, ...]  # one per mode
     vibrations: tuple[Vibration, ...]
-    noise_factor: FloatArray  # (q, q): square root of the noise covariance
+    noise_factor: FloatArray  # (q, q): square root of the noise covariance of the loop's own sensor
+    motions: Motions = ()  # of the channels that each vibration moves; of none by default
 
     def __post_init__(self) -> None:
         n, rate = self.hardware.modes, self.hardware.frame_rate_hz
@@ -38,6 +39,9 @@ class PlantParts:
                 )
         for line in self.vibrations:
             checked_direction(line, self.hardware)
+        lines = len(self.vibrations)
+        motions = self.motions or ({},) * lines
+        set_fields(self, motions=checked_motions(motions, self.hardware.suite, lines))
 
     @property
     def order(self) -> int:
@@ -46,7 +50,7 @@ class PlantParts:
 
     @property
     def size(self) -> int:
-        """Number of states of the plant."""
+        """Number of states of the plant of the loop's own sensor."""
         blocks = self.order + held_frames(self.hardware)
         return 2 * len(self.vibrations) + blocks * self.hardware.modes
 
@@ -54,12 +58,3 @@ class PlantParts:
 def held_frames(hardware: LoopHardware) -> int:
     """Return how many frames of the total phase the state of a plant holds."""
     return max(int(np.ceil(hardware.delay_frames)), 2) - 1
-
-
-def noise_factor(noise_nm: Any, q: int) -> FloatArray:
-    """Return the square root (q, q) of the noise covariance, from deviations or the covariance."""
-    if np.ndim(noise_nm) < 2:
-        deviations = one_or_each(noise_nm, "noise_nm", q, above=0)
-        return frozen_copy(np.diag(np.broadcast_to(deviations, q)))
-    covariance = definite(noise_nm, "noise_nm", size=(q, "to match the measurements"))
-    return frozen_copy(np.linalg.cholesky(covariance))

@@ -24,17 +24,26 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
 from lbt_synth.linear.state_space import sigma_sparkline
-from lbt_synth.models.ar_model import ARModel, padded_coefficients
+from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
+from lbt_synth.models.plant.assembly import plant_matrices
 from lbt_synth.models.plant.full_state import FullStatePlant
-from lbt_synth.models.plant.parts import PlantParts, held_frames, noise_factor
+from lbt_synth.models.plant.parts import PlantParts
+from lbt_synth.models.plant.readings import known_states
+from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, frozen_copy, integer, one_or_each
+from lbt_synth.validation import (
+    FloatArray,
+    frozen_copy,
+    integer,
+    one_or_each,
+    require_instance,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,7 +51,8 @@ class TipTiltPlant(EstimationProblem):
     """Turbulence, vibrations, delay and noise as an estimation problem (reduced form).
 
     Made by :func:`tip_tilt_plant`. The measurement of this problem is
-    ``ybar(k) = y(k) + sensor_matrix N u(k-d)``, without the known input.
+    ``ybar(k) = y(k) + sensor_matrix N u(k-d)``, without the known input; that of each sensor, where
+    the loop has several. Its period is that of all sensors.
 
     Parameters
     ----------
@@ -52,23 +62,31 @@ class TipTiltPlant(EstimationProblem):
         One model per mode.
     vibrations : tuple of Vibration
         The vibrations, possibly none.
+    motions : tuple of mapping
+        For each vibration, the :class:`Motion` of each channel that it moves.
+    memory : int
+        Number of states that hold past innovations, of a mixed filter.
     """
 
     hardware: LoopHardware
     turbulence: tuple[ARModel, ...]
     vibrations: tuple[Vibration, ...]
+    motions: Motions = ()
+    memory: int = 0
 
     def _brief(self) -> str:
-        lines = count_text(len(self.vibrations), "vibration")
-        return f"{self.hardware._brief()}, {count_text(self.n_states, 'state')}, {lines}"
+        counts = [(self.n_states, "state"), (len(self.vibrations), "vibration")]
+        if self.hardware.suite.sensors:
+            counts.append((len(self.hardware.suite.units), "sensor"))
+        return ", ".join([self.hardware._brief(), *(count_text(*count) for count in counts)])
 
     def _summarise(self) -> Summary:
-        deviations = np.sqrt(np.diag(self.R))
+        deviations = np.linalg.norm(self.own_noise_factor, axis=1)
         facts = disturbance_facts(self.turbulence, self.vibrations, deviations)
         system, caption = self._shown_system()
         return Summary(
             tables=[fact_table("Plant", self.hardware.facts(), facts)],
-            curve=sigma_sparkline(system, caption),
+            curve=sigma_sparkline(system.lifted(), caption),
         )
 
     def full(self) -> FullStatePlant:
@@ -85,26 +103,22 @@ class TipTiltPlant(EstimationProblem):
         >>> plant.full().A.shape  # 2 p + 2 n + m = 2 + 4 + 2, the paper's case
         (8, 8)
         """
-        hw = self.hardware
-        mirror = hw.mirror_system.whole
-        A_mirror, B_mirror, C_mirror = mirror.repeated(hw.n_commands)
-        n, past = self.A.shape[0], mirror.n_states * hw.n_commands
-        A = np.zeros((n + past, n + past))
-        A[:n, :n], A[n:, n:] = self.A, A_mirror
-        B_known = np.zeros((n + past, hw.n_commands))  # u(k-1) is the input
-        B_known[n:] = B_mirror
-        response = -hw.sensor @ hw.influence
-        C = np.hstack([self.C, response @ C_mirror])
-        pad = np.zeros((past, self.B.shape[1]))
+        A_known, B_known, C_known, D_known = known_states(self.hardware)
+        (A, B, C, _), n, past = self.stacks(), self.n_states, A_known.shape[-1]
+        whole = np.zeros((self.period, n + past, n + past))
+        whole[:, :n, :n], whole[:, n:, n:] = A, A_known
+        entry = np.concatenate([np.zeros((self.period, n, B_known.shape[-1])), B_known], axis=1)
+        single = self.period == 1
         return FullStatePlant(
-            A=A,
-            B=np.vstack([self.B, pad]),
-            C=C,
+            A=whole,
+            B=np.concatenate([B, np.zeros((self.period, past, B.shape[-1]))], axis=1),
+            C=np.concatenate([C, C_known], axis=2),
             D=self.D,
-            L=np.hstack([self.L, np.zeros((self.L.shape[0], past))]),
-            B_known=frozen_copy(B_known),
-            D_known=frozen_copy(mirror.D * response),
-            hardware=hw,
+            L=np.hstack([self.L, np.zeros((len(self.L), past))]),
+            read=self.read,
+            B_known=frozen_copy(entry[0] if single else entry),  # u(k-1) is the input
+            D_known=frozen_copy(D_known[0] if single else D_known),
+            hardware=self.hardware,
             dt_s=self.dt_s,
         )
 
@@ -160,24 +174,87 @@ class TipTiltPlant(EstimationProblem):
 
         A plant that holds the memory of a mixed filter raises a ProblemError.
         """
-        q = self.hardware.n_measurements
-        parts = PlantParts(
-            hardware=self.hardware,
-            turbulence=self.turbulence,
-            vibrations=self.vibrations,
-            noise_factor=self.D[:, -q:],
-        )
-        if self.n_states != parts.size:
+        if self.memory:
             raise ProblemError(
                 "this plant holds the memory of a mixed filter, and cannot be assembled again; "
                 "take the plant that the filter was designed for."
             )
-        return parts
+        return PlantParts(
+            hardware=self.hardware,
+            turbulence=self.turbulence,
+            vibrations=self.vibrations,
+            noise_factor=self.own_noise_factor,
+            motions=self.motions,
+        )
+
+    @property
+    def own_noise_factor(self) -> FloatArray:
+        """Square root of the noise covariance of the loop's own sensor, (q, q)."""
+        q, D = self.hardware.n_measurements, self.stacks()[3][0]
+        first = D.shape[1] - self.hardware.n_readings
+        return D[:q, first : first + q]
+
+    def with_memory(self, taps: FloatArray) -> TipTiltPlant:
+        """Add the past innovations of a filter as states; see :class:`EstimationProblem`."""
+        longer = EstimationProblem.with_memory(self, taps)
+        return cast("TipTiltPlant", replace(longer, memory=self.memory + np.shape(taps)[1]))
+
+    def own_sensor_alone(self) -> TipTiltPlant:
+        """Return the plant of the loop's own sensor, without the others."""
+        if not self.hardware.suite.sensors:
+            return self
+        alone = replace(self.parts(), hardware=self.hardware.own_sensor_alone(), motions=())
+        return assemble(alone)
+
+    def with_sensors(self, suite: SensorSuite, motions: Motions = ()) -> TipTiltPlant:
+        """Return the plant of the loop with other sensors beside its own.
+
+        Parameters
+        ----------
+        suite : SensorSuite
+            The other sensors.
+        motions : tuple of mapping, optional
+            For each vibration of the plant, in order, the :class:`Motion` of each channel that it
+            moves; by default no channel moves.
+
+        Returns
+        -------
+        TipTiltPlant
+            The plant, of the common period of all sensors.
+
+        Raises
+        ------
+        ProblemError
+            If a rate is not a fraction of the frame rate, a delay is too short, or names or sizes
+            clash.
+
+        Examples
+        --------
+        A 20 Hz line that shakes tip by 500 nm, and the mirror's accelerometer by 1000 nm:
+
+        >>> import lbt_synth as lbt
+        >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
+        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=500, direction=(1,))
+        >>> plant = lbt.tip_tilt_plant(
+        ...     frame_rate_hz=1000, turbulence=slow, vibrations=[line], noise_nm=15, modes=1
+        ... )
+        >>> mirror = lbt.models.Accelerometer(
+        ...     name="mirror", rate_hz=1000, delay_frames=1, channels=("m1",), noise_m_s2=2e-4
+        ... )
+        >>> suite = lbt.models.SensorSuite(sensors=(mirror,))
+        >>> shaken = plant.with_sensors(suite, ({"m1": lbt.models.Motion(size=2)},))
+        >>> shaken.period, shaken.n_states, shaken.n_measurements
+        (1, 6, 2)
+        """
+        require_instance(suite, SensorSuite, "suite")
+        hardware = replace(self.hardware, suite=suite)
+        return assemble(replace(self.parts(), hardware=hardware, motions=motions))
 
     def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
         """Gain over the full state; the known input has no error and needs no gain."""
         gain = self._checked_gain(gain_predictor)
-        return np.vstack([gain, np.zeros((len(full.A) - len(gain), gain.shape[1]))])
+        shape = (*gain.shape[:-2], full.n_states - self.n_states, gain.shape[-1])
+        return np.concatenate([gain, np.zeros(shape)], axis=-2)
 
 
 def tip_tilt_plant(
@@ -273,45 +350,16 @@ def tip_tilt_plant(
 
 def assemble(parts: PlantParts) -> TipTiltPlant:
     """Assemble a plant from its parts."""
-    hardware, p, n = parts.hardware, len(parts.vibrations), parts.hardware.modes
-    ar2 = [line.ar_model(hardware.frame_rate_hz) for line in parts.vibrations]
-    lines = np.array([model.coefficients for model in ar2]).reshape(p, 2)
-    air = padded_coefficients(parts.turbulence)
-
-    tur, tot, size = 2 * p, 2 * p + air.size, parts.size  # where parts of the state begin, and end
-    total = np.zeros((n, size))
-    total[:, :p] = np.array([line.direction for line in parts.vibrations]).reshape(p, n).T
-    total[:, tur : tur + n] = np.eye(n)
-    A = np.zeros((size, size))
-    A[:tur, :tur], A[tur:tot, tur:tot] = _companion(lines), _companion(air)
-    A[tot : tot + n], A[tot + n :, tot : size - n] = total, np.eye(size - tot - n)
-
-    q = hardware.n_measurements
-    B = np.zeros((size, p + n + q))
-    B[:p, :p] = np.diag([m.driving_rms_nm for m in ar2])
-    B[tur : tur + n, p : p + n] = np.diag([m.driving_rms_nm for m in parts.turbulence])
-    C = np.zeros((q, size))
-    C[:, size - n :] = hardware.sensor
-    late = held_frames(hardware) + 1 - hardware.delay_frames  # weight of the frame before
+    matrices = plant_matrices(parts)
     return TipTiltPlant(
-        A=A,
-        B=B,
-        C=C,
-        D=np.hstack([np.zeros((q, p + n)), parts.noise_factor]),
-        L=(1 - late) * total + late * np.eye(n, size, k=tot),
-        dt_s=hardware.dt_s,
-        hardware=hardware,
+        **{name: getattr(matrices, name) for name in "ABCDL"},
+        read=parts.hardware.suite.read(parts.hardware),
+        dt_s=parts.hardware.dt_s,
+        hardware=parts.hardware,
         turbulence=parts.turbulence,
         vibrations=parts.vibrations,
+        motions=parts.motions,
     )
-
-
-def _companion(coefficients: FloatArray) -> FloatArray:
-    """State matrix (k order, k order) of k AR processes with coefficients (k, order)."""
-    k, order = coefficients.shape
-    A = np.eye(k * order, k=-k)
-    A[:k] = np.hstack([np.diag(lag) for lag in coefficients.T])
-    return A
 
 
 def retuned_plant(

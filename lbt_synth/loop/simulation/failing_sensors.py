@@ -17,12 +17,11 @@ from lbt_synth.loop.simulation.disturbances import (
 )
 from lbt_synth.loop.simulation.run import Simulation, record_run
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
-from lbt_synth.models.fusion.plant import memory, own_exposure, suite_exposures
-from lbt_synth.models.fusion.seen_vibration import seen_vibration
-from lbt_synth.models.fusion.sensors import (
+from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.seen_vibration import seen_vibration
+from lbt_synth.models.sensor_suite import (
     Accelerometer,
     Motion,
-    SensorSuite,
     checked_motions,
     period_frames,
 )
@@ -59,9 +58,8 @@ class Drop:
         return self.start_s <= time_s < self.end_s
 
 
-def simulate_fused(
+def simulate_sensors(
     filters: Mapping[frozenset[str], Controller],
-    suite: SensorSuite,
     truth: Truth,
     *,
     hardware: LoopHardware,
@@ -85,28 +83,28 @@ def simulate_fused(
     seen = [j for j, motion in enumerate(truth.motions) if motion]
     total, lines = draw_parts(truth, hardware, rng=rng, zero_frame=settle, oscillators=seen, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
-    others = draw_others(truth, hardware, suite, lines, other_rng, zero_frame=settle, **size)
+    others = draw_others(truth, hardware, lines, other_rng, zero_frame=settle, **size)
     added = np.concatenate([noise, others], axis=2)
     for vibration, line in zip(truth.vibrations, lines, strict=True):
         total += line.motion[:, :, None] * checked_direction(vibration, hardware)
     for drop in drops:
-        if drop.unit not in suite.units:
+        if drop.unit not in hardware.suite.units:
             raise ProblemError(
-                f"a sensor that fails must be one of {', '.join(suite.units)}; got {drop.unit!r}."
+                f"a sensor that fails must be one of {', '.join(hardware.suite.units)}; got "
+                f"{drop.unit!r}."
             )
     rate = hardware.frame_rate_hz
     events = {
         settle + int(np.ceil(segment.start_s * rate - 1e-6)): segment
         for segment in run_segments(drops, frames / rate)
     }
-    out = _run(filters, suite, hardware, total, added, truth.sensor_gain, events)
+    out = _run(filters, hardware, total, added, truth.sensor_gain, events)
     return record_run(total, out, hardware, settle=settle, seed=seed)
 
 
 def draw_others(
     truth: Truth,
     hardware: LoopHardware,
-    suite: SensorSuite,
     lines: Sequence[DrawnLine],
     rng: np.random.Generator,
     *,
@@ -119,6 +117,7 @@ def draw_others(
     What a wavefront sensor reads of the residual is no part of them. The lines are those of
     :func:`draw_parts`, whose time 0 is frame ``zero_frame``.
     """
+    suite = hardware.suite
     factors = [sensor.noise_factor(hardware.modes) for sensor in suite.sensors]
     drawn = [rng.standard_normal((cases, frames, len(factor))) @ factor.T for factor in factors]
     out = np.concatenate(drawn, axis=2)
@@ -203,7 +202,6 @@ def run_segments(drops: Sequence[Drop], duration_s: float) -> tuple[Segment, ...
 
 def _run(
     filters: Mapping[frozenset[str], Controller],
-    suite: SensorSuite,
     hardware: LoopHardware,
     total: FloatArray,
     added: FloatArray,
@@ -211,10 +209,10 @@ def _run(
     events: Mapping[int, Segment],
 ) -> FloatArray:
     """Run all cases side by side; return ``phi_res, u, y``, (cases, frames, n + m + q)."""
-    cases, frames, n = total.shape
+    (cases, frames, n), suite = total.shape, hardware.suite
     m, rows, read = hardware.n_commands, suite.rows(hardware), suite.read(hardware)
     period, taps = len(read), hardware.mirror_taps
-    exposures = [own_exposure(hardware), *suite_exposures(suite, hardware)]
+    exposures = [own_exposure(hardware), *other_exposures(hardware)]
     held = memory(exposures, n, period)
     seen = held.C.copy()
     seen[:, : hardware.n_measurements] *= sensor_gain

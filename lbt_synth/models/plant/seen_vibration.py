@@ -21,8 +21,8 @@ from scipy.linalg import expm
 
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.matrix_functions import symmetrise
-from lbt_synth.models.fusion.sensors import Accelerometer, Motion, period_frames
 from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.models.sensor_suite import Accelerometer, Motion, period_frames
 from lbt_synth.models.vibration import Vibration, require_below_nyquist
 from lbt_synth.validation import FloatArray, frozen_copy, set_fields
 
@@ -106,7 +106,7 @@ def seen_vibration(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.fusion.seen_vibration import seen_vibration
+    >>> from lbt_synth.models.plant.seen_vibration import seen_vibration
     >>> line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
     >>> mirror = lbt.models.Accelerometer(
     ...     name="mirror", rate_hz=800, delay_frames=1, channels=("m1",), noise_m_s2=1e-3

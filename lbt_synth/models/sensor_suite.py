@@ -10,29 +10,42 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.loop_hardware import LoopHardware
-from lbt_synth.models.plant.parts import noise_factor
 from lbt_synth.validation import (
     BoolArray,
     ComplexArray,
     FloatArray,
     Positive,
     check_fields,
+    definite,
+    frozen_copy,
     matrix,
+    one_or_each,
     set_fields,
 )
+
+if TYPE_CHECKING:
+    from lbt_synth.models.loop_hardware import LoopHardware
 
 OWN_SENSOR = "wavefront"
 LONGEST_PERIOD = 1000  # frames of the loop per reading
 LONGEST_DELAY = 100  # of a sensor [its periods]
 _WHOLE = 1e-9
+
+
+def noise_factor(noise_nm: Any, q: int) -> FloatArray:
+    """Return the square root (q, q) of the noise covariance, from deviations or the covariance."""
+    if np.ndim(noise_nm) < 2:
+        deviations = one_or_each(noise_nm, "noise_nm", q, above=0)
+        return frozen_copy(np.diag(np.broadcast_to(deviations, q)))
+    covariance = definite(noise_nm, "noise_nm", size=(q, "to match the measurements"))
+    return frozen_copy(np.linalg.cholesky(covariance))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +61,7 @@ class Motion:
 
     Examples
     --------
-    >>> from lbt_synth.models.fusion.sensors import Motion
+    >>> from lbt_synth.models.sensor_suite import Motion
     >>> Motion(size=2.0, phase_deg=180).factor.real
     -2.0
     """
@@ -91,7 +104,7 @@ class WavefrontSensor:
 
     Examples
     --------
-    >>> from lbt_synth.models.fusion.sensors import WavefrontSensor
+    >>> from lbt_synth.models.sensor_suite import WavefrontSensor
     >>> WavefrontSensor(name="truth", rate_hz=50, delay_frames=3, noise_nm=4.0).units
     ('truth',)
     """
@@ -162,7 +175,7 @@ class Accelerometer:
 
     Examples
     --------
-    >>> from lbt_synth.models.fusion.sensors import Accelerometer
+    >>> from lbt_synth.models.sensor_suite import Accelerometer
     >>> mirror = Accelerometer(
     ...     name="mirror", rate_hz=1000, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-4
     ... )
@@ -254,27 +267,27 @@ class SensorSuite:
     Parameters
     ----------
     sensors : tuple of WavefrontSensor and Accelerometer
-        At least one; wavefront sensors become the first, as their measurements are.
+        None by default; wavefront sensors become the first, as their measurements are.
 
     Examples
     --------
-    >>> from lbt_synth.models.fusion.sensors import SensorSuite, WavefrontSensor
+    >>> from lbt_synth.models.sensor_suite import SensorSuite, WavefrontSensor
     >>> slow = WavefrontSensor(name="truth", rate_hz=50, delay_frames=3, noise_nm=4.0)
     >>> SensorSuite(sensors=(slow,)).units
     ('wavefront', 'truth')
     """
 
-    sensors: tuple[Sensor, ...]
+    sensors: tuple[Sensor, ...] = ()
     units: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         # in the order of their measurements
         sensors = tuple(sorted(self.sensors, key=lambda each: isinstance(each, Accelerometer)))
         units = (OWN_SENSOR, *(unit for sensor in sensors for unit in sensor.units))
-        if not sensors or len(set(units)) < len(units):
+        if len(set(units)) < len(units):
             raise ProblemError(
                 f"sensors and channels must have different names, none of them {OWN_SENSOR!r}; "
-                f"got {', '.join(units[1:]) or 'no sensor'}."
+                f"got {', '.join(units[1:])}."
             )
         set_fields(self, sensors=sensors, units=units)
 
@@ -303,7 +316,7 @@ class SensorSuite:
 
     def period(self, hardware: LoopHardware) -> int:
         """Return the common period of all sensors [frames of the loop]."""
-        period = int(np.lcm.reduce([period_frames(s, hardware) for s in self.sensors]))
+        period = int(np.lcm.reduce([1, *(period_frames(s, hardware) for s in self.sensors)]))
         if period > LONGEST_PERIOD:
             raise ProblemError(
                 f"the common period of the sensors must be at most {LONGEST_PERIOD} frames; got "
@@ -343,6 +356,9 @@ class SensorSuite:
             for unit in sensor.units:
                 out[:: period_frames(sensor, hardware), rows[unit]] = True
         return out
+
+
+OWN_SENSOR_ALONE = SensorSuite()
 
 
 def checked_motions(motions: Motions, suite: SensorSuite, lines: int) -> Motions:

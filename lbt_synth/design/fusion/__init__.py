@@ -1,1 +1,0 @@
-"""Filters of several sensors, and what becomes of their loops when a sensor fails."""

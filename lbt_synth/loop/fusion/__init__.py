@@ -1,1 +1,0 @@
-"""Loops of several sensors: closed exactly, their residual, and runs in which sensors fail."""
