@@ -32,6 +32,7 @@ from lbt_synth.linear.estimation_problem import (
     scale_states,
 )
 from lbt_synth.linear.lyapunov import stationary_root
+from lbt_synth.linear.matrix_functions import as_stack
 from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
@@ -106,12 +107,11 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
             f"the witness must have the period of the problem, {problem.period}; got "
             f"{witness.period}."
         )
-    covariances = covariance.reshape(-1, *covariance.shape[-2:])
-    starts = witness.states.reshape(-1, *witness.states.shape[-2:])
-    disturbances = witness.disturbances.reshape(-1, *witness.disturbances.shape[-2:])
+    covariances, disturbances = as_stack(covariance), as_stack(witness.disturbances)
     spaces = [whitening_coordinates(own) for own in covariances]
     states = [  # in the space of a filter's error
-        basis @ (inverse @ x) for x, (basis, inverse) in zip(starts, spaces, strict=True)
+        basis @ (inverse @ x)
+        for x, (basis, inverse) in zip(as_stack(witness.states), spaces, strict=True)
     ]
     gained = spent = 0.0
     for t, (x, w) in enumerate(zip(states, disturbances, strict=True)):
@@ -206,7 +206,7 @@ def _worst_burst(problem: EstimationProblem, P: FloatArray, gamma: float) -> Wit
     With the costate p, ``p(j) = (I + W P)^-1 A' p(j+1)``, ``x(j) = P p(j)``, ``w(j) = B' p(j+1)``
     is the worst past that leads there.
     """
-    N, L, phases = problem.period, problem.L, P.reshape(-1, *P.shape[-2:])
+    N, L, phases = problem.period, problem.L, as_stack(P)
     top = [np.linalg.eigh(L @ own @ L.T) for own in phases]
     last = int(np.argmax([values[-1] for values, _ in top]))
     end = L.T @ top[last][1][:, -1]

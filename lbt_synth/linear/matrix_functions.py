@@ -14,6 +14,11 @@ def transpose(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
     return stack.swapaxes(-1, -2)
 
 
+def as_stack(matrix: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
+    """Return a matrix as a stack of one, and a stack as it is."""
+    return matrix[None] if matrix.ndim == 2 else matrix
+
+
 def symmetrise(stack: FloatArray) -> FloatArray:
     """Symmetric part of each matrix of a stack."""
     return np.asarray((stack + transpose(stack)) / 2, dtype=np.float64)

@@ -21,7 +21,7 @@ from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.linear.matrix_functions import complex_schur, solve_stack, transpose
+from lbt_synth.linear.matrix_functions import as_stack, complex_schur, solve_stack, transpose
 from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
@@ -74,10 +74,10 @@ class LinearSystem(Summarised):
 
     def _set_phases(self, period: int, **parts: FloatArray) -> None:
         """Set matrices, (n, m) for one phase, (N, n, m) for more; one of all phases is repeated."""
-        stacks = {name: part.reshape(-1, *part.shape[-2:]) for name, part in parts.items()}
+        stacks = {name: as_stack(part) for name, part in parts.items()}
         period = max(period, *(len(stack) for stack in stacks.values()))
         for name, stack in stacks.items():
-            if parts[name].ndim > 3 or len(stack) not in (1, period):
+            if stack.ndim > 3 or len(stack) not in (1, period):
                 raise DimensionError(
                     f"{name} must be one matrix, or one for each of {period} phases; got "
                     f"{parts[name].shape}."
@@ -105,9 +105,7 @@ class LinearSystem(Summarised):
 
     def stacks(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return A, B, C and D as stacks (N, ...), of one matrix where the period is 1."""
-        if self.period > 1:
-            return self.A, self.B, self.C, self.D
-        return self.A[None], self.B[None], self.C[None], self.D[None]
+        return as_stack(self.A), as_stack(self.B), as_stack(self.C), as_stack(self.D)
 
     def require_one_phase(self, what: str, instead: str) -> None:
         """Refuse a longer period than a sample: say what needs one, and what to try."""
@@ -512,9 +510,11 @@ class RunningController:
     controller: Controller
     state: FloatArray = field(init=False)
     phase: int = field(init=False)  # of the next sample
+    _phases: list[tuple[FloatArray, ...]] = field(init=False, repr=False)  # A, B, C, D of each
     form = "plain"
 
     def __post_init__(self) -> None:
+        self._phases = list(zip(*self.controller.stacks(), strict=True))
         self.reset()
 
     def reset(self) -> None:
@@ -527,16 +527,14 @@ class RunningController:
         A measurement that is not finite raises a NonFiniteError and leaves the state as it is:
         hold the last command.
         """
-        k = self.controller
+        A, B, C, D = self._phases[self.phase]
         measured = np.asarray(y, dtype=np.float64)
-        if measured.shape != (k.B.shape[-1],):
+        if measured.shape != (B.shape[1],):
             raise DimensionError(
-                f"y must have shape ({k.B.shape[-1]},) to match B {k.B.shape}; got "
-                f"{measured.shape}."
+                f"y must have shape ({B.shape[1]},) to match B {B.shape}; got {measured.shape}."
             )
         if not np.isfinite(measured).all():
             raise NonFiniteError(f"y must be finite; got {measured}. Hold the last command.")
-        A, B, C, D = (stack[self.phase] for stack in k.stacks())
         self.state = A @ self.state + B @ measured
-        self.phase = (self.phase + 1) % k.period
+        self.phase = (self.phase + 1) % len(self._phases)
         return np.asarray(C @ self.state + D @ measured)

@@ -22,12 +22,12 @@ from lbt_synth.linear.estimation_problem import (
     error_units,
     scale_states,
 )
-from lbt_synth.linear.matrix_functions import is_stable
+from lbt_synth.linear.matrix_functions import is_stable, nearest_powers_of_two
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.linear.riccati.equations import Equations
 from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
-from lbt_synth.validation import BoolArray, FloatArray, frozen_copy
+from lbt_synth.validation import FloatArray, frozen_copy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,8 +100,9 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
         from lbt_synth.linear.riccati.periodic import periodic_kalman
 
         return periodic_kalman(problem)
-    if not problem.read.all():
-        return _scatter_gains(kalman_riccati(problem.phase(0)), problem.read[0])
+    part = ReadPart(problem)
+    if not part.is_whole:
+        return part.scatter(kalman_riccati(part.problem))
     require_detectable(problem)
     dare = solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R, problem.S)
     innovation = problem.R + problem.C @ dare.X @ problem.C.T
@@ -116,18 +117,41 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     )
 
 
-def _scatter_gains(solution: FilterRiccati, rows: BoolArray) -> FilterRiccati:
-    """Return the solution with gains of all measurements, zero for those that are not read."""
-    gains = np.zeros((2, len(solution.P), len(rows)))
-    gains[:, :, rows] = solution.gain_predictor, solution.gain_filter
-    predictor, filtering = (frozen_copy(gain) for gain in gains)
-    return replace(solution, gain_predictor=predictor, gain_filter=filtering)
+_ALIKE = 1e4  # ratio of the noise of measurements up to which they keep their units
 
 
-def _gather_gains(solution: FilterRiccati, rows: BoolArray) -> FilterRiccati:
-    """Return the solution with the gains of what is read."""
-    predictor, filtering = solution.gain_predictor[:, rows], solution.gain_filter[:, rows]
-    return replace(solution, gain_predictor=predictor, gain_filter=filtering)
+class ReadPart:
+    """The measurements of a problem that are read, in units of their noise if these differ much."""
+
+    def __init__(self, problem: EstimationProblem) -> None:
+        A, B, C, D = problem.read_parts(0)
+        self.rows = problem.read[0]
+        sizes = np.linalg.norm(D, axis=1)
+        alike = sizes.max() <= _ALIKE * sizes.min()
+        self.units = np.ones(len(D)) if alike else nearest_powers_of_two(sizes)
+        self.is_whole = bool(alike and self.rows.all())
+        self.problem = problem
+        if not self.is_whole:
+            C, D = (part / self.units[:, None] for part in (C, D))
+            self.problem = EstimationProblem(A=A, B=B, C=C, D=D, L=problem.L, dt_s=problem.dt_s)
+
+    def gather(self, solution: FilterRiccati) -> FilterRiccati:
+        """Return a solution of the whole problem as one of the part."""
+        if self.is_whole:
+            return solution
+        predictor, filtering = solution.gain_predictor, solution.gain_filter
+        predictor, filtering = (gain[:, self.rows] * self.units for gain in (predictor, filtering))
+        return replace(solution, gain_predictor=predictor, gain_filter=filtering)
+
+    def scatter(self, solution: FilterRiccati) -> FilterRiccati:
+        """Return a solution of the part with gains of all measurements, zero for the others."""
+        if self.is_whole:
+            return solution
+        gains = np.zeros((2, len(solution.P), len(self.rows)))
+        gains[:, :, self.rows] = solution.gain_predictor, solution.gain_filter
+        gains[:, :, self.rows] /= self.units
+        predictor, filtering = (frozen_copy(gain) for gain in gains)
+        return replace(solution, gain_predictor=predictor, gain_filter=filtering)
 
 
 _RESIDUAL_LIMIT = 1e-9
@@ -291,12 +315,10 @@ def gamma_riccati(
         from lbt_synth.linear.riccati.periodic import periodic_hinf
 
         return periodic_hinf(problem, gamma, start)
-    if not problem.read.all():
-        rows = problem.read[0]
-        solution = gamma_riccati(problem.phase(0), gamma, start=_gather_gains(start, rows))
-        return None if solution is None else _scatter_gains(solution, rows)
-    equation = GammaEquation(problem, start)
-    return equation.solution(gamma, equation.trial(gamma))
+    part = ReadPart(problem)
+    equation = GammaEquation(part.problem, part.gather(start))
+    solution = equation.solution(gamma, equation.trial(gamma))
+    return None if solution is None else part.scatter(solution)
 
 
 def meets_level(problem: EstimationProblem, gamma: float, start: FilterRiccati) -> bool:
@@ -321,12 +343,10 @@ def least_gamma(
         from lbt_synth.linear.riccati.periodic import least_periodic_gamma
 
         return least_periodic_gamma(problem, lower, upper, start)
-    if problem.read.all():
-        return _search_level(GammaEquation(problem, start), lower, upper)
-    rows = problem.read[0]
-    equation = GammaEquation(problem.phase(0), _gather_gains(start, rows))
+    part = ReadPart(problem)
+    equation = GammaEquation(part.problem, part.gather(start))
     lower, upper, solution = _search_level(equation, lower, upper)
-    return lower, upper, _scatter_gains(solution, rows)
+    return lower, upper, part.scatter(solution)
 
 
 def _search_level(
