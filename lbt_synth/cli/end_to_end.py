@@ -14,13 +14,13 @@ from lbt_synth.cli.loop_inputs import load_design, load_designs
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
-from lbt_synth.design import Design, FusedFilter
+from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
+from lbt_synth.interop.specula.accompanied_filter import unread_sensors
 from lbt_synth.interop.specula.calibration import Calibration
 from lbt_synth.interop.specula.cases import summarise_run
-from lbt_synth.interop.specula.fused_filter import unread_sensors
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.report.figures.end_to_end import end_to_end_figure, end_to_end_table_figure
 from lbt_synth.report.figures.style import save_figure
@@ -81,7 +81,7 @@ def run(arguments: Namespace) -> Report:
     refuse_replacing(outputs, [arguments.config, arguments.gain])
     choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
-    design = load_design(arguments.gain, several_sensors=True)
+    design = load_design(arguments.gain, any_sensors=True)
     setup.controller(design)  # refuses a filter of another loop before any work
     version = specula_version()
     make_directory(arguments.output)
@@ -107,7 +107,7 @@ def run(arguments: Namespace) -> Report:
         f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
         facts,
     )
-    if isinstance(design, FusedFilter) and (unread := unread_sensors(design)):
+    if unread := unread_sensors(design):
         report.notes.append(
             "note: the pyramid is the only wavefront sensor of the simulation: the fall-back "
             f"filter of the gain file runs, without {listing_text(unread)}."

@@ -24,7 +24,7 @@ def run(arguments: Namespace) -> Report:
     require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     config = load_config(arguments.config)
     choose_config_unit(arguments, config)
-    files = load_designs(arguments.gains, several_sensors=True)
+    files = load_designs(arguments.gains, any_sensors=True)
     with show_spinner("comparing", quiet=arguments.json):
         designs = _config_designs(config)
         designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}

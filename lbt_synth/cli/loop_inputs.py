@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
 
 from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config
@@ -15,14 +14,11 @@ from lbt_synth.files import load_gain
 from lbt_synth.models import Truth
 from lbt_synth.models.loop_hardware import loop_differences
 
-if TYPE_CHECKING:  # it takes long to load
-    from lbt_synth.design import FusedFilter
 
-
-def load_design(path: str, *, several_sensors: bool = False) -> Design:
-    """Load a design; refuse one of several sensors unless the command takes it."""
+def load_design(path: str, *, any_sensors: bool = False) -> Design:
+    """Load a design; refuse one that reads other sensors unless the command takes it."""
     design = load_gain(path)
-    if several_sensors or not design.several_sensors:
+    if any_sensors or not design.other_sensors:
         return design
     raise ProblemError(
         f"{path} is a design of several sensors; this command takes designs of the loop's own "
@@ -30,14 +26,14 @@ def load_design(path: str, *, several_sensors: bool = False) -> Design:
     )
 
 
-def load_designs(paths: list[str], *, several_sensors: bool = False) -> dict[str, Design]:
+def load_designs(paths: list[str], *, any_sensors: bool = False) -> dict[str, Design]:
     """Load designs, named by the stems of their files or, where these repeat, by longer tails."""
     if len({Path(path).resolve() for path in paths}) != len(paths):
         raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
     stems = [printable(Path(path).stem) for path in paths]
     names = stems if len(set(stems)) == len(stems) else _distinct_tails(paths)
     return {
-        name: load_design(path, several_sensors=several_sensors)
+        name: load_design(path, any_sensors=any_sensors)
         for name, path in zip(names, paths, strict=True)
     }
 
@@ -57,11 +53,7 @@ def loop_difference_notes(config: Config, design: Design) -> list[str]:
     notes = []
     if design.hardware is not None:
         notes = loop_differences(design.hardware, config.hardware)
-    elif design.several_sensors:
-        own = cast("FusedFilter", design)
-        notes = loop_differences(own.loop_hardware, config.hardware)
-        here = config.fused_plant
-        if here is None or not here.suite.is_same(own.problem.suite):
+        if design.other_sensors and not config.hardware.suite.is_same(design.hardware.suite):
             notes.append(
                 "runs with the sensors of the gain file beside the loop's own, not with those of "
                 "the configuration."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lbt_synth.cli.display import choose_config_unit
@@ -12,7 +12,6 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
-from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import design_report, write_report
 from lbt_synth.report.designs.assessment import DesignAssessment
@@ -20,7 +19,7 @@ from lbt_synth.report.designs.report import count_steps
 from lbt_synth.report.designs.tables import AssessmentRow, assessment_row, good_range, verdict
 from lbt_synth.report.page.page_files import require_page_names
 from lbt_synth.report.provenance import require_letters, time_text
-from lbt_synth.report.several_sensors import write_fused_report
+from lbt_synth.report.several_sensors import write_sensors_report
 from lbt_synth.storage.rows import json_record, json_units, row_table
 
 _IN_MARGINS = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz")
@@ -35,11 +34,11 @@ def run(arguments: Namespace) -> Report:
     require_letters(arguments.title or "", "--title")
     config = load_config(arguments.config)
     choose_config_unit(arguments, config)
-    designs = load_designs(arguments.gains, several_sensors=True)
-    fused = {name: each for name, each in designs.items() if isinstance(each, FusedFilter)}
+    designs = load_designs(arguments.gains, any_sensors=True)
+    several = [name for name, design in designs.items() if design.other_sensors]
     files = dict(zip(designs, arguments.gains, strict=True))
-    if fused:
-        return _report_several_sensors(arguments, config, designs, fused, files)
+    if several:
+        return _report_several_sensors(arguments, config, designs, several, files)
     total = count_steps(len(designs)) + 1
     with count_progress(total=total, what="report", quiet=arguments.json) as count:
         found = design_report(config, designs, gain_files=files, advance=count)
@@ -73,21 +72,21 @@ def _report_several_sensors(
     arguments: Namespace,
     config: Config,
     designs: Mapping[str, Design],
-    fused: Mapping[str, FusedFilter],
+    several: Sequence[str],
     files: Mapping[str, str],
 ) -> Report:
     """Write the page of designs of several sensors, which have no one transfer function."""
-    if len(fused) < len(designs):
-        own = ", ".join(name for name in designs if name not in fused)
+    if len(several) < len(designs):
+        alone = ", ".join(name for name in designs if name not in several)
         raise ProblemError(
             f"a page is of designs of several sensors, or of the loop's own sensor alone; got "
-            f"{', '.join(fused)} of the first kind and {own} of the second. lbt-synth limits takes "
-            "both."
+            f"{', '.join(several)} of the first kind and {alone} of the second. lbt-synth limits "
+            "takes both."
         )
     with show_spinner("report", quiet=arguments.json):
-        written, found = write_fused_report(
+        written, found = write_sensors_report(
             config,
-            fused,
+            designs,
             arguments.output,
             gain_files=files,
             pdf=arguments.pdf,

@@ -31,7 +31,7 @@ def run(arguments: Namespace) -> Report:
         f"proved: the certificate, computed again from this file of digest {digest}.",
         f"not proved, the file's word: {'; '.join(unproved)}.",
     ]
-    if not design.several_sensors:
+    if not design.other_sensors:
         cost = frame_cost(design)
         report.data["frame_cost"] = json_record(cost)
         report.tables.append(fact_table("Cost per frame, as exported to C", cost))

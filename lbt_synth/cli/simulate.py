@@ -16,7 +16,6 @@ from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design import Design
-from lbt_synth.design.fusion.fused_filter import FusedFilter
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
@@ -32,8 +31,8 @@ from lbt_synth.loop import (
     stable_sensor_gains,
     strehl,
 )
-from lbt_synth.loop.fusion.simulation import READINGS, Drop
 from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_nan
+from lbt_synth.loop.simulation.failing_sensors import READINGS, Drop
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.simulation import sensor_failure_figure, simulation_figure
@@ -69,7 +68,7 @@ def parse_drop(text: str) -> Drop:
     return Drop(unit=parts["unit"], **times, reading=parts["reading"] or READINGS[0])
 
 
-def run_fused(arguments: Namespace, config: Config, design: FusedFilter) -> Report:
+def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Report:
     """Run the loop of a design of several sensors."""
     for option in ("stroke", "form", "telemetry"):
         if getattr(arguments, option) is not None:
@@ -141,8 +140,8 @@ def run(arguments: Namespace) -> Report:
     config = load_config(arguments.config)
     choose_config_unit(arguments, config)
     design = load_gain(arguments.gain)
-    if isinstance(design, FusedFilter):
-        return run_fused(arguments, config, design)
+    if design.other_sensors:
+        return run_all_sensors(arguments, config, design)
     if arguments.drop:
         raise ProblemError(
             "--drop goes with a design of several sensors: give sensors in the configuration and "

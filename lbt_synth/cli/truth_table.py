@@ -5,7 +5,7 @@ from __future__ import annotations
 from lbt_synth.cli.output import Report
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.loop import least_fused_residual
+from lbt_synth.loop import least_residual
 from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_or_none
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import compare_in_truth
@@ -17,14 +17,14 @@ _NAME = "this design"
 def say_limit(limit: ResidualLimit, config: Config) -> str:
     """Return the sentence on the limit of a truth, and on what other sensors can add to it."""
     least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
-    fused = config.fused_plant
-    if fused is None:
+    suite = config.hardware.suite
+    if not suite.sensors:
         return f"least residual of any linear controller in the truth: {least}"
     said = f"least residual of any linear controller of the loop's own sensor in the truth: {least}"
-    floor = limit_or_none(lambda: least_fused_residual(config.hardware, config.truth, fused.suite))
+    floor = limit_or_none(lambda: least_residual(config.hardware, config.truth))
     if floor is None:
         return f"{said}; with the other sensors it is less"
-    why = ", even if accelerometers knew all vibrations in advance" * bool(fused.suite.channels)
+    why = ", even if accelerometers knew all vibrations in advance" * bool(suite.channels)
     return (
         f"{said}; of all sensors not less than {nm_text(floor.rms_nm, '.6g', unit='nm rms')}{why}"
     )

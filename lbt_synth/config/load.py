@@ -22,12 +22,11 @@ from lbt_synth.config.plant_and_truth import (
 )
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
-from lbt_synth.config.several_sensors import build_fused_plant, build_true_motions
+from lbt_synth.config.several_sensors import build_sensors, build_true_motions
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
-from lbt_synth.models.plant.readings import FusedPlant
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -52,7 +51,7 @@ class Config(Summarised):
     settings : FileSection
         The file's values, checked; sections as attributes.
     plant : TipTiltPlant
-        Plant of the design.
+        Plant of the design, with all sensors.
     truth : Truth
         What the loop really meets.
     imaging : Imaging
@@ -66,8 +65,6 @@ class Config(Summarised):
         mean of ``model.sensor_gain`` if it is a list.
     source : pathlib.Path
         The file.
-    fused_plant : FusedPlant or None
-        Plant that several sensors see; None where the loop has its own sensor alone.
     """
 
     settings: FileSection
@@ -78,7 +75,6 @@ class Config(Summarised):
     noise_nm: float | FloatArray
     sensor_gain: float
     source: Path
-    fused_plant: FusedPlant | None = None
 
     def _brief(self) -> str:
         return f"{self.source.name}, {self.hardware._brief()}"
@@ -154,14 +150,14 @@ class Config(Summarised):
         with name_file(self.source):
             design = request.build(self)
         said = design.assumptions
-        if self.other_sensors and not design.several_sensors:
+        if self.other_sensors and not design.other_sensors:
             said = (*said, f"the loop's own sensor is read alone, without {self.other_sensors}")
         return replace(design, configuration=self.text, assumptions=said)
 
     @property
     def other_sensors(self) -> str:
         """Names of the sensors and channels beside the loop's own, empty if there are none."""
-        return "" if self.fused_plant is None else ", ".join(self.fused_plant.suite.units[1:])
+        return ", ".join(self.hardware.suite.units[1:])
 
     @property
     def text(self) -> str:
@@ -266,9 +262,9 @@ def build_config(settings: FileSection, source: Path) -> Config:
         noise_nm = measurement_noise_nm(settings)
         plant = build_plant(settings, atmosphere, noise_nm)
         truth = build_truth(settings, atmosphere, noise_nm, plant)
-        fused = build_fused_plant(settings, plant)
-        if fused is not None:
-            truth = replace(truth, motions=build_true_motions(settings, fused))
+        plant = build_sensors(settings, plant)
+        if plant.hardware.suite.sensors:
+            truth = replace(truth, motions=build_true_motions(settings, plant))
     except ProblemError as error:
         raise ConfigError(f"{source}: {error}", path=getattr(error, "path", "")) from error
     except ArithmeticError as error:
@@ -291,5 +287,4 @@ def build_config(settings: FileSection, source: Path) -> Config:
         noise_nm=noise_nm,
         sensor_gain=reference_gain(settings),
         source=source,
-        fused_plant=fused,
     )

@@ -15,7 +15,6 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.config.sensor_sections import OtherSensorSection
 from lbt_synth.errors import name_key
 from lbt_synth.models import TipTiltPlant, Vibration
-from lbt_synth.models.plant.readings import FusedPlant, fused_plant
 from lbt_synth.models.sensor_suite import (
     Accelerometer,
     Motion,
@@ -27,22 +26,23 @@ from lbt_synth.models.sensor_suite import (
 )
 
 
-def build_fused_plant(settings: FileSection, own: TipTiltPlant) -> FusedPlant | None:
-    """Build the plant that several sensors see; None where the loop has its own sensor alone."""
+def build_sensors(settings: FileSection, plant: TipTiltPlant) -> TipTiltPlant:
+    """Return the plant with the other sensors of the configuration."""
     if not settings.sensors:
-        return None
+        return plant
     with name_key("sensors"):
         suite = SensorSuite(
             sensors=tuple(_build_sensor(name, each) for name, each in settings.sensors.items())
         )
         motions = _build_motions(settings, "model", suite)
-        return fused_plant(own, suite, motions)
+        return plant.with_sensors(suite, motions)
 
 
-def build_true_motions(settings: FileSection, plant: FusedPlant) -> Motions:
+def build_true_motions(settings: FileSection, plant: TipTiltPlant) -> Motions:
     """Return how the channels move with each vibration of the truth."""
     owner = true_vibrations_owner(settings)
-    return plant.motions if owner == "model" else _build_motions(settings, owner, plant.suite)
+    suite = plant.hardware.suite
+    return plant.motions if owner == "model" else _build_motions(settings, owner, suite)
 
 
 def _build_sensor(name: str, section: OtherSensorSection) -> Sensor:

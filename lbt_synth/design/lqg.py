@@ -344,6 +344,7 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
             f"{type(plant).__name__}. Try tip_tilt_plant."
         )
     rho = number(command_weight, "command_weight", at_least=0)
+    plant.require_own_sensor("lqg")
     hardware = plant.hardware
     rank = int(np.linalg.matrix_rank(hardware.influence))
     if rank < hardware.modes:

@@ -146,8 +146,8 @@ def _claimed(value: Any, name: str) -> float | tuple[float, ...]:
     """Return a claim of a file: a number that is not negative, or one for each mode."""
     if isinstance(value, list):
         return tuple(number(part, name, at_least=0) for part in value)
-    number(value, name, at_least=0)
-    return value
+    claim = number(value, name, at_least=0)
+    return value if type(value) is int else claim
 
 
 class _Codec(NamedTuple):

@@ -159,6 +159,11 @@ class Design(Summarised, ABC):
         return float(self.claims.get("rms", np.nan))
 
     @property
+    def controllers(self) -> Mapping[frozenset[str], Controller]:
+        """The controller for each set of sensors and channels that are not read, none included."""
+        return {frozenset(): self.controller}
+
+    @property
     def knows_mirror(self) -> bool:
         """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
         return True
@@ -298,8 +303,8 @@ def with_certificate(design: AnyDesign, hint: str) -> AnyDesign:
     evidence = design.examine()
     norms = {name: float(getattr(evidence.certificate, name)) for name in ("rms", "gamma")}
     named = {claim.name for claim in design.CLAIMS}
-    claims = {name: norm for name, norm in norms.items() if name in named} | design.claims
-    claiming = replace(design, claims=claims)
+    claims = {name: norm for name, norm in norms.items() if name in named}
+    claiming = replace(design, claims={**claims, **design.claims})
     return replace(claiming, certificate=claiming._conclude(evidence).require(hint))
 
 

@@ -90,6 +90,7 @@ def robust(
     True
     """
     require_instance(plant, TipTiltPlant, "plant")
+    plant.require_own_sensor("robust")
     lines = _bands_per_mode(bands, plant.hardware.modes)
     gains = tuple(number(g, "scenarios", above=0) for g in sequence(scenarios, "scenarios"))
     if not gains:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth
-from lbt_synth.design import Check, Design, FusedFilter, certify_loop
+from lbt_synth.design import Check, Design, certify_loop
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.arithmetic_cost import FrameCost
@@ -51,10 +51,10 @@ def require_exportable(design: Design, written: Controller | None = None) -> Non
     A design of several sensors is refused, too: only C source has an input for each of them.
     """
     require_certified(design)
-    if isinstance(design, FusedFilter):
+    if design.other_sensors:
         raise ProblemError(
-            f"this design reads several sensors ({', '.join(design.problem.suite.units)}), each "
-            "when it is due; what this target loads has one matrix, for a loop of one sensor. "
+            f"this design reads {', '.join(design.other_sensors)} beside the loop's own sensor, "
+            "each when it is due; what this target loads has one matrix, for a loop of one sensor. "
             "Export it to C."
         )
     if design.hardware is None:
@@ -182,7 +182,7 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
         ("method", f"{design.method} ({design.solver.route})"),
         ("gain file", "not named" if gain_digest is None else f"SHA-256 {gain_digest}"),
     ]
-    hardware = design.loop_hardware if isinstance(design, FusedFilter) else design.hardware
+    hardware = design.hardware
     if hardware is None:
         lines += [("sampling", f"{design.controller.dt_s!r} s"), ("units", "those of the problem")]
     else:
@@ -192,7 +192,7 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
             ("units", "y: nm rms wavefront where the sensor matrix is the identity;"),
             ("", "u: nm rms wavefront where the influence matrix is"),
         ]
-    if isinstance(design, FusedFilter) and design.problem.suite.channels:
+    if hardware is not None and design.other_sensors and hardware.suite.channels:
         lines.append(("", "channels of accelerometers: metres per second squared"))
     checks = design.certificate.checks
     lines.append(("certificate", f"{len(checks)} checks passed"))

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from lbt_synth.errors import ProblemError
 from lbt_synth.methods.method import Section
 
 Horizon = Annotated[
@@ -40,16 +39,3 @@ class BoundOptions(Section):
     def bound(self) -> dict[str, Any]:
         """Return the bound as an argument: an absolute one, else the multiple of the least."""
         return {"gamma_ratio": self.gamma_ratio} if self.gamma is None else {"gamma": self.gamma}
-
-
-_OWN_SENSOR_ALONE = {"route": ("riccati", None), "horizon": (1,), "taps": (16,), "rms": (None,)}
-
-
-def require_several_sensors(options: Section) -> None:
-    """Refuse options that filters of several sensors do not have."""
-    for name, usual in _OWN_SENSOR_ALONE.items():
-        if getattr(options, name, usual[0]) not in usual:
-            raise ProblemError(
-                f"{name} must be left out with several sensors: it is an option of filters of the "
-                "loop's own sensor alone."
-            )

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import BOUNDS, BoundOptions, require_several_sensors
+from lbt_synth.methods.filters import BOUNDS, BoundOptions
 from lbt_synth.methods.method import DesignInputs, Method
 
 if TYPE_CHECKING:
     from lbt_synth.design.filter_design import FilterDesign
-    from lbt_synth.design.fusion.fused_filter import FusedFilter
 
 
 class HinfOptions(BoundOptions):
@@ -22,12 +21,7 @@ class HinfOptions(BoundOptions):
     )
 
 
-def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign | FusedFilter:
-    if inputs.fused_plant is not None:
-        require_several_sensors(options)
-        from lbt_synth.design.fusion.fused_filter import fused_hinf
-
-        return fused_hinf(inputs.fused_plant, **options.bound())
+def _build(inputs: DesignInputs, options: HinfOptions) -> FilterDesign:
     from lbt_synth.design.hinf import hinf
 
     return hinf(inputs.plant, **options.bound(), horizon=options.horizon, route=options.route)

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import Horizon, require_several_sensors
+from lbt_synth.methods.filters import Horizon
 from lbt_synth.methods.method import DesignInputs, Method, Section
 
 if TYPE_CHECKING:
     from lbt_synth.design.filter_design import FilterDesign
-    from lbt_synth.design.fusion.fused_filter import FusedFilter
 
 
 class KalmanOptions(Section):
@@ -21,12 +20,7 @@ class KalmanOptions(Section):
     horizon: Horizon = 1
 
 
-def _build(inputs: DesignInputs, options: KalmanOptions) -> FilterDesign | FusedFilter:
-    if inputs.fused_plant is not None:
-        require_several_sensors(options)
-        from lbt_synth.design.fusion.fused_filter import fused_kalman
-
-        return fused_kalman(inputs.fused_plant)
+def _build(inputs: DesignInputs, options: KalmanOptions) -> FilterDesign:
     from lbt_synth.design.kalman import kalman
 
     return kalman(inputs.plant, horizon=options.horizon, route=options.route)

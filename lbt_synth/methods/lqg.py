@@ -26,7 +26,7 @@ class LqgOptions(Section):
 def _build(inputs: DesignInputs, options: LqgOptions) -> LqgDesign:
     from lbt_synth.design.lqg import lqg
 
-    return lqg(inputs.plant, command_weight=options.command_weight)
+    return lqg(inputs.plant.own_sensor_alone(), command_weight=options.command_weight)
 
 
 METHOD = Method(

@@ -16,7 +16,6 @@ from pydantic import BaseModel, ConfigDict
 if TYPE_CHECKING:
     from lbt_synth.design.result import Design
     from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
-    from lbt_synth.models.plant.readings import FusedPlant
 
 
 class Section(BaseModel):
@@ -48,11 +47,7 @@ class DesignInputs(Protocol):
 
     @property
     def plant(self) -> TipTiltPlant:
-        """Plant of the design."""
-
-    @property
-    def fused_plant(self) -> FusedPlant | None:
-        """Plant that several sensors see; None where the loop has its own sensor alone."""
+        """Plant of the design, with all sensors of the loop."""
 
     @property
     def hardware(self) -> LoopHardware:

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from lbt_synth.methods.filters import BOUNDS, BoundOptions, require_several_sensors
+from lbt_synth.methods.filters import BOUNDS, BoundOptions
 from lbt_synth.methods.method import DesignInputs, Method
 
 if TYPE_CHECKING:
     from lbt_synth.design.filter_design import FilterDesign
-    from lbt_synth.design.fusion.fused_filter import FusedFilter
 
 
 class MixedOptions(BoundOptions):
@@ -28,12 +27,7 @@ class MixedOptions(BoundOptions):
     )
 
 
-def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign | FusedFilter:
-    if inputs.fused_plant is not None:
-        require_several_sensors(options)
-        from lbt_synth.design.fusion.fused_filter import fused_mixed
-
-        return fused_mixed(inputs.fused_plant, **options.bound())
+def _build(inputs: DesignInputs, options: MixedOptions) -> FilterDesign:
     from lbt_synth.design.mixed import mixed
 
     bound = options.bound() if options.rms is None else {"rms": options.rms}

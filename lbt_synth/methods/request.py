@@ -142,7 +142,6 @@ class PlantInputs:
     plant: TipTiltPlant
     design_defaults: Mapping[str, Any] = field(default_factory=dict)
     atmosphere: None = None
-    fused_plant: None = None
     sensor_gain: float = 1.0
     sensor_gains: tuple[float, float] | None = None  # to be stable at, relative to the plant's
 

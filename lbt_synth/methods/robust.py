@@ -58,7 +58,8 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
         spectrum = _choose_spectrum(inputs, section)
         bands = _build_bands(inputs, section)
         demands = _list_demands(inputs, section, spectrum)
-        return robust(inputs.plant, bands=bands, turbulence=spectrum, demands=demands, **arguments)
+        plant = inputs.plant.own_sensor_alone()
+        return robust(plant, bands=bands, turbulence=spectrum, demands=demands, **arguments)
 
 
 def _choose_spectrum(inputs: DesignInputs, section: RobustSection) -> Spectrum | None:
@@ -160,7 +161,7 @@ def _list_command_bounds(
     bound_commands = partial(
         CommandRms,
         turbulence=models[0] if spectrum is None else spectrum,
-        noise_nm=float(max(noise_per_mode(inputs.hardware, inputs.plant.R))),
+        noise_nm=float(max(noise_per_mode(inputs.hardware, inputs.plant.own_sensor_alone().R))),
     )
     return [bound_commands(at_most_nm=bound, rate=rate) for bound, rate in bounds]
 

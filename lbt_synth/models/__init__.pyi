@@ -1,5 +1,4 @@
 from .ar_model import ARModel as ARModel
-from .fusion.plant import fused_plant as fused_plant
 from .loop_hardware import LoopHardware as LoopHardware
 from .mirror.position_loop import PositionLoop as PositionLoop
 from .plant.frequency_prior import spread_plant as spread_plant

@@ -148,7 +148,7 @@ class LoopHardware(Summarised):
     @property
     def n_readings(self) -> int:
         """Number of measurements of all sensors."""
-        return max(rows.stop for rows in self.suite.rows(self).values())
+        return max(int(rows.stop) for rows in self.suite.rows(self).values())
 
     @property
     def period(self) -> int:

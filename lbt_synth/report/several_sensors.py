@@ -8,9 +8,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from lbt_synth.config import Config
-from lbt_synth.design.fusion.failures import failure_rows
-from lbt_synth.design.fusion.fused_filter import FusedFilter
-from lbt_synth.loop.fusion.simulation import Drop
+from lbt_synth.design import Design
+from lbt_synth.loop.simulation.failing_sensors import Drop
+from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.report.charts.description import Chart
 from lbt_synth.report.figures.simulation import sensor_failure_panels
 from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
@@ -32,9 +32,9 @@ from lbt_synth.studies.truth_comparison import TruthComparison
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again
 
 
-def write_fused_report(
+def write_sensors_report(
     config: Config,
-    designs: Mapping[str, FusedFilter],
+    designs: Mapping[str, Design],
     path: str | os.PathLike[str],
     *,
     gain_files: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
@@ -54,10 +54,10 @@ def write_fused_report(
     found = compare_in_truth(designs, config)
     sections = [_summary_section(config, designs, found)]
     for number, (name, design) in enumerate(designs.items(), start=1):
-        rows = failure_rows(design.problem, design.gains, design.fallbacks)
+        failures = design.tables()[0]
         blocks: tuple[Block, ...] = (
             fact_table(name, design.facts()),
-            row_table("When sensors fail", rows),
+            row_table(failures.title, failures.rows),
             _failure_chart(config, name, design, f"failures-{number}"),
             row_table("Certificate, computed again", design.recertify().checks),
         )
@@ -72,13 +72,13 @@ def write_fused_report(
 
 
 def _summary_section(
-    config: Config, designs: Mapping[str, FusedFilter], found: TruthComparison
+    config: Config, designs: Mapping[str, Design], found: TruthComparison
 ) -> Section:
     """Open with what each design leaves in the truth, beside references."""
     blocks: list[Block] = []
     for name, design in designs.items():
         own = next(row for row in found.rows if row.design == name)
-        others = listing_text(list(design.problem.suite.units[1:]))
+        others = listing_text(list(design.other_sensors))
         text = f"{name} reads {others} beside the loop's own sensor, and leaves "
         text += nm_text(own.residual_nm, ".1f", unit="nm rms")
         if found.limit is not None:
@@ -92,9 +92,9 @@ def _summary_section(
     return Section(key="summary", title="Summary", blocks=tuple(blocks))
 
 
-def _failure_chart(config: Config, name: str, design: FusedFilter, key: str) -> Chart:
+def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:
     """Draw a run in which each sensor and channel is missing in turn."""
-    units = design.problem.suite.units
+    units = (OWN_SENSOR, *design.other_sensors)
     drops = [
         Drop(unit=unit, start_s=(2 * i + 1) * _AWAY_S, end_s=(2 * i + 2) * _AWAY_S)
         for i, unit in enumerate(units)

@@ -27,7 +27,6 @@ from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 if TYPE_CHECKING:
-    from lbt_synth.loop.fusion.fused_loop import AnyLoop
     from lbt_synth.loop.least_residuals.band_limit import BandLimit
     from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 
@@ -192,12 +191,12 @@ def limits(
     )
 
 
-def _limit_nm(loop: AnyLoop, limit: ResidualLimit | BandLimit | None) -> float:
+def _limit_nm(loop: ClosedLoop, limit: ResidualLimit | BandLimit | None) -> float:
     """Return a limit of the loop's own sensor; nan where a loop reads others, or there is none."""
     return limit.rms_nm if limit is not None and isinstance(loop, ClosedLoop) else np.nan
 
 
-def _phase_margin_deg(loop: AnyLoop) -> float:
+def _phase_margin_deg(loop: ClosedLoop) -> float:
     """Return the least phase margin; nan if the loop is unstable, or of several sensors."""
     if not loop.is_stable or not isinstance(loop, ClosedLoop):
         return np.nan
@@ -223,7 +222,7 @@ def _error_band(truth: Truth, shifts: FloatArray) -> tuple[float, float] | None:
 
 
 def _evaluate_loop(
-    loop: AnyLoop, truth: Truth, imaging: Imaging, shifts: FloatArray
+    loop: ClosedLoop, truth: Truth, imaging: Imaging, shifts: FloatArray
 ) -> tuple[float, float, FloatArray]:
     """Return residual [nm], Strehl ratio and residual at each shift [nm]; nan if unstable."""
     if not loop.is_stable:

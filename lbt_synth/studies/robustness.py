@@ -198,6 +198,7 @@ def robustness_map(
     errors_hz: ArrayLike,
     sensor_gains: ArrayLike,
     delay_errors_frames: ArrayLike = (0.0,),
+    hardware: LoopHardware | None = None,
     advance: Callable[[int], object] | None = None,
 ) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
@@ -217,6 +218,8 @@ def robustness_map(
         Real sensor gains relative to the design's sensor matrix.
     delay_errors_frames : (d,) array_like, optional
         Real delay less that of the design [frames].
+    hardware : LoopHardware, optional
+        Loop to close; that of the design by default.
     advance : callable, optional
         Called with the number of points computed since its last call.
 
@@ -250,7 +253,7 @@ def robustness_map(
     """
     for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
         require_instance(value, kind)
-    hardware = _checked_hardware(design)
+    hardware = _checked_hardware(design, hardware)
     errors = _checked_axis(errors_hz, "errors_hz")
     gains = _checked_axis(sensor_gains, "sensor_gains", above=0)
     delays = _checked_axis(
@@ -312,9 +315,9 @@ def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
     return next(((band.low_hz - most_hz, band.high_hz - most_hz) for band in held), None)
 
 
-def _checked_hardware(design: Design) -> LoopHardware:
-    """Return the loop of a design, which has one or two axes."""
-    hardware = require_hardware(design, "a map")
+def _checked_hardware(design: Design, hardware: LoopHardware | None) -> LoopHardware:
+    """Return the loop of a design, or the other one given, which has one or two axes."""
+    hardware = hardware or require_hardware(design, "a map")
     if hardware.modes > 2:
         raise DimensionError(
             f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."

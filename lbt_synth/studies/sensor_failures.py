@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.design.fusion.fused_filter import FusedFilter
+from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, Simulation, residual_budget
-from lbt_synth.loop.fusion.fused_loop import FusedLoop, close_fused_loop
-from lbt_synth.loop.fusion.simulation import Drop, Segment, run_segments, simulate_fused
+from lbt_synth.loop import ClosedLoop, Imaging, Simulation, close_loop, residual_budget
+from lbt_synth.loop.simulation.failing_sensors import (
+    Drop,
+    Segment,
+    run_segments,
+    simulate_sensors,
+)
 from lbt_synth.loop.strehl import series_strehl
-from lbt_synth.models import Truth
+from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 
 
@@ -71,7 +76,7 @@ class FailureRun:
 
 
 def run_failures(
-    design: FusedFilter,
+    design: Design,
     config: Config,
     truth: Truth,
     drops: Sequence[Drop],
@@ -82,11 +87,11 @@ def run_failures(
 ) -> FailureRun:
     """Run the loop of a configuration in which sensors fail, none after the end of the run."""
     filters = design.controllers
-    simulation = simulate_fused(
+    hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
+    simulation = simulate_sensors(
         filters,
-        design.problem.suite,
         truth,
-        hardware=config.hardware,
+        hardware=hardware,
         frames=frames,
         cases=cases,
         seed=seed,
@@ -94,7 +99,7 @@ def run_failures(
         drops=drops,
     )
     segments = run_segments(drops, frames / config.hardware.frame_rate_hz)
-    loops = [_segment_loop(design, filters, config, truth, segment) for segment in segments]
+    loops = [_segment_loop(hardware, filters, truth, segment) for segment in segments]
     return FailureRun(
         simulation=simulation,
         segments=segments,
@@ -109,16 +114,14 @@ def run_failures(
 
 
 def _segment_loop(
-    design: FusedFilter,
+    hardware: LoopHardware,
     filters: Mapping[frozenset[str], Controller],
-    config: Config,
     truth: Truth,
     segment: Segment,
-) -> FusedLoop:
+) -> ClosedLoop:
     """Return the loop of a segment, with its filter."""
-    return close_fused_loop(
-        config.hardware,
-        design.problem.suite,
+    return close_loop(
+        hardware,
         filters[frozenset(segment.missing)],
         sensor_gain=truth.sensor_gain,
         blind=(*segment.missing, *segment.wrong),

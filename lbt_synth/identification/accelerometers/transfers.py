@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design.fusion.failures import MOST_UNITS
+from lbt_synth.design.fallbacks import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.accelerometers.laying import (
     ClockShift,

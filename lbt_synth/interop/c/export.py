@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.design import Design, FusedFilter
+from lbt_synth.design import Design
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.interop.arithmetic_cost import frame_cost, has_straight_line_form
 from lbt_synth.interop.c.arithmetic import join, read_source
-from lbt_synth.interop.c.fused_export import export_fused
+from lbt_synth.interop.c.masked_export import export_masked
 from lbt_synth.interop.c.source_text import (
     exact_constant,
     render_source,
@@ -127,10 +127,10 @@ def export_c(
     choice(precision, "precision", ("double", "single"))
     prefix = require_identifier(target.stem if name is None else name)
     form = _checked_form(design, form)
-    if isinstance(design, FusedFilter):
+    if isinstance(design, Design) and design.other_sensors:
         _require_one_sensor(modes, other_gain)
         require_certified(design)
-        return export_fused(
+        return export_masked(
             target,
             design,
             name=prefix,
@@ -207,7 +207,7 @@ def _source_path(path: str | os.PathLike[str]) -> Path:
 
 def _checked_form(design: ModalDesign, form: str | None) -> str:
     """Return the form of the source; a filter of several sensors has one."""
-    several = isinstance(design, FusedFilter)
+    several = isinstance(design, Design) and bool(design.other_sensors)
     if form is None:
         return "estimator" if several else "plain"
     choice(form, "form", ("plain", "estimator"))

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from lbt_synth.design import FusedFilter
+from lbt_synth.design import Design
 from lbt_synth.design.modal import MixedController
 from lbt_synth.errors import ProblemError
+from lbt_synth.interop.specula.accompanied_filter import accompany_filter
 from lbt_synth.interop.specula.calibration import Calibration, cache_directory, calibrate
 from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
-from lbt_synth.interop.specula.fused_filter import accompany_filter
 from lbt_synth.interop.specula.optics import Modes, Optics
 from lbt_synth.interop.specula.system import EndToEndSystem
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
@@ -106,7 +106,7 @@ class EndToEndSetup:
         tip_tilt_gain : float, optional
             Integrator gain of tip and tilt where there is no filter.
         """
-        if isinstance(filter, FusedFilter):
+        if isinstance(filter, Design) and filter.other_sensors:
             shaken = Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
             filter = accompany_filter(filter, shaken, **self._length)  # noqa: A001
         hardware = getattr(filter, "hardware", None)

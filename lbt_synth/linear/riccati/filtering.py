@@ -325,8 +325,8 @@ def meets_level(problem: EstimationProblem, gamma: float, start: FilterRiccati) 
     """Return whether a filter meets a level of gamma; ``start`` is the Kalman filter's solution."""
     if problem.period > 1:
         return gamma_riccati(problem, gamma, start=start) is not None
-    rows = problem.read[0]
-    equation = GammaEquation(problem.phase(0), _gather_gains(start, rows))
+    part = ReadPart(problem)
+    equation = GammaEquation(part.problem, part.gather(start))
     return equation.trial(gamma).P is not None
 
 

@@ -127,7 +127,7 @@ def draw_others(
         seen = [first + i for i, name in enumerate(suite.channels) if name in moved]
         if isinstance(vibration, Vibration) and seen:
             process = seen_vibration(vibration, moved, suite.accelerometers, hardware)
-            inner = rng.standard_normal((cases, 1 + frames, process.B.shape[2] - 3))
+            inner = rng.standard_normal((cases, 1 + frames, process.B.shape[-1] - 3))
             drive = np.concatenate([line.drive, inner], axis=2)
             out[:, :, seen] += run_oscillator(process, vibration, drive)[:, :, 1:]
         elif seen:

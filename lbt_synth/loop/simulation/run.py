@@ -158,6 +158,11 @@ def simulate(
         controller = as_controller(controller, others=", an object with step(y) and reset()")
         loop = close_loop(hardware, controller, sensor_gain=truth.sensor_gain)
         loop.require_stable()
+        if loop.reads_others:
+            raise ProblemError(
+                "this run has readings of the loop's own sensor alone; got a controller of several "
+                "sensors. Try lbt-synth simulate."
+            )
         default = settling_frames(loop.spectral_radius)
     settle = default
     if settle_frames is not None:

@@ -226,4 +226,4 @@ def _sampled(angle: float, damping: float) -> tuple[FloatArray, FloatArray]:
     whole[:3, :3], whole[3:, 3:], whole[1, 4] = -rates, rates.T, 1.0
     both = expm(whole)
     transition = both[3:, 3:].T
-    return transition, np.linalg.cholesky(symmetrise(transition @ both[:3, 3:]))
+    return transition, np.asarray(np.linalg.cholesky(symmetrise(transition @ both[:3, 3:])))

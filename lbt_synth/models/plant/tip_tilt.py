@@ -192,12 +192,21 @@ class TipTiltPlant(EstimationProblem):
         """Square root of the noise covariance of the loop's own sensor, (q, q)."""
         q, D = self.hardware.n_measurements, self.stacks()[3][0]
         first = D.shape[1] - self.hardware.n_readings
-        return D[:q, first : first + q]
+        return np.asarray(D[:q, first : first + q])
 
     def with_memory(self, taps: FloatArray) -> TipTiltPlant:
         """Add the past innovations of a filter as states; see :class:`EstimationProblem`."""
-        longer = EstimationProblem.with_memory(self, taps)
-        return cast("TipTiltPlant", replace(longer, memory=self.memory + np.shape(taps)[1]))
+        longer = cast("TipTiltPlant", EstimationProblem.with_memory(self, taps))
+        return replace(longer, memory=longer.n_states - self.n_states + self.memory)
+
+    def require_own_sensor(self, what: str) -> None:
+        """Refuse a loop with other sensors beside its own, for what reads that alone."""
+        if self.hardware.suite.sensors:
+            others = ", ".join(self.hardware.suite.units[1:])
+            raise ProblemError(
+                f"{what} reads the loop's own sensor alone; got a plant that {others} see, too. "
+                "Take plant.own_sensor_alone(), or kalman, hinf or mixed, which read all."
+            )
 
     def own_sensor_alone(self) -> TipTiltPlant:
         """Return the plant of the loop's own sensor, without the others."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -28,23 +29,10 @@ from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
 from lbt_synth.loop.moving_gain import MovingGain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.storage.rows import fill_row
 from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 _GAINS = np.geomspace(0.01, 100.0, 400)  # where stable intervals are looked for
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopDesign(Design):
-    """A design in the loop of a configuration instead of its own."""
-
-    loop_hardware: LoopHardware  # The loop
-
-    @property
-    def hardware(self) -> LoopHardware | None:
-        """The loop."""
-        return self.loop_hardware
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -109,9 +97,9 @@ def assess_design(
     )
     checks, complaint = _recertify(design)
     own = design.hardware
-    carrier = fill_row(LoopDesign, design, loop_hardware=hardware)
+    mapped = partial(robustness_map, design, truth, config.imaging, hardware=hardware)
     curve, found = (
-        robustness_map(carrier, truth, config.imaging, errors_hz=errors_hz, sensor_gains=gains)
+        mapped(errors_hz=errors_hz, sensor_gains=gains)
         for gains in ([truth.sensor_gain], sensor_gains / assumed_gain)
     )
     return DesignAssessment(

@@ -11,11 +11,10 @@ from lbt_synth.design import Design
 from lbt_synth.linear import hinf_norm, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop
-from lbt_synth.report.designs.assessment import LoopDesign
 from lbt_synth.report.designs.simulation import exact_spectrum
 from lbt_synth.report.explore.knobs import shift_range_hz
 from lbt_synth.report.figures.loop import frequency_grid
-from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.studies import robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -88,9 +87,10 @@ def performance(
     truth = replace(config.truth, **lines)
     shifts = np.unique(np.append(np.linspace(*shift_range_hz(start), _SHIFTS), shift_hz))
     found = robustness_map(
-        fill_row(LoopDesign, design, loop_hardware=hardware),
+        design,
         truth,
         config.imaging,
+        hardware=hardware,
         errors_hz=shifts,
         sensor_gains=[truth.sensor_gain],
     )

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.signal import welch
 
 from lbt_synth.loop import Simulation
-from lbt_synth.loop.fusion.simulation import Segment
+from lbt_synth.loop.simulation.failing_sensors import Segment
 from lbt_synth.report.charts.description import Axis, Curve, Mark, Panel, Span
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import FREQUENCY

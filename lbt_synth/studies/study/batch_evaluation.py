@@ -97,8 +97,9 @@ def are_evaluated_together(study: Study, controller: StudyController) -> bool:
     if study.settings.evaluation != "exact":
         return False
     if controller.design is None:
-        return _is_kalman_for_sample(controller) and study.config.fused_plant is None
-    return not controller.design.several_sensors
+        alone = not study.config.hardware.suite.sensors
+        return _is_kalman_for_sample(controller) and alone
+    return not controller.design.other_sensors
 
 
 def _evaluate_groups(

@@ -20,8 +20,7 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, refuse_config
 from lbt_synth.loop import ClosedLoop, residual_budget, simulate, strehl
-from lbt_synth.loop.fusion.fused_loop import AnyLoop
-from lbt_synth.loop.fusion.simulation import simulate_fused
+from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
 from lbt_synth.models import LoopHardware, Truth
@@ -179,7 +178,7 @@ def evaluate_row(
 ) -> tuple[dict[str, float], tuple[Failure, ...]]:
     """Evaluate one sample, and return its results by column and its failures."""
     failures: list[Failure] = []
-    loops: dict[str, AnyLoop] = {}
+    loops: dict[str, ClosedLoop] = {}
     out: dict[str, float] = {}
     with _note_failure(failures, row, study.controllers):
         sample = make_sample(study, values)
@@ -225,12 +224,12 @@ def design_for_sample(controller: StudyController, sample: Sample) -> Design:
     return sample.config.design(controller.request)
 
 
-def close_sample_loop(sample: Sample, design: Design) -> AnyLoop:
+def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
     """Close the real loop of a sample with a design."""
     return design.close(sample.hardware, sensor_gain=sample.truth.sensor_gain)
 
 
-def _evaluate_exactly(loop: AnyLoop, sample: Sample) -> dict[str, float]:
+def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
     """Return the exact residual of a stable loop by origin, and its Strehl ratio."""
     budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
     spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
@@ -239,25 +238,16 @@ def _evaluate_exactly(loop: AnyLoop, sample: Sample) -> dict[str, float]:
     return {"strehl": ratio} | {name: getattr(budget, part) for name, part in RESIDUALS.items()}
 
 
-def _simulate(loop: AnyLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
+def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
     """Return the mean Strehl ratio and the residual of a stable loop, simulated as configured."""
     section = sample.config.settings.simulation
     sizes = {"frames": section.frames, "cases": section.cases, "settle_frames": settle}
-    truth, hardware = sample.truth, sample.hardware
-    if isinstance(loop, ClosedLoop):
-        run = simulate(loop.controller, truth, hardware=hardware, seed=seed, **sizes)
+    truth, hardware = sample.truth, loop.hardware
+    if loop.reads_others:
+        filters = {frozenset[str](): loop.controller}
+        run = simulate_sensors(filters, truth, hardware=hardware, seed=seed, **sizes)
     else:
-        own = {frozenset[str](): loop.controller}
-        run = simulate_fused(
-            own,
-            loop.suite,
-            truth,
-            hardware=hardware,
-            frames=section.frames,
-            cases=section.cases,
-            settle_frames=settle,
-            seed=seed,
-        )
+        run = simulate(loop.controller, truth, hardware=hardware, seed=seed, **sizes)
     return {
         "strehl": float(np.mean(run.strehl(sample.config.imaging))),
         "residual_nm": float(np.sqrt(np.mean(run.rms_nm**2))),

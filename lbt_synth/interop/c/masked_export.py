@@ -5,19 +5,19 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from lbt_synth.design import Check, FusedFilter
+from lbt_synth.design import Check, Design, FilterDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.arithmetic_cost import FrameCost, frame_cost
-from lbt_synth.interop.c.fused_terms import (
-    FusedSource,
-    FusedTerms,
-    fused_rehearsal_error,
-    fused_terms,
-    prove_fused,
+from lbt_synth.interop.c.masked_terms import (
+    MaskedSource,
+    MaskedTerms,
+    masked_rehearsal_error,
+    masked_terms,
+    prove_masked,
 )
 from lbt_synth.interop.c.source_text import exact_constant, render_source, wrap_sum
 from lbt_synth.interop.export_checks import Exported, comment_text, provenance_lines, write_export
@@ -29,9 +29,9 @@ MOST_GAINS = 1_000_000  # in the table: 8 MB of memory, 25 MB of source
 _LARGEST_ERROR = 0.01  # of the largest command
 
 
-def export_fused(
+def export_masked(
     target: Path,
-    design: FusedFilter,
+    design: Design,
     *,
     name: str,
     precision: str,
@@ -40,14 +40,14 @@ def export_fused(
 ) -> Exported:
     """Write a filter of several sensors, as :func:`export_c` does; all its checks have to pass."""
     single = precision == "single"
-    exact = fused_terms(design)
+    exact = masked_terms(cast("FilterDesign", design))
     _require_short(exact)
     terms = exact.rounded() if single else exact
-    error_single = fused_rehearsal_error(design, exact.rounded(), np.float32)
-    error = error_single if single else fused_rehearsal_error(design, exact, np.float64)
+    error_single = masked_rehearsal_error(design, exact.rounded(), np.float32)
+    error = error_single if single else masked_rehearsal_error(design, exact, np.float64)
     how = "a run in which each sensor is missing for a while"
     close = Check("commands in a rehearsal, difference", error, _LARGEST_ERROR, how)
-    checks = (*prove_fused(design, terms), close)
+    checks = (*prove_masked(design, terms), close)
     require_proved(checks, f"{precision} precision", "Try double precision.")
     lines = provenance_lines(design, gain_digest)
     if single:
@@ -55,7 +55,7 @@ def export_fused(
     cost = _frame_cost(design, terms)
     header = target.with_suffix(".h")
     source, declarations = render_source(
-        "fused",
+        "masked",
         single=single,
         p=name,
         P=name.upper(),
@@ -83,12 +83,12 @@ def export_fused(
         sensors=list(terms.rows),
         error=error,
         error_single=error_single,
-        start=lambda _: FusedSource(terms, dtype),
+        start=lambda _: MaskedSource(terms, dtype),
         cost=cost,
     )
 
 
-def _require_short(terms: FusedTerms) -> None:
+def _require_short(terms: MaskedTerms) -> None:
     """Refuse a table of gains that no computer should have to hold."""
     gains = sum(np.count_nonzero(_used(terms, some)) for some in terms.gains)
     count = gains * next(iter(terms.gains.values())).shape[1]
@@ -100,7 +100,7 @@ def _require_short(terms: FusedTerms) -> None:
         )
 
 
-def _used(terms: FusedTerms, missing: frozenset[str]) -> BoolArray:
+def _used(terms: MaskedTerms, missing: frozenset[str]) -> BoolArray:
     """Return which readings are due in each phase where some sensors are missing, (N, q)."""
     used = terms.read.copy()
     for unit in missing:
@@ -108,7 +108,7 @@ def _used(terms: FusedTerms, missing: frozenset[str]) -> BoolArray:
     return used
 
 
-def _written_out(terms: FusedTerms, *, single: bool) -> dict[str, Any]:
+def _written_out(terms: MaskedTerms, *, single: bool) -> dict[str, Any]:
     """Return what the templates print of the terms."""
     writer = _SumWriter(len(terms.command[0]), exact_constant(0.0, single=single))
     transition = writer.write("A B", terms.transition, "x{}", 18)
@@ -170,7 +170,7 @@ class _SumWriter:
         return "+", f"c[{len(self.constants) - 1}] * {signal}"
 
 
-def _describe_units(terms: FusedTerms) -> list[dict[str, Any]]:
+def _describe_units(terms: MaskedTerms) -> list[dict[str, Any]]:
     """Return name, identifier, measurements and period of each sensor and channel."""
     words = [re.sub(r"[^A-Z0-9]+", "_", unit.upper())[:24].strip("_") for unit in terms.rows]
     if len(set(words)) < len(words) or not all(words):  # names that differ in other letters alone
@@ -189,14 +189,14 @@ def _describe_units(terms: FusedTerms) -> list[dict[str, Any]]:
     ]
 
 
-def _due_masks(terms: FusedTerms) -> list[int]:
+def _due_masks(terms: MaskedTerms) -> list[int]:
     """Return which sensors and channels are due in each phase, as sums of powers of two."""
     places = [own.start for own in terms.rows.values()]
     masks: list[int] = (terms.read[:, places] @ (1 << np.arange(len(places)))).tolist()
     return masks
 
 
-def _gain_table(terms: FusedTerms, *, single: bool) -> dict[str, Any]:
+def _gain_table(terms: MaskedTerms, *, single: bool) -> dict[str, Any]:
     """Return the gains, column by column, and where those of each phase and set begin."""
     units = tuple(terms.rows)
     sets = [
@@ -218,7 +218,7 @@ def _gain_table(terms: FusedTerms, *, single: bool) -> dict[str, Any]:
     return {"gain_blocks": blocks, "first": first, "gain_count": count, "sets": len(sets)}
 
 
-def _frame_cost(design: FusedFilter, terms: FusedTerms) -> FrameCost:
+def _frame_cost(design: Design, terms: MaskedTerms) -> FrameCost:
     """Count the arithmetic of a frame in which all sensors are read."""
     writes, factors, stored = 0, 0, 0
     for part in (terms.transition, terms.innovation, terms.command[None]):

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Check, FusedFilter
+from lbt_synth.design import Check, Design, FilterDesign
 from lbt_synth.interop.c.source_text import round_to_single
 from lbt_synth.interop.export_checks import FRAMES
 from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.loop import close_loop
+from lbt_synth.loop.budget import plant_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.loop.fusion.fused_loop import close_fused_loop, fused_model_budget
-from lbt_synth.loop.fusion.simulation import Drop, simulate_fused
+from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
 from lbt_synth.models import Truth
 from lbt_synth.validation import BoolArray, FloatArray
 
@@ -27,7 +28,7 @@ _LOSS = 0.01  # of the residual, relative
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FusedTerms:
+class MaskedTerms:
     """The coefficients of a filter of several sensors, as its source has them.
 
     With the states x (s,), of which the first n are estimates, and the commands u(k-1) that were
@@ -43,7 +44,7 @@ class FusedTerms:
     rows: Mapping[str, slice]  # of each sensor or channel in y
     dt_s: float
 
-    def rounded(self) -> FusedTerms:
+    def rounded(self) -> MaskedTerms:
         """Return the terms in single precision."""
         names = ("transition", "innovation", "command")
         whole = round_to_single({name: getattr(self, name) for name in names})
@@ -70,30 +71,35 @@ class FusedTerms:
         )
 
 
-def fused_terms(design: FusedFilter) -> FusedTerms:
+def masked_terms(design: FilterDesign) -> MaskedTerms:
     """Return the coefficients of a filter of several sensors and of its fall-backs."""
     plant = design.problem
-    n, s, m = plant.n_states, plant.n_states + plant.n_known, plant.own.hardware.n_commands
+    full = plant.full()
+    n, s, m = plant.n_states, full.n_states, plant.hardware.n_commands
+    A, _, C, _ = full.stacks()
     transition = np.zeros((plant.period, s, s + m))
-    transition[:, :n, :n] = plant.A
-    transition[:, n:, n:] = np.concatenate([plant.A_known, plant.B_known], axis=2)
-    predicted = np.concatenate([plant.stacks()[2], plant.C_known, plant.D_known], axis=2)
-    fallbacks = {frozenset(each.missing): each.gains for each in design.fallbacks}
-    return FusedTerms(
+    transition[:, :, :s], transition[:, :, s:] = A, full.B_known
+    predicted = np.zeros((plant.period, plant.n_measurements, s + m))
+    predicted[:, :, :s], predicted[:, :, s:] = C, full.D_known
+    filters = {(): design.gain_predictor} | {f.missing: f.gains for f in design.fallbacks}
+    return MaskedTerms(
         transition=transition,
         innovation=-predicted,
-        command=design.controller.phase(0).C,
-        gains={frozenset(): design.gains, **fallbacks},
+        command=design.controller.stacks()[2][0],
+        gains={
+            frozenset(missing): np.reshape(gains, (plant.period, n, plant.n_measurements))
+            for missing, gains in filters.items()
+        },
         read=plant.read,
-        rows=plant.suite.rows(plant.own.hardware),
+        rows=plant.hardware.suite.rows(plant.hardware),
         dt_s=plant.dt_s,
     )
 
 
-class FusedSource:
+class MaskedSource:
     """A source of several sensors, stepped as it is written: term by term, each rounded."""
 
-    def __init__(self, terms: FusedTerms, dtype: Any) -> None:
+    def __init__(self, terms: MaskedTerms, dtype: Any) -> None:
         self._terms, self._dtype = terms, dtype
         self._parts = [terms.transition, terms.innovation, terms.command]
         self._parts = [part.astype(dtype) for part in self._parts]
@@ -139,27 +145,26 @@ class FusedSource:
         return np.asarray(self._last, dtype=np.float64)
 
 
-def fused_rehearsal_error(design: FusedFilter, terms: FusedTerms, dtype: Any) -> float:
+def masked_rehearsal_error(design: Design, terms: MaskedTerms, dtype: Any) -> float:
     """Largest difference of commands from the design's, over the largest command.
 
     Both get the readings and commands of a run of the design's loop, in which each sensor and
     channel is missing for a while. The source is stable by itself, so that no loop is needed.
     """
     plant, units = design.problem, tuple(terms.rows)
-    own, rate = plant.own, plant.own.hardware.frame_rate_hz
+    rate = plant.hardware.frame_rate_hz
     turns = 2 * len(units) + 1
     length = plant.period * int(np.ceil(FRAMES / turns / plant.period))  # all are due at its begin
     starts = {unit: (2 * i + 1) * length for i, unit in enumerate(units)}
-    run = simulate_fused(
+    run = simulate_sensors(
         design.controllers,
-        plant.suite,
         Truth(
-            turbulence=own.turbulence,
-            vibrations=own.vibrations,
+            turbulence=plant.turbulence,
+            vibrations=plant.vibrations,
             motions=plant.motions,
-            noise_nm=np.linalg.norm(own.parts().noise_factor, axis=1),
+            noise_nm=np.linalg.norm(plant.own_noise_factor, axis=1),
         ),
-        hardware=own.hardware,
+        hardware=plant.hardware,
         frames=turns * length,
         settle_frames=0,
         drops=[
@@ -168,7 +173,7 @@ def fused_rehearsal_error(design: FusedFilter, terms: FusedTerms, dtype: Any) ->
         ],
     )
     expected, readings = run.commands[0], run.measurements[0]
-    source = FusedSource(terms, dtype)
+    source = MaskedSource(terms, dtype)
     found, last = np.empty_like(expected), np.zeros_like(expected[0])
     with np.errstate(all="ignore"):  # what overflows is found to be infinite
         for k, y in enumerate(readings):
@@ -179,7 +184,7 @@ def fused_rehearsal_error(design: FusedFilter, terms: FusedTerms, dtype: Any) ->
     return error if np.isfinite(error) else float("inf")
 
 
-def prove_fused(design: FusedFilter, terms: FusedTerms) -> tuple[Check, ...]:
+def prove_masked(design: Design, terms: MaskedTerms) -> tuple[Check, ...]:
     """Check the loops around the coefficients of a source: that of all sensors, and the others.
 
     The estimator is stable by itself, with all sensors; each loop is stable, with the residual of
@@ -199,14 +204,14 @@ def prove_fused(design: FusedFilter, terms: FusedTerms) -> tuple[Check, ...]:
         radii, losses = [0.0], [0.0]
         for some in sets:
             loops = [
-                close_fused_loop(plant.own.hardware, plant.suite, k, blind=tuple(some))
+                close_loop(plant.hardware, k, blind=tuple(some))
                 for k in (terms.controller(some), controllers[some])
             ]
             radii.append(loops[0].system.radius_per_frame)
             if not loops[0].is_stable:
                 losses.append(np.inf)
                 break
-            own, before = (fused_model_budget(loop, plant).rms_nm for loop in loops)
+            own, before = (plant_budget(loop, plant).rms_nm for loop in loops)
             losses.append(own / before - 1)
         checks.append(Check(f"spectral radius with {name}", max(radii), limit, how))
         what = f"residual with {name}, loss"

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.design import FusedFilter
+from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import Controller
-from lbt_synth.loop.fusion.simulation import draw_others
 from lbt_synth.loop.simulation.disturbances import draw_parts
+from lbt_synth.loop.simulation.failing_sensors import draw_others
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.validation import FloatArray
 
@@ -45,13 +46,14 @@ class AccompaniedFilter:
         return self._running.step(measured)
 
 
-def unread_sensors(design: FusedFilter) -> tuple[str, ...]:
+def unread_sensors(design: Design) -> tuple[str, ...]:
     """Return the sensors that an end-to-end simulation does not have: further wavefront sensors."""
-    return tuple(sensor.name for sensor in design.problem.suite.wavefront)
+    hardware = design.hardware
+    return () if hardware is None else tuple(s.name for s in hardware.suite.wavefront)
 
 
 def accompany_filter(
-    design: FusedFilter, shaken: Truth, *, frames: int, settle_frames: int, seed: int
+    design: Design, shaken: Truth, *, frames: int, settle_frames: int, seed: int
 ) -> AccompaniedFilter:
     """Return a filter of tip and tilt with the readings of its accelerometers in a run.
 
@@ -59,7 +61,8 @@ def accompany_filter(
     vibrations of the run, and how channels move with them; frames and seed are those of
     :func:`run_end_to_end`, whose motions the readings follow.
     """
-    hardware, channels = design.loop_hardware, design.problem.suite.channels
+    hardware = require_hardware(design, "an end-to-end simulation")
+    channels = hardware.suite.channels
     if (hardware.n_measurements, hardware.n_commands) != (2, 2):
         raise DimensionError(
             "the filter must map two measurements of the loop's own sensor, tip and tilt, to two "
@@ -75,7 +78,7 @@ def accompany_filter(
     rng, oscillators = np.random.default_rng(seed), range(len(shaken.vibrations))
     _, lines = draw_parts(shaken, hardware, rng=rng, oscillators=oscillators, **size)
     (own_rng,) = rng.spawn(1)
-    others = draw_others(shaken, hardware, design.problem.suite, lines, own_rng, **size)
+    others = draw_others(shaken, hardware, lines, own_rng, **size)
     return AccompaniedFilter(
         controller=design.controllers[missing], others=others[0], hardware=hardware
     )
