@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.signal import lfilter
+from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
 from lbt_synth.models.plant.readings import fused_plant
@@ -61,20 +62,43 @@ def held_mean(history, k, age, frames):
     return out / frames
 
 
-def acceleration(hardware, sensor, motion, frequency_hz, signal):
-    """Return what a channel reads in each frame of a vibration (frames, ...), in m/s^2."""
-    age, step = age_frames(hardware, sensor), 2 * np.pi * frequency_hz / hardware.frame_rate_hz
-    whole = int(np.floor(age + 1e-9))
-    factor = motion.size * np.exp(1j * (np.deg2rad(motion.phase_deg) - step * (age - whole)))
-    if sensor.highpass_hz:
-        factor = factor / (1 + sensor.highpass_hz / (1j * frequency_hz))
-    # two successive samples have this factor at the frequency of the vibration
-    turn = np.exp(-1j * step)
-    first, second = np.linalg.solve([[1, turn.real], [0, turn.imag]], [factor.real, factor.imag])
-    v = np.concatenate([np.zeros((whole + 3, *signal.shape[1:])), signal, 0 * signal[:1]])
-    bend = (v[2:] - 2 * v[1:-1] + v[:-2]) * hardware.frame_rate_hz**2 * 1e-9
-    k = np.arange(len(signal)) + whole + 2  # bend[i] is that at sample i + 1 of v
-    return first * bend[k - whole] + second * bend[k - whole - 1]
+def channel_factor(sensor, motion, frequency_hz):
+    """Return the complex factor of a channel at the frequency of a line."""
+    factor = motion.size * np.exp(1j * np.deg2rad(motion.phase_deg))
+    return factor / (1 + (sensor.highpass_hz or 0.0) / (1j * frequency_hz))
+
+
+def newest_end(hardware, sensor):
+    """Return how many frames before the end of a frame its reading's exposure ends."""
+    return age_frames(hardware, sensor) - frames_per_reading(hardware, sensor) + 1
+
+
+def acceleration(hardware, sensor, motion, line):
+    """Return mean positions and readings (frames, kicks) of a line after kicks in frame 0.
+
+    A reading is the mean over its exposure: acceleration, and velocity where it is out of phase.
+    """
+    w, period = 2 * np.pi * line.frequency_hz, frames_per_reading(hardware, sensor)
+    newest = newest_end(hardware, sensor)
+    whole = int(np.floor(newest + 1e-9))
+    oscillator = KickedOscillator(w * hardware.dt_s, line.damping, line.rms_nm, steps=8)
+    positions, states = oscillator.paths(1 - (newest - whole), 400)
+    ends = np.concatenate([np.zeros((whole + period, *states.shape[1:])), states])
+    change = ends[period : period + len(states)] - ends[: len(states)]
+    x, v = np.moveaxis(change / (period * hardware.dt_s), 2, 0)
+    factor = channel_factor(sensor, motion, line.frequency_hz)
+    return positions, 1e-9 * w * (factor.real * v - factor.imag * x)
+
+
+def sinusoid_reading(hardware, sensor, motion, frequency_hz, signal):
+    """Return what a channel reads (frames,) of a sinusoid of mean positions (frames,) [nm]."""
+    w, frames = 2 * np.pi * frequency_hz, np.arange(len(signal))
+    wave = np.exp(1j * w * hardware.dt_s * frames)
+    parts = np.linalg.lstsq(np.stack([wave.real, -wave.imag], axis=1), signal)[0]
+    ages = newest_end(hardware, sensor) + np.arange(frames_per_reading(hardware, sensor))
+    mean = np.mean(np.exp(-1j * w * hardware.dt_s * ages))
+    factor = channel_factor(sensor, motion, frequency_hz)
+    return np.real(-1e-9 * w**2 * factor * mean * complex(*parts) * wave)
 
 
 def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuck=0.0):
@@ -136,34 +160,44 @@ def simulated_covariances(plant, controller, *, frames=300, **loop):
     begin = 4 * N if N > 1 else 8
     total, added, origins = [], [], []
 
-    def drive(origin, model, direction, motion, frequency_hz):
+    def add(origin, signal, direction, read, t):
+        pad = ((begin + t, N - t), (0, 0))
+        total.append(np.pad(signal[:frames], pad)[:, :, None] * direction)
+        added.append(np.pad(read[:frames], (*pad, (0, 0))))
+        origins.extend([origin] * signal.shape[1])
+
+    def drive(origin, model, direction):
+        white = model.driving_rms_nm * np.eye(frames, 1)
+        signal = lfilter([1.0], [1.0, *-np.asarray(model.coefficients)], white, axis=0)
         for t in range(N):
-            white = np.zeros(begin + N + frames)
-            white[begin + t] = model.driving_rms_nm
-            signal = lfilter([1.0], [1.0, *-np.asarray(model.coefficients)], white)
-            read = np.zeros((len(white), q))
-            for sensor in suite.accelerometers:
-                for channel in motion.keys() & set(sensor.channels):
-                    own = acceleration(hardware, sensor, motion[channel], frequency_hz, signal)
-                    read[:, rows[channel].start] = own
-            total.append(signal[:, None] * direction)
-            added.append(read)
-            origins.append(origin)
+            add(origin, signal, direction, np.zeros((frames, 1, q)), t)
 
     for mode, model in enumerate(plant.own.turbulence):
-        drive(0, model, np.eye(n)[mode], {}, 0.0)
+        drive(0, model, np.eye(n)[mode])
     for line, motion in zip(plant.own.vibrations, plant.motions, strict=True):
-        model, direction = line.ar_model(RATE_HZ), np.array(line.direction)
-        drive(1, model, direction, motion, line.frequency_hz)
+        direction = np.array(line.direction)
+        if not motion:
+            drive(1, line.ar_model(RATE_HZ), direction)
+            continue
+        readings = {}
+        for sensor in suite.accelerometers:
+            for channel in motion.keys() & set(sensor.channels):
+                signal, one = acceleration(hardware, sensor, motion[channel], line)
+                readings[rows[channel].start] = one
+        read = np.zeros((*signal.shape, q))
+        for row, one in readings.items():
+            read[:, :, row] = one
+        for t in range(N):
+            add(1, signal, direction, read, t)
     factors = [plant.own.D[:, -hardware.n_measurements :]]
     factors += [each.noise_factor(n) for each in suite.sensors]
     for column in block_diag(*factors).T:
         for t in range(N):
-            read = np.zeros((begin + N + frames, q))
-            read[begin + t] = column
-            total.append(np.zeros((len(read), n)))
-            added.append(read)
-            origins.append(2)
-    left = run_loop(plant, controller, np.stack(total, axis=1), np.stack(added, axis=1), **loop)
+            read = np.zeros((frames, 1, q))
+            read[0, 0] = column
+            add(2, np.zeros((frames, 1)), np.zeros(n), read, t)
+    left = run_loop(
+        plant, controller, np.concatenate(total, axis=1), np.concatenate(added, axis=1), **loop
+    )
     powers = np.einsum("fri,frj->rij", left, left) / N
     return [powers[np.array(origins) == origin].sum(axis=0) for origin in range(3)]

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-STEPS = 64  # of a frame, with four kicks each
-
 
 @dataclass(frozen=True)
 class KickedOscillator:
@@ -21,6 +19,7 @@ class KickedOscillator:
     angle: float  # w0 T
     damping: float
     rms_nm: float
+    steps: int = 64  # of a frame, with four kicks each
 
     @property
     def _rates(self) -> np.ndarray:
@@ -36,9 +35,9 @@ class KickedOscillator:
     def kicks(self) -> tuple[np.ndarray, np.ndarray]:
         """Times in a frame, and sizes."""
         nodes, weights = np.polynomial.legendre.leggauss(4)
-        times = (np.arange(STEPS)[:, None] + (nodes + 1) / 2) / STEPS
-        powers = 4 * self.damping * self.angle * self.rms_nm**2 * weights / (2 * STEPS)
-        return times.ravel(), np.sqrt(np.tile(powers, STEPS))
+        times = (np.arange(self.steps)[:, None] + (nodes + 1) / 2) / self.steps
+        powers = 4 * self.damping * self.angle * self.rms_nm**2 * weights / (2 * self.steps)
+        return times.ravel(), np.sqrt(np.tile(powers, self.steps))
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps (2, 2), (2, kicks) to the state at a time of a frame."""
@@ -63,3 +62,16 @@ class KickedOscillator:
         A[4:6, :2], B[4:6] = self.at(part)
         A[6:, 4:-2] = np.eye(size - 6)
         return A, B
+
+    def paths(self, part: float, frames: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean positions (frames, kicks) and states (frames, kicks, 2) at a part of frames.
+
+        Each kick of frame 0 has a path of its own, from rest.
+        """
+        A, state = self.chain(part, 1)
+        positions, states = np.empty((frames, state.shape[1])), []
+        for k in range(frames):
+            positions[k] = state[2]
+            states.append(state[4:6].T)
+            state = A @ state
+        return positions, np.array(states)

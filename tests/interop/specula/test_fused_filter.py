@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.fused_loops import acceleration
+from support.fused_loops import sinusoid_reading
 from support.small_telescope import BRIGHT, PATH, SETUP, needs_specula
 
 import lbt_synth as lbt
@@ -75,7 +75,9 @@ def test_channels_follow_the_motions_that_shake_the_telescope():
     moved = {0: tilts[:, 0] - 0.6 * second, 1: second}
     for column, channel in enumerate(("m1", "m2")):
         expected = sum(
-            acceleration(PATH, MIRROR, MOTIONS[line][channel], SHAKES[line].frequency_hz, motion)
+            sinusoid_reading(
+                PATH, MIRROR, MOTIONS[line][channel], SHAKES[line].frequency_hz, motion
+            )
             for line, motion in moved.items()
             if channel in MOTIONS[line]
         )

@@ -34,7 +34,10 @@ THIRD = Accelerometer(
     name="third", rate_hz=RATE_HZ / 3, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-3
 )
 HALF = Accelerometer(
-    name="half", rate_hz=RATE_HZ / 2, delay_frames=1.3, channels=("m2",), noise_m_s2=2e-3
+    name="half", rate_hz=RATE_HZ / 2, delay_frames=1.625, channels=("m2",), noise_m_s2=2e-3
+)
+SLEEPY = Accelerometer(  # its exposures wait, and end within a frame
+    name="sleepy", rate_hz=RATE_HZ / 3, delay_frames=2.875, channels=("m1", "m2"), noise_m_s2=2e-3
 )
 SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=500)
 AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, frame_rate_hz=RATE_HZ)
@@ -67,6 +70,7 @@ def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
         ({"delay_frames": 1.5, "turbulence": AR3}, {}),
         ({"delay_frames": 3, "sensors": (HALF, SLOW)}, {}),
         ({"sensors": (AGELESS,)}, {}),
+        ({"sensors": (SLEEPY,)}, {}),
         ({"mirror": SHELL, "influence_matrix": [[2.0, 0.1], [0.3, 1.0]]}, {}),
         ({"sensor_matrix": [[1, 0], [0, 1], [0.5, 0.5]], "noise_nm": [30, 30, 40]}, {}),
     ],
@@ -89,12 +93,12 @@ def test_rates_that_do_not_divide_each_other():
     assert np.abs(budget.noise_nm2 - noise).max() < 1e-8 * np.trace(noise)
 
 
-@pytest.mark.parametrize("age", [0, 1, 1.4])
-def test_a_sinusoid_leaves_what_a_run_leaves(age):
+@pytest.mark.parametrize(("age", "period"), [(0, 1), (1, 1), (1.4, 1), (2.4, 2)])
+def test_a_sinusoid_leaves_what_a_run_leaves(age, period):
     fast = Accelerometer(
         name="mirror",
-        rate_hz=RATE_HZ,
-        delay_frames=1 + age,
+        rate_hz=RATE_HZ / period,
+        delay_frames=(1 + age) / period,
         channels=("m1",),
         noise_m_s2=2e-3,
         highpass_hz=5.0,
@@ -105,11 +109,11 @@ def test_a_sinusoid_leaves_what_a_run_leaves(age):
     line = lbt.models.SinusoidalVibration(frequency_hz=hertz, rms_nm=200, direction=(3, 4))
     truth = Truth(turbulence=None, vibrations=(line,), motions=plant.motions[:1])
     budget = fused_budget(loop, truth)
-    # an accelerometer reads the second difference, turned and weakened, some frames ago
+    # an accelerometer reads -w^2 times the mean position, turned and weakened, some frames ago
     wave = 200 * np.sqrt(2) * np.exp(2j * np.pi * hertz / RATE_HZ * np.arange(frames))
     angle = 2 * np.pi * hertz / RATE_HZ
-    late = np.exp(-1j * angle * age) / (1 + 5.0 / (1j * hertz))
-    read = -4e-3 * np.sin(angle / 2) ** 2 * MOTIONS[0]["m2"].factor * late * wave
+    late = np.mean(np.exp(-1j * angle * (age - np.arange(period)))) / (1 + 5.0 / (1j * hertz))
+    read = -1e-9 * (2 * np.pi * hertz) ** 2 * MOTIONS[0]["m2"].factor * late * wave
     total, added = np.zeros((frames, 2, 2)), np.zeros((frames, 2, 5))
     for run, part in enumerate((np.real, np.imag)):
         total[:, run] = part(wave)[:, None] * np.array([0.6, 0.8])
