@@ -75,3 +75,13 @@ class KickedOscillator:
             states.append(state[4:6].T)
             state = A @ state
         return positions, np.array(states)
+
+    def draw(self, frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean positions and mean accelerations over w0^2 of frames, (frames,) each."""
+        A, B = self.chain(1.0, 2)
+        drives = rng.standard_normal((frames, B.shape[1])) @ B.T
+        state, states = np.zeros(len(A)), np.empty((frames, len(A)))
+        state[[0, 1, 4, 5]] = np.tile(self.rms_nm * rng.standard_normal(2), 2)
+        for k, drive in enumerate(drives):
+            state = states[k] = A @ state + drive
+        return states[:, 2], (states[:, 5] - states[:, 7]) / self.angle

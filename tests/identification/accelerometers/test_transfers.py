@@ -6,9 +6,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
+from lbt_synth.loop.fusion.simulation import draw_others
+from lbt_synth.loop.simulation.disturbances import draw_parts
+from lbt_synth.models import Accelerometer, Motion, SensorSuite
 
 RATE = 1000.0
 FRAMES = 20_000
@@ -22,7 +26,7 @@ class Night:
     """Two axes with lines and noise, the motions of the lines, and the model of the record."""
 
     record: lbt.identification.LoopRecord
-    motions: np.ndarray  # (lines, frames + 2 MARGIN)
+    accelerations: np.ndarray  # (lines, frames + 2 MARGIN), means over frames [m/s^2]
     model: lbt.identification.IdentifiedModel
 
 
@@ -30,26 +34,24 @@ class Night:
 def night() -> Night:
     """An open loop whose wavefront follows its lines by one frame."""
     rng = np.random.default_rng(3)
-    motions = []
-    for frequency, damping, rms, _ in LINES:
-        model = lbt.Vibration(frequency_hz=frequency, damping=damping, rms_nm=rms).ar_model(RATE)
-        drive = model.driving_rms_nm * rng.standard_normal(FRAMES + 2 * MARGIN + 2000)
-        motions.append(lfilter([1], [1, *-model.coefficients], drive)[2000:])
-    seen = np.zeros((FRAMES, 2))
-    for (_, _, _, axis), motion in zip(LINES, motions, strict=True):
-        seen[:, axis] += motion[MARGIN - 1 : MARGIN - 1 + FRAMES]
+    accelerations, seen = [], np.zeros((FRAMES, 2))
+    for frequency, damping, rms, axis in LINES:
+        w = 2 * np.pi * frequency
+        oscillator = KickedOscillator(w / RATE, damping, rms, steps=8)
+        position, acceleration = oscillator.draw(FRAMES + 2 * MARGIN, rng)
+        accelerations.append(1e-9 * w**2 * acceleration)
+        seen[:, axis] += position[MARGIN - 1 : MARGIN - 1 + FRAMES]
     seen += 8 * rng.standard_normal(seen.shape)
     record = lbt.identification.loop_record(seen, frame_rate_hz=RATE, unit="nm")
-    return Night(record, np.array(motions), lbt.identify(record))
+    return Night(record, np.array(accelerations), lbt.identify(record))
 
 
 def reading(*factors: float, age: int = 1, noise: float = 0.0, seed: int = 0) -> np.ndarray:
     """Return a channel that moves with the lines by real factors, as old as ``age``."""
-    total = np.asarray(factors) @ night().motions[: len(factors)]
-    second = 1e-9 * RATE**2 * np.diff(total, 2)  # value k is centred on frame k + 1 - MARGIN
-    start = MARGIN - 1 - age
+    total = np.asarray(factors) @ night().accelerations[: len(factors)]
+    start = MARGIN - age
     noisy = noise * np.random.default_rng(seed).standard_normal(FRAMES)
-    return np.asarray(second[start : start + FRAMES] + noisy)
+    return np.asarray(total[start : start + FRAMES] + noisy)
 
 
 def find(*channels: np.ndarray, **options) -> AccelerometerTransfers:
@@ -121,6 +123,43 @@ def test_a_fraction_of_a_frame_goes_into_the_phases():
         j = line_index(row)
         phase = 360 * LINES[j][0] / RATE * (found.age_frames - 1.5) + 180 * (j == 1)
         assert phase_error(row, phase) < 5 * row.phase_error_deg
+
+
+@pytest.mark.parametrize(("delay_frames", "rate_hz"), [(2.0, 800.0), (1.4, 800.0)])
+def test_a_run_gives_the_motions_back(delay_frames, rate_hz):
+    """The ratio of second differences is 5 % too small at 60 Hz and 800 Hz: 2 sin(w T / 2) / T."""
+    path = lbt.LoopHardware(frame_rate_hz=rate_hz, delay_frames=2, modes=2)
+    lines = tuple(
+        lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=60, direction=d)
+        for f, d in ((60.0, (1, 0)), (150.0, (0, 1)))
+    )
+    motions = ({"m1": Motion(size=2.0, phase_deg=30)}, {"m1": Motion(size=0.4, phase_deg=-120)})
+    sensor = Accelerometer(
+        name="mirror",
+        rate_hz=rate_hz,
+        delay_frames=delay_frames,
+        channels=("m1",),
+        noise_m_s2=1e-3,
+    )
+    truth = lbt.Truth(turbulence=None, vibrations=lines, motions=motions)
+    size = {"frames": 40_000, "cases": 1, "zero_frame": 0}
+    rng = np.random.default_rng(5)
+    _, drawn = draw_parts(truth, path, rng=rng, oscillators=(0, 1), **size)
+    read = draw_others(truth, path, SensorSuite(sensors=(sensor,)), drawn, rng, **size)
+    # the wavefront sensor measures in frame k the phase of frame k - 1
+    seen = np.stack([np.roll(line.motion[0], 1) for line in drawn], axis=1)
+    seen += rng.standard_normal(seen.shape)
+    record = lbt.identification.loop_record(seen[1:], frame_rate_hz=rate_hz, unit="nm")
+    found = lbt.identification.accelerometer_transfers(
+        lbt.identify(record), record, read[0, 1:], largest_shift_s=0.01
+    )
+    assert len(found.transfers) == 2
+    for row, line, motion in zip(found.transfers, lines, motions, strict=True):
+        late = 360 * line.frequency_hz / rate_hz * (found.age_frames - (delay_frames - 1))
+        size_nm, phase_deg = motion["m1"].size, motion["m1"].phase_deg + late
+        assert abs(row.motion_nm_per_nm / size_nm - 1) < 0.005
+        assert abs(row.motion_nm_per_nm - size_nm) < 4 * row.motion_error_nm_per_nm
+        assert phase_error(row, phase_deg) < min(4 * row.phase_error_deg, 0.5)
 
 
 def test_one_narrow_line_does_not_tell_the_shift():

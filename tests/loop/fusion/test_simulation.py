@@ -8,7 +8,9 @@ import pytest
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop.fusion.fused_loop import close_fused_loop
-from lbt_synth.loop.fusion.simulation import Drop, run_segments, simulate_fused
+from lbt_synth.loop.fusion.simulation import Drop, draw_others, run_segments, simulate_fused
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_parts
+from lbt_synth.models.fusion.seen_vibration import seen_vibration
 
 
 def run(fused, config, drops=(), **options):
@@ -82,6 +84,56 @@ def test_a_sinusoid_that_channels_see(fused, fused_config):
         cases=4,
     )
     assert np.sqrt(np.mean(found.rms_nm**2)) == pytest.approx(exact.rms_nm, rel=0.03)
+
+
+@pytest.mark.parametrize(("period", "delay_frames"), [(1, 1.3), (2, 1.6)])
+def test_readings_and_phase_of_a_run_are_those_of_one_oscillator(period, delay_frames):
+    """Where exposures end within a frame; the positions are drawn without knowing of it."""
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
+    line = lbt.Vibration(frequency_hz=60, damping=0.1, rms_nm=100, direction=(1,))
+    channel = lbt.models.Accelerometer(
+        name="mirror",
+        rate_hz=800 / period,
+        delay_frames=delay_frames,
+        channels=("m1",),
+        noise_m_s2=1e-9,
+    )
+    motion = {"m1": lbt.models.Motion(size=1, phase_deg=50)}
+    truth = lbt.Truth(turbulence=None, vibrations=(line,), motions=(motion,))
+    size = {"frames": 20_000, "cases": 4}
+    rng = np.random.default_rng(4)
+    _, drawn = draw_parts(truth, path, rng=rng, oscillators=(0,), **size)
+    suite = lbt.models.SensorSuite(sensors=(channel,))
+    read = draw_others(truth, path, suite, drawn, rng, zero_frame=0, **size)[:, 100::period, 0]
+    both = np.stack([drawn[0].motion[:, 100::period].ravel(), read.ravel()])
+    expected = seen_vibration(line, motion, (channel,), path).output_covariances()[0]
+    sizes = np.sqrt(np.diag(expected))
+    found = np.cov(both) / np.outer(sizes, sizes)
+    np.testing.assert_allclose(found, expected / np.outer(sizes, sizes), atol=0.03)
+    same = draw_disturbance(truth, path, rng=np.random.default_rng(4), oscillators=(0,), **size)
+    np.testing.assert_array_equal(same[:, :, 0], drawn[0].motion)
+
+
+def test_a_line_that_drifts_is_read_at_its_frequency_of_the_moment():
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
+    line = lbt.models.DriftingVibration(
+        start_hz=40, end_hz=80, duration_s=10, rms_nm=100, direction=(1,)
+    )
+    channel = lbt.models.Accelerometer(
+        name="mirror", rate_hz=800, delay_frames=2.5, channels=("m1",), noise_m_s2=1e-12
+    )
+    motion = {"m1": lbt.models.Motion(size=2, phase_deg=70)}
+    truth = lbt.Truth(turbulence=None, vibrations=(line,), motions=(motion,))
+    size = {"frames": 8000, "cases": 1, "zero_frame": 0}
+    _, drawn = draw_parts(truth, path, rng=np.random.default_rng(4), **size)
+    suite = lbt.models.SensorSuite(sensors=(channel,))
+    read = draw_others(truth, path, suite, drawn, np.random.default_rng(5), **size)[0, :, 0]
+    time_s = np.arange(8000) / 800
+    wave = np.exp(2j * np.pi * line.turns_at(time_s - 1.5 / 800))
+    start = np.random.default_rng(4).spawn(2)[1].uniform(0, 2 * np.pi)
+    size_m_s2 = 1e-9 * (2 * np.pi * line.frequency_hz_at(time_s)) ** 2 * line.amplitude_nm
+    expected = np.real(-size_m_s2 * motion["m1"].factor * wave * np.exp(1j * start))
+    assert np.abs(read - expected)[5:].max() < 2e-3 * np.abs(expected).max()
 
 
 def test_segments_of_drops_that_overlap():

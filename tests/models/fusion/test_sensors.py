@@ -1,15 +1,15 @@
 """Sensors beside the loop's own: ages, schedules, accelerations, refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from support.fused_loops import FAST, SLOW, acceleration
+from support.fused_loops import FAST, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.models import Accelerometer, LoopHardware, Motion, SensorSuite, WavefrontSensor
-from lbt_synth.models.sensor_suite import acceleration_taps, checked_motions, period_frames
+from lbt_synth.models.fusion.sensors import checked_motions, period_frames
 
 PATH = LoopHardware(frame_rate_hz=1000, delay_frames=2, modes=2)
 
@@ -25,43 +25,10 @@ def accelerometer(**changes):
     return Accelerometer(**(facts | {"noise_m_s2": 2e-4} | changes))
 
 
-@settings(max_examples=12)
-@given(
-    frequency_hz=st.floats(0.3, 480),
-    age=st.sampled_from([0.0, 1.0, 2.0]) | st.floats(0, 4, exclude_max=True),
-    factor=st.sampled_from([2.0, -1.0, 1j, 0.5 - 1.5j]),
-)
-def test_taps_have_the_factor_and_the_delay_at_the_line(frequency_hz, age, factor):
-    newest, taps = acceleration_taps(factor, frequency_hz, 1000.0, age)
-    angle = 2 * np.pi * frequency_hz / 1000
-    response = np.sum(taps * np.exp(-1j * angle * (newest + np.arange(len(taps)))))
-    second = -4e-9 * np.sin(angle / 2) ** 2 * 1000**2
-    expected = factor * second * np.exp(-1j * angle * age)
-    tolerance = 1e-9 * abs(expected) + 1e-15 * np.abs(taps).sum()
-    assert abs(response - expected) < tolerance
-    assert newest == int(age) - 1
-
-
-def test_a_slow_sinusoid_has_the_acceleration_of_physics():
-    newest, taps = acceleration_taps(1.0, 2.0, 1000.0, 0.0)
-    wave = 500 * np.cos(2 * np.pi * 2.0 * np.arange(-1, 2) / 1000)  # nm
-    assert newest == -1
-    assert taps @ wave == pytest.approx(-((2 * np.pi * 2) ** 2) * 500e-9, rel=1e-4)
-
-
-def test_the_support_of_these_tests_reads_the_same():
-    signal = np.random.default_rng(0).standard_normal(50)
-    motion = Motion(size=0.7, phase_deg=110)
-    factor = motion.factor * FAST.band(60.0)
-    newest, taps = acceleration_taps(factor, 60.0, 1000.0, FAST.age_frames(PATH))
-    read = acceleration(PATH, FAST, motion, 60.0, signal)
-    expected = np.convolve(signal, taps)[: len(signal) - newest]
-    np.testing.assert_allclose(read[10:], expected[10 - newest : len(read) - newest], rtol=1e-9)
-
-
 def test_the_high_pass_turns_and_weakens():
-    assert accelerometer(highpass_hz=20.0).band(20.0) == pytest.approx(0.5 + 0.5j)
-    assert accelerometer().band(20.0) == 1
+    motion = Motion(size=2.0)
+    assert accelerometer(highpass_hz=20.0).factor(motion, 20.0) == pytest.approx(1 + 1j)
+    assert accelerometer().factor(motion, 20.0) == 2
 
 
 @pytest.mark.parametrize(
@@ -72,7 +39,9 @@ def test_the_high_pass_turns_and_weakens():
         (1, wavefront(rate_hz=1000, delay_frames=1), 1),
         (2, accelerometer(), 1),
         (2, accelerometer(delay_frames=1), 0),
-        (3, accelerometer(rate_hz=500, delay_frames=1.25), 0.5),
+        (3, accelerometer(rate_hz=500, delay_frames=1.75), 1.5),
+        (3, accelerometer(rate_hz=500, delay_frames=1.5), 1),
+        (1.5, accelerometer(delay_frames=1), 0.5),
     ],
 )
 def test_ages(delay, sensor, age):
@@ -126,9 +95,12 @@ def test_the_noise_of_all_sensors():
         (lambda: accelerometer(channels=("m1", "m1")), "channels of mirror must be different"),
         (lambda: wavefront(sensor_matrix=np.eye(3)).response(2), "must have 2 columns"),
         (lambda: wavefront(delay_frames=1).age_frames(PATH), "at least 1.25 of its frames.*got 1"),
+        (lambda: accelerometer(delay_frames=0.5), "delay_frames.* at least 1"),
         (
-            lambda: accelerometer(delay_frames=0.5).age_frames(PATH),
-            "delay of mirror must be at least that of the commands, 1 frames of the loop; got 0.5",
+            lambda: accelerometer(rate_hz=500, delay_frames=1.25).age_frames(
+                replace(PATH, delay_frames=3)
+            ),
+            "delay of sensor mirror must be at least 1.5 of its frames, .* ended .* got 1.25",
         ),
         (lambda: period_frames(wavefront(rate_hz=300), PATH), "whole multiple .*got 300 Hz"),
         (lambda: period_frames(wavefront(rate_hz=2000), PATH), "whole multiple"),

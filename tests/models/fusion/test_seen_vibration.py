@@ -1,0 +1,117 @@
+"""Vibrations that accelerometers see, against oscillators that are kicked within each frame."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_lyapunov
+from support.oscillators import KickedOscillator
+
+import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.models import Accelerometer, LoopHardware, Motion
+from lbt_synth.models.fusion.seen_vibration import seen_vibration
+
+RATE_HZ = 800.0
+PATH = LoopHardware(frame_rate_hz=RATE_HZ, delay_frames=2, modes=1)
+LAGS = 4
+
+
+def mirror(**changes):
+    facts = {"name": "mirror", "rate_hz": RATE_HZ, "delay_frames": 1, "noise_m_s2": 1e-3}
+    return Accelerometer(**(facts | {"channels": ("a", "v")} | changes))
+
+
+def lag_covariances(A, B, C):
+    """Return the covariances of y(k + lag) and y(k) of a system without periods."""
+    P = solve_discrete_lyapunov(A, B @ B.T)
+    return np.array([C @ np.linalg.matrix_power(A, lag) @ P @ C.T for lag in range(LAGS)])
+
+
+@pytest.mark.parametrize("part", [1.0, 0.25])
+@pytest.mark.parametrize(
+    ("frequency_hz", "damping"), [(5, 1e-3), (5, 0.1), (60, 0.05), (150, 0.03), (390, 0.9)]
+)
+def test_exact_sampling_has_the_covariances_of_256_kicks_a_frame(frequency_hz, damping, part):
+    line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=563.6)
+    motion = {"a": Motion(size=1), "v": Motion(size=1, phase_deg=90)}
+    late = mirror(delay_frames=2 - part)
+    seen = seen_vibration(line, motion, (late,), PATH)
+    w = 2 * np.pi * frequency_hz
+    units = 1.0, -1e-9 * w**2, -1e-9 * w**2  # the readings are about -w^2 times positions
+    found = lag_covariances(seen.A[0], seen.B[0], seen.C[0] / np.array(units)[:, None])
+    A, B = KickedOscillator(w / RATE_HZ, damping, 563.6).chain(part, 2)
+    C = np.zeros((3, len(A)))
+    C[0, 2] = 1.0
+    C[1, [5, 7]] = np.array([-1, 1]) * RATE_HZ / w  # less the mean acceleration over w^2
+    C[2, [4, 6]] = np.array([1, -1]) * RATE_HZ / w  # the mean velocity over w
+    expected = lag_covariances(A, B, C)
+    sizes = np.sqrt(np.diag(expected[0]))
+    assert np.abs((found - expected) / np.outer(sizes, sizes)).max() < 1e-9
+    assert sizes[0] < 563.6
+
+
+def test_the_oscillator_has_the_rms_of_the_line():
+    line = lbt.Vibration(frequency_hz=150, damping=0.03, rms_nm=563.6)
+    P = seen_vibration(line, {}, (), PATH).covariances()[0]
+    np.testing.assert_allclose(P[1:, 1:], 563.6**2 * np.eye(2), rtol=1e-12, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("period", "age"), [(1, 0.0), (1, 0.3), (1, 2.0), (1, 1.6), (2, 1.0), (4, 3.7), (4, 9.25)]
+)
+@pytest.mark.parametrize("ahead", [0, 1, 3])
+def test_a_line_that_hardly_decays_is_read_as_a_sinusoid(period, age, ahead):
+    """In size and phase: its readings over its mean positions, as it turns freely."""
+    sensor = mirror(rate_hz=RATE_HZ / period, delay_frames=(age + 1) / period, highpass_hz=20.0)
+    motion = {"a": Motion(size=2, phase_deg=-30), "v": Motion(size=0.5, phase_deg=110)}
+    line = lbt.Vibration(frequency_hz=77, damping=1e-9, rms_nm=1)
+    seen = seen_vibration(line, motion, (sensor,), PATH, ahead=ahead)
+    turn = 2j * np.pi * 77 / RATE_HZ
+    # the free motion from frame to frame; after some frames the memory is filled
+    state = seen.still @ np.array([1.0, 1.0j])
+    for t in range(30 * seen.period):
+        state = seen.A[t % seen.period] @ state
+    position, *readings = seen.C[0] @ state
+    ratios = np.array(readings) / (position * np.exp(-turn * ahead))
+    expected = [sensor.swing(motion[name], 77.0, PATH) for name in ("a", "v")]
+    np.testing.assert_allclose(ratios, expected, rtol=1e-6)
+
+
+def test_the_mean_acceleration_of_a_sinusoid_is_that_of_physics():
+    w, ages = 2 * np.pi * 60, 0.3 + np.arange(2)
+    found = mirror(rate_hz=RATE_HZ / 2, delay_frames=1.15).swing(Motion(size=3), 60.0, PATH)
+    late = np.mean(np.exp(-1j * w * ages / RATE_HZ))
+    assert found == pytest.approx(-3e-9 * w**2 * late, rel=1e-12)
+
+
+def test_a_reading_knows_nothing_of_the_frame_to_come():
+    line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
+    seen = seen_vibration(line, {"a": Motion(size=1)}, (mirror(),), PATH)
+    assert not seen.D.any()
+    # of the drive of its own frame it has what the velocity at the end has
+    w = 2 * np.pi * 60
+    np.testing.assert_allclose(
+        (seen.C[0] @ seen.B[0])[1], 1e-9 * w * RATE_HZ * seen.B[0, 2], rtol=1e-12
+    )
+
+
+def test_positions_do_not_depend_on_who_reads():
+    line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
+    alone = seen_vibration(line, {}, (), PATH)
+    late = mirror(delay_frames=1.4), mirror(name="b", channels=("b",), delay_frames=2.7)
+    seen = seen_vibration(line, {"v": Motion(size=1), "b": Motion(size=2)}, late, PATH)
+    np.testing.assert_allclose(seen.B[0, :3, :3], alone.B[0], rtol=1e-9, atol=1e-9)
+    assert np.abs(seen.B[0, :3, 3:]).max() < 1e-9 * np.abs(alone.B).max()
+
+
+def test_channels_that_move_alike_share_their_memory():
+    line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
+    alike = {"a": Motion(size=1), "v": Motion(size=0.3, phase_deg=180)}
+    apart = alike | {"v": Motion(size=0.3, phase_deg=90)}
+    sizes = [seen_vibration(line, each, (mirror(),), PATH).n_states for each in (alike, apart)]
+    assert sizes == [4, 5]
+
+
+def test_lines_above_the_nyquist_frequency_are_refused():
+    line = lbt.Vibration(frequency_hz=401, damping=0.05, rms_nm=500)
+    with pytest.raises(ProblemError, match="below the Nyquist frequency"):
+        seen_vibration(line, {}, (), PATH)
