@@ -25,7 +25,9 @@ from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.loop.fusion.fused_loop import close_fused_loop
-from lbt_synth.models.plant.readings import FusedPlant
+from lbt_synth.loop.simulation.disturbances import run_oscillator
+from lbt_synth.models.fusion.plant import FusedPlant
+from lbt_synth.models.fusion.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -63,17 +65,18 @@ def random_lines(rng: np.random.Generator) -> list[lbt.Vibration]:
     return out
 
 
-def series(line: lbt.Vibration, frames: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw the motion of a line [nm]."""
-    model = line.ar_model(RATE)
-    settle = int(5 / (2 * np.pi * line.damping * line.frequency_hz) * RATE)
-    drive = model.driving_rms_nm * rng.standard_normal(frames + settle)
-    return np.asarray(lfilter([1], [1, *-model.coefficients], drive)[settle:])
-
-
-def accelerations(motion: np.ndarray) -> np.ndarray:
-    """Return second differences of motions [nm] as accelerations [m/s^2]."""
-    return np.asarray(1e-9 * RATE**2 * np.diff(motion, 2, axis=-1))
+def series(
+    line: lbt.Vibration, frames: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw mean positions [nm] and mean accelerations [m/s^2] of a line in frames."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE)
+    mirror = lbt.models.Accelerometer(
+        name="mirror", rate_hz=RATE, delay_frames=1, channels=("m1",), noise_m_s2=1.0
+    )
+    seen = seen_vibration(line, {"m1": lbt.models.Motion(size=1)}, (mirror,), path)
+    drive = rng.standard_normal((1, 1 + frames, seen.B.shape[2]))
+    positions, accelerations = run_oscillator(seen, line, drive)[0].T
+    return positions, accelerations
 
 
 def case(seed: int, frames: int) -> Case:
@@ -86,8 +89,9 @@ def case(seed: int, frames: int) -> Case:
     turbulence = lbt.models.ARModel(
         coefficients=[a1, a2], driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=RATE
     )
-    shaking = np.array([series(line, frames + 2 * MARGIN, rng) for line in lines])
-    total = np.array([line.direction for line in lines]).T @ shaking[:, MARGIN:-MARGIN]
+    drawn = [series(line, frames + 2 * MARGIN, rng) for line in lines]
+    positions, accelerations = np.array(drawn).transpose(1, 0, 2)
+    total = np.array([line.direction for line in lines]).T @ positions[:, MARGIN:-MARGIN]
     slow = lfilter(
         [1],
         [1, -a1, -a2],
@@ -96,11 +100,9 @@ def case(seed: int, frames: int) -> Case:
     late = int(rng.integers(0, 21))
     motions = rng.uniform(0.3, 3, (2, 3)) * rng.choice([-1, 1], (2, 3))
     motions[np.arange(2), rng.integers(0, 3, 2)] *= rng.integers(0, 2, 2)
-    own = [series(line, frames + 2 * MARGIN, rng) for line in random_lines(rng)]
-    readings = accelerations(np.vstack([motions @ shaking, np.sum(own, axis=0)]))
-    # column k of the second differences is centred on frame k + 1 - MARGIN
-    start = MARGIN - 2 - late
-    readings = readings[:, start : start + frames]
+    unrelated = sum(series(line, frames + 2 * MARGIN, rng)[1] for line in random_lines(rng))
+    start = MARGIN - 1 - late  # the wavefront's reading of a frame is of the frame before
+    readings = np.vstack([motions @ accelerations, unrelated])[:, start : start + frames]
     size = readings.std(axis=1, keepdims=True)
     size = size * rng.uniform(0.1, 1, (3, 1))
     readings = readings + size * rng.standard_normal(readings.shape)
@@ -180,14 +182,14 @@ def loss(seed: int, frames: int) -> float:
         path = lbt.config.save_config(Path(folder) / "model.yaml", settings, comments=comments)
         config = lbt.load_config(path)
     best, own = true_plant(it, found.channels[0].channel, found.channels[1].channel), config.plant
-    kalman = lbt.linear.kalman_riccati
-    least = close(best, best.controller(kalman(best).gain_predictor), best.suite)
+    kalman = lbt.linear.periodic_kalman
+    least = close(best, best.controller(kalman(best).gains), best.suite)
     if config.fused_plant is None:
         loop = lbt.close_loop(best.own.hardware, lbt.kalman(own).controller)
     else:
         plant = config.fused_plant
         read = true_plant(it, *plant.suite.channels)
-        loop = close(best, plant.controller(kalman(plant).gain_predictor), read.suite)
+        loop = close(best, plant.controller(kalman(plant).gains), read.suite)
     truth = replace(it.truth, motions=best.motions)
     if config.fused_plant is not None:
         truth = replace(it.truth, motions=read.motions)

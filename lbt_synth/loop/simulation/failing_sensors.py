@@ -125,12 +125,14 @@ def draw_others(
     first = out.shape[2] - len(suite.channels)  # column of the first channel
     for vibration, line, moved in zip(truth.vibrations, lines, moving, strict=True):
         seen = [first + i for i, name in enumerate(suite.channels) if name in moved]
-        if isinstance(vibration, Vibration) and seen:
+        if not seen:
+            continue
+        if isinstance(vibration, Vibration):
             process = seen_vibration(vibration, moved, suite.accelerometers, hardware)
             inner = rng.standard_normal((cases, 1 + frames, process.B.shape[-1] - 3))
             drive = np.concatenate([line.drive, inner], axis=2)
             out[:, :, seen] += run_oscillator(process, vibration, drive)[:, :, 1:]
-        elif seen:
+        else:
             time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
             readings = [
                 _acceleration(sensor, hardware, vibration, line.motion, moved[name], time_s)
@@ -166,8 +168,8 @@ def _acceleration(
     swing = sensor.swing(moved, frequency_hz, hardware) * np.exp(1j * turn * newest)
     # beyond its begin the motion counts as still: the first readings are in the settling
     padded = np.pad(motion, ((0, 0), (newest + 1, 0)), mode="edge")[:, : motion.shape[1] + 1]
-    late, later = padded[:, 1:], padded[:, :-1]
-    return np.asarray(swing.real * late - swing.imag * (later - np.cos(turn) * late) / np.sin(turn))
+    now, before = padded[:, 1:], padded[:, :-1]
+    return np.asarray(swing.real * now - swing.imag * (before - np.cos(turn) * now) / np.sin(turn))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

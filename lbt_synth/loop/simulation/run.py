@@ -175,9 +175,15 @@ def simulate(
             f"need {gigabytes:.3g} GB. Run fewer cases at once, with different seeds."
         )
     disturbance_rng, noise_rng = np.random.default_rng(seed).spawn(2)
-    size = {"frames": settle + frames, "cases": cases}
-    total = draw_disturbance(truth, hardware, rng=disturbance_rng, zero_frame=settle, **size)
-    noise = draw_noise(truth, hardware, rng=noise_rng, **size)
+    total = draw_disturbance(
+        truth,
+        hardware,
+        frames=settle + frames,
+        cases=cases,
+        rng=disturbance_rng,
+        zero_frame=settle,
+    )
+    noise = draw_noise(truth, hardware, frames=settle + frames, cases=cases, rng=noise_rng)
     if isinstance(controller, Controller) and stroke is None:
         outputs = filter_series(loop.system, np.concatenate([total, noise], axis=2))
     else:

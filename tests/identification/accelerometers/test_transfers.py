@@ -84,7 +84,7 @@ def test_factors_shift_and_noise_are_those_of_the_channels():
             assert row.coherence > 0.5
     for row in found.channels:
         assert row.noise_m_s2 == pytest.approx(noise, rel=0.2)
-    assert found.channels[1].verdict == "used for 31.1, 56 Hz"
+    assert found.channels[1].verdict == "used for 30.9, 56 Hz"
 
 
 def test_errors_count_that_of_the_sensor_gain():
@@ -125,9 +125,10 @@ def test_a_fraction_of_a_frame_goes_into_the_phases():
         assert phase_error(row, phase) < 5 * row.phase_error_deg
 
 
-@pytest.mark.parametrize(("delay_frames", "rate_hz"), [(2.0, 800.0), (1.4, 800.0)])
-def test_a_run_gives_the_motions_back(delay_frames, rate_hz):
-    """The ratio of second differences is 5 % too small at 60 Hz and 800 Hz: 2 sin(w T / 2) / T."""
+@pytest.mark.parametrize("delay_frames", [2.0, 1.4])
+def test_a_run_gives_the_motions_back(delay_frames):
+    """Second differences of samples are smaller than accelerations: by 2 % at 60, 11 % at 150 Hz."""
+    rate_hz = 800.0
     path = lbt.LoopHardware(frame_rate_hz=rate_hz, delay_frames=2, modes=2)
     lines = tuple(
         lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=60, direction=d)
@@ -143,12 +144,12 @@ def test_a_run_gives_the_motions_back(delay_frames, rate_hz):
     )
     truth = lbt.Truth(turbulence=None, vibrations=lines, motions=motions)
     size = {"frames": 40_000, "cases": 1, "zero_frame": 0}
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(1)
     _, drawn = draw_parts(truth, path, rng=rng, oscillators=(0, 1), **size)
     read = draw_others(truth, path, SensorSuite(sensors=(sensor,)), drawn, rng, **size)
     # the wavefront sensor measures in frame k the phase of frame k - 1
     seen = np.stack([np.roll(line.motion[0], 1) for line in drawn], axis=1)
-    seen += rng.standard_normal(seen.shape)
+    seen += 8 * rng.standard_normal(seen.shape)
     record = lbt.identification.loop_record(seen[1:], frame_rate_hz=rate_hz, unit="nm")
     found = lbt.identification.accelerometer_transfers(
         lbt.identify(record), record, read[0, 1:], largest_shift_s=0.01
