@@ -75,8 +75,8 @@ def accompany_filter(
         )
     missing = frozenset(unread_sensors(design))
     size = {"frames": settle_frames + frames, "cases": 1, "zero_frame": settle_frames}
-    rng, oscillators = np.random.default_rng(seed), range(len(shaken.vibrations))
-    _, lines = draw_parts(shaken, hardware, rng=rng, oscillators=oscillators, **size)
+    rng = np.random.default_rng(seed)
+    _, lines = draw_parts(shaken, hardware, rng=rng, oscillators=True, **size)
     (own_rng,) = rng.spawn(1)
     others = draw_others(shaken, hardware, lines, own_rng, **size)
     return AccompaniedFilter(

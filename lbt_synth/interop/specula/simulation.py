@@ -143,7 +143,12 @@ class EndToEndSetup:
         """
         control = self.controller(filter, tip_tilt_gain=tip_tilt_gain)
         return run_end_to_end(
-            self.system, control, vibrations=self.vibrations, **self._length, **options
+            self.system,
+            control,
+            vibrations=self.vibrations,
+            motions=self.motions,
+            **self._length,
+            **options,
         )
 
     @property
@@ -157,6 +162,7 @@ def run_end_to_end(
     controller: SteppedController,
     *,
     vibrations: Sequence[TrueVibration] = (),
+    motions: Motions = (),
     frames: int = 1600,
     settle_frames: int = 400,
     seed: int = 0,
@@ -185,6 +191,9 @@ def run_end_to_end(
     vibrations : sequence of Vibration, SinusoidalVibration or DriftingVibration, optional
         Vibrations of tip and tilt; their direction has two components. A drift begins with
         the exposure.
+    motions : tuple of mapping, optional
+        For each vibration, how channels of accelerometers move with it. A resonance that channels
+        see is a continuous oscillator, others are AR2 processes.
     frames : int, optional
         Frames of the exposure.
     settle_frames : int, optional
@@ -238,7 +247,7 @@ has; got FilterDesign.
     frames = integer(frames, "frames", at_least=2)
     settle = integer(settle_frames, "settle_frames", at_least=RAMP_FRAMES)
     seed = integer(seed, "seed", at_least=0, at_most=LARGEST_SEED)
-    shaken = Truth(turbulence=None, vibrations=tuple(vibrations))
+    shaken = Truth(turbulence=None, vibrations=tuple(vibrations), motions=motions)
     total = settle + frames
     tilts = draw_disturbance(
         shaken,
@@ -247,7 +256,7 @@ has; got FilterDesign.
         cases=1,
         rng=np.random.default_rng(seed),
         zero_frame=settle,
-        oscillators=range(len(shaken.vibrations)),  # as accelerometers see them
+        oscillators=True,
     )[0]
     if calibration is None:
         calibration = calibrate(system, cache=cache)

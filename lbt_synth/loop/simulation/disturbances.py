@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,14 +37,14 @@ def draw_disturbance(
     cases: int,
     rng: np.random.Generator,
     zero_frame: int = 0,
-    oscillators: Collection[int] = (),
+    oscillators: bool = False,
 ) -> FloatArray:
     """Draw the total phase, (cases, frames, n) [nm].
 
     Each part has its own random stream: a truth with one more vibration keeps its turbulence.
     So has each mode where the modes have different spectra. Time 0 of a vibration that drifts is
-    frame ``zero_frame``. The resonances at some places among the vibrations are continuous
-    ``oscillators``, as accelerometers see them; the others are AR2 processes.
+    frame ``zero_frame``. Resonances are AR2 processes; with ``oscillators`` those that channels
+    of the truth see are continuous oscillators.
     """
     total, lines = draw_parts(
         truth,
@@ -69,7 +68,7 @@ def draw_parts(
     cases: int,
     rng: np.random.Generator,
     zero_frame: int = 0,
-    oscillators: Collection[int] = (),
+    oscillators: bool = False,
 ) -> tuple[FloatArray, list[DrawnLine]]:
     """Draw the turbulence, (cases, frames, n) [nm], and each vibration."""
     n = hardware.modes
@@ -83,9 +82,9 @@ def draw_parts(
         for mode, (own, mode_rng) in enumerate(zip(spectra, turbulence_rng.spawn(n), strict=True)):
             if own is not None:
                 total[:, :, mode] += _draw(own, hardware, frames, cases, mode_rng)
-    for j, (vibration, line_rng) in enumerate(zip(truth.vibrations, line_rngs, strict=True)):
+    for vibration, seen, line_rng in zip(truth.vibrations, truth.motions, line_rngs, strict=True):
         checked_direction(vibration, hardware)
-        if isinstance(vibration, Vibration) and j in oscillators:
+        if isinstance(vibration, Vibration) and seen and oscillators:
             alone = seen_vibration(vibration, {}, (), hardware)
             drive = line_rng.standard_normal((cases, 1 + frames, alone.B.shape[2]))
             motion = run_oscillator(alone, vibration, drive)[:, :, 0]

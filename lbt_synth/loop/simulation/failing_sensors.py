@@ -80,8 +80,7 @@ def simulate_sensors(
     settle = integer(settle_frames, "settle_frames", at_least=0)
     rng, noise_rng, other_rng = np.random.default_rng(seed).spawn(3)
     size = {"frames": settle + frames, "cases": cases}
-    seen = [j for j, motion in enumerate(truth.motions) if motion]
-    total, lines = draw_parts(truth, hardware, rng=rng, zero_frame=settle, oscillators=seen, **size)
+    total, lines = draw_parts(truth, hardware, rng=rng, zero_frame=settle, oscillators=True, **size)
     noise = draw_noise(truth, hardware, rng=noise_rng, **size)
     others = draw_others(truth, hardware, lines, other_rng, zero_frame=settle, **size)
     added = np.concatenate([noise, others], axis=2)

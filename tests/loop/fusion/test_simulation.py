@@ -102,7 +102,7 @@ def test_readings_and_phase_of_a_run_are_those_of_one_oscillator(period, delay_f
     truth = lbt.Truth(turbulence=None, vibrations=(line,), motions=(motion,))
     size = {"frames": 20_000, "cases": 4}
     rng = np.random.default_rng(4)
-    _, drawn = draw_parts(truth, path, rng=rng, oscillators=(0,), **size)
+    _, drawn = draw_parts(truth, path, rng=rng, oscillators=True, **size)
     suite = lbt.models.SensorSuite(sensors=(channel,))
     read = draw_others(truth, path, suite, drawn, rng, zero_frame=0, **size)[:, 100::period, 0]
     both = np.stack([drawn[0].motion[:, 100::period].ravel(), read.ravel()])
@@ -110,7 +110,7 @@ def test_readings_and_phase_of_a_run_are_those_of_one_oscillator(period, delay_f
     sizes = np.sqrt(np.diag(expected))
     found = np.cov(both) / np.outer(sizes, sizes)
     np.testing.assert_allclose(found, expected / np.outer(sizes, sizes), atol=0.03)
-    same = draw_disturbance(truth, path, rng=np.random.default_rng(4), oscillators=(0,), **size)
+    same = draw_disturbance(truth, path, rng=np.random.default_rng(4), oscillators=True, **size)
     np.testing.assert_array_equal(same[:, :, 0], drawn[0].motion)
 
 
