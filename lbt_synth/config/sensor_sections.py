@@ -64,7 +64,7 @@ class OtherSensorSection(Section):
     )
     rate_hz: q.Hertz = Field(description="readings per second, a fraction of the frame rate [Hz]")
     delay_frames: float = Field(
-        gt=0, le=100, description="total delay, in periods of the sensor [frames]"
+        ge=1, le=100, description="total delay, in periods of the sensor [frames]"
     )
     noise_nm: q.NanometresOrEach | None = Field(
         default=None, description="noise of a reading of a wavefront sensor [nm rms]"

@@ -175,3 +175,5 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
     assert motions == [{}, {"m1": (1.5, -170.25)}, *[{}] * (len(motions) - 2)]
     assert "standard error 0.02" in path.read_text()
     assert ("give the real delay" in path.read_text()) == (age in (-3, 500))
+    # readings of the frame itself have not ended when a loop of less than two frames acts
+    assert found.loop_age(1.5) == (age if 0 < age < 100 else 1)
