@@ -24,10 +24,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.loop.fusion.fused_loop import close_fused_loop
+from lbt_synth.loop.sensor_budget import close_fused_loop
 from lbt_synth.loop.simulation.disturbances import run_oscillator
-from lbt_synth.models.fusion.plant import FusedPlant
-from lbt_synth.models.fusion.seen_vibration import seen_vibration
+from lbt_synth.models.plant.readings import TipTiltPlant
+from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -184,20 +184,20 @@ def loss(seed: int, frames: int) -> float:
     best, own = true_plant(it, found.channels[0].channel, found.channels[1].channel), config.plant
     kalman = lbt.linear.periodic_kalman
     least = close(best, best.controller(kalman(best).gains), best.suite)
-    if config.fused_plant is None:
+    if config.plant is None:
         loop = lbt.close_loop(best.own.hardware, lbt.kalman(own).controller)
     else:
-        plant = config.fused_plant
-        read = true_plant(it, *plant.suite.channels)
+        plant = config.plant
+        read = true_plant(it, *plant.hardware.suite.channels)
         loop = close(best, plant.controller(kalman(plant).gains), read.suite)
     truth = replace(it.truth, motions=best.motions)
-    if config.fused_plant is not None:
+    if config.plant is not None:
         truth = replace(it.truth, motions=read.motions)
     least_nm = lbt.residual_budget(least, replace(it.truth, motions=best.motions)).rms_nm
     return (lbt.residual_budget(loop, truth).rms_nm / least_nm) ** 2 - 1
 
 
-def true_plant(it: Case, *channels: str) -> FusedPlant:
+def true_plant(it: Case, *channels: str) -> TipTiltPlant:
     """Return the plant of a record as it was drawn, with some of its useful channels."""
     own = lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
@@ -221,12 +221,12 @@ def true_plant(it: Case, *channels: str) -> FusedPlant:
         }
         for j in range(len(it.truth.vibrations))
     ]
-    return lbt.models.fused_plant(own, lbt.models.SensorSuite(sensors=(instrument,)), tuple(moving))
+    return lbt.models.plant(own, lbt.models.SensorSuite(sensors=(instrument,)), tuple(moving))
 
 
 def close(plant, controller, suite):
     """Close the loop of the truth around a controller that reads some channels."""
-    return close_fused_loop(plant.own.hardware, suite, controller)
+    return close_fused_loop(plant.hardware, suite, controller)
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.interop.specula import optics
-from lbt_synth.loop.fusion.fused_loop import close_fused_loop
+from lbt_synth.loop.sensor_budget import close_fused_loop
 
 CACHE = sys.argv[2] if len(sys.argv) > 2 else None
 SETUP = replace(lbt.load_config("examples/lbt.yaml").end_to_end, frames=800)
@@ -110,8 +110,8 @@ def sensor_row(config: lbt.config.Config, design: lbt.Design, seed: int) -> list
     gain = run.tip_tilt_gain / config.sensor_gain
     truth = replace(config.truth, noise_nm=run.tip_tilt_noise_nm, sensor_gain=gain)
     loop = design.close(config.hardware, sensor_gain=gain)
-    if isinstance(design, lbt.design.FusedFilter):
-        suite, missing = design.problem.suite, ("truth",)
+    if isinstance(design, lbt.design.FilterDesign):
+        suite, missing = design.problem.hardware.suite, ("truth",)
         own = design.controllers[frozenset(missing)]
         loop = close_fused_loop(config.hardware, suite, own, sensor_gain=gain, blind=missing)
     exact = np.sqrt(np.diag(lbt.residual_budget(loop, truth).total_nm2))

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.interop.c.fused_terms import fused_terms
+from lbt_synth.interop.c.masked_terms import masked_terms
 
 ROOT = Path(__file__).resolve().parents[1]
 DRIVER = """
@@ -61,9 +61,9 @@ def built(design: lbt.Design, step: str, precision: str, **options: str) -> ctyp
     return library
 
 
-def one_phase(design: lbt.design.FusedFilter) -> lbt.Design:
+def one_phase(design: lbt.design.FilterDesign) -> lbt.Design:
     """The filter of a phase in which only the fast sensors are due, as one of a single rate."""
-    terms = fused_terms(design)
+    terms = masked_terms(design)
     own = terms.controller()
     whole = terms.transition[1] + own.B[1] @ terms.innovation[1]
     A, applied = np.split(whole, [len(whole)], axis=1)
@@ -87,7 +87,7 @@ def main() -> None:
     states = fused.controller.n_states
     lines = -(-(states - config.plant.n_states) // 4) + 1
     alone = lbt.kalman(lbt.models.spread_plant(config.plant, half_width_hz=3.5, lines=lines))
-    read, rows = fused.problem.read, fused.problem.suite.rows(fused.problem.own.hardware)
+    read, rows = fused.problem.read, fused.problem.hardware.suite.rows(fused.problem.own.hardware)
     fresh = np.array([[row[own.start] for own in rows.values()] for row in read], dtype=np.uint8)
     pointer, period = ctypes.c_void_p(fresh.ctypes.data), len(fresh)
     cases = {

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 import lbt_synth as lbt
-from lbt_synth.loop.fusion.fused_loop import AnyLoop, close_fused_loop
-from lbt_synth.loop.fusion.simulation import simulate_fused
+from lbt_synth.loop.sensor_budget import AnyLoop, close_fused_loop
+from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 
 CONFIG = """\
 version: 1
@@ -66,9 +66,9 @@ def tip_nm(config: lbt.config.Config, loop: AnyLoop) -> float:
 def fused_tip_nm(air: str, ratio: float, damping: float) -> float:
     """Return what the Kalman filter of both sensors leaves of tip."""
     config = load(air, ratio, damping)
-    plant = config.fused_plant
+    plant = config.plant
     controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
-    return tip_nm(config, close_fused_loop(config.hardware, plant.suite, controller))
+    return tip_nm(config, close_fused_loop(config.hardware, plant.hardware.suite, controller))
 
 
 def halving_excess(ratio: float, *, air: str, damping: float, half_nm: float) -> float:
@@ -97,9 +97,9 @@ def print_table(what: str, cases: list[tuple[str, str, float]]) -> None:
         loops = lbt.close_loop(config.hardware, plain), fused.loop()
         own, both = (tip_nm(config, loop) for loop in loops)
         lines = [lbt.residual_budget(loop, config.truth).vibration_nm for loop in loops]
-        run = simulate_fused(
+        run = simulate_sensors(
             fused.controllers,
-            fused.problem.suite,
+            fused.problem.hardware.suite,
             config.truth,
             hardware=config.hardware,
             frames=FRAMES,

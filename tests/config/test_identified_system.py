@@ -165,7 +165,7 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
         rate_hz=1000.0,
     )
     path = save_identified(tmp_path, TWO, accelerometers=found)
-    fused = lbt.load_config(path).fused_plant
+    fused = lbt.load_config(path).plant
     (sensor,) = fused.suite.sensors
     assert (sensor.channels, sensor.delay_frames) == (("m1",), delay)
     assert sensor.noise_m_s2.tolist() == [2e-4]

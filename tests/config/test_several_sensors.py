@@ -18,8 +18,8 @@ def load(tmp_path, *edits):
 
 
 def test_a_file_describes_its_sensors(fused_config):
-    plant = fused_config.fused_plant
-    assert plant.suite.units == ("wavefront", "slow", "m1", "m2")
+    plant = fused_config.plant
+    assert plant.hardware.suite.units == ("wavefront", "slow", "m1", "m2")
     assert plant.period == 2
     assert plant.read.tolist() == [[True] * 6, [True, True, False, False, True, True]]
     assert plant.motions[1]["m2"].phase_deg == 150
@@ -27,7 +27,7 @@ def test_a_file_describes_its_sensors(fused_config):
 
 
 def test_a_file_without_them_has_none(config):
-    assert config.fused_plant is None
+    assert config.plant is None
 
 
 def test_the_own_sensor_among_the_others(tmp_path, fused_config):
@@ -37,16 +37,16 @@ def test_the_own_sensor_among_the_others(tmp_path, fused_config):
         ("loop: {frame_rate_hz: 1000, delay_frames: 2, axes: 2}\nsensor: {noise_nm: 75}\n", ""),
         ("sensors:\n", f"sensors:\n{own}"),
     )
-    assert written.fused_plant.suite.units == fused_config.fused_plant.suite.units
-    assert np.array_equal(written.fused_plant.A, fused_config.fused_plant.A)
-    assert np.array_equal(written.fused_plant.C, fused_config.fused_plant.C)
+    assert written.plant.hardware.suite.units == fused_config.plant.hardware.suite.units
+    assert np.array_equal(written.plant.A, fused_config.plant.A)
+    assert np.array_equal(written.plant.C, fused_config.plant.C)
 
 
 def test_the_own_sensor_alone_is_the_loop(tmp_path):
     text = CONFIG[: CONFIG.index("loop:")] + "sensors: {wavefront: {rate_hz: 500, noise_nm: 9}}\n"
     text += "model: {turbulence: {kind: ar, coefficients: [0.9], driving_rms_nm: 5}}\n"
     config = lbt.load_config(write_config(tmp_path, text))
-    assert config.fused_plant is None
+    assert config.plant is None
     assert config.hardware.frame_rate_hz == 500
 
 
@@ -64,7 +64,7 @@ def test_a_spread_line_moves_its_channels_with_each_of_its_lines(tmp_path):
             "frequency_hz: 20, spread_hz: 1, lines: 3, damping: 0.01",
         ),
     )
-    motions = config.fused_plant.motions
+    motions = config.plant.motions
     assert [sorted(motion) for motion in motions] == [["m1"], ["m1"], ["m1"], ["m2"]]
 
 
@@ -72,7 +72,7 @@ def test_correlated_noise(tmp_path):
     config = load(
         tmp_path, ("noise_m_s2: 2.0e-4", "covariance: [[4.0e-8, 2.0e-8], [2.0e-8, 4.0e-8]]")
     )
-    factor = config.fused_plant.suite.accelerometers[0].noise_factor(2)
+    factor = config.plant.hardware.suite.accelerometers[0].noise_factor(2)
     assert np.allclose(factor @ factor.T, [[4e-8, 2e-8], [2e-8, 4e-8]])
 
 

@@ -154,7 +154,11 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
         small.specifications[0], demands=(lbt.design.shaping.ModulusMargin(at_least=0.9),)
     )
     assert not replace(small, specifications=(stricter,)).recertify().passed
-    assert not replace(small, claims={"objective_nm": (small.objective_nm[0] * 0.999,)}).recertify().passed
+    assert (
+        not replace(small, claims={"objective_nm": (small.objective_nm[0] * 0.999,)})
+        .recertify()
+        .passed
+    )
 
 
 @pytest.mark.parametrize(

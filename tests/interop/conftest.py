@@ -5,7 +5,7 @@ from support.exports import lbt_config, lbt_designs
 
 import lbt_synth as lbt
 from lbt_synth.interop import export_checks
-from lbt_synth.interop.c import fused_terms
+from lbt_synth.interop.c import masked_terms
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def designs():
 @pytest.fixture
 def short_rehearsal(monkeypatch):
     """Rehearse few frames, in tests that do not look at what is found there."""
-    for module in (export_checks, fused_terms):
+    for module in (export_checks, masked_terms):
         monkeypatch.setattr(module, "FRAMES", 100)
     export_checks._own_commands.cache_clear()
     yield

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.fused_loops import SLOW, example_plant
+from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.interop.cacao.truncation import predictive_filter
@@ -95,7 +95,7 @@ def test_a_loop_that_the_target_makes_unstable_is_named(tmp_path, slow, monkeypa
 
 def test_what_cannot_be_rehearsed_is_refused(slow):
     bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
-    fused = lbt.design.fused_kalman(example_plant((SLOW,)))
+    fused = lbt.kalman(example_plant((SLOW,)))
     problem = lbt.errors.ProblemError
     for given, options, error, words in (
         ((slow, "dao", PHASE[:, :1]), {}, lbt.errors.DimensionError, r"\(frames, 2\)"),

@@ -7,11 +7,11 @@ from support.commands import run
 from support.several_sensors import write_config
 
 import lbt_synth as lbt
-from lbt_synth.report.several_sensors import write_fused_report
+from lbt_synth.report.several_sensors import write_sensors_report
 
 
 def test_a_page_has_the_table_of_failures_and_a_run(fused, fused_file, fused_config, tmp_path):
-    files, found = write_fused_report(
+    files, found = write_sensors_report(
         fused_config, {"both": fused}, tmp_path / "page.html", gain_files={"both": fused_file}
     )
     text = files[0].read_text(encoding="utf-8")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.loop.fusion.simulation import Drop
+from lbt_synth.loop.simulation.failing_sensors import Drop
 from lbt_synth.studies.sensor_failures import run_failures
 
 

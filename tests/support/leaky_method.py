@@ -49,7 +49,9 @@ class LeakyDesign(Design):
         """Return what is left of a command."""
         after, left = Column(name="after_s", heading="after"), Column(name="left", heading="left")
         decay = -self.claims["leak_per_s"]
-        rows = [Facts((after, left), {"after_s": t, "left": np.exp(decay * t)}) for t in (0.01, 0.1)]
+        rows = [
+            Facts((after, left), {"after_s": t, "left": np.exp(decay * t)}) for t in (0.01, 0.1)
+        ]
         return (RowTable(key="leak", title="What is left", rows=rows),)
 
     def notes(self):

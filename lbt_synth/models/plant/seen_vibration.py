@@ -19,10 +19,10 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import expm
 
+from lbt_synth.linear import StateSpace
 from lbt_synth.linear.matrix_functions import symmetrise
-from lbt_synth.linear.periodic.system import PeriodicSystem
-from lbt_synth.models.fusion.sensors import Accelerometer, Motion, period_frames
 from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.models.sensor_suite import Accelerometer, Motion, period_frames
 from lbt_synth.models.vibration import Vibration, require_below_nyquist
 from lbt_synth.validation import FloatArray, frozen_copy, set_fields
 
@@ -31,7 +31,7 @@ _PARALLEL = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenVibration(PeriodicSystem):
+class SeenVibration(StateSpace):
     """System from white noise to the mean position in a frame [nm], and readings [m/s^2].
 
     The first states are the mean position in the newest frame, then position and velocity over w0
@@ -41,7 +41,7 @@ class SeenVibration(PeriodicSystem):
     still: FloatArray  # (n, 2): state after a rest at a position and a velocity
 
     def __post_init__(self) -> None:
-        PeriodicSystem.__post_init__(self)
+        StateSpace.__post_init__(self)
         set_fields(self, still=frozen_copy(self.still))
 
 
@@ -106,7 +106,7 @@ def seen_vibration(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.fusion.seen_vibration import seen_vibration
+    >>> from lbt_synth.models.plant.seen_vibration import seen_vibration
     >>> line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
     >>> mirror = lbt.models.Accelerometer(
     ...     name="mirror", rate_hz=800, delay_frames=1, channels=("m1",), noise_m_s2=1e-3
@@ -159,9 +159,9 @@ def seen_vibration(
     output = np.vstack(C)
     return SeenVibration(
         A=A,
-        B=B[None],
-        C=output[None],
-        D=np.zeros((1, len(output), B.shape[1])),
+        B=B,
+        C=output,
+        D=np.zeros((len(output), B.shape[1])),
         dt_s=hardware.dt_s,
         still=still,
     )
@@ -226,5 +226,4 @@ def _sampled(angle: float, damping: float) -> tuple[FloatArray, FloatArray]:
     whole[:3, :3], whole[3:, 3:], whole[1, 4] = -rates, rates.T, 1.0
     both = expm(whole)
     transition = both[3:, 3:].T
-    root = np.linalg.cholesky(symmetrise(transition @ both[:3, 3:]))
-    return transition, np.asarray(root, dtype=np.float64)
+    return transition, np.asarray(np.linalg.cholesky(symmetrise(transition @ both[:3, 3:])))

@@ -144,9 +144,7 @@ def test_a_shaped_design_returns_from_its_gain_file(small, tmp_path, ending):
     ],
 )
 def test_impossible_claims_of_a_gain_file_are_refused(small, tmp_path, change, message):
-    path = edited_file(
-        tmp_path / "gain.npz", small, lambda document: change(document["meta"])
-    )
+    path = edited_file(tmp_path / "gain.npz", small, lambda document: change(document["meta"]))
     with pytest.raises(lbt.errors.GainFileError, match=message):
         lbt.load_gain(path)
 

@@ -10,8 +10,8 @@ from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
-from lbt_synth.loop.fusion.simulation import draw_others
 from lbt_synth.loop.simulation.disturbances import draw_parts
+from lbt_synth.loop.simulation.failing_sensors import draw_others
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 
 RATE = 1000.0

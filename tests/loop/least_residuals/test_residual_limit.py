@@ -12,7 +12,6 @@ from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.result import model_limit
-from lbt_synth.loop.fusion.fused_loop import close_fused_loop
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 
@@ -300,16 +299,16 @@ def fused_variances(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=
     )
     suite = lbt.models.SensorSuite(sensors=tuple(sensors))
     motions = tuple(moves for _, moves in lines)
-    plant = lbt.models.fused_plant(own, suite, motions)
+    plant = lbt.models.plant(own, suite, motions)
     controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
-    loop = close_fused_loop(own.hardware, suite, controller)
+    loop = close_loop(replace(own.hardware, suite=suite), controller)
     truth = lbt.Truth(
         turbulence=slow,
         vibrations=tuple(line for line, _ in lines),
         motions=motions,
         noise_nm=own_noise,
     )
-    limit = lbt.loop.least_fused_residual(own.hardware, truth, suite)
+    limit = lbt.loop.least_residual(own.hardware, truth, suite)
     left = float(np.trace(lbt.residual_budget(loop, truth).total_nm2))
     return left, float(limit.variance_nm2.sum())
 
@@ -352,7 +351,7 @@ def test_accelerometers_cannot_do_more_than_know_the_vibrations():
 def test_a_sensor_without_noise_gains_nothing():
     truth = lbt.Truth(turbulence=ar(0.99), noise_nm=0.0)
     suite = lbt.models.SensorSuite(sensors=(second(RATE / 5, 2, 3.0),))
-    both = lbt.loop.least_fused_residual(path(2.0), truth, suite)
+    both = lbt.loop.least_residual(path(2.0), truth, suite)
     assert both.rms_nm == lbt.loop.least_residual(path(2.0), truth).rms_nm
 
 

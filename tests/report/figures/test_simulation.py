@@ -3,7 +3,7 @@
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.loop.fusion.simulation import Drop, run_segments, simulate_fused
+from lbt_synth.loop.simulation.failing_sensors import Drop, run_segments, simulate_sensors
 from lbt_synth.report.figures.simulation import sensor_failure_figure, simulation_figure
 
 
@@ -27,9 +27,9 @@ def test_modes_count_from_one_as_everywhere():
 
 def test_spans_and_levels(fused, fused_config):
     drops = [Drop(unit="m1", start_s=0.5, end_s=1), Drop(unit="m1", start_s=1.5)]
-    run = simulate_fused(
+    run = simulate_sensors(
         fused.controllers,
-        fused.problem.suite,
+        fused.problem.hardware.suite,
         fused_config.truth,
         hardware=fused_config.hardware,
         frames=2000,

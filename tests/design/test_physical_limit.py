@@ -32,8 +32,8 @@ def designed(frequency_hz, damping, noise, age):
         noise_m_s2=1e-9 * noise * (2 * np.pi * frequency_hz) ** 2 * RMS_NM,
     )
     suite = lbt.models.SensorSuite(sensors=(channel,))
-    plant = lbt.models.fused_plant(own, suite, ({"m1": lbt.models.Motion(size=1)},))
-    return lbt.design.fused_kalman(plant)
+    plant = lbt.models.plant(own, suite, ({"m1": lbt.models.Motion(size=1)},))
+    return lbt.kalman(plant)
 
 
 def physics(frequency_hz, damping, noise, age):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.fused_loops import (
+from support.sensor_loops import (
     AIR,
     FAST,
     LINES,
@@ -18,11 +18,10 @@ from support.fused_loops import (
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import kalman_riccati
-from lbt_synth.loop.fusion.fused_loop import (
+from lbt_synth.loop.sensor_budget import (
     close_fused_loop,
-    fused_budget,
-    fused_model_budget,
-    fused_radii_by_gain,
+    plant_budget,
+    residual_budget,
 )
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
@@ -46,8 +45,8 @@ AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, fra
 def closed(plant, **facts):
     """Return the controller of the Kalman filter, and its loop."""
     controller = plant.controller(kalman_riccati(plant).gain_predictor)
-    hardware = plant.own.hardware
-    return controller, close_fused_loop(hardware, plant.suite, controller, **facts)
+    hardware = plant.hardware
+    return controller, close_fused_loop(hardware, plant.hardware.suite, controller, **facts)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
@@ -57,7 +56,7 @@ def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
     P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
     _, loop = closed(plant)
     rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
-    assert fused_model_budget(loop, plant).rms_nm == pytest.approx(rms, rel=1e-9)
+    assert plant_budget(loop, plant).rms_nm == pytest.approx(rms, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +77,7 @@ def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
 def test_budgets_are_what_impulses_leave(changes, loop):
     plant = example_plant(**changes)
     controller, own = closed(plant, **loop)
-    budget = fused_model_budget(own, plant)
+    budget = plant_budget(own, plant)
     exact = budget.turbulence_nm2, budget.random_vibration_nm2, budget.noise_nm2
     for one, simulated in zip(exact, simulated_covariances(plant, controller, **loop), strict=True):
         assert np.abs(one - simulated).max() < 1e-8 * np.trace(one)
@@ -88,7 +87,7 @@ def test_rates_that_do_not_divide_each_other():
     plant = example_plant((THIRD, SELDOM), lines=LINES[:1], motions=MOTIONS[:1])
     assert plant.period == 60
     controller, loop = closed(plant)
-    budget = fused_model_budget(loop, plant)
+    budget = plant_budget(loop, plant)
     *_, noise = simulated_covariances(plant, controller, frames=200)
     assert np.abs(budget.noise_nm2 - noise).max() < 1e-8 * np.trace(noise)
 
@@ -108,7 +107,7 @@ def test_a_sinusoid_leaves_what_a_run_leaves(age, period):
     hertz, frames = 62.5, 400
     line = lbt.models.SinusoidalVibration(frequency_hz=hertz, rms_nm=200, direction=(3, 4))
     truth = Truth(turbulence=None, vibrations=(line,), motions=plant.motions[:1])
-    budget = fused_budget(loop, truth)
+    budget = residual_budget(loop, truth)
     # an accelerometer reads -w^2 times the mean position, turned and weakened, some frames ago
     wave = 200 * np.sqrt(2) * np.exp(2j * np.pi * hertz / RATE_HZ * np.arange(frames))
     angle = 2 * np.pi * hertz / RATE_HZ
@@ -135,7 +134,7 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
 
     plant = example_plant()
     controller, loop = closed(plant)
-    budget = fused_budget(loop, Truth(turbulence=[Broad(), None], noise_nm=0.0))
+    budget = residual_budget(loop, Truth(turbulence=[Broad(), None], noise_nm=0.0))
     N, frames, first = 4, 512, 16
     entries = [(t, first + t, 0) for t in range(N)]
     total = impulse(first + N + frames, N, 2, entries)
@@ -157,13 +156,13 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
 def test_spectra_and_their_ar_models_agree():
     plant = example_plant()
     _, loop = closed(plant)
-    by_lyapunov = fused_budget(loop, Truth(turbulence=AIR))
+    by_lyapunov = residual_budget(loop, Truth(turbulence=AIR))
 
     class Same:
         def psd(self, frequency_hz):
             return AIR.psd(frequency_hz)
 
-    by_quadrature = fused_budget(loop, Truth(turbulence=Same()))
+    by_quadrature = residual_budget(loop, Truth(turbulence=Same()))
     np.testing.assert_allclose(
         by_quadrature.turbulence_nm2, by_lyapunov.turbulence_nm2, rtol=1e-7, atol=1e-6
     )
@@ -173,7 +172,7 @@ def test_the_truth_may_have_another_noise_and_gain():
     plant = example_plant()
     controller, loop = closed(plant, sensor_gain=0.8)
     noisy, calm = (
-        fused_budget(loop, Truth(turbulence=None, noise_nm=noise, sensor_gain=0.8)).noise_nm2
+        residual_budget(loop, Truth(turbulence=None, noise_nm=noise, sensor_gain=0.8)).noise_nm2
         for noise in (75.0, 0.0)
     )
     *_, whole = simulated_covariances(plant, controller, sensor_gain=0.8)
@@ -186,32 +185,32 @@ def test_an_unstable_loop_has_no_budget():
     _, loop = closed(example_plant(), sensor_gain=8.0)
     assert not loop.is_stable
     with pytest.raises(UnstableLoopError, match="over a period of 4 frames at a sensor gain of 8"):
-        fused_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
+        residual_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
 
 
 def test_refusals():
     plant = example_plant()
     _, loop = closed(plant)
     with pytest.raises(ProblemError, match="truth's sensor gain 0.9; got 1"):
-        fused_budget(loop, Truth(turbulence=AIR, sensor_gain=0.9))
+        residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.9))
     with pytest.raises(ProblemError, match="no sensor or channel is called 'm9'"):
         closed(plant, blind=("m9",))
     other, _ = closed(example_plant((FAST,)))
     with pytest.raises(ProblemError, match="6 measurements to 2 commands in a period of 4"):
-        close_fused_loop(plant.own.hardware, plant.suite, other)
+        close_loop(plant.hardware, other)
     with pytest.raises(ProblemError, match="sensor_gain"):
         closed(plant, sensor_gain=0.0)
     drifting = lbt.models.DriftingVibration(
         start_hz=20, end_hz=30, duration_s=1, damping=0.01, rms_nm=100
     )
     with pytest.raises(ProblemError, match="stationary"):
-        fused_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
+        residual_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
 
 
 def test_radii_of_many_gains_are_those_of_their_loops():
     plant = example_plant(influence_matrix=[[2.0, 0.1], [0.3, 1.0]])
     controller, _ = closed(plant)
     gains = np.array([0.2, 0.7, 1.0, 1.7])
-    found = fused_radii_by_gain(plant.own.hardware, plant.suite, controller)(gains)
+    found = radii_by_gain(plant.hardware, controller)(gains)
     loops = [closed(plant, sensor_gain=gain)[1].spectral_radius for gain in gains]
     np.testing.assert_allclose(found, loops, rtol=1e-9)

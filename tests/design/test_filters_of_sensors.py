@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.fused_loops import FAST, LINES, SLOW, example_plant
+from lbt_synth.design.fusion import fused_filter
+from lbt_synth.design.fusion.fused_filter import dwell_frames
+from support.sensor_loops import FAST, LINES, SLOW, example_plant
 
 import lbt_synth as lbt
-from lbt_synth.design import fused_hinf, fused_kalman
-from lbt_synth.design.fusion import fused_filter
-from lbt_synth.design.fusion.failures import make_fallbacks
-from lbt_synth.design.fusion.fused_filter import dwell_frames
+from lbt_synth.design.fallbacks import make_fallbacks
 from lbt_synth.errors import CertificateError, InfeasibleError, LbtSynthError, ProblemError
 from lbt_synth.linear import kalman_riccati
 from lbt_synth.models import Accelerometer, WavefrontSensor
@@ -18,12 +17,12 @@ from lbt_synth.models import Accelerometer, WavefrontSensor
 
 @pytest.fixture(scope="module")
 def kalman():
-    return fused_kalman(example_plant((FAST, SLOW)))
+    return lbt.kalman(example_plant((FAST, SLOW)))
 
 
 @pytest.fixture(scope="module")
 def hinf():
-    return fused_hinf(example_plant((SLOW,)), gamma_ratio=1.1)
+    return lbt.hinf(example_plant((SLOW,)), gamma_ratio=1.1)
 
 
 def failed(design):
@@ -46,7 +45,7 @@ def test_a_certified_filter(kalman):
 
 def test_each_sensor_helps(kalman):
     alone = lbt.kalman(kalman.problem.own).rms
-    two = fused_kalman(example_plant((FAST,))).rms
+    two = lbt.kalman(example_plant((FAST,))).rms
     assert kalman.rms < two < alone
 
 
@@ -75,10 +74,10 @@ def test_an_hinf_filter(hinf):
     assert hinf.certificate.passed
     assert hinf.gamma_requested == pytest.approx(1.1 * hinf.gamma_least)
     assert hinf.gamma_least < hinf.gamma < hinf.gamma_requested
-    kalman = fused_kalman(hinf.problem)
+    kalman = lbt.kalman(hinf.problem)
     assert kalman.rms < hinf.rms
     assert hinf.gamma < kalman.gamma
-    assert fused_hinf(hinf.problem, gamma=hinf.gamma_requested).gains == pytest.approx(hinf.gains)
+    assert lbt.hinf(hinf.problem, gamma=hinf.gamma_requested).gains == pytest.approx(hinf.gains)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
@@ -112,12 +111,12 @@ def test_a_design_that_fails_is_not_returned(monkeypatch):
         lambda plant: replace(solve(plant), gain_predictor=1.01 * solve(plant).gain_predictor),
     )
     with pytest.raises(CertificateError, match="failed its certificate"):
-        fused_kalman(example_plant((SLOW,)))
+        lbt.kalman(example_plant((SLOW,)))
 
 
 def test_the_loop_of_one_rate_is_that_of_the_filter():
     fast = WavefrontSensor(name="other", rate_hz=1000, delay_frames=2, noise_nm=1e7)
-    design = fused_kalman(example_plant((fast,)))
+    design = lbt.kalman(example_plant((fast,)))
     alone = lbt.kalman(design.problem.own)
     hardware = design.loop_hardware
     loop = lbt.close_loop(hardware, alone)
@@ -132,12 +131,12 @@ def test_the_loop_of_one_rate_is_that_of_the_filter():
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda: fused_kalman(example_plant().own), ProblemError, "plant must be a"),
-        (lambda: fused_hinf(example_plant().own), ProblemError, "plant must be a"),
-        (lambda: fused_hinf(example_plant((SLOW,)), gamma=1.0), InfeasibleError, "least"),
-        (lambda: fused_hinf(example_plant((SLOW,)), gamma_ratio=0.5), LbtSynthError, "gamma_ratio"),
+        (lambda: lbt.kalman(example_plant().own), ProblemError, "plant must be a"),
+        (lambda: lbt.hinf(example_plant().own), ProblemError, "plant must be a"),
+        (lambda: lbt.hinf(example_plant((SLOW,)), gamma=1.0), InfeasibleError, "least"),
+        (lambda: lbt.hinf(example_plant((SLOW,)), gamma_ratio=0.5), LbtSynthError, "gamma_ratio"),
         (
-            lambda: fused_kalman(
+            lambda: lbt.kalman(
                 example_plant(
                     (
                         Accelerometer(
@@ -163,23 +162,23 @@ def test_refusals(make, error, words):
 
 @pytest.mark.parametrize("ratio", [1.02, 1.1])
 def test_it_lies_between_the_two(fused_config, fused, ratio):
-    plant = fused_config.fused_plant
-    central = lbt.design.fused_hinf(plant, gamma_ratio=ratio)
-    mixed = lbt.design.fused_mixed(plant, gamma_ratio=ratio)
+    plant = fused_config.plant
+    central = lbt.hinf(plant, gamma_ratio=ratio)
+    mixed = lbt.mixed(plant, gamma_ratio=ratio)
     assert fused.rms < mixed.rms < central.rms
     assert central.gamma < mixed.gamma <= mixed.gamma_requested * (1 + 1e-9)
     assert mixed.gamma == pytest.approx(mixed.gamma_requested, rel=1e-5)
 
 
 def test_a_bound_that_the_kalman_filter_meets(fused_config, fused):
-    found = lbt.design.fused_mixed(fused_config.fused_plant, gamma=1.01 * fused.gamma)
+    found = lbt.mixed(fused_config.plant, gamma=1.01 * fused.gamma)
     assert found.method == "fused kalman"
     assert found.rms == pytest.approx(fused.rms, rel=1e-12)
 
 
 def test_a_bound_below_the_least(fused_config):
     with pytest.raises(InfeasibleError, match="gamma must be at least"):
-        lbt.design.fused_mixed(fused_config.fused_plant, gamma=1.0)
+        lbt.mixed(fused_config.plant, gamma=1.0)
 
 
 def test_a_configuration_and_its_gain_file(fused_config, tmp_path):

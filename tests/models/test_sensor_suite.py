@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.fused_loops import FAST, SLOW
+from support.sensor_loops import FAST, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.models import Accelerometer, LoopHardware, Motion, SensorSuite, WavefrontSensor
-from lbt_synth.models.fusion.sensors import checked_motions, period_frames
+from lbt_synth.models.sensor_suite import checked_motions, period_frames
 
 PATH = LoopHardware(frame_rate_hz=1000, delay_frames=2, modes=2)
 

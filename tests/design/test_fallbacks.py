@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.fused_loops import (
+from support.sensor_loops import (
     FAST,
     SLOW,
     acceleration,
@@ -12,7 +12,7 @@ from support.fused_loops import (
 )
 
 from lbt_synth.design import failure_rows
-from lbt_synth.design.fusion.failures import (
+from lbt_synth.design.fallbacks import (
     failed_loop,
     failure_sets,
     fallback_gains,
@@ -20,7 +20,8 @@ from lbt_synth.design.fusion.failures import (
 )
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import kalman_riccati
-from lbt_synth.loop.fusion.fused_loop import fused_model_budget, model_readings
+from lbt_synth.loop.budget import plant_budget
+from lbt_synth.loop.sensor_budget import model_readings
 
 
 def test_every_set_of_sensors_may_fail():
@@ -73,13 +74,13 @@ def test_readings_are_residual_and_noise():
     plant = example_plant((FAST,))
     loop = failed_loop(plant, kalman_riccati(plant).gain_predictor, ())
     readings = model_readings(loop, plant)
-    left = fused_model_budget(loop, plant).total_nm2
+    left = plant_budget(loop, plant).total_nm2
     np.testing.assert_allclose(readings[:2, :2], left + 75**2 * np.eye(2), rtol=1e-9)
     power = np.diag(FAST.noise_m_s2).copy()
     for line, motion in zip(plant.own.vibrations, plant.motions, strict=True):
         for i, channel in enumerate(FAST.channels):
             if channel in motion:
-                _, read = acceleration(plant.own.hardware, FAST, motion[channel], line)
+                _, read = acceleration(plant.hardware, FAST, motion[channel], line)
                 power[i] += np.sum(read**2)
     np.testing.assert_allclose(np.diag(readings)[2:], power, rtol=1e-9)
 
@@ -98,9 +99,9 @@ def test_what_is_missing_is_not_used():
 
 def test_without_any_reading_the_mirror_stays():
     plant = example_plant((SLOW,))
-    gains = fallback_gains(plant, plant.suite.units)
+    gains = fallback_gains(plant, plant.hardware.suite.units)
     assert not gains.any()
-    loop = failed_loop(plant, gains, plant.suite.units)
+    loop = failed_loop(plant, gains, plant.hardware.suite.units)
     assert loop.is_stable
     row = failure_rows(plant, gains, make_fallbacks(plant)[-1:])[0]
     powers = [line.rms_nm**2 for line in plant.own.vibrations]

@@ -7,18 +7,23 @@ import pytest
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop.fusion.fused_loop import close_fused_loop
-from lbt_synth.loop.fusion.simulation import Drop, draw_others, run_segments, simulate_fused
+from lbt_synth.loop.sensor_budget import close_fused_loop
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_parts
-from lbt_synth.models.fusion.seen_vibration import seen_vibration
+from lbt_synth.loop.simulation.failing_sensors import (
+    Drop,
+    draw_others,
+    run_segments,
+    simulate_sensors,
+)
+from lbt_synth.models.plant.seen_vibration import seen_vibration
 
 
 def run(fused, config, drops=(), **options):
     """One run of the loop."""
     sizes = {"frames": 10_000, "cases": 8, "seed": 3} | options
-    return simulate_fused(
+    return simulate_sensors(
         fused.controllers,
-        fused.problem.suite,
+        fused.problem.hardware.suite,
         config.truth,
         hardware=config.hardware,
         drops=drops,
@@ -29,7 +34,10 @@ def run(fused, config, drops=(), **options):
 def exact_nm(fused, config, missing, filtered):
     """The exact residual where some sensors read zero and a filter takes some as missing."""
     loop = close_fused_loop(
-        config.hardware, fused.problem.suite, fused.controllers[frozenset(filtered)], blind=missing
+        config.hardware,
+        fused.problem.hardware.suite,
+        fused.controllers[frozenset(filtered)],
+        blind=missing,
     )
     return lbt.residual_budget(loop, config.truth).rms_nm
 
@@ -61,7 +69,7 @@ def test_the_wavefront_sensor_may_go_and_come_back(fused, fused_config):
 def test_a_frozen_wavefront_runs_away_where_the_table_says_so(fused, fused_config):
     away = Drop(unit="wavefront", start_s=1, reading="frozen")
     loop = close_fused_loop(
-        fused_config.hardware, fused.problem.suite, fused.controller, blind=("wavefront",)
+        fused_config.hardware, fused.problem.hardware.suite, fused.controller, blind=("wavefront",)
     )
     found = run(fused, fused_config, [away], frames=6000, cases=2)
     grows = np.max(np.abs(found.residual_nm[:, -100:])) > 1e4
@@ -75,9 +83,9 @@ def test_a_sinusoid_that_channels_see(fused, fused_config):
     )
     truth = replace(fused_config.truth, vibrations=lines)
     exact = lbt.residual_budget(fused.loop(), truth)
-    found = simulate_fused(
+    found = simulate_sensors(
         fused.controllers,
-        fused.problem.suite,
+        fused.problem.hardware.suite,
         truth,
         hardware=fused_config.hardware,
         frames=20_000,

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from support.fused_loops import AIR, FAST, LINES, MOTIONS, SLOW, example_plant, held_mean
 from support.periodic_problems import relative_distance
+from support.sensor_loops import AIR, FAST, LINES, MOTIONS, SLOW, example_plant, held_mean
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import Accelerometer, SensorSuite, WavefrontSensor, fused_plant
-from lbt_synth.models.fusion.plant import Exposure, memory, own_exposure, suite_exposures
+from lbt_synth.models.plant.readings import Exposure, memory, own_exposure, suite_exposures
 
 
 @pytest.mark.parametrize(

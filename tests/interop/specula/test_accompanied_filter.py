@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.fused_loops import sinusoid_reading
+from support.sensor_loops import sinusoid_reading
 from support.small_telescope import BRIGHT, PATH, SETUP, needs_specula
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.interop.specula.fused_filter import AccompaniedFilter, accompany_filter
+from lbt_synth.interop.specula.accompanied_filter import AccompaniedFilter, accompany_filter
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
@@ -55,7 +55,7 @@ def fused_design(*sensors, modes=2, noise_nm=15.0, **changes):
     )
     suite = SensorSuite(sensors=sensors or (MIRROR,))
     motions = MOTIONS if suite.channels else ()
-    return lbt.design.fused_kalman(lbt.models.fused_plant(own, suite, motions))
+    return lbt.kalman(lbt.models.plant(own, suite, motions))
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_a_further_wavefront_sensor_is_not_read(fused):
     shaken = lbt.Truth(turbulence=None, vibrations=SHAKES, motions=MOTIONS)
     with_truth = accompany_filter(both, shaken, **LENGTH)
     without = accompany_filter(fused, shaken, **LENGTH)
-    rows = both.problem.suite.rows(PATH)
+    rows = both.problem.hardware.suite.rows(PATH)
     assert not with_truth.controller.B[:, :, rows["truth"]].any()
     y = np.random.default_rng(1).standard_normal((200, 2))
     # the readings have other noise: only the wavefront's part is compared

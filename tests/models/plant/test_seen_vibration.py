@@ -8,7 +8,7 @@ from support.oscillators import KickedOscillator
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import Accelerometer, LoopHardware, Motion
-from lbt_synth.models.fusion.seen_vibration import seen_vibration
+from lbt_synth.models.plant.seen_vibration import seen_vibration
 
 RATE_HZ = 800.0
 PATH = LoopHardware(frame_rate_hz=RATE_HZ, delay_frames=2, modes=1)

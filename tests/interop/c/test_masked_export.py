@@ -13,9 +13,9 @@ from support.exports import relative
 import lbt_synth as lbt
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.c import fused_export
-from lbt_synth.interop.c.fused_terms import FusedSource, fused_terms
+from lbt_synth.interop.c.masked_terms import MaskedSource, masked_terms
 from lbt_synth.interop.target import target_named, target_names
-from lbt_synth.loop.fusion.simulation import Drop, simulate_fused
+from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
 
 FRAMES = 1200
 DROPS = (
@@ -44,9 +44,9 @@ def theirs(written):
 
 def run(fused, config, filters):
     """A run in which sensors fail, alone and together; its readings and commands."""
-    return simulate_fused(
+    return simulate_sensors(
         filters,
-        fused.problem.suite,
+        fused.problem.hardware.suite,
         config.truth,
         hardware=config.hardware,
         frames=FRAMES,
@@ -182,12 +182,12 @@ def test_reset_forgets(theirs):
 
 def renamed(fused, names):
     """The design with other names of its sensor and channels."""
-    sensors = fused.problem.suite.sensors
+    sensors = fused.problem.hardware.suite.sensors
     slow, mirror = replace(sensors[0], name=names[0]), replace(sensors[1], channels=names[1:])
     suite = lbt.models.SensorSuite(sensors=(slow, mirror))
     place = dict(zip(sensors[1].channels, names[1:], strict=True))
     motions = tuple({place[c]: m for c, m in own.items()} for own in fused.problem.motions)
-    return lbt.design.fused_kalman(lbt.models.fused_plant(fused.problem.own, suite, motions))
+    return lbt.kalman(lbt.models.plant(fused.problem.own, suite, motions))
 
 
 @pytest.mark.usefixtures("short_rehearsal")
@@ -235,7 +235,7 @@ def test_what_has_no_source_is_refused(tmp_path, fused):
 
 @pytest.mark.usefixtures("short_rehearsal")
 def test_a_table_that_is_too_long_is_refused(tmp_path, fused, monkeypatch):
-    terms = fused_terms(fused)
+    terms = masked_terms(fused)
     count = sum(np.count_nonzero(gains.any(axis=1)) for gains in terms.gains.values())
     count *= fused.problem.n_states
     monkeypatch.setattr(fused_export, "MOST_GAINS", count)
@@ -293,7 +293,7 @@ def test_flags_that_hide_such_readings_are_refused(tmp_path, written):
 
 def test_a_source_that_is_stepped_without_more_is_that_of_all_sensors(fused):
     """What is due is new, and its own commands are applied: the controller of the design."""
-    source, own = FusedSource(fused_terms(fused), np.float64), fused.controller
+    source, own = MaskedSource(masked_terms(fused), np.float64), fused.controller
     x = np.zeros(own.n_states)
     for k, y in enumerate(np.random.default_rng(5).standard_normal((30, 6))):
         x = own.A[k % 2] @ x + own.B[k % 2] @ y

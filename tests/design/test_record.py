@@ -12,7 +12,7 @@ from lbt_synth.errors import GainFileError
 def test_a_file_gives_the_design_back(fused, tmp_path, ending):
     again = lbt.load_gain(lbt.save_gain(tmp_path / f"fused.{ending}", fused))
     assert np.array_equal(again.gains, fused.gains)
-    assert again.problem.suite.units == fused.problem.suite.units
+    assert again.problem.hardware.suite.units == fused.problem.hardware.suite.units
     assert again.certificate.passed
     assert [f.missing for f in again.fallbacks] == [f.missing for f in fused.fallbacks]
     assert again.rms == pytest.approx(fused.rms, rel=1e-9)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.interop.c.fused_terms import fused_rehearsal_error, fused_terms, prove_fused
+from lbt_synth.interop.c.masked_terms import masked_rehearsal_error, masked_terms, prove_masked
 
 
 @pytest.fixture(scope="module")
 def terms(fused):
-    return fused_terms(fused)
+    return masked_terms(fused)
 
 
 def test_the_terms_make_the_controllers_of_the_design(fused, terms):
@@ -37,7 +37,7 @@ def test_single_precision_is_that_of_the_source(terms):
 
 def test_the_proof_is_of_the_loop_around_the_terms(fused, terms):
     """Stable alone, too: what is left of the state where neither readings nor commands come."""
-    checks = {check.name: check for check in prove_fused(fused, terms)}
+    checks = {check.name: check for check in prove_masked(fused, terms)}
     assert len(checks) == 5
     assert all(check.passed for check in checks.values())
     radius = checks["spectral radius with all sensors"].value
@@ -61,18 +61,18 @@ def test_the_proof_is_of_the_loop_around_the_terms(fused, terms):
 )
 def test_other_gains_fail(fused, terms, missing, factor, failed):
     gains = {some: own * (factor if some == missing else 1) for some, own in terms.gains.items()}
-    checks = prove_fused(fused, replace(terms, gains=gains))
+    checks = prove_masked(fused, replace(terms, gains=gains))
     assert set(failed) <= {check.name for check in checks if not check.passed}
     others = "any sensors missing" if not missing else "all sensors"
     assert all(check.passed for check in checks if others in check.name)
 
 
 def test_the_rehearsal_sees_each_filter(fused, terms):
-    assert fused_rehearsal_error(fused, terms, np.float64) < 1e-11
+    assert masked_rehearsal_error(fused, terms, np.float64) < 1e-11
     for missing in [(), ("wavefront",), ("slow",), ("m1",), ("m2",)]:
         gains = dict(terms.gains)
         gains[frozenset(missing)] = 1.01 * gains[frozenset(missing)]
-        off = fused_rehearsal_error(fused, replace(terms, gains=gains), np.float64)
+        off = masked_rehearsal_error(fused, replace(terms, gains=gains), np.float64)
         assert off > 1e-7
     huge = replace(terms, command=terms.command * 1e37)
-    assert fused_rehearsal_error(fused, huge, np.float32) == np.inf
+    assert masked_rehearsal_error(fused, huge, np.float32) == np.inf

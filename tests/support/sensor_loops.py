@@ -108,7 +108,7 @@ def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuc
     the acceleration of channels (frames, runs, q). A reading that is not new is a large number.
     Sensors that are blind read what is stuck (runs, q), or zero.
     """
-    hardware, suite = plant.own.hardware, plant.suite
+    hardware, suite = plant.hardware, plant.hardware.suite
     taps, frames, runs = hardware.mirror_taps, *total.shape[:2]
     rows = suite.rows(hardware)
     sources = [("wavefront", hardware.sensor, 1.0, 1, sensor_gain)]
@@ -154,7 +154,7 @@ def simulated_covariances(plant, controller, *, frames=300, **loop):
     White noise leaves the sum of the squares of what an impulse leaves, mean over the phases in
     which it may come. All impulses run side by side.
     """
-    hardware, suite, N = plant.own.hardware, plant.suite, plant.period
+    hardware, suite, N = plant.hardware, plant.hardware.suite, plant.period
     n, rows = hardware.modes, suite.rows(hardware)
     q = max(own.stop for own in rows.values())
     begin = 4 * N if N > 1 else 8
