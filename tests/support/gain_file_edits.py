@@ -19,7 +19,6 @@ from support.shaping import shaped_design
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
 from lbt_synth.files.gain_file.store import _READERS
-from lbt_synth.models.plant.readings import fused_plant
 from lbt_synth.models.sensor_suite import Accelerometer, Motion, SensorSuite, WavefrontSensor
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes
 
@@ -69,7 +68,7 @@ def fused_original(*, bounded):
     )
     own = odd_plant()
     motions = ({"m1": Motion(size=2.0, phase_deg=20.0)},) * len(own.vibrations)
-    plant = fused_plant(own, SensorSuite(sensors=(slow, shaken)), motions)
+    plant = own.with_sensors(SensorSuite(sensors=(slow, shaken)), motions)
     return lbt.hinf(plant, gamma_ratio=1.2) if bounded else lbt.kalman(plant)
 
 

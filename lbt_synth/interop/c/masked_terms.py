@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ from lbt_synth.loop import close_loop
 from lbt_synth.loop.budget import plant_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
-from lbt_synth.models import Truth
+from lbt_synth.models import TipTiltPlant, Truth
 from lbt_synth.validation import BoolArray, FloatArray
 
 _LOSS = 0.01  # of the residual, relative
@@ -73,7 +73,7 @@ class MaskedTerms:
 
 def masked_terms(design: FilterDesign) -> MaskedTerms:
     """Return the coefficients of a filter of several sensors and of its fall-backs."""
-    plant = design.problem
+    plant = cast("TipTiltPlant", design.problem)
     full = plant.full()
     n, s, m = plant.n_states, full.n_states, plant.hardware.n_commands
     A, _, C, _ = full.stacks()

@@ -245,7 +245,7 @@ def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> di
     truth, hardware = sample.truth, loop.hardware
     if loop.reads_others:
         filters = {frozenset[str](): loop.controller}
-        run = simulate_sensors(filters, truth, hardware=hardware, seed=seed, **sizes)
+        run = simulate_sensors(filters, truth, hardware=hardware, seed=seed, drops=(), **sizes)
     else:
         run = simulate(loop.controller, truth, hardware=hardware, seed=seed, **sizes)
     return {
