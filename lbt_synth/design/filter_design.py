@@ -190,26 +190,6 @@ class FilterDesign(Design):
         return self.problem.controller(self.gain_predictor)
 
     @property
-    def gamma_requested(self) -> float:
-        """Bound that the H-infinity design was given; nan without one."""
-        return float(self.claims.get("gamma_requested", np.nan))
-
-    @property
-    def rms_requested(self) -> float:
-        """Bound on the standard deviation that the design was given; nan without one."""
-        return float(self.claims.get("rms_requested", np.nan))
-
-    @property
-    def gamma_least(self) -> float:
-        """Norm that a filter of the problem achieves, with the least gamma; nan if not computed."""
-        return float(self.claims.get("gamma_least", np.nan))
-
-    @property
-    def gamma_infeasible(self) -> float:
-        """Level that no filter reaches: the least gamma is not below it; nan if not computed."""
-        return float(self.claims.get("gamma_infeasible", np.nan))
-
-    @property
     def proof(self) -> Witness:
         """The witness; without one, no disturbance at all, which proves nothing."""
         (n, p), N = self.problem.B.shape[-2:], self.problem.period

@@ -159,6 +159,26 @@ class Design(Summarised, ABC):
         return float(self.claims.get("rms", np.nan))
 
     @property
+    def gamma_requested(self) -> float:
+        """Bound that the H-infinity design was given; nan without one."""
+        return float(self.claims.get("gamma_requested", np.nan))
+
+    @property
+    def rms_requested(self) -> float:
+        """Bound on the standard deviation that the design was given; nan without one."""
+        return float(self.claims.get("rms_requested", np.nan))
+
+    @property
+    def gamma_least(self) -> float:
+        """Norm that a filter of the problem achieves, with the least gamma; nan if not computed."""
+        return float(self.claims.get("gamma_least", np.nan))
+
+    @property
+    def gamma_infeasible(self) -> float:
+        """Level that no filter reaches: the least gamma is not below it; nan if not computed."""
+        return float(self.claims.get("gamma_infeasible", np.nan))
+
+    @property
     def controllers(self) -> Mapping[frozenset[str], Controller]:
         """The controller for each set of sensors and channels that are not read, none included."""
         return {frozenset(): self.controller}
@@ -295,12 +315,14 @@ class Design(Summarised, ABC):
 AnyDesign = TypeVar("AnyDesign", bound=Design)
 
 
-def with_certificate(design: AnyDesign, hint: str) -> AnyDesign:
+def with_certificate(
+    design: AnyDesign, hint: str, *, evidence: Evidence | None = None
+) -> AnyDesign:
     """Return a design with its certificate; raise CertificateError with a hint if it fails.
 
-    It claims the norms of its error as they are computed.
+    It claims the norms of its error as they are computed. The evidence is at hand, or computed.
     """
-    evidence = design.examine()
+    evidence = evidence or design.examine()
     norms = {name: float(getattr(evidence.certificate, name)) for name in ("rms", "gamma")}
     named = {claim.name for claim in design.CLAIMS}
     claims = {name: norm for name, norm in norms.items() if name in named}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from lbt_synth.design.certificate import (
     Check,
     certify_error,
 )
+from lbt_synth.design.claims import Claim, Evidence, measured_claim
+from lbt_synth.design.result import Design, SolverReport, with_certificate, without_units
 from lbt_synth.errors import (
     CertificateError,
     NumericalError,
@@ -23,80 +26,104 @@ from lbt_synth.errors import (
     SynthesisError,
 )
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.output_feedback.lower_bound import ControlWitness, infeasible_control_level
-from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant
+from lbt_synth.linear.output_feedback.lower_bound import (
+    NO_PROOF,
+    ControlWitness,
+    infeasible_control_level,
+)
+from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
 from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
 from lbt_synth.linear.state_space import StateSpace, sigma_sparkline
-from lbt_synth.storage.rows import column, fact_table, row_table, table_row
-from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.rows import fact_table, row_table
+from lbt_synth.storage.summaries import Summary
 
 _SHARES = (0.0, 1e-6, 1e-5, 1e-4)  # of the errors and disturbances, added in turn
 
 
-@table_row
-class ControllerFacts:
-    """What a controller of a generalised plant is, and what it leaves."""
+def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
+    """Check that the norm keeps its bound."""
+    above = evidence.certificate.gamma / gamma - 1
+    yield Check("norm of the closed loop over its bound, less 1", above, NORM_TOLERANCE, LEVEL_SETS)
 
-    method: str = column("method")
-    route: str = column("route")
-    n_states: int = column("states of the controller")
-    gamma: float = column("gamma, the norm from w to z")
-    gamma_requested: float | None = column("gamma requested")
-    gamma_least: float | None = column("least gamma, reached by a controller")
-    gamma_infeasible: float | None = column("gamma that no controller reaches")
-    rms: float = column("rms of z for white w of unit variance")
+
+def _check_least_rms(evidence: Evidence, least: float) -> Iterator[Check]:
+    """Check that the variance is what the equations say the least one is."""
+    above = evidence.certificate.rms / max(least, 1e-300) - 1
+    how = "closed loop against the Riccati equations"
+    yield Check("rms over the least, less 1", above, VARIANCE_TOLERANCE, how)
+
+
+def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
+    """Check that the witness proves the level."""
+    design = evidence.design
+    proved = infeasible_control_level(scaled_plant(design.problem).plant, design.witness)
+    above = level / max(proved, 1e-300) - 1
+    how = "pairs that no measurement shows and no control moves"
+    name = "infeasible level over the level proved, less 1"
+    yield Check(name, above, INFEASIBLE_TOLERANCE, how)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControllerDesign(Summarised):
-    """A certified controller of a generalised plant."""
+class ControllerDesign(Design):
+    """A certified controller of a generalised plant, ``u = K y``.
 
-    plant: GeneralizedPlant  # the plant
-    controller: StateSpace  # from y to u, in textbook form: ``u = K y``
-    closed_loop: StateSpace  # from w to z
-    gamma: float  # H-infinity norm of the closed loop, recomputed
-    rms: float  # standard deviation of z for white w of unit variance per sample
-    # the bound that was given; the norm that a controller achieves; and a level that none reaches,
-    # proved by ``witness``. Where they were not computed they are nan
-    gamma_requested: float = np.nan
-    gamma_least: float = np.nan
-    gamma_infeasible: float = np.nan
-    # the proof that ``gamma_infeasible`` cannot be reached; its ``reason`` says why in words
-    witness: ControlWitness | None = None
-    certificate: Certificate  # the checks, computed from the matrices of plant and controller alone
-    method: str  # "h2", "hinf" or "mixed", and how it was solved
-    route: str
-    # share of the errors and disturbances that was added because the plant's own equations are
-    # singular, or leave rounding alone; mostly 0. The certificate is that of the plant as given
+    Attributes
+    ----------
+    problem : GeneralizedPlant
+        The plant.
+    controller : StateSpace
+        From y to u, in textbook form.
+    closed_loop : StateSpace
+        From w to z; ``gamma`` is its norm, ``rms`` that of z for white w of unit variance.
+    witness : ControlWitness
+        The proof that ``gamma_infeasible`` cannot be reached; its ``reason`` says why in words.
+    regularised : float
+        Share of the errors and disturbances that was added because the plant's own equations are
+        singular, or leave rounding alone; mostly 0. The certificate is that of the plant as given.
+    """
+
+    CLAIMS: ClassVar[tuple[Claim, ...]] = (
+        measured_claim("gamma", "gamma, the norm from w to z"),
+        measured_claim("rms", "rms of z for white w of unit variance"),
+        Claim(name="rms_least", heading="least rms of any controller", checks=_check_least_rms),
+        Claim(name="gamma_requested", heading="gamma requested", checks=_check_bound),
+        Claim(name="gamma_least", heading="least gamma, reached by a controller"),
+        Claim(
+            name="gamma_infeasible",
+            heading="gamma that no controller reaches",
+            checks=_check_infeasible,
+        ),
+    )
+
+    problem: GeneralizedPlant
+    controller: StateSpace  # type: ignore[assignment]
+    closed_loop: StateSpace
+    witness: ControlWitness = NO_PROOF
     regularised: float = 0.0
 
-    def _brief(self) -> str:
-        return f"{self.method}, {len(self.controller.A)} states, gamma {self.gamma:.6g}"
+    def make_controller(self) -> StateSpace:  # type: ignore[override]
+        """Return the controller as it was computed."""
+        return self.controller
 
-    def _summarise(self) -> Summary:
-        facts = ControllerFacts(
-            method=self.method,
-            route=self.route,
-            n_states=len(self.controller.A),
-            gamma=self.gamma,
-            gamma_requested=_given(self.gamma_requested),
-            gamma_least=_given(self.gamma_least),
-            gamma_infeasible=_given(self.gamma_infeasible),
-            rms=self.rms,
-        )
-        notes = [] if self.witness is None else [f"below: {self.witness.reason}"]
+    def examine(self) -> Evidence:
+        """Compute the norms of the closed loop."""
+        name = "spectral radius of the closed loop"
+        return Evidence(design=self, certificate=certify_error(self.closed_loop, stability=name))
+
+    def notes(self) -> list[str]:
+        """Return why no controller is below the level, and what was added to a singular plant."""
+        notes = [f"below: {self.witness.reason}"] if "gamma_infeasible" in self.claims else []
         if self.regularised:
             notes.append(f"singular problem, regularised by a share of {self.regularised:g}")
-        curve = sigma_sparkline(self.closed_loop, "largest singular value from w to z")
+        return notes
+
+    def _summarise(self) -> Summary:
         tables = [
-            fact_table("Controller", facts),
+            without_units(fact_table("Controller", self.facts())),
             row_table("Certificate", self.certificate.checks),
         ]
-        return Summary(tables=tables, notes=notes, curve=curve)
-
-
-def _given(value: float) -> float | None:
-    return None if np.isnan(value) else value
+        curve = sigma_sparkline(self.closed_loop, "largest singular value from w to z")
+        return Summary(tables=tables, notes=self.notes(), curve=curve)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -149,48 +176,21 @@ def certified_controller(
     *,
     method: str,
     route: str,
-    gamma_requested: float = np.nan,
-    gamma_least: float = np.nan,
-    gamma_infeasible: float = np.nan,
-    witness: ControlWitness | None = None,
+    witness: ControlWitness = NO_PROOF,
     regularised: float = 0.0,
-    least_rms: float = np.nan,
     hint: str = "",
+    **claims: float,
 ) -> ControllerDesign:
-    """Check what is claimed of a loop, and return the design.
-
-    ``least_rms`` is what the least variance is known to be. Raises a CertificateError if a check
-    fails.
-    """
-    certificate = checked.certificate
-    checks = list(certificate.checks)
-    if np.isfinite(certificate.gamma):
-        if np.isfinite(gamma_requested):
-            limit = gamma_requested * (1 + NORM_TOLERANCE)
-            checks.append(Check("norm of the closed loop", certificate.gamma, limit, LEVEL_SETS))
-        if np.isfinite(least_rms):
-            above = certificate.rms / max(least_rms, 1e-300) - 1
-            how = "closed loop against the Riccati equations"
-            checks.append(Check("rms over the least, less 1", above, VARIANCE_TOLERANCE, how))
-        if witness is not None:
-            proved = infeasible_control_level(scaled.plant, witness)
-            above = gamma_infeasible / max(proved, 1e-300) - 1
-            how = "pairs that no measurement shows and no control moves"
-            name = "infeasible level over the level proved, less 1"
-            checks.append(Check(name, above, INFEASIBLE_TOLERANCE, how))
-    certificate = replace(certificate, checks=tuple(checks)).require(hint)
-    return ControllerDesign(
-        plant=scaled.given,
+    """Check what is claimed of a loop, and return the design; CertificateError if it fails."""
+    design = ControllerDesign(
+        method=method,
+        problem=scaled.given,
         controller=checked.controller,
         closed_loop=checked.loop,
-        gamma=certificate.gamma,
-        rms=certificate.rms,
-        gamma_requested=gamma_requested,
-        gamma_least=gamma_least,
-        gamma_infeasible=gamma_infeasible,
+        claims=claims,
         witness=witness,
-        certificate=certificate,
-        method=method,
-        route=route,
+        solver=SolverReport(route=route, status="solved", iterations=0),
         regularised=regularised,
     )
+    evidence = Evidence(design=design, certificate=checked.certificate)
+    return with_certificate(design, hint, evidence=evidence)
