@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lbt_synth.design.claims import Claim, Evidence
+from lbt_synth.design.claims import Claim
 from lbt_synth.design.integrator_law import LAW_CLAIMS, PURE, IntegratorLaw
-from lbt_synth.design.result import UNCERTIFIED, Design, SolverReport, with_certificate
+from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import LoopEnsemble, close_loop, stable_sensor_gains
@@ -60,10 +60,6 @@ class IntegratorDesign(Design):
     def poles(self) -> ComplexArray:
         """Poles of the closed loop."""
         return close_loop(self.problem, self.controller).system.poles
-
-    def examine(self) -> Evidence:
-        """Compute nothing but the loop, which every design's certificate has."""
-        return Evidence(design=self, certificate=UNCERTIFIED)
 
 
 def integrator(
