@@ -103,6 +103,9 @@ def test_the_compiled_filter_closes_the_loop(
         def __init__(self, missing):
             self.C = [Stepped(missing)] * 2
 
+        def stacks(self):
+            return self.A, self.B, self.C, self.D
+
     filters = {some: Filter(some) for some in fused.controllers}
     found = run(fused, fused_config, filters)
     assert relative(found.commands, simulated.commands) < limit
