@@ -109,7 +109,8 @@ def _kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArr
     """Return the gains of predictor and filter (2, n, q) at a phase."""
     A, B, C, D = problem.read_parts(t)
     innovation = C @ P @ C.T + D @ D.T
-    out, rows = np.zeros((2, problem.n_states, problem.n_measurements)), problem.read[t]
+    out = np.zeros((2, problem.n_states, problem.n_measurements))
+    rows = problem.read[t % problem.period]
     out[0][:, rows] = np.linalg.solve(innovation, (A @ P @ C.T + B @ D.T).T).T
     out[1][:, rows] = np.linalg.solve(innovation, C @ P).T
     return out
@@ -196,7 +197,8 @@ def _central_gains(problem: EstimationProblem, t: int, gamma: float, P: FloatArr
     innovations[: len(C), : len(C)] += D @ D.T
     innovations[len(C) :, len(C) :] -= np.eye(len(problem.L))
     gain_filter = np.linalg.solve(innovations, outputs @ P)[: len(C)].T
-    out, rows = np.zeros((2, problem.n_states, problem.n_measurements)), problem.read[t]
+    out = np.zeros((2, problem.n_states, problem.n_measurements))
+    rows = problem.read[t % problem.period]
     out[0][:, rows], out[1][:, rows] = A @ gain_filter + injection, gain_filter
     return out
 
