@@ -24,6 +24,7 @@ from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.fallbacks import (
     Fallback,
     dwell_frames,
+    failed_loop,
     failure_rows,
     fallback_checks,
     make_fallbacks,
@@ -37,7 +38,7 @@ from lbt_synth.design.result import (
     model_limits,
     with_certificate,
 )
-from lbt_synth.errors import DimensionError, NumericalError
+from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
 from lbt_synth.linear.estimation_problem import decorrelate
 from lbt_synth.linear.matrix_functions import relative_distance
@@ -49,7 +50,7 @@ from lbt_synth.linear.riccati.filtering import (
 )
 from lbt_synth.loop import stable_sensor_gains
 from lbt_synth.storage.rows import Column
-from lbt_synth.validation import ComplexArray, FloatArray, matrix, set_fields
+from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 ORIGIN = "distance from its Riccati filter"
 
@@ -171,18 +172,9 @@ class FilterDesign(Design):
     fallbacks: tuple[Fallback, ...] = ()
 
     def __post_init__(self) -> None:
-        problem = self.problem
-        sizes = {
-            "rows": (problem.n_states, f"to match A {problem.A.shape}"),
-            "cols": (problem.n_measurements, f"to match C {problem.C.shape}"),
-        }
-        gain_filter = matrix(self.gain_filter, "gain_filter", **sizes, stacked=True)
-        if gain_filter.shape != np.shape(self.gain_predictor):
-            raise DimensionError(
-                f"gain_filter must be {np.shape(self.gain_predictor)}, as the predictor gain; got "
-                f"{gain_filter.shape}."
-            )
-        set_fields(self, gain_filter=gain_filter)
+        gains = {"gain_predictor": self.gain_predictor, "gain_filter": self.gain_filter}
+        named = {name: self.problem.checked_gain(gain, name) for name, gain in gains.items()}
+        set_fields(self, **named)
         Design.__post_init__(self)
 
     def make_controller(self) -> Controller:
@@ -253,9 +245,14 @@ class FilterDesign(Design):
 
     def notes(self) -> list[str]:
         """Return what the table of failures says, and which failures the loop has to see."""
-        if not self.tables():
+        plant = self.problem
+        if not reads_several(plant):
             return []
-        unseen = [row.missing for row in self.tables()[0].rows if row.must_switch]
+        unseen = [
+            " + ".join(fallback.missing)
+            for fallback in self.fallbacks
+            if not failed_loop(plant, self.gain_predictor, fallback.missing).is_stable
+        ]
         warning = (
             f"note: unstable if these fail unseen: {'; '.join(unseen)}. The computer of the loop "
             "has to see such a failure, and take the fall-back filter."

@@ -190,7 +190,7 @@ class EstimationProblem(LinearSystem):
         >>> float(p.error_system([[0.4]]).A[0, 0])
         0.5
         """
-        gain = self._checked_gain(gain_predictor)
+        gain = self.checked_gain(gain_predictor)
         D = np.zeros((len(self.L), self.B.shape[-1]))
         return StateSpace(
             A=self.A - gain @ self.C, B=self.B - gain @ self.D, C=self.L, D=D, dt_s=self.dt_s
@@ -326,26 +326,26 @@ class EstimationProblem(LinearSystem):
         >>> float(p.controller([[0.4]]).start().step([1.0])[0])
         0.4
         """
-        gain = self._checked_gain(gain_predictor)
+        gain = self.checked_gain(gain_predictor)
         A, D = self.A - gain @ self.C, np.zeros_like(self.L @ gain)
         return Controller(A=A, B=gain, C=self.L, D=D, dt_s=self.dt_s)
 
-    def _checked_gain(self, gain_predictor: FloatArray) -> FloatArray:
+    def checked_gain(self, gain: FloatArray, name: str = "gain_predictor") -> FloatArray:
         """Return gains (n, q), or (N, n, q) of a longer period, zero for what is not read."""
         gain = matrix(
-            gain_predictor,
-            "gain_predictor",
+            gain,
+            name,
             rows=(self.n_states, f"to match A {self.A.shape}"),
             cols=(self.n_measurements, f"to match C {self.C.shape}"),
             stacked=True,
         )
         if gain.ndim > 2 and gain.shape[:-2] != (self.period,):
             raise DimensionError(
-                f"gain_predictor must be one matrix, or one for each of {self.period} phases; got "
+                f"{name} must be one matrix, or one for each of {self.period} phases; got "
                 f"{gain.shape}."
             )
-        if not self.read.all():
-            gain = gain * self.read[:, None, :]
+        if not self.read.all() or (self.period > 1 and gain.ndim == 2):
+            gain = frozen_copy(gain * self.read[:, None, :])
         return gain[0] if self.period == 1 and gain.ndim > 2 else gain
 
 

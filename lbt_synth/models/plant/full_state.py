@@ -41,7 +41,7 @@ class FullStatePlant(EstimationProblem):
         ``N^+ L x_hat(k | k-1)`` and needs no state of its own. The predictor gain is over the full
         state, (n, q).
         """
-        gain = self._checked_gain(gain_predictor)
+        gain = self.checked_gain(gain_predictor)
         to_command = self.hardware.projector @ self.L
         applied = self.B_known - gain @ self.D_known
         A = self.A - gain @ self.C + applied @ to_command
@@ -53,7 +53,7 @@ class FullStatePlant(EstimationProblem):
 
         The predictor gain is over the full state, (n, q).
         """
-        gain = self._checked_gain(gain_predictor)
+        gain = self.checked_gain(gain_predictor)
         B = np.concatenate([gain, self.B_known - gain @ self.D_known], axis=-1)
         D = np.zeros((self.L.shape[0], B.shape[-1]))
         return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)

@@ -261,7 +261,7 @@ class TipTiltPlant(EstimationProblem):
 
     def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
         """Gain over the full state; the known input has no error and needs no gain."""
-        gain = self._checked_gain(gain_predictor)
+        gain = self.checked_gain(gain_predictor)
         shape = (*gain.shape[:-2], full.n_states - self.n_states, gain.shape[-1])
         return np.concatenate([gain, np.zeros(shape)], axis=-2)
 
