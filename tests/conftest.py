@@ -72,18 +72,18 @@ def cluster():
 
 
 @pytest.fixture(scope="session")
-def fused_config(tmp_path_factory):
+def sensors_config(tmp_path_factory):
     """A loop of several sensors."""
-    return lbt.load_config(write_config(tmp_path_factory.mktemp("fused")))
+    return lbt.load_config(write_config(tmp_path_factory.mktemp("sensors")))
 
 
 @pytest.fixture(scope="session")
-def fused(fused_config):
+def sensors_design(sensors_config):
     """Its Kalman filter."""
-    return fused_config.design("kalman")
+    return sensors_config.design("kalman")
 
 
 @pytest.fixture(scope="session")
-def fused_file(fused, tmp_path_factory):
+def sensors_file(sensors_design, tmp_path_factory):
     """The gain file of that filter."""
-    return lbt.save_gain(tmp_path_factory.mktemp("fused_gain") / "fused.fits", fused)
+    return lbt.save_gain(tmp_path_factory.mktemp("sensors_gain") / "sensors.fits", sensors_design)

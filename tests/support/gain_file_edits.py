@@ -55,7 +55,7 @@ def bare_problem():
     )
 
 
-def fused_original(*, bounded):
+def sensors_original(*, bounded):
     """A filter of a slow sensor and an accelerometer beside the loop's own sensor."""
     slow = WavefrontSensor(name="slow", rate_hz=400, delay_frames=2, noise_nm=9.0)
     shaken = Accelerometer(
@@ -81,8 +81,8 @@ ORIGINALS = {
     "mixed": lambda: lbt.mixed(lbt_axis_plant(modes=1), gamma_ratio=1.1, taps=4),
     "lqg": lambda: lbt.lqg(slow_plant(2.0, shell(), modes=2), command_weight=0.01),
     "shaped": shaped_design,
-    "fused": lambda: fused_original(bounded=False),
-    "fused_hinf": lambda: fused_original(bounded=True),
+    "sensors": lambda: sensors_original(bounded=False),
+    "sensors_hinf": lambda: sensors_original(bounded=True),
     "integrator": lambda: lbt.integrator(odd_plant().hardware, gain=0.3),
     "mirror": lambda: lbt.integrator(slow_plant(2.0, shell(), modes=2).hardware, gain=0.1),
 }

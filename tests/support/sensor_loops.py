@@ -6,7 +6,6 @@ from scipy.signal import lfilter
 from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
-from lbt_synth.models.plant.readings import fused_plant
 from lbt_synth.models.sensor_suite import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 RATE_HZ = 1000.0
@@ -39,7 +38,7 @@ def example_plant(sensors=(FAST, SLOW), *, lines=LINES, motions=MOTIONS, **chang
     own = lbt.tip_tilt_plant(frame_rate_hz=RATE_HZ, vibrations=lines or None, **facts)
     suite = SensorSuite(sensors=sensors)
     moved = [{name: each[name] for name in each if name in suite.channels} for each in motions]
-    return fused_plant(own, suite, tuple(moved))
+    return own.with_sensors(suite, tuple(moved))
 
 
 def frames_per_reading(hardware, sensor):
@@ -172,9 +171,9 @@ def simulated_covariances(plant, controller, *, frames=300, **loop):
         for t in range(N):
             add(origin, signal, direction, np.zeros((frames, 1, q)), t)
 
-    for mode, model in enumerate(plant.own.turbulence):
+    for mode, model in enumerate(plant.turbulence):
         drive(0, model, np.eye(n)[mode])
-    for line, motion in zip(plant.own.vibrations, plant.motions, strict=True):
+    for line, motion in zip(plant.vibrations, plant.motions, strict=True):
         direction = np.array(line.direction)
         if not motion:
             drive(1, line.ar_model(RATE_HZ), direction)
@@ -189,7 +188,7 @@ def simulated_covariances(plant, controller, *, frames=300, **loop):
             read[:, :, row] = one
         for t in range(N):
             add(1, signal, direction, read, t)
-    factors = [plant.own.D[:, -hardware.n_measurements :]]
+    factors = [plant.own_noise_factor]
     factors += [each.noise_factor(n) for each in suite.sensors]
     for column in block_diag(*factors).T:
         for t in range(N):

@@ -27,6 +27,6 @@ simulation: {frames: 2000, cases: 2, settle_frames: 500}
 
 def write_config(folder: Path, text: str = CONFIG) -> Path:
     """Write the configuration into a folder."""
-    path = folder / "fused.yaml"
+    path = folder / "sensors.yaml"
     path.write_text(text)
     return path
