@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.models.plant.tip_tilt import TipTiltPlant, with_vibrations
+from lbt_synth.models.plant.tip_tilt import TipTiltPlant, assemble
+from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, integer, number, real_array
 
@@ -69,7 +70,7 @@ def spread_plant(
     >>> [line.frequency_hz for line in spread.vibrations]
     [19.25, 19.75, 20.25, 20.75]
     """
-    plant.parts()  # refuses the memory of a mixed filter
+    parts = plant.parts()  # refuses the memory of a mixed filter
     if not plant.vibrations:
         raise ProblemError(
             "a frequency prior needs a plant with a vibration; got one without any. Try "
@@ -82,7 +83,8 @@ def spread_plant(
         )
     first = plant.vibrations[0].frequency_hz
     made: list[Vibration] = []
-    for line in plant.vibrations:
+    motions: Motions = ()
+    for line, motion in zip(plant.vibrations, plant.motions, strict=True):
         if frequencies_hz is None:
             given = line_frequencies(line.frequency_hz, half_width_hz, lines)
         else:
@@ -93,7 +95,8 @@ def spread_plant(
                     f"{first:.6g} and {line.frequency_hz:.6g} Hz. Try half_width_hz."
                 )
         made += spread_lines(line, given, weights)
-    return with_vibrations(plant, made)
+        motions += (motion,) * (len(made) - len(motions))
+    return assemble(replace(parts, vibrations=tuple(made), motions=motions))
 
 
 def line_frequencies(

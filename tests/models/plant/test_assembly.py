@@ -1,5 +1,7 @@
 """Plants of several sensors: what they hold, and where they are plants of one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.periodic_problems import relative_distance
@@ -7,8 +9,9 @@ from support.sensor_loops import AIR, FAST, LINES, MOTIONS, SLOW, example_plant,
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models import Accelerometer, SensorSuite, WavefrontSensor, fused_plant
-from lbt_synth.models.plant.readings import Exposure, memory, own_exposure, suite_exposures
+from lbt_synth.models import Accelerometer, SensorSuite, WavefrontSensor
+from lbt_synth.models.plant.readings import Exposure, memory, other_exposures, own_exposure
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 @pytest.mark.parametrize(
@@ -31,7 +34,7 @@ def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
     signal = np.random.default_rng(0).standard_normal((200, 2))
     response = np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]])
     exposure = Exposure(response=response, age_frames=float(age), period=period)
-    held, compared = memory([exposure], 2, common, 1e-3), 0
+    held, compared = memory([exposure], 2, common), 0
     x = np.zeros(held.n_states)
     for k, s in enumerate(signal):
         t = k % common
@@ -45,12 +48,13 @@ def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
 
 
 def test_sensors_side_by_side():
-    path = lbt.LoopHardware(frame_rate_hz=1000, delay_frames=2.5, modes=2)
     slow = WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
-    exposures = [own_exposure(path), *suite_exposures(SensorSuite(sensors=(slow,)), path)]
+    suite = SensorSuite(sensors=(slow,))
+    path = lbt.LoopHardware(frame_rate_hz=1000, delay_frames=2.5, modes=2, suite=suite)
+    exposures = [own_exposure(path), *other_exposures(path)]
     assert [(e.age_frames, e.period) for e in exposures] == [(1.0, 1), (6.5, 4)]
-    both = memory(exposures, 2, 4, path.dt_s)
-    alone = [memory([each], 2, 4, path.dt_s) for each in exposures]
+    both = memory(exposures, 2, 4)
+    alone = [memory([each], 2, 4) for each in exposures]
     assert both.n_states == sum(each.n_states for each in alone)
     n = alone[0].n_states
     np.testing.assert_array_equal(both.A[:, n:, n:], alone[1].A)
@@ -65,78 +69,94 @@ def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
         name="mirror", rate_hz=500, delay_frames=2, channels=("m1",), noise_m_s2=1.0
     )
     plant = example_plant((fast,), motions=({}, {}), delay_frames=delay)
-    alone, n = lbt.kalman(plant.own), plant.own.n_states
-    solution = lbt.linear.periodic_kalman(plant)
+    own = plant.own_sensor_alone()
+    alone, n = lbt.kalman(own), own.n_states
+    solution = lbt.linear.kalman_riccati(plant)
     assert plant.period == 2
-    for P, gains in zip(solution.P, solution.gains, strict=True):
+    for P, gains in zip(solution.P, solution.gain_predictor, strict=True):
         assert relative_distance(gains[:n, :2], alone.gain_predictor) < 1e-9
         assert not gains[:, 2:].any()
         power = np.trace(plant.L @ P @ plant.L.T)
         assert power == pytest.approx(alone.rms**2, rel=1e-9)
     # and so does its controller
-    own, fused = alone.controller, plant.controller(solution.gains)
+    both = plant.controller(solution.gain_predictor)
     y = np.random.default_rng(0).standard_normal((50, 3))
-    states, commands = [np.zeros(own.n_states), np.zeros(fused.n_states)], np.zeros((2, 50, 2))
-    for k in range(50):
-        for i, (c, used) in enumerate(((own, y[k, :2]), (fused.phase(k), y[k]))):
-            states[i] = c.A @ states[i] + c.B @ used
-            commands[i, k] = c.C @ states[i] + c.D @ used
-    np.testing.assert_allclose(commands[1], commands[0], atol=1e-9)
+    running, alike = both.start(), alone.controller.start()
+    commands = np.array([(running.step(each), alike.step(each[:2])) for each in y])
+    np.testing.assert_allclose(commands[:, 0], commands[:, 1], atol=1e-9)
 
 
 def test_what_a_plant_holds():
     plant = example_plant()
-    assert plant.period == 4
-    assert plant.n_measurements == 6
-    assert plant.unit_rows(("m2", "wavefront")).tolist() == [1, 1, 0, 0, 0, 1]
+    own = plant.own_sensor_alone()
+    assert (plant.period, own.period, plant.n_measurements) == (4, 1, 6)
+    assert plant.hardware.suite.marked(("m2", "wavefront"), plant.hardware).tolist() == [
+        *(1, 1, 0, 0, 0, 1)
+    ]
     # of a line three states for two, and two ends of exposures: of the first line, which channels
     # see at two phases, position and velocity; a sum and two readings that wait, of two modes
-    assert plant.n_states == plant.own.n_states + (1 + 4) + (1 + 2) + 3 * 2
-    assert plant.n_known == 2 + 3 * 2
-    assert "4 sensors, period 4" in plant._brief()
+    assert plant.n_states == own.n_states + (1 + 4) + (1 + 2) + 3 * 2
+    assert plant.full().n_states == plant.n_states + 2 + 3 * 2
+    assert "4 sensors" in plant._brief()
+    assert plant.turbulence == own.turbulence == (AIR, AIR)
+    np.testing.assert_allclose(plant.own_noise_factor, 75 * np.eye(2))
+    again = own.with_sensors(plant.hardware.suite, plant.motions)
+    np.testing.assert_array_equal(again.A, plant.A)
+    assert own.own_sensor_alone() is own
+
+
+def test_lines_that_move_keep_their_channels():
+    plant = example_plant()
+    shifted = retuned_plant(plant, [5.0, -5.0])
+    assert shifted.motions == plant.motions
+    spread = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=3)
+    assert spread.motions == (plant.motions[0],) * 3 + (plant.motions[1],) * 3
+    one = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=1)
+    np.testing.assert_allclose(one.C, plant.C, rtol=1e-12)
 
 
 def test_lines_that_no_channel_sees_stay_in_place():
     plant = example_plant((FAST,), motions=({}, MOTIONS[1]))
-    own = plant.own
+    own = plant.own_sensor_alone()
     kept = [0, 2, *range(4, own.n_states)]  # without the samples of the second line
-    np.testing.assert_array_equal(plant.A[0][: len(kept), : len(kept)], own.A[np.ix_(kept, kept)])
+    np.testing.assert_array_equal(plant.A[: len(kept), : len(kept)], own.A[np.ix_(kept, kept)])
     # its mean position has its place in the total phase, and no channel sees the first line
-    position = plant.A[0][len(kept) - 2 : len(kept), len(kept)]
+    position = plant.A[len(kept) - 2 : len(kept), len(kept)]
     np.testing.assert_allclose(position, LINES[1].direction, rtol=1e-12)
-    assert not plant.C[0][2:, : len(kept)].any()
+    assert not plant.C[2:, : len(kept)].any()
 
 
 def test_noise_of_a_reading_is_that_of_nothing_else():
-    plant = example_plant()
-    assert not (plant.B @ plant.D.transpose(0, 2, 1)).any()
+    assert not example_plant().S.any()
 
 
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda: fused_plant(1, SensorSuite(sensors=(SLOW,))), ProblemError, "own must be a"),
-        (lambda: fused_plant(example_plant().own, (SLOW,)), ProblemError, "suite must be a"),
+        (lambda: example_plant().with_sensors((SLOW,)), ProblemError, "suite must be a"),
         (
-            lambda: fused_plant(example_plant().own, SensorSuite(sensors=(FAST,)), ({},)),
+            lambda: example_plant().with_sensors(SensorSuite(sensors=(FAST,)), ({},)),
             DimensionError,
             "one mapping per vibration",
         ),
-        (lambda: example_plant().controller(np.zeros((1, 2, 3))), DimensionError, "gains must be"),
-        (lambda: example_plant().unit_rows(("m9",)), ProblemError, "called 'm9'"),
+        (lambda: replace(example_plant().parts(), motions=({},)), DimensionError, "one mapping"),
+        (
+            lambda: example_plant().controller(np.zeros((1, 2, 3))),
+            DimensionError,
+            "gain_predictor must have",
+        ),
         (
             lambda: example_plant(delay_frames=4, sensors=(FAST,)),
             ProblemError,
             "sensor mirror must be at least 3 of its frames",
+        ),
+        (
+            lambda: example_plant().require_own_sensor("this"),
+            ProblemError,
+            "this reads the loop's own sensor alone; got a plant that truth, m1, m2 see, too",
         ),
     ],
 )
 def test_refusals(make, error, words):
     with pytest.raises(error, match=words):
         make()
-
-
-def test_a_plant_of_turbulence_alone():
-    plant = example_plant((SLOW,), lines=(), motions=())
-    assert plant.own.turbulence == (AIR, AIR)
-    assert plant.n_measurements == 4

@@ -37,7 +37,7 @@ def test_exact_sampling_has_the_covariances_of_256_kicks_a_frame(frequency_hz, d
     seen = seen_vibration(line, motion, (late,), PATH)
     w = 2 * np.pi * frequency_hz
     units = 1.0, -1e-9 * w**2, -1e-9 * w**2  # the readings are about -w^2 times positions
-    found = lag_covariances(seen.A[0], seen.B[0], seen.C[0] / np.array(units)[:, None])
+    found = lag_covariances(seen.A, seen.B, seen.C / np.array(units)[:, None])
     A, B = KickedOscillator(w / RATE_HZ, damping, 563.6).chain(part, 2)
     C = np.zeros((3, len(A)))
     C[0, 2] = 1.0
@@ -69,8 +69,8 @@ def test_a_line_that_hardly_decays_is_read_as_a_sinusoid(period, age, ahead):
     # the free motion from frame to frame; after some frames the memory is filled
     state = seen.still @ np.array([1.0, 1.0j])
     for t in range(30 * seen.period):
-        state = seen.A[t % seen.period] @ state
-    position, *readings = seen.C[0] @ state
+        state = seen.stacks()[0][t % seen.period] @ state
+    position, *readings = seen.stacks()[2][0] @ state
     ratios = np.array(readings) / (position * np.exp(-turn * ahead))
     expected = [sensor.swing(motion[name], 77.0, PATH) for name in ("a", "v")]
     np.testing.assert_allclose(ratios, expected, rtol=1e-6)
@@ -90,7 +90,7 @@ def test_a_reading_knows_nothing_of_the_frame_to_come():
     # of the drive of its own frame it has what the velocity at the end has
     w = 2 * np.pi * 60
     np.testing.assert_allclose(
-        (seen.C[0] @ seen.B[0])[1], 1e-9 * w * RATE_HZ * seen.B[0, 2], rtol=1e-12
+        (seen.C @ seen.B)[1], 1e-9 * w * RATE_HZ * seen.B[2], rtol=1e-12
     )
 
 
@@ -99,8 +99,8 @@ def test_positions_do_not_depend_on_who_reads():
     alone = seen_vibration(line, {}, (), PATH)
     late = mirror(delay_frames=1.4), mirror(name="b", channels=("b",), delay_frames=2.7)
     seen = seen_vibration(line, {"v": Motion(size=1), "b": Motion(size=2)}, late, PATH)
-    np.testing.assert_allclose(seen.B[0, :3, :3], alone.B[0], rtol=1e-9, atol=1e-9)
-    assert np.abs(seen.B[0, :3, 3:]).max() < 1e-9 * np.abs(alone.B).max()
+    np.testing.assert_allclose(seen.B[:3, :3], alone.B, rtol=1e-9, atol=1e-9)
+    assert np.abs(seen.B[:3, 3:]).max() < 1e-9 * np.abs(alone.B).max()
 
 
 def test_channels_that_move_alike_share_their_memory():
