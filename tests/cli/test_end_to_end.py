@@ -192,13 +192,13 @@ def test_a_design_of_several_sensors_runs_without_those_that_are_not_simulated(
         moved = "{accelerometers: {m1: {motion_nm_per_nm: 2}}, "
         text = text.replace(old, moved + old[1:])
     file.write_text(text + SENSORS)
-    gain, out = tmp_path / "fused.fits", tmp_path / "run"
+    gain, out = tmp_path / "sensors.fits", tmp_path / "run"
     lbt.save_gain(gain, lbt.load_config(file).design("kalman"))
     arguments = ["end-to-end", str(file), str(gain), "-o", str(out), "--cache", str(cache)]
     assert main(arguments) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "the fall-back filter of the gain file runs, without truth." in printed
-    assert json.loads((out / "summary.json").read_text())["method"] == "fused kalman"
+    assert json.loads((out / "summary.json").read_text())["method"] == "kalman"
     alone = lbt.load_config(small_config(tmp_path)).end_to_end
     with pytest.raises(ProblemError, match=r"moves a channel of the design \(m1\)"):
         alone.controller(lbt.files.load_gain(gain))

@@ -95,11 +95,11 @@ def config_file(tmp_path):
     return write_config(tmp_path)
 
 
-def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, fused_file):
+def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, sensors_file):
     figure = tmp_path / "drops.png"
     status, text, _ = run(
         capsys,
-        *("simulate", config_file, fused_file, "--drop", "m2@0.5s", "-o", figure),
+        *("simulate", config_file, sensors_file, "--drop", "m2@0.5s", "-o", figure),
         *("--drop", "wavefront@1s..1.2s", "--frames", 2000),
     )
     assert status == 0
@@ -107,8 +107,8 @@ def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, fused_file)
     assert figure.stat().st_size > 10_000
 
 
-def test_the_run_reaches_beyond_the_last_event(capsys, config_file, fused_file):
-    arguments = ("simulate", config_file, fused_file, "--drop", "m2@0.5s", "--cases", 1, "--json")
+def test_the_run_reaches_beyond_the_last_event(capsys, config_file, sensors_file):
+    arguments = ("simulate", config_file, sensors_file, "--drop", "m2@0.5s", "--cases", 1, "--json")
     data = json.loads(run(capsys, *arguments)[1])
     assert data["frames"] == 5500
     assert [row["sensors"] for row in data["segments"]] == ["none", "m2"]
@@ -128,8 +128,8 @@ def test_the_run_reaches_beyond_the_last_event(capsys, config_file, fused_file):
         (("--sensor-gain", 30), "must be stable"),
     ],
 )
-def test_what_it_refuses(capsys, config_file, fused_file, arguments, said):
-    status, out, error = run(capsys, "simulate", config_file, fused_file, *arguments)
+def test_what_it_refuses(capsys, config_file, sensors_file, arguments, said):
+    status, out, error = run(capsys, "simulate", config_file, sensors_file, *arguments)
     assert status != 0
     assert out == ""
     assert said in error
@@ -150,45 +150,45 @@ def test_a_design_of_one_sensor_has_nothing_to_drop(capsys, config_file, gains):
         ("rehearse", "--for", "c"),
     ],
 )
-def test_commands_for_one_sensor_say_so(capsys, fused_file, command):
-    status, out, error = run(capsys, command[0], fused_file, *command[1:])
+def test_commands_for_one_sensor_say_so(capsys, sensors_file, command):
+    status, out, error = run(capsys, command[0], sensors_file, *command[1:])
     assert (status, out) == (2, "")
     assert "is a design of several sensors" in error
 
 
-def test_the_table_of_the_paper_has_no_channels(capsys, fused_file, tmp_path):
+def test_the_table_of_the_paper_has_no_channels(capsys, sensors_file, tmp_path):
     out = tmp_path / "table"
-    status, _, error = run(capsys, "end-to-end-table", LBT_YAML, fused_file, "-o", out)
+    status, _, error = run(capsys, "end-to-end-table", LBT_YAML, sensors_file, "-o", out)
     assert status == 2
     assert "is a design of several sensors" in error
     assert not out.exists()
 
 
-def test_show_prints_what_failures_do(capsys, fused_file):
-    status, text, _ = run(capsys, "show", fused_file)
+def test_show_prints_what_failures_do(capsys, sensors_file):
+    status, text, _ = run(capsys, "show", sensors_file)
     assert status == 0
     assert "When sensors fail" in text
     assert "wavefront + slow + m1 + m2" in text
     assert "of the loop's own sensor in the truth" in text
 
 
-def test_verify_and_limits_take_it(tmp_path, capsys, fused_file):
-    assert "verified" in run(capsys, "verify", fused_file)[1]
+def test_verify_and_limits_take_it(tmp_path, capsys, sensors_file):
+    assert "verified" in run(capsys, "verify", sensors_file)[1]
     few = write_config(tmp_path, SEVERAL_SENSORS + "robustness: {errors_hz: [0]}\n")
-    status, text, _ = run(capsys, "limits", few, fused_file)
+    status, text, _ = run(capsys, "limits", few, sensors_file)
     assert status == 0
-    assert "fused" in text
+    assert "sensors_design" in text
     assert _OTHER_SENSORS not in text
 
 
 @pytest.mark.parametrize("command", ["limits", "simulate", "report"])
 def test_other_sensors_than_those_of_the_configuration_are_named(
-    tmp_path, capsys, fused_file, command
+    tmp_path, capsys, sensors_file, command
 ):
     noisy = SEVERAL_SENSORS.replace("noise_m_s2: 2.0e-4", "noise_m_s2: 2.0e-2")
     few = write_config(tmp_path, noisy + "robustness: {errors_hz: [0]}\n")
     output = ("-o", tmp_path / "a.html") if command == "report" else ()
-    status, text, _ = run(capsys, command, few, fused_file, *output)
+    status, text, _ = run(capsys, command, few, sensors_file, *output)
     assert status == 0
     assert _OTHER_SENSORS in text
 
@@ -218,8 +218,8 @@ def test_options_that_several_sensors_do_not_have(tmp_path, capsys, config_file,
     assert not gain.exists()
 
 
-def test_a_design_has_units(tmp_path, capsys, fused_file):
-    text = run(capsys, "show", fused_file)[1]
+def test_a_design_has_units(tmp_path, capsys, sensors_file):
+    text = run(capsys, "show", sensors_file)[1]
     (line,) = (row for row in text.splitlines() if row.lstrip().startswith("estimation error, rms"))
     assert line.split()[-1] == "nm"
 
@@ -230,12 +230,12 @@ def test_what_a_drop_says():
     assert drop.reading == "frozen"
 
 
-def test_it_is_exported_to_c(tmp_path, capsys, fused_file):
+def test_it_is_exported_to_c(tmp_path, capsys, sensors_file):
     out = tmp_path / "k.c"
-    status, text, error = run(capsys, "export", fused_file, "--for", "c", "-o", out)
+    status, text, error = run(capsys, "export", sensors_file, "--for", "c", "-o", out)
     assert (status, error) == (0, "")
     assert "spectral radius with any sensors missing" in text
-    data = json.loads(run(capsys, "export", fused_file, "--for", "c", "-o", out, "--json")[1])
+    data = json.loads(run(capsys, "export", sensors_file, "--for", "c", "-o", out, "--json")[1])
     assert (data["measurements"], data["commands"]) == (6, 2)
 
 
@@ -246,8 +246,8 @@ def test_it_is_exported_to_c(tmp_path, capsys, fused_file):
         (("--for", "dao", "-o", "k.npy"), "reads several sensors (wavefront, slow, m1, m2)"),
     ],
 )
-def test_exports_that_cannot_hold_it(tmp_path, capsys, fused_file, options, said):
-    status, out, error = run(capsys, "export", fused_file, *options[:-1], tmp_path / options[-1])
+def test_exports_that_cannot_hold_it(tmp_path, capsys, sensors_file, options, said):
+    status, out, error = run(capsys, "export", sensors_file, *options[:-1], tmp_path / options[-1])
     assert (status, out) == (2, "")
     assert said in error
     assert not list(tmp_path.iterdir())

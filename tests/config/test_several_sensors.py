@@ -17,29 +17,29 @@ def load(tmp_path, *edits):
     return lbt.load_config(write_config(tmp_path, text))
 
 
-def test_a_file_describes_its_sensors(fused_config):
-    plant = fused_config.plant
+def test_a_file_describes_its_sensors(sensors_config):
+    plant = sensors_config.plant
     assert plant.hardware.suite.units == ("wavefront", "slow", "m1", "m2")
     assert plant.period == 2
     assert plant.read.tolist() == [[True] * 6, [True, True, False, False, True, True]]
     assert plant.motions[1]["m2"].phase_deg == 150
-    assert fused_config.truth.motions == plant.motions
+    assert sensors_config.truth.motions == plant.motions
 
 
 def test_a_file_without_them_has_none(config):
     assert config.plant is None
 
 
-def test_the_own_sensor_among_the_others(tmp_path, fused_config):
+def test_the_own_sensor_among_the_others(tmp_path, sensors_config):
     own = "  wavefront: {rate_hz: 1000, delay_frames: 2, noise_nm: 75}\n"
     written = load(
         tmp_path,
         ("loop: {frame_rate_hz: 1000, delay_frames: 2, axes: 2}\nsensor: {noise_nm: 75}\n", ""),
         ("sensors:\n", f"sensors:\n{own}"),
     )
-    assert written.plant.hardware.suite.units == fused_config.plant.hardware.suite.units
-    assert np.array_equal(written.plant.A, fused_config.plant.A)
-    assert np.array_equal(written.plant.C, fused_config.plant.C)
+    assert written.plant.hardware.suite.units == sensors_config.plant.hardware.suite.units
+    assert np.array_equal(written.plant.A, sensors_config.plant.A)
+    assert np.array_equal(written.plant.C, sensors_config.plant.C)
 
 
 def test_the_own_sensor_alone_is_the_loop(tmp_path):
@@ -96,7 +96,7 @@ def test_mistakes_are_named(tmp_path, old, new, said):
         load(tmp_path, (old, new))
 
 
-def test_methods_for_the_own_sensor_leave_the_others_out(fused_config):
-    design = fused_config.design("integrator", gain=0.3)
+def test_methods_for_the_own_sensor_leave_the_others_out(sensors_config):
+    design = sensors_config.design("integrator", gain=0.3)
     assert design.controller.D.shape == (2, 2)
     assert design.assumptions == ("the loop's own sensor is read alone, without slow, m1, m2",)

@@ -95,14 +95,14 @@ def test_a_loop_that_the_target_makes_unstable_is_named(tmp_path, slow, monkeypa
 
 def test_what_cannot_be_rehearsed_is_refused(slow):
     bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
-    fused = lbt.kalman(example_plant((SLOW,)))
+    several = lbt.kalman(example_plant((SLOW,)))
     problem = lbt.errors.ProblemError
     for given, options, error, words in (
         ((slow, "dao", PHASE[:, :1]), {}, lbt.errors.DimensionError, r"\(frames, 2\)"),
         ((slow, "dao", PHASE), {"sensor_gain": 0.0}, problem, "sensor_gain must be above 0"),
         ((slow, "dao", PHASE), {"sensor_gain": 4.0}, lbt.errors.UnstableLoopError, None),
         ((bare, "dao", PHASE), {}, problem, "bare estimation problem"),
-        ((fused, "c", PHASE), {}, problem, "got one of several sensors"),
+        ((several, "c", PHASE), {}, problem, "got one of several sensors"),
     ):
         with pytest.raises(error, match=words):
             lbt.interop.rehearse(*given, **options)

@@ -8,7 +8,7 @@ from support.limits import RATE, ar
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.design.result import model_limit
+from lbt_synth.design.result import model_limits
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.report.figures.studies import limits_figure
 
@@ -46,9 +46,11 @@ def test_study_of_an_unstable_design(config):
     limits_figure(study)
 
 
-def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(fused, fused_config):
-    loop = (fused_config.hardware, fused_config.truth, fused_config.imaging)
-    designs = {"fused": fused, "own": fused_config.design("integrator")}
+def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(
+    sensors_design, sensors_config
+):
+    loop = (sensors_config.hardware, sensors_config.truth, sensors_config.imaging)
+    designs = {"several": sensors_design, "own": sensors_config.design("integrator")}
     several, own = lbt.studies.limits(designs, *loop).rows
     assert several.stable
     assert np.isnan(several.above_limit_percent)
@@ -77,7 +79,7 @@ def test_plants_in_the_full_form(delay):
     for plant in (lbt_axis_plant(delay_frames=delay), lbt_axis_plant(delay_frames=delay, modes=2)):
         limit = least_model_residual(plant.full())
         assert limit.rms_nm == pytest.approx(least_model_residual(plant).rms_nm, rel=1e-9)
-    _, found, above = model_limit(lbt.kalman(plant.full()))
+    _, found, above = model_limits(lbt.kalman(plant.full())).values()
     assert found == pytest.approx(limit.rms_nm)
     assert np.isnan(above) if delay == 2.7 else abs(above) < 1e-6
 
@@ -91,14 +93,11 @@ def test_full_plants_that_do_not_decouple():
     full = lbt.tip_tilt_plant(**parts, vibrations=lines).full()
     with pytest.raises(lbt.errors.ProblemError, match="the disturbance across them"):
         least_model_residual(full)
-    assert np.isnan(model_limit(lbt.kalman(full))[1:]).all()
+    assert np.isnan([*model_limits(lbt.kalman(full)).values()][1:]).all()
     plain = lbt.tip_tilt_plant(**parts, vibrations=lines[1:]).full()
     entry = plain.D.copy()
     entry[:, 0] = 1.0
     with pytest.raises(lbt.errors.ProblemError, match="independent of the disturbance"):
         least_model_residual(replace(plain, D=entry))
-    assert np.isnan(
-        model_limit(
-            lbt.kalman(lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0))
-        )
-    ).all()
+    bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    assert not model_limits(lbt.kalman(bare))

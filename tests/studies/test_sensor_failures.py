@@ -10,41 +10,50 @@ from lbt_synth.loop.simulation.failing_sensors import Drop
 from lbt_synth.studies.sensor_failures import run_failures
 
 
-def test_each_segment_has_its_exact_residual(fused, fused_config):
+def test_each_segment_has_its_exact_residual(sensors_design, sensors_config):
     drops = [Drop(unit="m1", start_s=8), Drop(unit="m2", start_s=16, reading="zero")]
     found = run_failures(
-        fused, fused_config, fused_config.truth, drops, frames=24_000, cases=6, seed=4
+        sensors_design, sensors_config, sensors_config.truth, drops, frames=24_000, cases=6, seed=4
     )
-    rows = found.rows(fused_config.imaging)
+    rows = found.rows(sensors_config.imaging)
     assert [row.sensors for row in rows] == ["none", "m1", "m1, m2 (zero)"]
+    loop = lbt.close_loop(sensors_design.hardware, sensors_design)
     assert rows[0].exact_nm == pytest.approx(
-        lbt.residual_budget(fused.loop(), fused_config.truth).rms_nm, rel=1e-9
+        lbt.residual_budget(loop, sensors_config.truth).rms_nm, rel=1e-9
     )
     for row in rows:
         assert row.residual_nm == pytest.approx(row.exact_nm, rel=0.06)
     assert rows[0].strehl > rows[1].strehl > rows[2].strehl
 
 
-def test_a_loop_that_a_blind_sensor_destabilises_has_no_exact_answer(fused, fused_config):
+def test_a_loop_that_a_blind_sensor_destabilises_has_no_exact_answer(
+    sensors_design, sensors_config
+):
     away = Drop(unit="wavefront", start_s=0.5, reading="zero")
     slow = Drop(unit="slow", start_s=0.5, reading="missing")
     found = run_failures(
-        fused, fused_config, fused_config.truth, [away, slow], frames=600, cases=1, seed=4
+        sensors_design,
+        sensors_config,
+        sensors_config.truth,
+        [away, slow],
+        frames=600,
+        cases=1,
+        seed=4,
     )
     stable = np.isfinite(found.exact_nm[1])
     assert found.stable == (True, stable)
-    last = found.rows(fused_config.imaging)[1]
+    last = found.rows(sensors_config.imaging)[1]
     assert last.stable == np.isfinite(last.strehl) == stable
-    radius = fused.controllers[frozenset({"slow"})].to_statespace().radius_per_frame
+    radius = sensors_design.controllers[frozenset({"slow"})].to_statespace().radius_per_frame
     assert stable == (radius < 1)  # nothing closes the loop: the controller alone decides
 
 
-def test_a_frozen_reading_and_a_drift_have_no_exact_answer(fused, fused_config):
+def test_a_frozen_reading_and_a_drift_have_no_exact_answer(sensors_design, sensors_config):
     frozen = [Drop(unit="m1", start_s=0.5, reading="frozen")]
     size = {"frames": 600, "cases": 1, "seed": 4}
-    found = run_failures(fused, fused_config, fused_config.truth, frozen, **size)
+    found = run_failures(sensors_design, sensors_config, sensors_config.truth, frozen, **size)
     assert (np.isfinite(found.exact_nm).tolist(), found.stable) == ([True, False], (True, True))
-    line, *others = fused_config.truth.vibrations
+    line, *others = sensors_config.truth.vibrations
     moving = lbt.models.DriftingVibration(
         start_hz=line.frequency_hz,
         end_hz=line.frequency_hz + 0.1,
@@ -53,6 +62,6 @@ def test_a_frozen_reading_and_a_drift_have_no_exact_answer(fused, fused_config):
         rms_nm=line.rms_nm,
         direction=line.direction,
     )
-    drifting = replace(fused_config.truth, vibrations=(moving, *others))
-    found = run_failures(fused, fused_config, drifting, [], **size)
+    drifting = replace(sensors_config.truth, vibrations=(moving, *others))
+    found = run_failures(sensors_design, sensors_config, drifting, [], **size)
     assert (np.isfinite(found.exact_nm).tolist(), found.stable) == ([False], (True,))

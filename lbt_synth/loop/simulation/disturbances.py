@@ -86,7 +86,7 @@ def draw_parts(
         checked_direction(vibration, hardware)
         if isinstance(vibration, Vibration) and seen and oscillators:
             alone = seen_vibration(vibration, {}, (), hardware)
-            drive = line_rng.standard_normal((cases, 1 + frames, alone.B.shape[2]))
+            drive = line_rng.standard_normal((cases, 1 + frames, alone.B.shape[-1]))
             motion = run_oscillator(alone, vibration, drive)[:, :, 0]
             lines.append(DrawnLine(motion=motion, drive=drive))
             continue

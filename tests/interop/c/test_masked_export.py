@@ -12,7 +12,7 @@ from support.exports import relative
 
 import lbt_synth as lbt
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
-from lbt_synth.interop.c import fused_export
+from lbt_synth.interop.c import masked_export
 from lbt_synth.interop.c.masked_terms import MaskedSource, masked_terms
 from lbt_synth.interop.target import target_named, target_names
 from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
@@ -29,10 +29,12 @@ MISSING, NOT_FINITE, NOT_DUE, NOT_APPLIED = 1, 2, 4, 8
 
 
 @pytest.fixture(scope="module")
-def written(fused, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("fused_c")
+def written(sensors_design, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("masked_c")
     return {
-        precision: lbt.interop.export_c(folder / f"{precision}.c", fused, precision=precision)
+        precision: lbt.interop.export_c(
+            folder / f"{precision}.c", sensors_design, precision=precision
+        )
         for precision in ("double", "single")
     }
 
@@ -42,13 +44,12 @@ def theirs(written):
     return CompiledFilter(written["double"].files[0])
 
 
-def run(fused, config, filters):
+def run(sensors_design, config, filters):
     """A run in which sensors fail, alone and together; its readings and commands."""
     return simulate_sensors(
         filters,
-        fused.problem.hardware.suite,
         config.truth,
-        hardware=config.hardware,
+        hardware=sensors_design.hardware,
         frames=FRAMES,
         settle_frames=0,
         drops=DROPS,
@@ -56,9 +57,9 @@ def run(fused, config, filters):
 
 
 @pytest.fixture(scope="module")
-def simulated(fused, fused_config):
+def simulated(sensors_design, sensors_config):
     """That run with the filters of the design."""
-    return run(fused, fused_config, fused.controllers)
+    return run(sensors_design, sensors_config, sensors_design.controllers)
 
 
 def fresh_in(k, missing=None):
@@ -81,7 +82,7 @@ def test_the_commands_are_those_of_the_simulation(simulated, theirs):
 
 @pytest.mark.parametrize(("precision", "limit"), [("double", 1e-9), ("single", 1e-3)])
 def test_the_compiled_filter_closes_the_loop(
-    fused, fused_config, simulated, written, precision, limit
+    sensors_design, sensors_config, simulated, written, precision, limit
 ):
     """The simulation with the compiled source as its filters, for each set that is missing."""
     theirs = CompiledFilter(written[precision].files[0], single=precision == "single")
@@ -97,23 +98,20 @@ def test_the_compiled_filter_closes_the_loop(
             return theirs.step(y[:, 0], fresh_in(next(frame), self.missing), theirs.u)[:, None]
 
     class Filter:
-        n_states = fused.problem.n_measurements
+        n_states = sensors_design.problem.n_measurements
         A, B, D = np.zeros((2, 6, 6)), np.tile(np.eye(6), (2, 1, 1)), np.zeros((2, 2, 6))
 
         def __init__(self, missing):
             self.C = [Stepped(missing)] * 2
 
-        def stacks(self):
-            return self.A, self.B, self.C, self.D
-
-    filters = {some: Filter(some) for some in fused.controllers}
-    found = run(fused, fused_config, filters)
+    filters = {some: Filter(some) for some in sensors_design.controllers}
+    found = run(sensors_design, sensors_config, filters)
     assert relative(found.commands, simulated.commands) < limit
     assert relative(found.residual_nm, simulated.residual_nm) < limit
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
-def test_the_rehearsal_is_the_arithmetic_of_the_source(fused, written, precision):
+def test_the_rehearsal_is_the_arithmetic_of_the_source(sensors_design, written, precision):
     """Bit for bit, with what is new drawn at random."""
     single = precision == "single"
     theirs = CompiledFilter(written[precision].files[0], single=single)
@@ -183,14 +181,14 @@ def test_reset_forgets(theirs):
     assert np.array_equal(*runs)
 
 
-def renamed(fused, names):
+def renamed(sensors_design, names):
     """The design with other names of its sensor and channels."""
-    sensors = fused.problem.hardware.suite.sensors
+    sensors = sensors_design.problem.hardware.suite.sensors
     slow, mirror = replace(sensors[0], name=names[0]), replace(sensors[1], channels=names[1:])
     suite = lbt.models.SensorSuite(sensors=(slow, mirror))
     place = dict(zip(sensors[1].channels, names[1:], strict=True))
-    motions = tuple({place[c]: m for c, m in own.items()} for own in fused.problem.motions)
-    return lbt.kalman(lbt.models.plant(fused.problem.own, suite, motions))
+    motions = tuple({place[c]: m for c, m in own.items()} for own in sensors_design.problem.motions)
+    return lbt.kalman(sensors_design.problem.own_sensor_alone().with_sensors(suite, motions))
 
 
 @pytest.mark.usefixtures("short_rehearsal")
@@ -202,8 +200,8 @@ def renamed(fused, names):
         (("x" * 30, "int", "\\\n*/"), ["WAVEFRONT_0", "X" * 24 + "_1", "INT_2", "3"]),
     ],
 )
-def test_names_of_sensors_that_are_no_identifiers(tmp_path, fused, names, found):
-    files = lbt.interop.export_c(tmp_path / "odd.c", renamed(fused, names)).files
+def test_names_of_sensors_that_are_no_identifiers(tmp_path, sensors_design, names, found):
+    files = lbt.interop.export_c(tmp_path / "odd.c", renamed(sensors_design, names)).files
     header = files[1].read_text()
     assert re.findall(r"ODD_SENSOR_(\w+) = ", header) == found
     assert header.isascii()
@@ -223,12 +221,14 @@ def test_the_header_is_fit_for_cpp(tmp_path, written):
     subprocess.run([compiler("c++"), *flags, user], check=True)
 
 
-def test_what_has_no_source_is_refused(tmp_path, fused):
+def test_what_has_no_source_is_refused(tmp_path, sensors_design):
     failed = lbt.design.Check("of a test", 1.0, 0.5, "hand")
-    wrong = replace(fused, certificate=replace(fused.certificate, checks=(failed,)))
+    wrong = replace(
+        sensors_design, certificate=replace(sensors_design.certificate, checks=(failed,))
+    )
     for design, options, error, words in (
-        (fused, {"form": "plain"}, ProblemError, "in estimator form alone"),
-        (fused, {"name": "kal-man"}, ProblemError, "prefix of the C names must"),
+        (sensors_design, {"form": "plain"}, ProblemError, "in estimator form alone"),
+        (sensors_design, {"name": "kal-man"}, ProblemError, "prefix of the C names must"),
         (wrong, {}, CertificateError, "of a test"),
     ):
         with pytest.raises(error, match=words):
@@ -237,30 +237,30 @@ def test_what_has_no_source_is_refused(tmp_path, fused):
 
 
 @pytest.mark.usefixtures("short_rehearsal")
-def test_a_table_that_is_too_long_is_refused(tmp_path, fused, monkeypatch):
-    terms = masked_terms(fused)
+def test_a_table_that_is_too_long_is_refused(tmp_path, sensors_design, monkeypatch):
+    terms = masked_terms(sensors_design)
     count = sum(np.count_nonzero(gains.any(axis=1)) for gains in terms.gains.values())
-    count *= fused.problem.n_states
-    monkeypatch.setattr(fused_export, "MOST_GAINS", count)
-    lbt.interop.export_c(tmp_path / "k.c", fused)
-    monkeypatch.setattr(fused_export, "MOST_GAINS", count - 1)
+    count *= sensors_design.problem.n_states
+    monkeypatch.setattr(masked_export, "MOST_GAINS", count)
+    lbt.interop.export_c(tmp_path / "k.c", sensors_design)
+    monkeypatch.setattr(masked_export, "MOST_GAINS", count - 1)
     with pytest.raises(ProblemError, match=rf"got {count:,}, in a period of 2 frames"):
-        lbt.interop.export_c(tmp_path / "long.c", fused)
+        lbt.interop.export_c(tmp_path / "long.c", sensors_design)
 
 
-def test_commands_that_are_off_are_refused(tmp_path, fused, monkeypatch):
-    monkeypatch.setattr(fused_export, "_LARGEST_ERROR", 1e-9)
-    lbt.interop.export_c(tmp_path / "k.c", fused)
+def test_commands_that_are_off_are_refused(tmp_path, sensors_design, monkeypatch):
+    monkeypatch.setattr(masked_export, "_LARGEST_ERROR", 1e-9)
+    lbt.interop.export_c(tmp_path / "k.c", sensors_design)
     with pytest.raises(NumericalError, match=r"in a rehearsal.*Try double precision"):
-        lbt.interop.export_c(tmp_path / "single.c", fused, precision="single")
+        lbt.interop.export_c(tmp_path / "single.c", sensors_design, precision="single")
     assert not list(tmp_path.glob("single*"))
 
 
 @pytest.mark.parametrize("target", sorted({*target_names()} - {"c"}))
-def test_other_targets_refuse_it(tmp_path, fused, target):
+def test_other_targets_refuse_it(tmp_path, sensors_design, target):
     own = target_named(target)
     with pytest.raises(ProblemError, match=r"several sensors \(wavefront, slow, m1, m2\)"):
-        own.write(own.path_in(tmp_path), fused)
+        own.write(own.path_in(tmp_path), sensors_design)
     assert not list(tmp_path.iterdir())
 
 
@@ -294,9 +294,9 @@ def test_flags_that_hide_such_readings_are_refused(tmp_path, written):
     assert "compile without -ffast-math" in done.stderr
 
 
-def test_a_source_that_is_stepped_without_more_is_that_of_all_sensors(fused):
+def test_a_source_that_is_stepped_without_more_is_that_of_all_sensors(sensors_design):
     """What is due is new, and its own commands are applied: the controller of the design."""
-    source, own = MaskedSource(masked_terms(fused), np.float64), fused.controller
+    source, own = MaskedSource(masked_terms(sensors_design), np.float64), sensors_design.controller
     x = np.zeros(own.n_states)
     for k, y in enumerate(np.random.default_rng(5).standard_normal((30, 6))):
         x = own.A[k % 2] @ x + own.B[k % 2] @ y

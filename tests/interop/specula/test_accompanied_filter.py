@@ -34,7 +34,7 @@ SETTINGS = replace(
 )
 
 
-def fused_design(*sensors, modes=2, noise_nm=15.0, **changes):
+def dim_filter(*sensors, modes=2, noise_nm=15.0, **changes):
     """A Kalman filter of the small telescope's loop and of its accelerometer."""
     lines = [
         lbt.Vibration(
@@ -55,16 +55,16 @@ def fused_design(*sensors, modes=2, noise_nm=15.0, **changes):
     )
     suite = SensorSuite(sensors=sensors or (MIRROR,))
     motions = MOTIONS if suite.channels else ()
-    return lbt.kalman(lbt.models.plant(own, suite, motions))
+    return lbt.kalman(own.with_sensors(suite, motions))
 
 
 @pytest.fixture(scope="module")
-def fused():
-    return fused_design()
+def shaking():
+    return dim_filter()
 
 
 def test_channels_follow_the_motions_that_shake_the_telescope():
-    quiet = fused_design(replace(MIRROR, noise_m_s2=1e-7))
+    quiet = dim_filter(replace(MIRROR, noise_m_s2=1e-7))
     shaken = lbt.Truth(turbulence=None, vibrations=SHAKES, motions=MOTIONS)
     own = accompany_filter(quiet, shaken, **LENGTH)
     tilts = draw_disturbance(
@@ -103,11 +103,11 @@ def test_steps_are_those_of_the_filter_of_all_readings():
         own.reset()
 
 
-def test_a_further_wavefront_sensor_is_not_read(fused):
-    both = fused_design(TRUTH_SENSOR, MIRROR)
+def test_a_further_wavefront_sensor_is_not_read(shaking):
+    both = dim_filter(TRUTH_SENSOR, MIRROR)
     shaken = lbt.Truth(turbulence=None, vibrations=SHAKES, motions=MOTIONS)
     with_truth = accompany_filter(both, shaken, **LENGTH)
-    without = accompany_filter(fused, shaken, **LENGTH)
+    without = accompany_filter(shaking, shaken, **LENGTH)
     rows = both.problem.hardware.suite.rows(PATH)
     assert not with_truth.controller.B[:, :, rows["truth"]].any()
     y = np.random.default_rng(1).standard_normal((200, 2))
@@ -117,20 +117,23 @@ def test_a_further_wavefront_sensor_is_not_read(fused):
     np.testing.assert_allclose(steps[0], steps[1], rtol=1e-6, atol=1e-9)
 
 
-def test_filters_that_do_not_fit_are_refused(fused):
+def test_filters_that_do_not_fit_are_refused(shaking):
     with pytest.raises(ProblemError, match=r"moves a channel of the design \(m1, m2\)"):
-        replace(SETTINGS, motions=({}, {})).controller(fused)
+        replace(SETTINGS, motions=({}, {})).controller(shaking)
     with pytest.raises(DimensionError, match="two measurements .* got 1 to 1"):
-        SETTINGS.controller(fused_design(TRUTH_SENSOR, modes=1))
+        SETTINGS.controller(dim_filter(TRUTH_SENSOR, modes=1))
     with pytest.raises(ProblemError, match="800 Hz and 2.5 frames"):
-        SETTINGS.controller(fused_design(replace(MIRROR, delay_frames=2), delay_frames=2.5))
+        SETTINGS.controller(dim_filter(replace(MIRROR, delay_frames=2), delay_frames=2.5))
 
 
 @needs_specula
-def test_with_accelerometers_a_dim_star_leaves_less_as_predicted(fused, cache):
-    """Fused against wavefront only, each as the exact analysis says of the pyramid's noise."""
+def test_with_accelerometers_a_dim_star_leaves_less_as_predicted(shaking, cache):
+    """All sensors against the wavefront only, each as the exact analysis says of the pyramid's noise."""
     found, expected = {}, {}
-    for name, design in (("fused", fused), ("alone", lbt.kalman(fused.problem.own))):
+    for name, design in (
+        ("all", shaking),
+        ("alone", lbt.kalman(shaking.problem.own_sensor_alone())),
+    ):
         run = SETTINGS.run(design, cache=cache)
         truth = lbt.Truth(
             turbulence=None,
@@ -144,4 +147,4 @@ def test_with_accelerometers_a_dim_star_leaves_less_as_predicted(fused, cache):
         expected[name] = lbt.residual_budget(loop, truth).rms_nm
     for name, value in found.items():
         assert value == pytest.approx(expected[name], rel=0.1)
-    assert found["fused"] < 0.7 * found["alone"]
+    assert found["all"] < 0.7 * found["alone"]

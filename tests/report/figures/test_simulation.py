@@ -25,13 +25,13 @@ def test_modes_count_from_one_as_everywhere():
     assert names == [f"mode {i}, residual" for i in (1, 2, 3)]
 
 
-def test_spans_and_levels(fused, fused_config):
+def test_spans_and_levels(sensors_design, sensors_config):
     drops = [Drop(unit="m1", start_s=0.5, end_s=1), Drop(unit="m1", start_s=1.5)]
     run = simulate_sensors(
-        fused.controllers,
-        fused.problem.hardware.suite,
-        fused_config.truth,
-        hardware=fused_config.hardware,
+        sensors_design.controllers,
+        sensors_design.problem.hardware.suite,
+        sensors_config.truth,
+        hardware=sensors_config.hardware,
         frames=2000,
         drops=drops,
     )
