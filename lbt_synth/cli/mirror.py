@@ -41,11 +41,12 @@ def run(arguments: Namespace) -> Report:
     require_outputs(arguments.output, inputs=[arguments.config])
     config = load_config(arguments.config)
     choose_config_unit(arguments, config)
-    hardware, shell = config.hardware, _require_local_loop(config)
+    plant, shell = config.plant.own_sensor_alone(), _require_local_loop(config)
+    hardware = plant.hardware
     step = shell.step_response(arguments.tolerance)
     with show_spinner("designing", quiet=arguments.json):
         rows = studies.mirror(
-            config.plant,
+            plant,
             config.truth,
             config.imaging,
             command_weight=config.settings.design.command_weight,

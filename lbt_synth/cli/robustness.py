@@ -64,7 +64,7 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
     rows = list(
         track_progress(
             studies.robustness(
-                config.plant,
+                config.plant.own_sensor_alone(),
                 truth_at_sensor_gain(config, arguments.sensor_gain),
                 config.imaging,
                 errors_hz=errors,

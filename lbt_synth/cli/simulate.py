@@ -237,7 +237,8 @@ def _exact_answers(loop: ClosedLoop, config: Config, truth: Truth) -> ExactAnswe
     if truth.drifts:
         return ExactAnswers()
     budget = residual_budget(loop, truth)
-    limit_nm = limit_or_nan(lambda: least_residual(config.hardware, truth))
+    alone = config.hardware.own_sensor_alone()
+    limit_nm = limit_or_nan(lambda: least_residual(alone, truth))
     return fill_row(
         ExactAnswers,
         budget,

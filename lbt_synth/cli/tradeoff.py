@@ -26,7 +26,7 @@ def run(arguments: Namespace) -> Report:
     choose_config_unit(arguments, config)
     points = list(
         track_progress(
-            tradeoff(config.plant, points=count, taps=taps),
+            tradeoff(config.plant.own_sensor_alone(), points=count, taps=taps),
             total=count * len(FAMILIES),
             what="filters",
             quiet=arguments.json,

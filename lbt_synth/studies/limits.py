@@ -150,14 +150,15 @@ def limits(
         raise ProblemError("errors_hz must hold at least one error; got none.")
     vibrations = stationary_vibrations(truth.vibrations)
     shifts = _frequency_shifts(truth, errors)
-    limit = limit_or_none(lambda: least_residual(hardware, truth))
+    alone = hardware.own_sensor_alone()
+    limit = limit_or_none(lambda: least_residual(alone, truth))
     band_hz = _error_band(truth, shifts)
     band = None
     if band_hz is not None:
         line = vibrations[0]
         band = limit_or_none(
             lambda: least_worst_residual(
-                hardware, truth, band_hz=band_hz, rms_nm=line.rms_nm, direction=line.direction
+                alone, truth, band_hz=band_hz, rms_nm=line.rms_nm, direction=line.direction
             )
         )
     rows, curves = [], []
@@ -193,12 +194,12 @@ def limits(
 
 def _limit_nm(loop: ClosedLoop, limit: ResidualLimit | BandLimit | None) -> float:
     """Return a limit of the loop's own sensor; nan where a loop reads others, or there is none."""
-    return limit.rms_nm if limit is not None and isinstance(loop, ClosedLoop) else np.nan
+    return limit.rms_nm if limit is not None and not loop.reads_others else np.nan
 
 
 def _phase_margin_deg(loop: ClosedLoop) -> float:
     """Return the least phase margin; nan if the loop is unstable, or of several sensors."""
-    if not loop.is_stable or not isinstance(loop, ClosedLoop):
+    if not loop.is_stable or loop.reads_others:
         return np.nan
     return phase_margin_deg(broken_loops(loop))
 

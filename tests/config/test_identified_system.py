@@ -165,13 +165,12 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
         rate_hz=1000.0,
     )
     path = save_identified(tmp_path, TWO, accelerometers=found)
-    sensors_design = lbt.load_config(path).plant
-    (sensor,) = sensors_design.suite.sensors
+    plant = lbt.load_config(path).plant
+    (sensor,) = plant.hardware.suite.sensors
     assert (sensor.channels, sensor.delay_frames) == (("m1",), delay)
     assert sensor.noise_m_s2.tolist() == [2e-4]
     motions = [
-        {name: (each.size, each.phase_deg) for name, each in m.items()}
-        for m in sensors_design.motions
+        {name: (each.size, each.phase_deg) for name, each in m.items()} for m in plant.motions
     ]
     assert motions == [{}, {"m1": (1.5, -170.25)}, *[{}] * (len(motions) - 2)]
     assert "standard error 0.02" in path.read_text()

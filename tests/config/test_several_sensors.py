@@ -26,10 +26,6 @@ def test_a_file_describes_its_sensors(sensors_config):
     assert sensors_config.truth.motions == plant.motions
 
 
-def test_a_file_without_them_has_none(config):
-    assert config.plant is None
-
-
 def test_the_own_sensor_among_the_others(tmp_path, sensors_config):
     own = "  wavefront: {rate_hz: 1000, delay_frames: 2, noise_nm: 75}\n"
     written = load(
@@ -46,7 +42,7 @@ def test_the_own_sensor_alone_is_the_loop(tmp_path):
     text = CONFIG[: CONFIG.index("loop:")] + "sensors: {wavefront: {rate_hz: 500, noise_nm: 9}}\n"
     text += "model: {turbulence: {kind: ar, coefficients: [0.9], driving_rms_nm: 5}}\n"
     config = lbt.load_config(write_config(tmp_path, text))
-    assert config.plant is None
+    assert config.plant.hardware.suite.units == ("wavefront",)
     assert config.hardware.frame_rate_hz == 500
 
 

@@ -89,9 +89,7 @@ def test_a_reading_knows_nothing_of_the_frame_to_come():
     assert not seen.D.any()
     # of the drive of its own frame it has what the velocity at the end has
     w = 2 * np.pi * 60
-    np.testing.assert_allclose(
-        (seen.C @ seen.B)[1], 1e-9 * w * RATE_HZ * seen.B[2], rtol=1e-12
-    )
+    np.testing.assert_allclose((seen.C @ seen.B)[1], 1e-9 * w * RATE_HZ * seen.B[2], rtol=1e-12)
 
 
 def test_positions_do_not_depend_on_who_reads():
