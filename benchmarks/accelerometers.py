@@ -24,9 +24,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.loop.sensor_budget import close_fused_loop
 from lbt_synth.loop.simulation.disturbances import run_oscillator
-from lbt_synth.models.plant.readings import TipTiltPlant
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficients
 
@@ -74,7 +72,7 @@ def series(
         name="mirror", rate_hz=RATE, delay_frames=1, channels=("m1",), noise_m_s2=1.0
     )
     seen = seen_vibration(line, {"m1": lbt.models.Motion(size=1)}, (mirror,), path)
-    drive = rng.standard_normal((1, 1 + frames, seen.B.shape[2]))
+    drive = rng.standard_normal((1, 1 + frames, seen.B.shape[-1]))
     positions, accelerations = run_oscillator(seen, line, drive)[0].T
     return positions, accelerations
 
@@ -173,7 +171,7 @@ def examine(seed: int, frames: int) -> dict[str, list[float]]:
 
 
 def loss(seed: int, frames: int) -> float:
-    """Return what the identified fused filter leaves in the truth, over the one from the truth."""
+    """Return what the identified filter of all sensors leaves in the truth, over the one from the truth."""
     it = case(seed, frames)
     model = lbt.identify(it.record)
     found = lbt.identification.accelerometer_transfers(model, it.record, it.accelerations)
@@ -181,23 +179,20 @@ def loss(seed: int, frames: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
         path = lbt.config.save_config(Path(folder) / "model.yaml", settings, comments=comments)
         config = lbt.load_config(path)
-    best, own = true_plant(it, found.channels[0].channel, found.channels[1].channel), config.plant
-    kalman = lbt.linear.periodic_kalman
-    least = close(best, best.controller(kalman(best).gains), best.suite)
-    if config.plant is None:
-        loop = lbt.close_loop(best.own.hardware, lbt.kalman(own).controller)
-    else:
-        plant = config.plant
-        read = true_plant(it, *plant.hardware.suite.channels)
-        loop = close(best, plant.controller(kalman(plant).gains), read.suite)
-    truth = replace(it.truth, motions=best.motions)
-    if config.plant is not None:
-        truth = replace(it.truth, motions=read.motions)
-    least_nm = lbt.residual_budget(least, replace(it.truth, motions=best.motions)).rms_nm
-    return (lbt.residual_budget(loop, truth).rms_nm / least_nm) ** 2 - 1
+    best = true_plant(it, *(row.channel for row in found.channels[:2]))
+    read = true_plant(it, *config.hardware.suite.channels)
+    least_nm, rms_nm = residual_nm(it, best, best), residual_nm(it, config.plant, read)
+    return (rms_nm / least_nm) ** 2 - 1
 
 
-def true_plant(it: Case, *channels: str) -> TipTiltPlant:
+def residual_nm(it: Case, plant: lbt.models.TipTiltPlant, real: lbt.models.TipTiltPlant) -> float:
+    """Return what the Kalman filter of a plant leaves in the loop of the truth."""
+    controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
+    loop = lbt.close_loop(real.hardware, controller)
+    return lbt.residual_budget(loop, replace(it.truth, motions=real.motions)).rms_nm
+
+
+def true_plant(it: Case, *channels: str) -> lbt.models.TipTiltPlant:
     """Return the plant of a record as it was drawn, with some of its useful channels."""
     own = lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
@@ -205,6 +200,8 @@ def true_plant(it: Case, *channels: str) -> TipTiltPlant:
         vibrations=it.truth.vibrations,
         noise_nm=it.truth.noise_nm,
     )
+    if not channels:
+        return own
     places = [int(name.removeprefix("channel")) - 1 for name in channels]
     instrument = lbt.models.Accelerometer(
         name="accelerometer",
@@ -221,12 +218,7 @@ def true_plant(it: Case, *channels: str) -> TipTiltPlant:
         }
         for j in range(len(it.truth.vibrations))
     ]
-    return lbt.models.plant(own, lbt.models.SensorSuite(sensors=(instrument,)), tuple(moving))
-
-
-def close(plant, controller, suite):
-    """Close the loop of the truth around a controller that reads some channels."""
-    return close_fused_loop(plant.hardware, suite, controller)
+    return own.with_sensors(lbt.models.SensorSuite(sensors=(instrument,)), tuple(moving))
 
 
 def main() -> None:
@@ -236,9 +228,9 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--fused", action="store_true", help="designs instead of channels")
+    parser.add_argument("--designs", action="store_true", help="designs instead of channels")
     given = parser.parse_args()
-    if given.fused:
+    if given.designs:
         work = partial(loss, frames=int(given.seconds * RATE))
         with ProcessPoolExecutor(given.jobs) as pool:
             lost = np.array(list(pool.map(work, range(given.first, given.first + given.records))))

@@ -13,7 +13,6 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.interop.specula import optics
-from lbt_synth.loop.sensor_budget import close_fused_loop
 
 CACHE = sys.argv[2] if len(sys.argv) > 2 else None
 SETUP = replace(lbt.load_config("examples/lbt.yaml").end_to_end, frames=800)
@@ -93,7 +92,7 @@ def sensors() -> None:
             file = Path(folder) / "dim.yaml"
             file.write_text(text.replace("model:", f"model:\n  sensor_gain: {assumed}", 1))
             config = lbt.load_config(file)
-        alone = {"wavefront alone": lbt.kalman(config.plant)}
+        alone = {"wavefront alone": lbt.kalman(config.plant.own_sensor_alone())}
         for name, design in ({"with accelerometer": config.design("kalman")} | alone).items():
             rows = np.array([sensor_row(config, design, seed) for seed in range(3)])
             mid, error = rows.mean(axis=0), rows.std(axis=0, ddof=1)
@@ -109,11 +108,9 @@ def sensor_row(config: lbt.config.Config, design: lbt.Design, seed: int) -> list
     # gains are relative to what the design assumes
     gain = run.tip_tilt_gain / config.sensor_gain
     truth = replace(config.truth, noise_nm=run.tip_tilt_noise_nm, sensor_gain=gain)
-    loop = design.close(config.hardware, sensor_gain=gain)
-    if isinstance(design, lbt.design.FilterDesign):
-        suite, missing = design.problem.hardware.suite, ("truth",)
-        own = design.controllers[frozenset(missing)]
-        loop = close_fused_loop(config.hardware, suite, own, sensor_gain=gain, blind=missing)
+    missing = ("truth",) if design.other_sensors else ()
+    own = design.controllers[frozenset(missing)]
+    loop = lbt.close_loop(config.hardware, own, sensor_gain=gain, blind=missing)
     exact = np.sqrt(np.diag(lbt.residual_budget(loop, truth).total_nm2))
     tip, tilt = run.rms_nm[:2]
     return [run.strehl, tip, exact[0], tilt, exact[1], run.tip_tilt_gain]

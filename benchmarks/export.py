@@ -1,5 +1,6 @@
 """What exports lose: run with ``python benchmarks/export.py`` from the repository."""
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -8,6 +9,9 @@ from speed_export import frame
 
 import lbt_synth as lbt
 from lbt_synth.interop.c import export as c_export
+
+sys.path.insert(0, "tests")
+from support.exports import bare_design
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
 
@@ -31,9 +35,8 @@ def source(folder: Path) -> None:
 
 def forms() -> None:
     """Nanoseconds a frame of both forms of the source, whichever would be chosen."""
-    kalman = lbt.kalman(CONFIG.plant)
     designs = {
-        "kalman": kalman,
+        "kalman": lbt.kalman(CONFIG.plant),
         "15 lines an axis": lbt.kalman(
             lbt.models.spread_plant(CONFIG.plant, half_width_hz=3.5, lines=15)
         ),
@@ -49,12 +52,7 @@ def forms() -> None:
             D=rng.standard_normal((2, 2)),
         )
         # the loop of the design is not what is timed
-        designs[f"no zeros, {n} states"] = lbt.Design(
-            method="random",
-            controller=full,
-            certificate=kalman.certificate,
-            solver=kalman.solver,
-        )
+        designs[f"no zeros, {n} states"] = bare_design(full)
     chosen = c_export.has_straight_line_form
     for name, design in designs.items():
         times = []

@@ -11,6 +11,7 @@ import argparse
 import ctypes
 import statistics
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -20,6 +21,9 @@ import lbt_synth as lbt
 from lbt_synth.interop.c.masked_terms import masked_terms
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from support.exports import bare_design
+
 DRIVER = """
 #define _POSIX_C_SOURCE 199309L
 #include <time.h>
@@ -68,13 +72,8 @@ def one_phase(design: lbt.design.FilterDesign) -> lbt.Design:
     whole = terms.transition[1] + own.B[1] @ terms.innovation[1]
     A, applied = np.split(whole, [len(whole)], axis=1)
     B = np.hstack([own.B[1], applied])
-    controller = lbt.Controller(A=A, B=B, C=terms.command, D=np.zeros((len(own.C[0]), B.shape[1])))
-    return lbt.Design(
-        method="one phase",
-        controller=controller,
-        certificate=lbt.design.Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0)),
-        solver=lbt.design.SolverReport(route="riccati", status="made", iterations=0),
-    )
+    D = np.zeros((len(terms.command), B.shape[1]))
+    return bare_design(lbt.Controller(A=A, B=B, C=terms.command, D=D))
 
 
 def main() -> None:
@@ -83,16 +82,17 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=25)
     options = parser.parse_args()
     config = lbt.load_config(ROOT / "examples" / "several_sensors.yaml")
-    fused = config.design("kalman")
-    states = fused.controller.n_states
-    lines = -(-(states - config.plant.n_states) // 4) + 1
-    alone = lbt.kalman(lbt.models.spread_plant(config.plant, half_width_hz=3.5, lines=lines))
-    read, rows = fused.problem.read, fused.problem.hardware.suite.rows(fused.problem.own.hardware)
+    design = config.design("kalman")
+    states = design.controller.n_states
+    own = config.plant.own_sensor_alone()
+    lines = -(-(states - own.n_states) // 4) + 1
+    alone = lbt.kalman(lbt.models.spread_plant(own, half_width_hz=3.5, lines=lines))
+    read, rows = design.problem.read, design.problem.hardware.suite.rows(config.hardware)
     fresh = np.array([[row[own.start] for own in rows.values()] for row in read], dtype=np.uint8)
     pointer, period = ctypes.c_void_p(fresh.ctypes.data), len(fresh)
     cases = {
-        "several sensors": (fused, "ctl_step(&state, y, fresh + k % period * CTL_SENSORS, u, u)"),
-        "one phase": (one_phase(fused), "ctl_step(&state, y, u)"),
+        "several sensors": (design, "ctl_step(&state, y, fresh + k % period * CTL_SENSORS, u, u)"),
+        "one phase": (one_phase(design), "ctl_step(&state, y, u)"),
         "own sensor alone": (alone, "ctl_step(&state, y, u, u)"),
     }
     print("| precision | filter | states | measurements | ns per frame | ratio |")

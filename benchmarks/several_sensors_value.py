@@ -19,7 +19,6 @@ import numpy as np
 from scipy.optimize import brentq
 
 import lbt_synth as lbt
-from lbt_synth.loop.sensor_budget import AnyLoop, close_fused_loop
 from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 
 CONFIG = """\
@@ -58,22 +57,22 @@ def load(air: str, ratio: float, damping: float) -> lbt.config.Config:
         return lbt.load_config(path)
 
 
-def tip_nm(config: lbt.config.Config, loop: AnyLoop) -> float:
+def tip_nm(config: lbt.config.Config, loop: lbt.ClosedLoop) -> float:
     """Return what a loop leaves of tip."""
     return float(np.sqrt(lbt.residual_budget(loop, config.truth).total_nm2[0, 0]))
 
 
-def fused_tip_nm(air: str, ratio: float, damping: float) -> float:
+def both_tip_nm(air: str, ratio: float, damping: float) -> float:
     """Return what the Kalman filter of both sensors leaves of tip."""
     config = load(air, ratio, damping)
     plant = config.plant
     controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
-    return tip_nm(config, close_fused_loop(config.hardware, plant.hardware.suite, controller))
+    return tip_nm(config, lbt.close_loop(config.hardware, controller))
 
 
 def halving_excess(ratio: float, *, air: str, damping: float, half_nm: float) -> float:
     """Return by how much a filter of both sensors misses half of the residual of one."""
-    return fused_tip_nm(air, ratio, damping) - half_nm
+    return both_tip_nm(air, ratio, damping) - half_nm
 
 
 def main() -> int:
@@ -93,13 +92,13 @@ def print_table(what: str, cases: list[tuple[str, str, float]]) -> None:
     print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
     for name, air, damping in cases:
         config = load(air, 10, damping)
-        fused, plain = config.design("kalman"), lbt.kalman(config.plant)
-        loops = lbt.close_loop(config.hardware, plain), fused.loop()
+        alone = config.plant.own_sensor_alone()
+        design = config.design("kalman")
+        loops = [lbt.close_loop(config.hardware, each) for each in (lbt.kalman(alone), design)]
         own, both = (tip_nm(config, loop) for loop in loops)
         lines = [lbt.residual_budget(loop, config.truth).vibration_nm for loop in loops]
         run = simulate_sensors(
-            fused.controllers,
-            fused.problem.hardware.suite,
+            design.controllers,
             config.truth,
             hardware=config.hardware,
             frames=FRAMES,
@@ -107,7 +106,7 @@ def print_table(what: str, cases: list[tuple[str, str, float]]) -> None:
         )
         simulated = float(np.sqrt(np.mean(run.residual_nm[:, :, 0] ** 2)))
         calm = replace(config.truth, vibrations=(), motions=())
-        least = np.sqrt(lbt.loop.least_residual(config.hardware, calm).variance_nm2[0])
+        least = np.sqrt(lbt.loop.least_residual(alone.hardware, calm).variance_nm2[0])
         excess = partial(halving_excess, air=air, damping=damping, half_nm=own / 2)
         halved = brentq(excess, 2, 100, xtol=0.01)
         print(

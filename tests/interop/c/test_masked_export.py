@@ -99,10 +99,13 @@ def test_the_compiled_filter_closes_the_loop(
 
     class Filter:
         n_states = sensors_design.problem.n_measurements
-        A, B, D = np.zeros((2, 6, 6)), np.tile(np.eye(6), (2, 1, 1)), np.zeros((2, 2, 6))
 
         def __init__(self, missing):
-            self.C = [Stepped(missing)] * 2
+            self.missing = missing
+
+        def stacks(self):
+            A, B, D = np.zeros((2, 6, 6)), np.tile(np.eye(6), (2, 1, 1)), np.zeros((2, 2, 6))
+            return A, B, [Stepped(self.missing)] * 2, D
 
     filters = {some: Filter(some) for some in sensors_design.controllers}
     found = run(sensors_design, sensors_config, filters)

@@ -29,9 +29,8 @@ def test_spans_and_levels(sensors_design, sensors_config):
     drops = [Drop(unit="m1", start_s=0.5, end_s=1), Drop(unit="m1", start_s=1.5)]
     run = simulate_sensors(
         sensors_design.controllers,
-        sensors_design.problem.hardware.suite,
         sensors_config.truth,
-        hardware=sensors_config.hardware,
+        hardware=sensors_design.hardware,
         frames=2000,
         drops=drops,
     )
