@@ -57,7 +57,7 @@ def load(air: str, ratio: float, damping: float) -> lbt.config.Config:
         return lbt.load_config(path)
 
 
-def tip_nm(config: lbt.config.Config, loop: lbt.ClosedLoop) -> float:
+def tip_nm(config: lbt.config.Config, loop: lbt.loop.ClosedLoop) -> float:
     """Return what a loop leaves of tip."""
     return float(np.sqrt(lbt.residual_budget(loop, config.truth).total_nm2[0, 0]))
 

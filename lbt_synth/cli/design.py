@@ -64,14 +64,15 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
         }
     )
     facts: list[Any] = [design.facts()]
-    margins = None
+    margins = []
     if design.hardware is not None:
         facts.append(_loop_facts(report, design.hardware))
-        margins = loop_margins(close_loop(design.hardware, design))
-        report.data["margins"] = json_record(margins)
+        if not design.other_sensors:
+            margins = [loop_margins(close_loop(design.hardware, design))]
+            report.data["margins"] = json_record(*margins)
         report.notes += _loop_notes(design, design.hardware, report.data)
     report.add_records(*facts)
-    printed = fact_table("Design", *facts, *([] if margins is None else [margins]))
+    printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
     report.notes += design.notes()
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
@@ -93,7 +94,7 @@ def add_moving_gain(report: Report, design: Design) -> None:
     """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
     from lbt_synth.loop import moving_gain
 
-    if design.hardware is None:
+    if design.hardware is None or design.other_sensors:
         return
     loop = close_loop(design.hardware, design)
     if loop.is_stable:
@@ -111,13 +112,13 @@ def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
 
 def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:
     notes = []
-    modulus, alone = data["margins"]["modulus"], data["controller_spectral_radius"]
+    alone = data["controller_spectral_radius"]
     if hardware.mirror is not None and not design.knows_mirror:
         notes.append(
             "note: this filter commands its estimate as if the mirror settled at once, so that its "
             "estimation error is not the residual; --method lqg commands for the mirror's dynamics."
         )
-    if modulus < _SMALL_MODULUS:
+    if "margins" in data and (modulus := data["margins"]["modulus"]) < _SMALL_MODULUS:
         notes.append(
             f"note: the modulus margin {modulus:.3g} is small; a loop is usually asked for "
             f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
