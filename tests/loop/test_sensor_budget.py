@@ -18,11 +18,8 @@ from support.sensor_loops import (
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import kalman_riccati
-from lbt_synth.loop.sensor_budget import (
-    close_fused_loop,
-    plant_budget,
-    residual_budget,
-)
+from lbt_synth.loop.budget import plant_budget
+from lbt_synth.loop.closed_loop import radii_by_gain
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
 AGELESS = Accelerometer(
@@ -45,8 +42,7 @@ AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, fra
 def closed(plant, **facts):
     """Return the controller of the Kalman filter, and its loop."""
     controller = plant.controller(kalman_riccati(plant).gain_predictor)
-    hardware = plant.hardware
-    return controller, close_fused_loop(hardware, plant.hardware.suite, controller, **facts)
+    return controller, lbt.close_loop(plant.hardware, controller, **facts)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
@@ -107,7 +103,7 @@ def test_a_sinusoid_leaves_what_a_run_leaves(age, period):
     hertz, frames = 62.5, 400
     line = lbt.models.SinusoidalVibration(frequency_hz=hertz, rms_nm=200, direction=(3, 4))
     truth = Truth(turbulence=None, vibrations=(line,), motions=plant.motions[:1])
-    budget = residual_budget(loop, truth)
+    budget = lbt.residual_budget(loop, truth)
     # an accelerometer reads -w^2 times the mean position, turned and weakened, some frames ago
     wave = 200 * np.sqrt(2) * np.exp(2j * np.pi * hertz / RATE_HZ * np.arange(frames))
     angle = 2 * np.pi * hertz / RATE_HZ
@@ -134,7 +130,7 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
 
     plant = example_plant()
     controller, loop = closed(plant)
-    budget = residual_budget(loop, Truth(turbulence=[Broad(), None], noise_nm=0.0))
+    budget = lbt.residual_budget(loop, Truth(turbulence=[Broad(), None], noise_nm=0.0))
     N, frames, first = 4, 512, 16
     entries = [(t, first + t, 0) for t in range(N)]
     total = impulse(first + N + frames, N, 2, entries)
@@ -156,13 +152,13 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
 def test_spectra_and_their_ar_models_agree():
     plant = example_plant()
     _, loop = closed(plant)
-    by_lyapunov = residual_budget(loop, Truth(turbulence=AIR))
+    by_lyapunov = lbt.residual_budget(loop, Truth(turbulence=AIR))
 
     class Same:
         def psd(self, frequency_hz):
             return AIR.psd(frequency_hz)
 
-    by_quadrature = residual_budget(loop, Truth(turbulence=Same()))
+    by_quadrature = lbt.residual_budget(loop, Truth(turbulence=Same()))
     np.testing.assert_allclose(
         by_quadrature.turbulence_nm2, by_lyapunov.turbulence_nm2, rtol=1e-7, atol=1e-6
     )
@@ -172,7 +168,7 @@ def test_the_truth_may_have_another_noise_and_gain():
     plant = example_plant()
     controller, loop = closed(plant, sensor_gain=0.8)
     noisy, calm = (
-        residual_budget(loop, Truth(turbulence=None, noise_nm=noise, sensor_gain=0.8)).noise_nm2
+        lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=noise, sensor_gain=0.8)).noise_nm2
         for noise in (75.0, 0.0)
     )
     *_, whole = simulated_covariances(plant, controller, sensor_gain=0.8)
@@ -184,27 +180,27 @@ def test_the_truth_may_have_another_noise_and_gain():
 def test_an_unstable_loop_has_no_budget():
     _, loop = closed(example_plant(), sensor_gain=8.0)
     assert not loop.is_stable
-    with pytest.raises(UnstableLoopError, match="over a period of 4 frames at a sensor gain of 8"):
-        residual_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
+    with pytest.raises(UnstableLoopError, match=r"an unstable one .* at sensor gain 8\)"):
+        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
 
 
 def test_refusals():
     plant = example_plant()
     _, loop = closed(plant)
     with pytest.raises(ProblemError, match="truth's sensor gain 0.9; got 1"):
-        residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.9))
+        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.9))
     with pytest.raises(ProblemError, match="no sensor or channel is called 'm9'"):
         closed(plant, blind=("m9",))
     other, _ = closed(example_plant((FAST,)))
     with pytest.raises(ProblemError, match="6 measurements to 2 commands in a period of 4"):
-        close_loop(plant.hardware, other)
+        lbt.close_loop(plant.hardware, other)
     with pytest.raises(ProblemError, match="sensor_gain"):
         closed(plant, sensor_gain=0.0)
     drifting = lbt.models.DriftingVibration(
         start_hz=20, end_hz=30, duration_s=1, damping=0.01, rms_nm=100
     )
     with pytest.raises(ProblemError, match="stationary"):
-        residual_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
+        lbt.residual_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
 
 
 def test_radii_of_many_gains_are_those_of_their_loops():

@@ -11,7 +11,7 @@ from support.limits import RATE, Anonymous, ar, budget, path, variance
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.design.result import model_limit
+from lbt_synth.design.result import model_limits
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 
@@ -142,7 +142,7 @@ def test_kalman_filters_of_fractional_delays_stay_above(delay):
     truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
     limit = lbt.loop.least_residual(plant.hardware, truth).rms_nm
     assert limit < budget(design, truth).rms_nm < 1.08 * limit
-    residual, found, above = model_limit(design)
+    residual, found, above = model_limits(design).values()
     assert found == pytest.approx(limit)
     assert residual == pytest.approx(budget(design, truth).rms_nm)  # not its estimation error
     assert residual < 0.99 * design.rms
@@ -151,7 +151,7 @@ def test_kalman_filters_of_fractional_delays_stay_above(delay):
 
 def test_kalman_of_the_example(config):
     design = lbt.kalman(config.plant)
-    residual_nm, limit_nm, above = model_limit(design)
+    residual_nm, limit_nm, above = model_limits(design).values()
     assert residual_nm == design.rms
     assert limit_nm == pytest.approx(192.619, abs=1e-3)
     assert abs(above) < 1e-8
@@ -285,7 +285,7 @@ def test_coupled_modes_without_a_limit_are_refused():
         least_model_residual(coupled_plant(delay_frames=2.4))
 
 
-def fused_variances(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=20.0):
+def variances_of_sensors(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=20.0):
     """Return what the Kalman filter of several sensors leaves, and the bound [nm^2]."""
     slow = ar(0.995, driving=8.0)
     own = lbt.tip_tilt_plant(
@@ -297,18 +297,17 @@ def fused_variances(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=
         sensor_matrix=[[sensor_gain]],
         modes=1,
     )
-    suite = lbt.models.SensorSuite(sensors=tuple(sensors))
     motions = tuple(moves for _, moves in lines)
-    plant = lbt.models.plant(own, suite, motions)
+    plant = own.with_sensors(lbt.models.SensorSuite(sensors=tuple(sensors)), motions)
     controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
-    loop = close_loop(replace(own.hardware, suite=suite), controller)
+    loop = lbt.close_loop(plant.hardware, controller)
     truth = lbt.Truth(
         turbulence=slow,
         vibrations=tuple(line for line, _ in lines),
         motions=motions,
         noise_nm=own_noise,
     )
-    limit = lbt.loop.least_residual(own.hardware, truth, suite)
+    limit = lbt.loop.least_residual(plant.hardware, truth)
     left = float(np.trace(lbt.residual_budget(loop, truth).total_nm2))
     return left, float(limit.variance_nm2.sum())
 
@@ -321,14 +320,14 @@ def second(rate_hz, delay_frames, noise_nm):
 
 @pytest.mark.parametrize("sensor_gain", [1.0, 0.6])
 def test_the_bound_of_two_sensors_of_each_frame_is_met(sensor_gain):
-    left, least = fused_variances([second(RATE, 2, 9.0)], sensor_gain=sensor_gain)
+    left, least = variances_of_sensors([second(RATE, 2, 9.0)], sensor_gain=sensor_gain)
     assert least == pytest.approx(left, rel=1e-7)
 
 
 @pytest.mark.parametrize(("divisor", "delay_frames"), [(2, 2), (5, 2), (5, 3.2), (20, 2)])
 def test_no_filter_of_a_slow_sensor_passes_the_bound(divisor, delay_frames):
-    left, least = fused_variances([second(RATE / divisor, delay_frames, 3.0)])
-    alone = fused_variances([second(RATE / divisor, delay_frames, 1e4)])[0]
+    left, least = variances_of_sensors([second(RATE / divisor, delay_frames, 3.0)])
+    alone = variances_of_sensors([second(RATE / divisor, delay_frames, 1e4)])[0]
     assert least < left < alone
     assert least > 0.3 * left  # it is no empty bound
 
@@ -342,19 +341,18 @@ def test_accelerometers_cannot_do_more_than_know_the_vibrations():
         )
         for noise in (1e-6, 1e-2)
     ]
-    known, hidden = (fused_variances([each], lines=[(line, moves)]) for each in seen)
+    known, hidden = (variances_of_sensors([each], lines=[(line, moves)]) for each in seen)
     assert known[1] == hidden[1]
     assert known[1] < known[0] < hidden[0]
     assert known[0] < 1.6 * known[1]
 
 
 def test_a_sensor_without_noise_gains_nothing():
-    truth = lbt.Truth(turbulence=ar(0.99), noise_nm=0.0)
+    calm = {"turbulence": ar(0.99), "noise_nm": 0.0}
     suite = lbt.models.SensorSuite(sensors=(second(RATE / 5, 2, 3.0),))
-    both = lbt.loop.least_residual(path(2.0), truth, suite)
-    assert both.rms_nm == lbt.loop.least_residual(path(2.0), truth).rms_nm
+    assert variance(path(suite=suite), **calm) == variance(path(), **calm)
 
 
 def test_an_exposure_that_ends_within_a_frame_has_no_bound():
     with pytest.raises(lbt.errors.ProblemError, match="ends within a frame of the loop"):
-        fused_variances([second(RATE / 5, 2.1, 3.0)])
+        variances_of_sensors([second(RATE / 5, 2.1, 3.0)])
