@@ -250,7 +250,7 @@ def require_agreement(found: DesignRecord, expected: DesignRecord) -> None:
 
 
 def require_certificate(stored: list[dict[str, Any]], computed: list[dict[str, Any]]) -> None:
-    """Refuse a certificate with other checks or limits than the one computed again.
+    """Refuse a certificate with other checks than the one computed again.
 
     The values of the checks are rounding to a large part, and are not compared.
     """
@@ -260,8 +260,8 @@ def require_certificate(stored: list[dict[str, Any]], computed: list[dict[str, A
     if missing := again.keys() - checks.keys():
         raise ValueError(f"the certificate lacks a check of the design: {min(missing)}")
     for name in checks:
-        require_same(checks[name]["limit"], again[name]["limit"], f"the limit of '{name}'")
-        number(checks[name]["value"], f"the value of '{name}'")
+        value = number(checks[name]["value"], f"the value of '{name}'")
+        require_same(checks[name], again[name] | {"value": value}, f"the check '{name}'")
 
 
 def require_same(found: Any, expected: Any, name: str) -> None:

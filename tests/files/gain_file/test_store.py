@@ -533,7 +533,9 @@ def test_a_demand_that_is_there_twice_is_refused(tmp_path):
     ("change", "words"),
     [
         ({"name": "beauty"}, "the design does not claim what was checked: beauty"),
-        ({"limit": 2.0}, "the limit of 'radius' must be 1.0 for this design; got 2.0"),
+        ({"limit": 2.0}, "the check 'radius'.limit must be 1.0 for this design; got 2.0"),
+        ({"computed_by": "a guess"}, "the check 'radius'.computed_by must be 'eigenvalues'"),
+        ({"more": 1}, "the check 'radius'.more is not known"),
         ({"value": "small"}, "the value of 'radius' must be a number"),
         (None, "the certificate lacks a check of the design: radius"),
     ],
