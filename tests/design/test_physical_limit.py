@@ -32,8 +32,7 @@ def designed(frequency_hz, damping, noise, age):
         noise_m_s2=1e-9 * noise * (2 * np.pi * frequency_hz) ** 2 * RMS_NM,
     )
     suite = lbt.models.SensorSuite(sensors=(channel,))
-    plant = lbt.models.plant(own, suite, ({"m1": lbt.models.Motion(size=1)},))
-    return lbt.kalman(plant)
+    return lbt.kalman(own.with_sensors(suite, ({"m1": lbt.models.Motion(size=1)},)))
 
 
 def physics(frequency_hz, damping, noise, age):
@@ -55,8 +54,8 @@ def least_nm(A, B, C, R):
 def left_nm(design, A, B, C, R):
     """Return what the loop of a design leaves of the oscillator: phase(k) - u(k - 1)."""
     k = design.controller
-    (K, L, M), n, s = (getattr(k, name)[0] for name in "ABC"), len(A), k.n_states
-    units = np.array([1.0, 1e-9 * (2 * np.pi * design.problem.own.vibrations[0].frequency_hz) ** 2])
+    K, L, M, n, s = k.A, k.B, k.C, len(A), k.n_states
+    units = np.array([1.0, 1e-9 * (2 * np.pi * design.problem.vibrations[0].frequency_hz) ** 2])
     L = L * units
     # states: the oscillator's, the controller's before y(k), u(k - 1), u(k - 2)
     whole, drive = np.zeros((n + s + 2,) * 2), np.zeros((n + s + 2, B.shape[1] + 2))
