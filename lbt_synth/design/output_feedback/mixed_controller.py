@@ -88,7 +88,7 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
             checked,
             method="mixed",
             route="free parameter",
-            gamma_requested=gamma,
+            claims={"gamma_requested": gamma},
             regularised=share,
             hint="Try a larger gamma, or more taps.",
         )

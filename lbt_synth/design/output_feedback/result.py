@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
@@ -179,7 +180,7 @@ def certified_controller(
     witness: ControlWitness = NO_PROOF,
     regularised: float = 0.0,
     hint: str = "",
-    **claims: float,
+    claims: Mapping[str, float] = MappingProxyType({}),
 ) -> ControllerDesign:
     """Check what is claimed of a loop, and return the design; CertificateError if it fails."""
     design = ControllerDesign(
