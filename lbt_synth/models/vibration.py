@@ -18,6 +18,8 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.resonance_spectrum import coefficient_rows
 from lbt_synth.validation import FloatArray, Positive, check_fields, choice, number, real_array
 
+_UNIT = 1e-15  # rounding of a length of one
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vibration:
@@ -126,7 +128,9 @@ def unit_direction(direction: Any) -> tuple[float, ...]:
         raise ProblemError(
             f"direction must be a vector over the modes, not zero; got {direction!r}."
         )
-    return tuple(float(v) for v in vector / length)
+    if abs(length - 1) > _UNIT:  # what has been scaled stays as it is, to the last bit
+        vector = vector / length
+    return tuple(float(v) for v in vector)
 
 
 def require_below_nyquist(frequency_hz: float, frame_rate_hz: float) -> None:

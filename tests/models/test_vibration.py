@@ -1,5 +1,7 @@
 """Vibrations: their processes, their drift, and what is no vibration."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -120,6 +122,14 @@ def test_the_variance_of_the_resonance_is_held_exactly(start, end, duration, dam
         P = A @ P @ A.T
         P[0, 0] += driving[k] ** 2
         assert P[0, 0] == pytest.approx(100**2, rel=1e-8)
+
+
+def test_a_direction_is_scaled_once():
+    """Else a gain file would move the lines that it holds by a last digit."""
+    for vector in np.random.default_rng(0).standard_normal((100, 3)):
+        line = drifting(direction=vector)
+        assert np.linalg.norm(line.direction) == pytest.approx(1, rel=1e-15)
+        assert replace(line, rms_nm=2).direction == line.direction
 
 
 def test_wrong_vibrations_are_refused():
