@@ -9,7 +9,7 @@ the loop's own sensor, of delay d and period 1, has the age 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
@@ -323,6 +323,12 @@ class SensorSuite:
                 f"{period}. Choose rates of which one divides the other."
             )
         return period
+
+    def later(self, frames: int, hardware: LoopHardware) -> SensorSuite:
+        """Return the same readings for a loop whose commands act some frames later."""
+        delays = [s.delay_frames + frames / period_frames(s, hardware) for s in self.sensors]
+        pairs = zip(self.sensors, delays, strict=True)
+        return SensorSuite(sensors=tuple(replace(s, delay_frames=delay) for s, delay in pairs))
 
     def rows(self, hardware: LoopHardware) -> dict[str, slice]:
         """Return which measurements each unit gives: the loop's own, wavefront, channels."""

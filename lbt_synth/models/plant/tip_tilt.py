@@ -167,7 +167,8 @@ class TipTiltPlant(EstimationProblem):
                 in_python="For an estimate without a loop, make an EstimationProblem of the "
                 "plant's matrices.",
             )
-        return assemble(replace(self.parts(), hardware=replace(hw, delay_frames=delay)))
+        later = replace(hw, delay_frames=delay, suite=hw.suite.later(steps - 1, hw))
+        return assemble(replace(self.parts(), hardware=later))
 
     def parts(self) -> PlantParts:
         """Return what the plant was assembled from.

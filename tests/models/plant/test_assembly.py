@@ -115,6 +115,19 @@ def test_lines_that_move_keep_their_channels():
     np.testing.assert_allclose(one.C, plant.C, rtol=1e-12)
 
 
+@pytest.mark.parametrize("steps", [0, 2, 3])
+def test_a_prediction_further_ahead_has_the_same_readings(steps):
+    plant = example_plant((FAST,))
+    parts = {name: getattr(plant, name) for name in "ABCDL"}
+    bare = lbt.EstimationProblem(**parts)  # which predicts without knowing of sensors
+    expected = lbt.kalman(bare, horizon=steps).rms
+    assert lbt.kalman(plant, horizon=steps).rms == pytest.approx(expected, rel=1e-9)
+    several = example_plant()
+    near, far = several.hardware, several.ahead(steps).hardware
+    for one, other in zip(near.suite.sensors, far.suite.sensors, strict=True):
+        assert other.age_frames(far) == pytest.approx(one.age_frames(near))
+
+
 def test_lines_that_no_channel_sees_stay_in_place():
     plant = example_plant((FAST,), motions=({}, MOTIONS[1]))
     own = plant.own_sensor_alone()
