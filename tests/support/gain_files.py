@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 from support.plants import lbt_axis_plant
+from support.sensor_loops import FAST, SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
@@ -17,6 +18,8 @@ def every_design():
         "hinf": lbt.hinf(plant, gamma_ratio=1.3, route="riccati"),
         "full": lbt.kalman(plant.full()),
         "bare": lbt.kalman(bare),
+        "sensors": lbt.kalman(example_plant((FAST, SLOW))),
+        "sensors_hinf": lbt.hinf(example_plant((SLOW,)), gamma_ratio=1.3),
         "integrator": lbt.integrator(plant.hardware, gain=0.3),
     }
 
