@@ -171,7 +171,7 @@ def examine(seed: int, frames: int) -> dict[str, list[float]]:
 
 
 def loss(seed: int, frames: int) -> float:
-    """Return what the identified filter of all sensors leaves in the truth, over the one from the truth."""
+    """Return what an identified filter of all sensors leaves in the truth, over the true one."""
     it = case(seed, frames)
     model = lbt.identify(it.record)
     found = lbt.identification.accelerometer_transfers(model, it.record, it.accelerations)

@@ -20,8 +20,7 @@ import numpy as np
 import lbt_synth as lbt
 from lbt_synth.interop.c.masked_terms import masked_terms
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, "tests")
 from support.exports import bare_design
 
 DRIVER = """
@@ -81,7 +80,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200_000)
     parser.add_argument("--repeats", type=int, default=25)
     options = parser.parse_args()
-    config = lbt.load_config(ROOT / "examples" / "several_sensors.yaml")
+    config = lbt.load_config("examples/several_sensors.yaml")
     design = config.design("kalman")
     states = design.controller.n_states
     own = config.plant.own_sensor_alone()

@@ -92,6 +92,12 @@ def test_mistakes_are_named(tmp_path, old, new, said):
         load(tmp_path, (old, new))
 
 
+def test_a_horizon_makes_all_sensors_later(sensors_config):
+    hardware = sensors_config.design("kalman", horizon=2).hardware
+    assert hardware.delay_frames == 3
+    assert [sensor.delay_frames for sensor in hardware.suite.sensors] == [3.0, 2.0]
+
+
 def test_methods_for_the_own_sensor_leave_the_others_out(sensors_config):
     design = sensors_config.design("integrator", gain=0.3)
     assert design.controller.D.shape == (2, 2)

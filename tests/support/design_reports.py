@@ -30,5 +30,5 @@ def three_designs(config):
     return {
         "kalman": lbt.kalman(config.plant),
         "slow": slow,
-        "wild": replace(slow, gain=1.5),  # unstable at gains above 2/3
+        "wild": replace(slow, claims={"gain": 1.5}),  # unstable at gains above 2/3
     }

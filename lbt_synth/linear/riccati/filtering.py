@@ -117,6 +117,17 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     )
 
 
+def kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
+    """Return the gains of predictor and filter (2, n, q) at a phase, for their covariance P."""
+    A, B, C, D = problem.read_parts(t)
+    innovation = C @ P @ C.T + D @ D.T
+    out = np.zeros((2, problem.n_states, problem.n_measurements))
+    rows = problem.read[t % problem.period]
+    out[0][:, rows] = np.linalg.solve(innovation, (A @ P @ C.T + B @ D.T).T).T
+    out[1][:, rows] = np.linalg.solve(innovation, C @ P).T
+    return out
+
+
 _ALIKE = 1e4  # ratio of the noise of measurements up to which they keep their units
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate
 from lbt_synth.linear.matrix_functions import is_stable, relative_distance, symmetrise
-from lbt_synth.linear.riccati.filtering import FilterRiccati, require_detectable
+from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_gains, require_detectable
 from lbt_synth.linear.riccati.routes import doubling
 from lbt_synth.linear.riccati.solvability import weight_root
 from lbt_synth.validation import FloatArray, frozen_copy
@@ -58,7 +58,7 @@ def periodic_kalman(problem: EstimationProblem) -> FilterRiccati:
     gains = np.zeros((2, problem.period, problem.n_states, problem.n_measurements))
     while steps < _NEWTON_STEPS:
         for t, P in enumerate(covariances):
-            gains[:, t] = _kalman_gains(problem, t, P)
+            gains[:, t] = kalman_gains(problem, t, P)
         error = problem.error_system(gains[0])
         if not error.spectral_radius < 1:
             break
@@ -94,25 +94,9 @@ def _sweep(problem: EstimationProblem, P: FloatArray) -> FloatArray:
     out = np.empty_like(problem.A)
     for t in range(problem.period):
         out[t] = P
-        gain = kalman_gain(problem, t, P)
+        gain = kalman_gains(problem, t, P)[0]
         error, drive = problem.A[t] - gain @ problem.C[t], problem.B[t] - gain @ problem.D[t]
         P = symmetrise(error @ P @ error.T + drive @ drive.T)
-    return out
-
-
-def kalman_gain(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
-    """Return the predictor gain (n, q) of a phase for the covariance of its prediction error."""
-    return np.asarray(_kalman_gains(problem, t, P)[0])
-
-
-def _kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
-    """Return the gains of predictor and filter (2, n, q) at a phase."""
-    A, B, C, D = problem.read_parts(t)
-    innovation = C @ P @ C.T + D @ D.T
-    out = np.zeros((2, problem.n_states, problem.n_measurements))
-    rows = problem.read[t % problem.period]
-    out[0][:, rows] = np.linalg.solve(innovation, (A @ P @ C.T + B @ D.T).T).T
-    out[1][:, rows] = np.linalg.solve(innovation, C @ P).T
     return out
 
 
