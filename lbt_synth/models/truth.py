@@ -112,7 +112,7 @@ class Truth(Summarised):
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
             frequency_errors_hz=self._checked_errors(),
-            motions=tuple(self.motions) or ({},) * len(self.vibrations),
+            motions=tuple(self.motions) if any(self.motions) else ({},) * len(self.vibrations),
         )
 
     def _brief(self) -> str:

@@ -178,7 +178,7 @@ def test_verify_and_limits_take_it(tmp_path, capsys, sensors_file):
     few = write_config(tmp_path, SEVERAL_SENSORS + "robustness: {errors_hz: [0]}\n")
     status, text, _ = run(capsys, "limits", few, sensors_file)
     assert status == 0
-    assert re.search(r"^ +sensors +kalman", text, re.MULTILINE)
+    assert re.search(r"^ +sensors +30\.14 ", text, re.MULTILINE)
     assert _OTHER_SENSORS not in text
 
 
@@ -215,7 +215,7 @@ def test_options_that_need_one_rate(tmp_path, capsys, config_file, method, optio
 
 def test_a_design_has_units(tmp_path, capsys, sensors_file):
     text = run(capsys, "show", sensors_file)[1]
-    (line,) = (row for row in text.splitlines() if row.lstrip().startswith("estimation error, rms"))
+    line = next(row for row in text.splitlines() if row.strip().startswith("estimation error, rms"))
     assert line.split()[-1] == "nm"
 
 
