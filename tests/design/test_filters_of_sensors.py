@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.sensor_loops import FAST, LINES, SLOW, example_plant
+from support.sensor_loops import AIR, FAST, LINES, MOTIONS, RATE_HZ, SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.design import fallbacks
@@ -189,8 +189,15 @@ def test_a_mixed_filter_lies_between_the_two(sensors_config, sensors_design, rat
 
 
 def test_sensors_that_are_all_read_complete_the_central_filter():
-    plant = example_plant((FAST,))
-    central, mixed = (make(plant, gamma_ratio=1.1) for make in (lbt.hinf, lbt.mixed))
+    own = lbt.tip_tilt_plant(
+        frame_rate_hz=RATE_HZ,
+        turbulence=AIR,
+        vibrations=[replace(LINES[0], direction=(1,))],
+        noise_nm=75,
+        modes=1,
+    )
+    plant = own.with_sensors(lbt.models.SensorSuite(sensors=(FAST,)), MOTIONS[:1])
+    central, mixed = lbt.hinf(plant, gamma_ratio=1.1), lbt.mixed(plant, gamma_ratio=1.1, taps=4)
     assert mixed.solver.route == "youla"
     assert lbt.kalman(plant).rms < mixed.rms < central.rms
     assert len(mixed.fallbacks) == 7

@@ -158,8 +158,8 @@ def test_oscillation_limits_the_level(seed):
     design = lbt.hinf_controller(random_plant(seed, D22=False))
     *_, frequency, unit = design.witness.reason.split()
     assert unit == "Hz"
-    response = design.plant.whole.frequency_response([float(frequency)])[0]
-    _, m2, _, p2 = design.plant.sizes
+    response = design.problem.whole.frequency_response([float(frequency)])[0]
+    _, m2, _, p2 = design.problem.sizes
     P11, P12, P21 = response[:-p2, :-m2], response[:-p2, -m2:], response[-p2:, :-m2]
     left = (np.eye(len(P12)) - P12 @ np.linalg.pinv(P12)) @ P11
     right = P11 @ (np.eye(P21.shape[1]) - np.linalg.pinv(P21) @ P21)
