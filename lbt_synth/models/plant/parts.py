@@ -40,7 +40,7 @@ class PlantParts:
         for line in self.vibrations:
             checked_direction(line, self.hardware)
         lines = len(self.vibrations)
-        motions = self.motions or ({},) * lines
+        motions = self.motions if any(self.motions) else ({},) * lines
         set_fields(self, motions=checked_motions(motions, self.hardware.suite, lines))
 
     @property

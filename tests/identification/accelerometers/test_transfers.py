@@ -129,7 +129,6 @@ def test_a_fraction_of_a_frame_goes_into_the_phases():
 def test_a_run_gives_the_motions_back(delay_frames):
     """Second differences of samples are smaller than accelerations: by 2 % at 60, 11 % at 150 Hz."""
     rate_hz = 800.0
-    path = lbt.LoopHardware(frame_rate_hz=rate_hz, delay_frames=2, modes=2)
     lines = tuple(
         lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=60, direction=d)
         for f, d in ((60.0, (1, 0)), (150.0, (0, 1)))
@@ -142,11 +141,13 @@ def test_a_run_gives_the_motions_back(delay_frames):
         channels=("m1",),
         noise_m_s2=1e-3,
     )
+    suite = SensorSuite(sensors=(sensor,))
+    path = lbt.LoopHardware(frame_rate_hz=rate_hz, delay_frames=2, modes=2, suite=suite)
     truth = lbt.Truth(turbulence=None, vibrations=lines, motions=motions)
     size = {"frames": 40_000, "cases": 1, "zero_frame": 0}
     rng = np.random.default_rng(1)
     _, drawn = draw_parts(truth, path, rng=rng, oscillators=True, **size)
-    read = draw_others(truth, path, SensorSuite(sensors=(sensor,)), drawn, rng, **size)
+    read = draw_others(truth, path, drawn, rng, **size)
     # the wavefront sensor measures in frame k the phase of frame k - 1
     seen = np.stack([np.roll(line.motion[0], 1) for line in drawn], axis=1)
     seen += 8 * rng.standard_normal(seen.shape)
