@@ -54,7 +54,9 @@ class Response:
 
     def repeated(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return A, B, C of as many equal systems, each state of all of them side by side."""
-        parts = (self.A, self.B[:, None], self.C)
+        parts = (self.A, self.B[:, None], self.C[None])
+        if count == 1:
+            return parts
         A, B, C = (np.asarray(np.kron(part, np.eye(count)), dtype=np.float64) for part in parts)
         return A, B, C
 

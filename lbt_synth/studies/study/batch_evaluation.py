@@ -10,14 +10,16 @@ import numpy as np
 from lbt_synth.config import Config, ensemble
 from lbt_synth.config.ensemble import AssumedAxis, Samples
 from lbt_synth.config.samples import Reads
-from lbt_synth.design.modal import ModalFilters, modal_filters
 from lbt_synth.errors import CertificateError
+from lbt_synth.linear import solve_dare
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop.ensemble.evaluation import (
     EnsembleResiduals,
     residuals_from_matrices,
     textbook_matrices,
 )
-from lbt_synth.models import PositionLoop, Vibration
+from lbt_synth.models import PositionLoop, Vibration, tip_tilt_plant
+from lbt_synth.models.plant.readings import known_states
 from lbt_synth.studies.study import sample as reference
 from lbt_synth.studies.study.sample import Sample, make_sample
 from lbt_synth.studies.study.study import (
@@ -39,8 +41,8 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> BatchResul
     """Evaluate consecutive samples.
 
     Samples whose configurations differ by numbers that its builders take as arrays are evaluated
-    together by :func:`ensemble_residuals`; Kalman filters for samples are designed together by
-    :func:`modal_filters`. Other designs, simulations, and samples that the configuration refuses
+    together by :func:`ensemble_residuals`; the equations of Kalman filters for samples are solved
+    together. Other designs, simulations, and samples that the configuration refuses
     are evaluated one by one. So is one sample of each group that is evaluated together, and the
     two answers must agree.
 
@@ -212,33 +214,51 @@ def _design_for_samples(samples: Samples) -> tuple[FloatArray, ...]:
     return _combine_axes([design, *same])
 
 
-def _design_axis(axis: AssumedAxis, mirror: PositionLoop | None) -> ModalFilters:
-    """Design the Kalman filters of one axis, one per sample."""
-    return modal_filters(
-        axis.turbulence,
-        noise_nm=axis.noise_nm,
-        vibrations={
-            i: [Vibration(frequency_hz=f, damping=d, rms_nm=r, direction=(1.0,)) for f, d, r in row]
-            for i, row in enumerate(axis.vibrations.tolist())
-            if row
-        },
-        delay_frames=axis.delay_frames,
-        sensor_gain=axis.sensor_gain,
-        mirror=mirror,
-    )
+def _design_axis(axis: AssumedAxis, mirror: PositionLoop | None) -> tuple[FloatArray, ...]:
+    """Design the Kalman filters of one axis, one per sample; their equations are solved at once.
+
+    Return the matrices A, B and C of all controllers, as :meth:`TipTiltPlant.controller` has them.
+    """
+    plants = [
+        tip_tilt_plant(
+            frame_rate_hz=axis.turbulence.frame_rate_hz,
+            turbulence=axis.turbulence.model(i),
+            noise_nm=axis.noise_nm[i],
+            vibrations=[
+                Vibration(frequency_hz=f, damping=d, rms_nm=r, direction=(1.0,))
+                for f, d, r in axis.vibrations[i].tolist()
+            ]
+            or None,
+            delay_frames=axis.delay_frames,
+            sensor_gain=axis.sensor_gain[i],
+            modes=1,
+            mirror=mirror,
+        )
+        for i in range(len(axis.noise_nm))
+    ]
+    A, C, L, Q, R = (np.stack([getattr(plant, name) for plant in plants]) for name in "ACLQR")
+    gains = transpose(solve_dare(transpose(A), transpose(C), Q, R).gain_feedback)
+    unit = replace(plants[0].hardware, sensor_matrix=None)
+    (A_known,), (B_known,), C_known, D_known = known_states(unit)
+    count, n, past = *gains.shape[:2], len(A_known)
+    sensor = axis.sensor_gain[:, None, None]
+    whole, zeros = np.zeros((count, n + past, n + past)), np.zeros((count, past, 1))
+    whole[:, :n, :n], whole[:, n:, n:] = A, A_known
+    entry = np.concatenate([gains, zeros], axis=1)
+    estimate = np.concatenate([L, transpose(zeros)], axis=2)
+    applied = np.vstack([np.zeros((n, 1)), B_known]) - entry @ (sensor * D_known)
+    seen = np.concatenate([C, sensor * C_known], axis=2)
+    return whole - entry @ seen + applied @ estimate, entry, estimate
 
 
-def _combine_axes(designs: list[ModalFilters]) -> tuple[FloatArray, ...]:
-    """Combine the controllers of all axes into one, in textbook form."""
-    sizes = [design.A.shape[1] for design in designs]
-    count, axes, states = len(designs[0].A), len(designs), sum(sizes)
-    A, B = np.zeros((count, states, states)), np.zeros((count, states, axes))
-    C, D = np.zeros((count, axes, states)), np.zeros((count, axes, axes))
-    start = 0
-    for axis, (design, size) in enumerate(zip(designs, sizes, strict=True)):
-        x = slice(start, start + size)
-        A[:, x, x], B[:, x, axis] = design.A, design.B[..., 0]
-        C[:, axis, x] = (design.C @ design.A)[:, 0]
-        D[:, axis, axis] = (design.C @ design.B + design.D)[:, 0, 0]
-        start += size
+def _combine_axes(axes: list[tuple[FloatArray, ...]]) -> tuple[FloatArray, ...]:
+    """Combine the controllers of all axes into one for each sample, in textbook form."""
+    ends = np.cumsum([0, *(A.shape[-1] for A, *_ in axes)])
+    count = len(axes[0][0])
+    A, B = np.zeros((count, ends[-1], ends[-1])), np.zeros((count, ends[-1], len(axes)))
+    C, D = np.zeros((count, len(axes), ends[-1])), np.zeros((count, len(axes), len(axes)))
+    for axis, (a, b, c) in enumerate(axes):
+        x = slice(*ends[axis : axis + 2])
+        A[:, x, x], B[:, x, axis], C[:, axis, x] = a, b[..., 0], (c @ a)[:, 0]
+        D[:, axis, axis] = (c @ b)[:, 0, 0]
     return A, B, C, D
