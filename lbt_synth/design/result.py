@@ -330,7 +330,8 @@ def with_certificate(
     named = {claim.name for claim in design.CLAIMS}
     claims = {name: norm for name, norm in norms.items() if name in named}
     claiming = replace(design, claims={**claims, **design.claims})
-    return replace(claiming, certificate=claiming._conclude(evidence).require(hint))
+    set_fields(claiming, certificate=claiming._conclude(evidence).require(hint))
+    return claiming
 
 
 def require_hardware(design: Design, what: str) -> LoopHardware:
