@@ -70,7 +70,7 @@ def optimised() -> None:
             f"optimised gain {found.gains[part].mean():.2f}",
             flush=True,
         )
-    control = lbt.design.modal.MixedController.integrators(found.gains, leak=setup.leaks)
+    control = lbt.design.modal.MixedController(gains=found.gains, leak=setup.leaks)
     for seed in (1, 2):
         uniform = first if seed == 1 else replace(setup, seed=seed).run(None, cache=CACHE)
         run = lbt.interop.run_end_to_end(

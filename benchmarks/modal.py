@@ -42,15 +42,16 @@ def main() -> None:
     modes = lbt.models.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
     radial, _ = noll_orders(MODES)
     noise = lbt.models.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
+    optimised = lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
 
     def integrators(gains):
-        loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators(gains))
+        control = lbt.design.modal.MixedController(gains=gains)
+        loop = lbt.design.modal.modal_loop(control, hardware=optimised.hardware)
         return loop.residual_rms_nm(modes, noise_nm=noise)
 
     best = minimize_scalar(
         lambda g: total(integrators(np.full(MODES, g))), bounds=(0.01, 0.9), method="bounded"
     )
-    optimised = lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
     filters = lbt.design.modal.modal_filters(modes, noise_nm=noise)
     rows = {
         f"integrators, gain {best.x:.2f}": integrators(np.full(MODES, best.x)),

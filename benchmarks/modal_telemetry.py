@@ -23,7 +23,7 @@ def main() -> None:
     print(f"exact: gain {exact.gains[0]:.4f}, {exact.rms_nm[0]:.2f} nm")
     print("| frames | gain | rms_nm, noise given | rms_nm, noise found |\n|---:|---:|---:|---:|")
     loop = lbt.design.modal.modal_loop(
-        lbt.design.modal.MixedController.integrators(np.full(MODES, 0.1))
+        lbt.design.modal.MixedController(gains=np.full(MODES, 0.1)), hardware=exact.hardware
     )
     for frames in (2048, 8192, 40_000):
         white = rng.standard_normal((MODES, frames + SETTLE))

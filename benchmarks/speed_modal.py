@@ -7,7 +7,13 @@ import scipy.linalg
 from harness import Row, paired, seconds, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.design.modal.plants import ModalModels
+from lbt_synth.design.modal import (
+    MixedController,
+    ModalFilters,
+    ModalLoop,
+    modal_filters,
+    modal_loop,
+)
 from lbt_synth.loop.simulation.run import step_loop
 
 RATE_HZ = 800.0
@@ -30,14 +36,12 @@ def turbulence(modes: int, order: int = 1) -> lbt.models.ModalTurbulence:
     )
 
 
-def controllers(
-    modes: int, kind: str
-) -> lbt.design.modal.MixedController | lbt.design.modal.ModalFilters:
+def controllers(modes: int, kind: str) -> MixedController | ModalFilters:
     """Integrators (1 state), Kalman filters of AR1 turbulence, of AR2, of AR2 and a line."""
     if kind == "integrator":
-        return lbt.design.modal.MixedController.integrators(np.full(modes, 0.4))
+        return MixedController(gains=np.full(modes, 0.4))
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=30.0)
-    return lbt.design.modal.modal_filters(
+    return modal_filters(
         turbulence(modes, 1 if kind == "AR1" else 2),
         noise_nm=NOISE_NM,
         vibrations=dict.fromkeys(range(modes), line) if kind == "line" else None,
@@ -48,7 +52,7 @@ def series_row(modes: int, kind: str, repeats: int) -> Row:
     """The loop over given series, and a copy of these series."""
     rng = np.random.default_rng(0)
     controller = controllers(modes, kind)
-    loop = lbt.design.modal.modal_loop(controller)
+    loop = modal_loop(controller, hardware=lbt.LoopHardware(frame_rate_hz=RATE_HZ))
     total, noise = rng.standard_normal((2, modes, LOOP_FRAMES))
     _checked(controller, loop, total, noise)
     row = paired(lambda: loop.run(total, noise), lambda: (total.copy(), noise.copy()), repeats)
@@ -57,16 +61,14 @@ def series_row(modes: int, kind: str, repeats: int) -> Row:
 
 
 def _checked(
-    controller: lbt.design.modal.MixedController | lbt.design.modal.ModalFilters,
-    loop: lbt.design.modal.ModalLoop,
+    controller: MixedController | ModalFilters,
+    loop: ModalLoop,
     total: np.ndarray,
     noise: np.ndarray,
 ) -> None:
     frames = 200
     path = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=len(total))
-    running = (
-        controller.start() if isinstance(controller, lbt.design.modal.ModalFilters) else controller
-    )
+    running = controller.start() if isinstance(controller, ModalFilters) else controller
     some = total[:, :frames], noise[:, :frames]
     expected = step_loop(running, 1.0, path, some[0].T[None], some[1].T[None])[0, :, : len(total)]
     error = np.max(np.abs(loop.run(*some).residual_nm - expected.T)) / np.max(np.abs(expected))
@@ -82,31 +84,27 @@ def loops_by_order() -> dict[int, Row]:
     rows = {}
     for kind in ("integrator", "AR1", "AR2", "line"):
         controller = controllers(672, kind)
-        states = (
-            int(controller.controller_states[0])
-            if isinstance(controller, lbt.design.modal.ModalFilters)
-            else 1
-        )
+        is_stack = isinstance(controller, ModalFilters)
+        states = controller.design(0).controller.n_states if is_stack else 1
         rows[states] = series_row(672, kind, 7)
     return with_growth(rows)
 
 
 def designs() -> dict[int, Row]:
-    """Certified filters of all modes; the peer solves the equations and certifies nothing."""
+    """Certified filters of all modes, equal ones once; the peer solves the equation of each."""
     rows = {}
     for count in (42, 168, 672, 2688):
         air = turbulence(count)
-        (stack,) = ModalModels.of(air, NOISE_NM, None).plants(2.0, np.ones(count))
+        filters = modal_filters(air, noise_nm=NOISE_NM)
+        plants = [filters.design(i).problem for i in range(count)]
+        equations = [(plant.A, plant.C, plant.Q, plant.R) for plant in plants]
 
-        def peer(stack=stack, count=count) -> None:
-            for i in range(count):
-                A, C = stack.A[i], stack.C[i]
-                X = scipy.linalg.solve_discrete_are(A.T, C.T, stack.Q[i], stack.R[i])
-                np.linalg.solve(stack.R[i] + C @ X @ C.T, C @ X @ A.T)
+        def peer(equations=equations) -> None:
+            for A, C, Q, R in equations:
+                X = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+                np.linalg.solve(R + C @ X @ C.T, C @ X @ A.T)
 
-        rows[count] = paired(
-            lambda a=air: lbt.design.modal.modal_filters(a, noise_nm=NOISE_NM), peer, 5, calls=3
-        )
+        rows[count] = paired(lambda a=air: modal_filters(a, noise_nm=NOISE_NM), peer, 5, calls=3)
     return with_growth(rows)
 
 
@@ -135,9 +133,7 @@ def steps() -> dict[int, Row]:
     )
     rows = {}
     for count in (42, 168, 672):
-        mixed = lbt.design.modal.MixedController(
-            filter=lbt.kalman(plant), gains=np.full(count, 0.4)
-        )
+        mixed = MixedController(filter=lbt.kalman(plant), gains=np.full(count, 0.4))
         y, slopes = np.ones(count), np.ones(2 * count)
         inverse = np.ones((count, 2 * count))
         rows[count] = paired(

@@ -2,7 +2,7 @@
 Hundreds of modes
 =================
 
-Every mode of an adaptive mirror may have its own filter. Here 672 of them are designed at once.
+Every mode of an adaptive mirror may have its own filter. Here 672 have one, equal modes the same.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ noise_nm = lbt.models.pyramid_modal_noise_nm(15.5, modes=672, modulation_lambda_
 
 integrators = lbt.design.modal.modal_gains(modes, noise_nm=noise_nm, frame_rate_hz=800)
 filters = lbt.design.modal.modal_filters(modes, noise_nm=noise_nm)
-print(f"{filters.n_modes} filters; certified: {filters.certificate.passed}")
+print(f"{filters.n_modes} filters, {len(filters.designs)} different and certified")
 
 # %%
 # What they leave, mode by mode:

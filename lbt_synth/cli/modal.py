@@ -105,8 +105,8 @@ def _design_controllers(
     gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **path, **seen)
 
     def integrator_rms(gain: float) -> FloatArray:
-        control = MixedController.integrators(np.full(noise.size, gain))
-        loop = modal_loop(control, frame_rate_hz=air.frame_rate_hz, **path)
+        control = MixedController(gains=np.full(noise.size, gain))
+        loop = modal_loop(control, hardware=hardware, sensor_gain=config.sensor_gain)
         return loop.residual_rms_nm(air, **seen)
 
     best = minimize_scalar(

@@ -8,15 +8,14 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from lbt_synth.design import Check, Design, IntegratorLaw, integrator, kalman
+from lbt_synth.design import Check, Design, IntegratorLaw, integrator
 from lbt_synth.design.modal import MixedController, ModalFilters
-from lbt_synth.design.modal.reconstructor import name_modes
-from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.design.modal.per_mode import name_modes
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop.export_checks import require_exportable, require_modal
-from lbt_synth.models import LoopHardware, tip_tilt_plant
+from lbt_synth.models import LoopHardware
 from lbt_synth.validation import integer, number
 
-_SAME = 1e-6  # relative difference of a filter designed alone from that of the batch
 ModalDesign: TypeAlias = Design | MixedController | ModalFilters
 
 
@@ -61,7 +60,9 @@ def all_modes(
     """Return the designs of a file, each certified; ``modal`` requires one of modes."""
     if hardware is not None and design.hardware is not None:
         raise ProblemError("hardware must be left out where a design has a loop; got both.")
-    if isinstance(design, MixedController | ModalFilters):
+    if isinstance(design, ModalFilters):
+        design = design.start()
+    if isinstance(design, MixedController):
         if other_gain is not None:
             raise ProblemError("other_gain goes with a design; here each mode has its own gain.")
         parts, own = _mode_designs(design, file, hardware), design.n_modes
@@ -94,11 +95,9 @@ def all_modes(
 
 
 def _mode_designs(
-    control: MixedController | ModalFilters, file: str, hardware: LoopHardware | None
+    control: MixedController, file: str, hardware: LoopHardware | None
 ) -> list[ModeDesign]:
     """Return the design of each mode; modes that get no command have none."""
-    if isinstance(control, ModalFilters):
-        return _filter_designs(control, tuple(range(control.n_modes)))
     if control.reconstructor is not None:
         raise ProblemError("the RTC reconstructs modes itself; got a reconstructor.")
     loop = control.hardware or hardware
@@ -107,7 +106,11 @@ def _mode_designs(
     if control.filter is None:
         found = []
     elif isinstance(control.filter, ModalFilters):
-        found = _filter_designs(control.filter, tuple(control.filtered))
+        filtered, which = np.array(control.filtered), control.filter.which
+        found = [
+            ModeDesign(design, tuple(filtered[which == i].tolist()))
+            for i, design in enumerate(control.filter.designs)
+        ]
     elif isinstance(control.filter, Design):
         require_modal(control.filter, file)
         found = [ModeDesign(control.filter, tuple(control.filtered))]
@@ -122,36 +125,4 @@ def _mode_designs(
         if gain > 0:
             design = integrator(single, gain=gain, law=IntegratorLaw(leak=leak))
             found.append(ModeDesign(design, tuple(int(mode) for mode in modes)))
-    return found
-
-
-def _filter_designs(filters: ModalFilters, modes: tuple[int, ...]) -> list[ModeDesign]:
-    """Design each filter alone; it is that of the batch, and has a certificate of its own."""
-    found = []
-    for index, mode in enumerate(modes):
-        lines = [replace(line, direction=(1.0,)) for line in filters.vibrations[index]]
-        design = kalman(
-            tip_tilt_plant(
-                frame_rate_hz=filters.turbulence.frame_rate_hz,
-                turbulence=filters.turbulence.model(index),
-                noise_nm=filters.noise_nm[index],
-                vibrations=lines or None,
-                delay_frames=filters.delay_frames,
-                sensor_gain=float(filters.sensor_gain[index]),
-                modes=1,
-                mirror=filters.mirror,
-            )
-        )
-        frequency = np.linspace(0.05, 0.45, 9) / filters.dt_s
-        own, alone = (
-            c.to_statespace().frequency_response(frequency)
-            for c in (filters.controller(index), design.controller)
-        )
-        apart = float(np.max(np.abs(own - alone)) / np.max(np.abs(own)))
-        if not apart < _SAME:
-            raise NumericalError(
-                f"the filter of mode {mode + 1} must be that of its models; it is {apart:.2g} off.",
-                residual=apart,
-            )
-        found.append(ModeDesign(design, (mode,)))
     return found

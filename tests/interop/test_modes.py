@@ -52,7 +52,7 @@ def test_filters_of_all_modes_make_one_matrix(tmp_path):
     matrix = np.load(lbt.interop.export_dao(tmp_path / "k.npy", filters).files[0])
     z = np.exp(2j * np.pi * np.linspace(0.01, 0.49, 20))
     for mode in range(3):
-        system = filters.controller(mode).to_statespace()
+        system = filters.design(mode).controller.to_statespace()
         expected = system.frequency_response(np.angle(z) / (2 * np.pi) * 800)[:, 0, 0]
         assert relative(response(matrix[:, mode].astype(float), z), expected) < 1e-4
     mixed = MixedController(filter=filters, gains=[0.4] * 5, filtered=[1, 2, 4])
@@ -172,7 +172,7 @@ def test_pyrtc_gets_the_gain_of_all_others_and_its_proof(tmp_path, designs):
 
 
 def test_integrators_alone_need_a_loop(tmp_path):
-    control = MixedController.integrators([0.5, 0.3])
+    control = MixedController(gains=[0.5, 0.3])
     with pytest.raises(lbt.errors.ProblemError, match="hardware must be given"):
         lbt.interop.export_dao(tmp_path / "k.npy", control)
     loop = lbt.LoopHardware(frame_rate_hz=500)
@@ -186,13 +186,13 @@ def test_what_makes_no_matrix_is_refused(tmp_path, designs):
             lbt.interop.export_dao(tmp_path / "k.npy", control, **options)
 
     loop = {"hardware": lbt.LoopHardware(frame_rate_hz=500)}
-    refused(MixedController.integrators([0.0, 0.0]), "at least one mode must have a gain", **loop)
-    refused(MixedController.integrators([0.5, 1.5]), "gain|stable", **loop)
+    refused(MixedController(gains=[0.0, 0.0]), "at least one mode must have a gain", **loop)
+    refused(MixedController(gains=[0.5, 1.5]), "gain|stable", **loop)
     bare = MixedController(filter=designs["kalman"].controller, gains=[0.0, 0.0, 0.5])
     refused(bare, "must be a certified design", **loop)
     refused(designs["kalman"], "hardware must be left out", **loop)
     refused(MixedController(filter=designs["hinf"], gains=GAINS), "left out", **loop)
     refused(designs["kalman"], "other_gain needs the number of modes", other_gain=0.3)
     refused(designs["kalman"], "above 0", other_gain=-0.3, modes=3)
-    refused(MixedController.integrators([0.5]), "other_gain goes with a design", other_gain=0.3)
+    refused(MixedController(gains=[0.5]), "other_gain goes with a design", other_gain=0.3)
     assert not list(tmp_path.iterdir())

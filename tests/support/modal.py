@@ -23,13 +23,22 @@ def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ModalTurbulenc
     )
 
 
-def single_plant(air, mode, lines, noise, gain, delay):
+def single_plant(air, mode, lines, noise, gain, **path):
     return lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
         turbulence=air.model(mode),
         vibrations=list(lines) or None,
         noise_nm=float(noise),
-        delay_frames=delay,
         sensor_gain=float(gain),
         modes=1,
+        **path,
+    )
+
+
+def integrator_loop(gains, *, sensor_gain=1.0, **path):
+    """Loop of all modes around an integrator for each."""
+    return lbt.design.modal.modal_loop(
+        lbt.design.modal.MixedController(gains=gains),
+        hardware=lbt.LoopHardware(**({"frame_rate_hz": RATE} | path)),
+        sensor_gain=sensor_gain,
     )

@@ -1,4 +1,4 @@
-"""Banks: many small controllers of the same size, run and closed into loops together.
+"""Banks: many small controllers of the same size, and their loops, as arrays.
 
 In series of closed loops a noise that comes before a sensor of gain g is like a phase: with
 ``r'(k) = phi_res(k) + noise(k+1) / g`` and ``phi'(k) = phi_tot(k) + noise(k+1) / g`` the loop has
@@ -8,24 +8,25 @@ the one input phi', the one output r', and measures ``y(k) = g r'(k-1)``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
-from lbt_synth.design.modal.plants import ModalModels
-from lbt_synth.errors import DimensionError
+from lbt_synth.linear import Controller
 from lbt_synth.linear.block_filtering import BatchedSystems
-from lbt_synth.linear.lyapunov import stationary_covariances
-from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop.closed_loop import loop_matrices
 from lbt_synth.models.mirror.frame_rate_system import Response
-from lbt_synth.validation import FloatArray, float_array
+from lbt_synth.validation import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ModalSystems:
-    """A stack of N systems that share no mode."""
+class Bank:
+    """N systems of the same size that share no mode.
+
+    They are controllers in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D
+    y(k)``, or their loops from ``[phi_tot, noise]`` to ``[phi_res, u]``, in textbook form.
+    """
 
     modes: np.ndarray  # (N, w), modes of each system
     A: FloatArray  # (N, s, s)
@@ -38,164 +39,87 @@ class ModalSystems:
         """Number of modes w of each system."""
         return int(self.modes.shape[1])
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Bank(ModalSystems):
-    """Controllers in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
-
-    B is (N, s, w), C (N, w, s) and D (N, w, w).
-    """
+    def take(self, rows: IntArray) -> Bank:
+        """Return some of the systems."""
+        return Bank(*(getattr(self, part.name)[rows] for part in fields(self)))
 
     def for_modes(self, modes: np.ndarray) -> Bank:
-        """Return the same controllers for other modes: i becomes ``modes[i]``."""
+        """Return the same systems for other modes: i becomes ``modes[i]``."""
         return replace(self, modes=modes[self.modes])
 
+    def textbook(self) -> tuple[FloatArray, ...]:
+        """Return controllers in textbook form."""
+        return self.A, self.B, self.C @ self.A, self.C @ self.B + self.D
 
-@dataclass(slots=True, eq=False)
-class RunningBanks:
-    """Banks with their states: ``step(y) -> u`` once a frame, and ``reset()``.
+    def close(self, sensor_gain: FloatArray, mirror: Response) -> Bank:
+        """Return the loops of controllers, with the sensor gain (n,) of every mode.
 
-    Every mode belongs to one controller.
-    """
-
-    banks: Sequence[Bank]
-    n_modes: int
-    _states: list[FloatArray] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Set all states to zero."""
-        self._states = [np.zeros((len(bank.A), bank.A.shape[-1], 1)) for bank in self.banks]
-
-    def step(self, y: Any) -> FloatArray:
-        """Take the measurements y(k), (n,), and return the commands u(k), (n,)."""
-        measured = float_array(y, "y")
-        if measured.shape != (self.n_modes,):
-            raise DimensionError(f"y must have shape ({self.n_modes},); got {measured.shape}.")
-        command = np.zeros(self.n_modes)
-        for i, bank in enumerate(self.banks):
-            entry = measured[bank.modes][..., None]
-            self._states[i] = bank.A @ self._states[i] + bank.B @ entry
-            command[bank.modes] = (bank.C @ self._states[i] + bank.D @ entry)[..., 0]
-        return command
-
-
-class LoopVariances(NamedTuple):
-    """Variances that the loops of a block leave, and the errors of their computation."""
-
-    variances: FloatArray  # (N, w), of each mode's residual
-    residuals: FloatArray  # (N,), relative, of the Lyapunov equations
-    rounding: FloatArray  # (N,), what it may have done to the variances, relative
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopBlock(ModalSystems):
-    """Closed loops of one bank, from ``[phi_tot, noise]`` to ``[phi_res, u]``, in textbook form.
-
-    B is (N, s, 2 w), C (N, 2 w, s) and D (N, 2 w, 2 w).
-    """
-
-    @property
-    def spectral_radii(self) -> FloatArray:
-        """Spectral radius of each loop, (N,)."""
-        return np.asarray(np.abs(np.linalg.eigvals(self.A)).max(axis=-1))
-
-    def variances(self, models: ModalModels) -> LoopVariances:
-        """Exact variances under models and white noise: Lyapunov equations of loops and models.
-
-        The variances are small differences where a process is nearly a random walk.
+        A controller of several modes is alone in its bank.
         """
-        count, w = self.modes.shape
-        n = self.A.shape[-1]
-        systems, drives, rows = models.disturbances(self.modes.ravel())
-        k, p = drives.shape[1:]
-        systems, drives = systems.reshape(count, w, k, k), drives.reshape(count, w, k, p)
-        rows = rows.reshape(count, w, 1, k)
-        A = np.zeros((count, n + w * k, n + w * k))
-        B = np.zeros((count, n + w * k, w + w * p))
-        C, D = np.zeros((count, w, n + w * k)), np.zeros((count, w, w + w * p))
-        noise = models.noise_nm[self.modes][:, None, :]
-        A[:, :n, :n], C[..., :n] = self.A, self.C[:, :w]
-        B[:, :n, :w], D[..., :w] = self.B[..., w:] * noise, self.D[:, :w, w:] * noise
-        for i in range(w):
-            x, v = slice(n + i * k, n + (i + 1) * k), slice(w + i * p, w + (i + 1) * p)
-            A[:, :n, x] = self.B[..., i : i + 1] @ rows[:, i]
-            C[..., x] = self.D[:, :w, i : i + 1] @ rows[:, i]
-            A[:, x, x], B[:, x, v] = systems[:, i], drives[:, i]
-        P, residuals = stationary_covariances(A, B @ transpose(B))
-        output = C @ P @ transpose(C) + D @ transpose(D)
-        variances = np.diagonal(output, axis1=-2, axis2=-1).copy()
-        sizes = np.abs(C) @ np.abs(P) @ np.abs(transpose(C))
-        sizes = np.diagonal(sizes, axis1=-2, axis2=-1) + np.sum(D**2, axis=-1)
-        small = np.finfo(float).tiny  # no disturbance: 0, and nothing is lost
-        rounding = np.finfo(float).eps * np.max(sizes / np.maximum(variances, small), axis=-1)
-        return LoopVariances(variances, residuals, np.asarray(rounding))
-
-    def phase_system(self, outputs: int) -> BatchedSystems:
-        """Return the systems from the phase to the first outputs, the residual first."""
         w = self.width
-        return BatchedSystems(self.A, self.B[..., :w], self.C[:, :outputs], self.D[:, :outputs, :w])
+        unit = np.eye(w)
+        if w == 1:
+            sensor, factor = unit, sensor_gain[self.modes][:, :, None]
+        else:
+            sensor, factor = np.diag(sensor_gain[self.modes[0]]), np.ones((1, 1, 1))
+        A0, A1, B, C0, C1, D = loop_matrices(
+            *self.textbook(), mirror=mirror, sensor=sensor, influence=unit
+        )
+        part = slice(2 * w)  # the measurement is left out
+        C = C0[:, part] + factor * C1[:, part]
+        return Bank(self.modes, A0 + factor * A1, B, C, D[:, part])
+
+    def phase_systems(self) -> tuple[BatchedSystems, BatchedSystems]:
+        """Return loops as systems from the phase, to the residual and to the commands."""
+        w = self.width
+        ends = slice(w), slice(w, 2 * w)
+        B, D = self.B[..., :w], self.D[..., :w]
+        residual, command = (BatchedSystems(self.A, B, self.C[:, i], D[:, i]) for i in ends)
+        return residual, command
 
 
-def close_bank(bank: Bank, sensor_gain: FloatArray, mirror: Response) -> LoopBlock:
-    """Close the loops of a bank, with the sensor gain (n,) of every mode.
-
-    A controller of several modes is alone in its bank, or all its modes have one gain.
-    """
-    w = bank.width
-    unit = np.eye(w)
-    if w == 1:
-        sensor, factor = unit, sensor_gain[bank.modes][:, :, None]
-    else:
-        sensor, factor = np.diag(sensor_gain[bank.modes[0]]), np.ones((1, 1, 1))
-    textbook = bank.A, bank.B, bank.C @ bank.A, bank.C @ bank.B + bank.D
-    A0, A1, B, C0, C1, D = loop_matrices(*textbook, mirror=mirror, sensor=sensor, influence=unit)
-    part = slice(2 * w)  # the measurement is left out
-    C = C0[:, part] + factor * C1[:, part]
-    return LoopBlock(bank.modes, A0 + factor * A1, B, C, D[:, part])
+def make_banks(controllers: Sequence[Controller], which: np.ndarray) -> tuple[Bank, ...]:
+    """Return the controllers of single modes, mode i that of ``which[i]``, by their sizes."""
+    sizes = np.array([controller.n_states for controller in controllers])
+    out = []
+    for size in np.unique(sizes):
+        alike = np.flatnonzero(sizes == size)
+        modes = np.flatnonzero(np.isin(which, alike))
+        place = np.searchsorted(alike, which[modes])
+        stacks = (
+            np.stack([getattr(controllers[i], name) for i in alike.tolist()])[place]
+            for name in "ABCD"
+        )
+        out.append(Bank(modes[:, None], *stacks))
+    return tuple(out)
 
 
 def filter_phase(
-    blocks: tuple[LoopBlock, ...],
+    loops: tuple[Bank, ...],
     systems: tuple[BatchedSystems, ...],
     total: FloatArray,
     scaled: FloatArray,
-    with_commands: bool,
-) -> tuple[FloatArray, FloatArray | None]:
-    """Return the residuals of all modes, and the commands on request.
-
-    Shapes: total, scaled (noise over sensor gain), residuals, commands (n, frames).
-    """
-    if len(blocks) == 1 and not with_commands:
-        modes = blocks[0].modes
-        if modes.shape[1] == 1 and isinstance(_index(modes[:, 0]), slice):
-            # all modes in their order: no other array is needed
-            joined = _effective_phase(blocks[0], total, scaled)
-            only = systems[0].filter(joined, in_place=True)[:, 1:, 0]
-            only[:, :-1] -= scaled[:, 1:]
-            return only, None
-    series = [np.empty(total.shape) for _ in range(2 if with_commands else 1)]
-    for block, system in zip(blocks, systems, strict=True):
-        w = block.width
-        if with_commands:
-            system = block.phase_system(2 * w)
-        out = system.filter(_effective_phase(block, total, scaled))[:, 1:]
-        for i in range(w):
-            which = _index(block.modes[:, i])
-            for k, target in enumerate(series):
-                target[which] = out[..., k * w + i]
-            series[0][which, :-1] -= scaled[which, 1:]
-    return series[0], series[1] if with_commands else None
+) -> FloatArray:
+    """Return what systems make of phi', with scaled the noise over sensor gain; (n, frames) all."""
+    alone = len(loops) == 1 and loops[0].width == 1
+    if alone and isinstance(_index(loops[0].modes[:, 0]), slice):
+        # all modes in their order: no other array is needed
+        phase = _effective_phase(loops[0], total, scaled)
+        return systems[0].filter(phase, in_place=True)[:, 1:, 0]
+    made = np.empty(total.shape)
+    for loop, system in zip(loops, systems, strict=True):
+        out = system.filter(_effective_phase(loop, total, scaled))[:, 1:]
+        for i, modes in enumerate(loop.modes.T):
+            made[_index(modes)] = out[..., i]
+    return made
 
 
-def _effective_phase(block: LoopBlock, total: FloatArray, scaled: FloatArray) -> FloatArray:
-    """Return phi' of a block's modes, (N, frames + 1, w), for the frames -1, 0, ..."""
-    count, w = block.modes.shape
+def _effective_phase(loop: Bank, total: FloatArray, scaled: FloatArray) -> FloatArray:
+    """Return phi' of some modes, (N, frames + 1, w), for the frames -1, 0, ..."""
+    count, w = loop.modes.shape
     out = np.empty((count, total.shape[1] + 1, w))
     for i in range(w):
-        which = _index(block.modes[:, i])
+        which = _index(loop.modes[:, i])
         noise, entry = scaled[which], out[:, :, i]
         entry[:, 0] = noise[:, 0]
         np.add(total[which, :-1], noise[:, 1:], out=entry[:, 1:-1])

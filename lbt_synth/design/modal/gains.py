@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
-from lbt_synth.design.modal.plants import Vibrations, lines_per_mode, number_per_mode
+from lbt_synth.design.modal.per_mode import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
@@ -52,8 +52,7 @@ class ModalGains:
     limit: FloatArray
     limited: BoolArray  # (n,): whether the gain is at that limit
     noise_nm: FloatArray  # (n,): measurement noise that was given or found [nm]
-    delay_frames: float  # total delay [frames]
-    mirror: PositionLoop | None  # dynamics of the mirror; None: it settles at once
+    hardware: LoopHardware  # loop of one mode, with delay, mirror and frame rate
 
 
 def modal_gains(
@@ -130,8 +129,8 @@ def modal_gains(
     edges += [_model_edges(model) for _, model in models]
     noise = number_per_mode(noise_nm, "noise_nm", count, zero=True)
     gain = number_per_mode(sensor_gain, "sensor_gain", count)
-    inputs = LoopInputs(path, density, np.concatenate(edges), noise, gain)
-    return find_gains(inputs, margin)
+    panels = np.concatenate(edges)
+    return find_gains(path, density, panels, noise_nm=noise, gain=gain, margin=margin)
 
 
 def _spectra_per_mode(
@@ -181,42 +180,49 @@ def _distinct_poles(poles: Any) -> ComplexArray:
     return np.asarray(inside[kept], dtype=np.complex128)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopInputs:
-    """What reaches the integrator loops of n modes: phase and noise."""
-
-    path: LoopHardware  # of one mode
-    density: Density  # of the phases, or of their differences of two frames
-    edges: FloatArray  # of panels for the spectra, over the Nyquist frequency
-    noise: FloatArray  # (n,)
-    gain: FloatArray  # of the sensor, (n,)
-    differenced: bool = False
-
-    def spectra(self, frequency_hz: FloatArray) -> FloatArray:
-        """Return the spectra (n, f); refuse what is not finite, or negative unless differenced."""
-        spectra = self.density(frequency_hz)
-        sound = np.isfinite(spectra) & ((spectra >= 0) | self.differenced)
-        wrong = np.flatnonzero(~sound.all(axis=1))
-        if wrong.size:
-            which = f"that of mode {wrong[0]} is not"
-            raise ProblemError(f"every spectrum must be finite and at least 0; {which}.")
-        return spectra
-
-    def transfers(self, frequency_hz: FloatArray, loop_gains: FloatArray) -> list[FloatArray]:
-        """Squared moduli (gains, f) of spectra and of noise over sensor gain to the residual."""
-        delay = np.exp(-2j * np.pi * (frequency_hz / self.path.frame_rate_hz))
-        mirror: ComplexArray = polyval(delay, self.path.mirror_taps)
-        difference = 1 - delay
-        power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
-        rejection = (1.0 if self.differenced else np.abs(difference) ** 2) / power
-        return [rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power]
+def _checked_spectra(
+    density: Density, frequency_hz: FloatArray, *, differenced: bool
+) -> FloatArray:
+    """Return the spectra (n, f); refuse what is not finite, or negative unless differenced."""
+    spectra = density(frequency_hz)
+    sound = np.isfinite(spectra) & ((spectra >= 0) | differenced)
+    wrong = np.flatnonzero(~sound.all(axis=1))
+    if wrong.size:
+        which = f"that of mode {wrong[0]} is not"
+        raise ProblemError(f"every spectrum must be finite and at least 0; {which}.")
+    return spectra
 
 
-def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
-    """Find the gains on finer and finer panels, until residuals and gains no longer change."""
-    path, gain, (least, most) = inputs.path, inputs.gain, TRIED_GAINS
+def _transfers(
+    path: LoopHardware, frequency_hz: FloatArray, loop_gains: FloatArray, *, differenced: bool
+) -> list[FloatArray]:
+    """Squared moduli (gains, f) of spectra and of noise over sensor gain to the residual."""
+    delay = np.exp(-2j * np.pi * (frequency_hz / path.frame_rate_hz))
+    mirror: ComplexArray = polyval(delay, path.mirror_taps)
+    difference = 1 - delay
+    power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
+    rejection = (1.0 if differenced else np.abs(difference) ** 2) / power
+    return [rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power]
+
+
+def find_gains(
+    path: LoopHardware,
+    density: Density,
+    edges: FloatArray,
+    *,
+    noise_nm: FloatArray,
+    gain: FloatArray,
+    margin: float,
+    differenced: bool = False,
+) -> ModalGains:
+    """Find the gains on finer and finer panels, until residuals and gains no longer change.
+
+    The spectra are those of the phases, or of their differences of two frames; they have edges of
+    panels, over the Nyquist frequency. The path is that of one mode, the gain (n,) the sensor's.
+    """
+    least, most = TRIED_GAINS
     rate, limit = path.frame_rate_hz, hardware_gain_limit(path)
-    noise_nm2 = (inputs.noise / gain) ** 2
+    noise_nm2 = (noise_nm / gain) ** 2
     distance = number(margin, "margin", at_least=round(1 - most, 9), below=1)
     loop_gains = np.geomspace(least, _HIGHEST, _GRID) * limit
     highest = (1 - distance) * limit * np.minimum(gain, 1.0)
@@ -228,14 +234,15 @@ def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
     # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
     path_taps = np.append(0.0, path.mirror_taps)
     poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
-    grid = [np.zeros(1), np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), inputs.edges]
+    grid = [np.zeros(1), np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), edges]
     edges = distinct_edges(np.concatenate(grid))
     last = np.full((2, gain.size), np.inf)  # gains and variances
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
-        rejection, propagation = inputs.transfers(nodes, loop_gains)
+        rejection, propagation = _transfers(path, nodes, loop_gains, differenced=differenced)
         propagated = propagation @ weights * 2 / rate
-        variances = (inputs.spectra(nodes) * weights) @ rejection.T
+        spectra = _checked_spectra(density, nodes, differenced=differenced)
+        variances = (spectra * weights) @ rejection.T
         variances += np.outer(noise_nm2, propagated)
         if np.any(variances[:, 0] == 0):
             raise ProblemError(
@@ -243,7 +250,7 @@ def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
                 f"{int(np.argmin(variances[:, 0]))}."
             )
         best, variance = _minimise(loop_gains, variances, limit, highest)
-        if inputs.differenced:
+        if differenced:
             floor = noise_nm2 * np.interp(best, loop_gains, propagated)
             variance = np.maximum(variance, floor)
         change = np.max(np.abs(np.stack([best, variance]) / last - 1), axis=1)
@@ -265,9 +272,8 @@ def find_gains(inputs: LoopInputs, margin: float) -> ModalGains:
         rms_nm=read_only(np.sqrt(variance)),
         limit=read_only(allowed),
         limited=read_only(gains > allowed * (1 - 1e-6)),
-        noise_nm=inputs.noise,
-        delay_frames=path.delay_frames,
-        mirror=path.mirror,
+        noise_nm=noise_nm,
+        hardware=path,
     )
 
 

@@ -6,29 +6,34 @@ The frames are those of :class:`LoopHardware` with a unit sensor and mirror.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design.certificate import RESIDUAL_TOLERANCE, VARIANCE_TOLERANCE
-from lbt_synth.design.modal.banks import LoopBlock, close_bank, filter_phase
-from lbt_synth.design.modal.filters import ModalFilters
+from lbt_synth.design.modal.banks import Bank, filter_phase
 from lbt_synth.design.modal.mixed_controller import MixedController
-from lbt_synth.design.modal.plants import ModalModels, Vibrations, number_per_mode
-from lbt_synth.design.modal.reconstructor import name_modes
+from lbt_synth.design.modal.per_mode import (
+    Lines,
+    Vibrations,
+    lines_per_mode,
+    name_modes,
+    number_per_mode,
+)
+from lbt_synth.design.modal.stack import ModalFilters
 from lbt_synth.errors import (
     DimensionError,
     NonFiniteError,
-    NumericalError,
     ProblemError,
     UnstableLoopError,
 )
 from lbt_synth.linear.block_filtering import BatchedSystems
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop
-from lbt_synth.validation import FloatArray, float_array, integer, number, read_only, real_array
+from lbt_synth.loop import EnsembleVibration, LoopEnsemble
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, require_loop_rate
+from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices
+from lbt_synth.loop.ensemble.loop_ensemble import turbulence_rows
+from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence
+from lbt_synth.validation import FloatArray, float_array, read_only, real_array, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,28 +53,23 @@ class ModalLoop:
 
     Attributes
     ----------
-    delay_frames : float
-        Total delay [frames].
-    frame_rate_hz : float or None
-        Frame rate [Hz]; None where nothing says it, a loop for any.
-    mirror : PositionLoop or None
-        Dynamics of the mirror; None: it settles at once.
+    hardware : LoopHardware
+        Delay, mirror and frame rate: the loop of one mode with a unit sensor.
     sensor_gain : (n,) ndarray
         Real sensor (optical) gain of each mode.
     spectral_radii : (n,) ndarray
         Largest modulus of the poles of the loop that each mode belongs to.
-    blocks : tuple
-        Matrices of the loops, those of the same size together.
+    controllers, loops : tuple of Bank
+        Controllers and their loops, those of the same size together.
     systems : tuple
-        The same from the phase to the residual, ready for long series.
+        The loops from the phase to the residual, ready for long series.
     """
 
-    delay_frames: float
-    frame_rate_hz: float | None
-    mirror: PositionLoop | None
+    hardware: LoopHardware
     sensor_gain: FloatArray
     spectral_radii: FloatArray
-    blocks: tuple[LoopBlock, ...]
+    controllers: tuple[Bank, ...]
+    loops: tuple[Bank, ...]
     systems: tuple[BatchedSystems, ...]
 
     @property
@@ -107,7 +107,7 @@ class ModalLoop:
         noise_nm: ArrayLike,
         vibrations: Vibrations | None = None,
     ) -> FloatArray:
-        """Exact stationary residual of each mode, by Lyapunov equations.
+        """Exact stationary residual of each mode, as :func:`ensemble_residuals` computes it.
 
         Parameters
         ----------
@@ -130,32 +130,25 @@ class ModalLoop:
         ProblemError
             If sizes clash, a value is out of its range, or the models are sampled at another
             frame rate than the loop's.
-        NumericalError
-            If rounding leaves too few digits: a process that is nearly a random walk.
         """
         self.require_stable()
-        models = ModalModels.of(turbulence, noise_nm, vibrations, modes=self.n_modes)
-        own, rate = models.turbulence.frame_rate_hz, self.frame_rate_hz
-        if rate is not None and not np.isclose(own, rate, rtol=1e-9):
-            got = f"{rate:.6g} Hz; got {own:.6g} Hz"
-            raise ProblemError(f"turbulence must be sampled at the loop's frame rate, {got}.")
+        if not isinstance(turbulence, ModalTurbulence):
+            turbulence = ModalTurbulence.of(turbulence)
+        if turbulence.n_modes != self.n_modes:
+            raise DimensionError(
+                f"turbulence must have {self.n_modes} modes; got {turbulence.n_modes}."
+            )
+        noise = number_per_mode(noise_nm, "noise_nm", self.n_modes, zero=True)
+        lines = lines_per_mode(vibrations, self.n_modes)
+        require_loop_rate(turbulence.frame_rate_hz, self.hardware)
         out = np.zeros(self.n_modes)
-        for block in self.blocks:
-            left = block.variances(models)
-            for what, error, limit in (
-                ("the residual of the Lyapunov equation", left.residuals, RESIDUAL_TOLERANCE),
-                ("rounding of the variance", left.rounding, VARIANCE_TOLERANCE),
-            ):
-                bad = np.flatnonzero(~(error < limit))
-                if bad.size:
-                    raise NumericalError(
-                        f"{what} must be below {limit:g}, relative; got {np.max(error):.3g} in "
-                        f"{name_modes(np.unique(block.modes[bad]))}. A process with a pole this "
-                        "close to 1 is a random walk: move the pole inwards.",
-                        status="lyapunov",
-                        residual=float(np.max(error)),
-                    )
-            out[block.modes] = np.sqrt(np.maximum(left.variances, 0))
+        for bank in self.controllers:
+            counts = np.array([len(lines[mode]) for mode in bank.modes[:, 0]])
+            for count in np.unique(counts):  # of vibrations, the same in an ensemble
+                some = bank.take(np.flatnonzero(counts == count))
+                out[some.modes] = _residuals(
+                    some, self.hardware, self.sensor_gain, turbulence, noise, lines
+                )
         return read_only(out)
 
     def run(
@@ -163,7 +156,6 @@ class ModalLoop:
         total_nm: ArrayLike,
         noise_nm: ArrayLike,
         *,
-        settle_frames: int = 0,
         all_series: bool = False,
     ) -> ModalRun:
         """Run the loop over given series, from zero states.
@@ -174,8 +166,6 @@ class ModalLoop:
             Total phase of each mode [nm].
         noise_nm : (n, frames) array_like
             Measurement noise of each mode [nm].
-        settle_frames : int, optional
-            Frames at the beginning that are run and dropped.
         all_series : bool, optional
             Whether to return commands and measurements, too.
 
@@ -196,7 +186,8 @@ class ModalLoop:
         >>> import numpy as np
         >>> import lbt_synth as lbt
         >>> loop = lbt.design.modal.modal_loop(
-        ...     lbt.design.modal.MixedController.integrators([0.5, 0.25])
+        ...     lbt.design.modal.MixedController(gains=[0.5, 0.25]),
+        ...     hardware=lbt.LoopHardware(frame_rate_hz=800),
         ... )
         >>> step = np.ones((2, 40))
         >>> loop.run(step, 0 * step).residual_nm[:, [0, 2, 39]].round(3).tolist()
@@ -209,38 +200,71 @@ class ModalLoop:
                 f"total_nm and noise_nm must both be ({self.n_modes}, frames); got {total.shape} "
                 f"and {noise.shape}."
             )
-        frames = total.shape[1]
-        settle = integer(settle_frames, "settle_frames", at_least=0)
-        if not settle < frames:
-            got = f"{frames} and {settle}"
-            raise ProblemError(f"there must be more frames than settle_frames; got {got}.")
+        if not total.shape[1]:
+            raise DimensionError("total_nm must have at least one frame; got none.")
         scaled = noise if np.all(self.sensor_gain == 1) else noise / self.sensor_gain[:, None]
         with np.errstate(all="ignore"):  # what is not finite is refused below
-            systems = self.systems
-            residual, commands = filter_phase(self.blocks, systems, total, scaled, all_series)
-        measurements = noise.copy() if all_series else None
-        if measurements is not None:
-            measurements[:, 1:] += self.sensor_gain[:, None] * residual[:, :-1]
-        kept = residual[:, settle:]
-        rms = np.sqrt(np.einsum("mf,mf->m", kept, kept) / kept.shape[1])
+            residual = filter_phase(self.loops, self.systems, total, scaled)
+            residual[:, :-1] -= scaled[:, 1:]
+        rms = np.sqrt(np.einsum("mf,mf->m", residual, residual) / residual.shape[1])
         if not np.isfinite(residual[:, -1]).all() or not np.isfinite(rms).all():
             real_array(total, "total_nm"), real_array(noise, "noise_nm")
             raise NonFiniteError("the residual must be finite; its numbers ran out of range.")
-        named = {"residual_nm": residual, "commands": commands, "measurements": measurements}
-        series: dict[str, Any] = {
-            name: None if each is None else read_only(each)[:, settle:]
-            for name, each in named.items()
-        }
-        return ModalRun(**series, rms_nm=read_only(rms))
+        commands = measurements = None
+        if all_series:
+            measurements = noise.copy()
+            measurements[:, 1:] += self.sensor_gain[:, None] * residual[:, :-1]
+            measurements = read_only(measurements)
+            systems = tuple(loop.phase_systems()[1] for loop in self.loops)
+            commands = read_only(filter_phase(self.loops, systems, total, scaled))
+        return ModalRun(
+            residual_nm=read_only(residual),
+            commands=commands,
+            measurements=measurements,
+            rms_nm=read_only(rms),
+        )
+
+
+def _residuals(
+    bank: Bank,
+    hardware: LoopHardware,
+    sensor_gain: FloatArray,
+    turbulence: ModalTurbulence,
+    noise_nm: FloatArray,
+    lines: Lines,
+) -> FloatArray:
+    """Residuals (N, w) of the loops of a bank, as an ensemble; hardware is that of one mode."""
+    w, gain, columns = bank.width, sensor_gain[bank.modes], list(bank.modes.T)
+    vibrations = [
+        EnsembleVibration(
+            frequency_hz=[lines[mode][i].frequency_hz for mode in column],
+            rms_nm=[lines[mode][i].rms_nm for mode in column],
+            damping=[lines[mode][i].damping for mode in column],
+            direction=axis,
+        )
+        for axis, column in zip(np.eye(w), columns, strict=True)
+        for i in range(len(lines[column[0]]))
+    ]
+    conditions = LoopEnsemble(
+        loops=len(bank.modes),
+        sensor_gain=gain[:, 0] if w == 1 else 1.0,
+        noise_nm=noise_nm[bank.modes],
+        turbulence=[turbulence_rows(turbulence, column) for column in columns],
+        vibrations=tuple(vibrations),
+    )
+    if w > 1:
+        sensor = np.diag(gain[0])
+        hardware = replace(hardware, modes=w, sensor_matrix=sensor, influence_matrix=None)
+    left = residuals_from_matrices(bank.textbook(), hardware, conditions)
+    power = left.turbulence_nm2 + left.noise_nm2 + left.random_vibration_nm2
+    return np.sqrt(np.diagonal(power, axis1=1, axis2=2))
 
 
 def modal_loop(
     controller: MixedController | ModalFilters,
     *,
-    delay_frames: float | None = None,
+    hardware: LoopHardware | None = None,
     sensor_gain: ArrayLike = 1.0,
-    mirror: PositionLoop | None = None,
-    frame_rate_hz: float | None = None,
 ) -> ModalLoop:
     """Close the loop of every mode, with a unit sensor and a mirror of unit gain.
 
@@ -248,17 +272,11 @@ def modal_loop(
     ----------
     controller : MixedController or ModalFilters
         Controllers of the modes, without a reconstructor: y are modal coefficients.
-    delay_frames : float, optional
-        Real total delay [frames]; by default that of the filters, or of the design that is the
-        mixed controller's filter, or 2.
+    hardware : LoopHardware, optional
+        Real delay, mirror and frame rate; its matrices play no part. By default that of the
+        filters, or of the design that is the mixed controller's filter.
     sensor_gain : float or (n,) array_like, optional
         Real sensor (optical) gain, of all modes or of each.
-    mirror : PositionLoop, optional
-        Real dynamics of the mirror, the same for all modes; by default those that the filters
-        or the design know, or none.
-    frame_rate_hz : float, optional
-        Frame rate [Hz]; by default that of the filters or of the design. Only a mirror with
-        dynamics needs it.
 
     Returns
     -------
@@ -269,72 +287,55 @@ def modal_loop(
     ------
     ProblemError
         If the controller has a reconstructor or is of another kind, a value is out of its
-        range, or the frame rate is not that of the filters.
+        range, no filter has a loop and none is given, or its frame rate is not the filters'.
 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators([0.5, 1.2]))
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> control = lbt.design.modal.MixedController(gains=[0.5, 1.2])
+    >>> loop = lbt.design.modal.modal_loop(control, hardware=path)
     >>> loop.is_stable, loop.spectral_radii.round(3).tolist()
     (False, [0.707, 1.095])
     >>> air = lbt.models.ModalTurbulence(
     ...     coefficients=[[0.99]], driving_rms_nm=[10.0], frame_rate_hz=800
     ... )
-    >>> one = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators([0.5]))
+    >>> control = lbt.design.modal.MixedController(gains=[0.5])
+    >>> one = lbt.design.modal.modal_loop(control, hardware=path)
     >>> one.residual_rms_nm(air, noise_nm=5.0).round(2).tolist()
     [15.98]
     """
     if not isinstance(controller, MixedController | ModalFilters):
         raise ProblemError(
             "controller must be a MixedController or ModalFilters; got "
-            f"{type(controller).__name__}. Try MixedController.integrators(gains)."
+            f"{type(controller).__name__}. Try MixedController(gains=gains)."
         )
     if isinstance(controller, MixedController) and controller.reconstructor is not None:
         raise ProblemError(
             "a modal loop is that of modal coefficients; got a controller with a "
             "reconstructor. Leave it out, or use simulate with the sensor's matrix."
         )
-    hardware, rate = _path(controller, delay_frames, mirror, frame_rate_hz)
-    n = controller.n_modes
-    gain = number_per_mode(sensor_gain, "sensor_gain", n)
-    response = hardware.mirror_system.whole
-    blocks = tuple(close_bank(bank, gain, response) for bank in controller.banks())
-    radii = np.zeros(n)
-    for block in blocks:
-        radii[block.modes] = block.spectral_radii[:, None]
+    path, dt_s = hardware or controller.hardware, controller.dt_s
+    if path is None:
+        raise ProblemError("hardware must be given where no filter has a loop; got None.")
+    require_instance(path, LoopHardware, "hardware")
+    path = path.single_mode()
+    if dt_s is not None and not np.isclose(path.dt_s, dt_s, rtol=1e-9):
+        raise ProblemError(
+            f"hardware must have the frame rate of the filters, {1 / dt_s:.6g} Hz; got "
+            f"{path.frame_rate_hz:.6g} Hz."
+        )
+    gain = number_per_mode(sensor_gain, "sensor_gain", controller.n_modes)
+    controllers = controller.banks()
+    loops = tuple(bank.close(gain, path.mirror_system.whole) for bank in controllers)
+    radii = np.zeros(controller.n_modes)
+    for loop in loops:
+        radii[loop.modes] = np.abs(np.linalg.eigvals(loop.A)).max(axis=-1)[:, None]
     return ModalLoop(
-        delay_frames=hardware.delay_frames,
-        frame_rate_hz=rate,
-        mirror=hardware.mirror,
+        hardware=path,
         sensor_gain=gain,
         spectral_radii=read_only(radii),
-        blocks=blocks,
-        systems=tuple(block.phase_system(block.width) for block in blocks),
+        controllers=controllers,
+        loops=loops,
+        systems=tuple(loop.phase_systems()[0] for loop in loops),
     )
-
-
-def _path(
-    controller: MixedController | ModalFilters,
-    delay_frames: float | None,
-    mirror: PositionLoop | None,
-    frame_rate_hz: float | None,
-) -> tuple[LoopHardware, float | None]:
-    """Return the hardware of one mode, from what is given or else designed for, and its rate."""
-    designed = controller.hardware
-    rate = None if controller.dt_s is None else 1 / controller.dt_s
-    if frame_rate_hz is not None:
-        given = number(frame_rate_hz, "frame_rate_hz", above=0)
-        if rate is not None and not np.isclose(given, rate, rtol=1e-9):
-            raise ProblemError(
-                f"frame_rate_hz must be that of the filters, {rate:.6g} Hz; got {given:.6g} Hz."
-            )
-        rate = given
-    if mirror is None and designed is not None:
-        mirror = designed.mirror
-    if delay_frames is None:
-        delay_frames = 2.0 if designed is None else designed.delay_frames
-    if mirror is not None and rate is None:
-        raise ProblemError("a mirror with dynamics needs frame_rate_hz; got none.")
-    sampling = 1.0 if rate is None else rate
-    path = LoopHardware(frame_rate_hz=sampling, delay_frames=delay_frames, modes=1, mirror=mirror)
-    return path, rate

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from lbt_synth.design.modal.banks import Bank, RunningBanks
-from lbt_synth.design.modal.filters import ModalFilters
-from lbt_synth.design.modal.plants import number_per_mode
-from lbt_synth.design.modal.reconstructor import Reconstructor, mode_indices
+from lbt_synth.design.modal.banks import Bank
+from lbt_synth.design.modal.per_mode import mode_indices, number_per_mode
+from lbt_synth.design.modal.reconstructor import Reconstructor
+from lbt_synth.design.modal.stack import ModalFilters
 from lbt_synth.design.result import Design
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
@@ -37,9 +37,9 @@ class MixedController:
 
     Parameters
     ----------
-    filter : Design, Controller, ModalFilters, object with ``step(y)`` and ``reset()``, or None
+    filter : Design, Controller, ModalFilters, object with ``step(y)`` and ``reset()``, optional
         Controller of the filtered modes, such as a Kalman design of a tip/tilt plant. An
-        object with a state is stepped as it is. None: all modes have integrators.
+        object with a state is stepped as it is. Without one all modes have integrators.
     gains : (n,) array_like
         Integrator gain of each mode, at least 0; those of filtered modes play no part.
     filtered : sequence of int, optional
@@ -70,12 +70,14 @@ class MixedController:
     [0.0, 0.0, 10.0, 6.0]
     """
 
-    filter: Any
+    filter: Any = None
     gains: FloatArray
     filtered: Sequence[int] = (0, 1)
     leak: Any = 1.0
     reconstructor: Reconstructor | None = None
-    _running: SteppedController | None = field(init=False, repr=False)
+    _running: SteppedController | None = field(init=False, repr=False)  # one filter
+    _stacks: tuple[Bank, ...] = field(init=False, repr=False)  # or a filter for each mode
+    _states: list[FloatArray] = field(init=False, repr=False)
     _modes: np.ndarray = field(init=False, repr=False)
     _gain: FloatArray = field(init=False, repr=False)
     _leak: FloatArray = field(init=False, repr=False)
@@ -96,44 +98,16 @@ class MixedController:
                     f"gains must be one per mode of the reconstructor, {own}; got {n}."
                 )
         self._gain, self._leak = np.array(self.gains), np.array(self.leak)
-        self._modes, self._running = np.zeros(0, dtype=np.intp), None
+        self._modes, self._running, self._stacks = np.zeros(0, dtype=np.intp), None, ()
         if self.filter is not None:
             self._modes = mode_indices(self.filtered, "filtered", n)
-            self._running = _start_filter(self.filter, self._modes.size)
+            if isinstance(self.filter, ModalFilters):
+                self._stacks = self._stacked_filters(self.filter)
+            else:
+                self._running = _start_filter(self.filter, self._modes.size)
             self._gain[self._modes] = self._leak[self._modes] = 0.0
         self.filtered = tuple(int(i) for i in self._modes)
         self.reset()
-
-    @classmethod
-    def integrators(
-        cls, gains: ArrayLike, *, leak: ArrayLike = 1.0, reconstructor: Reconstructor | None = None
-    ) -> MixedController:
-        """Return the classical controller: an integrator for every mode.
-
-        Parameters
-        ----------
-        gains : (n,) array_like
-            Integrator gain of each mode.
-        leak : float or (n,) array_like, optional
-            Leak of the integrators.
-        reconstructor : Reconstructor, optional
-            From slopes to modes.
-
-        Returns
-        -------
-        MixedController
-            A controller without a filter.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> classical = lbt.design.modal.MixedController.integrators([0.5, 0.3, 0.2])
-        >>> [float(u) for u in classical.step([1.0, 1.0, 1.0])]
-        [0.5, 0.3, 0.2]
-        """
-        return cls(
-            filter=None, gains=float_array(gains, "gains"), leak=leak, reconstructor=reconstructor
-        )
 
     @property
     def n_modes(self) -> int:
@@ -152,9 +126,7 @@ class MixedController:
     @property
     def hardware(self) -> LoopHardware | None:
         """Loop that the filter is designed for, of any number of modes; None if it says none."""
-        if isinstance(self.filter, ModalFilters):
-            return self.filter.hardware
-        return self.filter.hardware if isinstance(self.filter, Design) else None
+        return self.filter.hardware if isinstance(self.filter, Design | ModalFilters) else None
 
     @property
     def n_measurements(self) -> int:
@@ -164,6 +136,7 @@ class MixedController:
     def reset(self) -> None:
         """Set all integrators and the filter to zero."""
         self._command = np.zeros(self.gains.size)
+        self._states = [np.zeros((len(bank.A), bank.A.shape[-1], 1)) for bank in self._stacks]
         if self._running is not None:
             self._running.reset()
 
@@ -203,6 +176,10 @@ class MixedController:
             )
         command = self._leak * self._command
         command += self._gain * measured
+        for i, bank in enumerate(self._stacks):
+            entry = measured[bank.modes][..., None]
+            self._states[i] = bank.A @ self._states[i] + bank.B @ entry
+            command[bank.modes] = (bank.C @ self._states[i] + bank.D @ entry)[..., 0]
         if self._running is not None:
             own = float_array(self._running.step(measured[self._modes]), "the filter's commands")
             if own.shape != self._modes.shape:
@@ -231,9 +208,8 @@ class MixedController:
         one = np.ones((kept.size, 1, 1))
         leak, gain = self._leak[kept, None, None], self._gain[kept, None, None]
         out = [Bank(kept[:, None], leak, gain, one, np.zeros_like(one))] if kept.size else []
-        if isinstance(self._running, RunningBanks):
-            out += [bank.for_modes(self._modes) for bank in self._running.banks]
-        elif isinstance(self._running, RunningController):
+        out += self._stacks
+        if isinstance(self._running, RunningController):
             k = self._running.controller
             out.append(Bank(self._modes[None], k.A[None], k.B[None], k.C[None], k.D[None]))
         elif self._running is not None:
@@ -264,7 +240,7 @@ class MixedController:
         Examples
         --------
         >>> import lbt_synth as lbt
-        >>> classical = lbt.design.modal.MixedController.integrators([0.5, 0.3])
+        >>> classical = lbt.design.modal.MixedController(gains=[0.5, 0.3])
         >>> path = lbt.LoopHardware(frame_rate_hz=800)
         >>> lbt.close_loop(path, classical.as_controller(path.dt_s)).is_stable
         True
@@ -290,20 +266,25 @@ class MixedController:
         C = np.hstack([chosen.T @ C for chosen, _, _, C, _ in each])
         return Controller(A=A, B=B, C=C, D=D, dt_s=1.0 if period is None else period)
 
+    def _stacked_filters(self, filters: ModalFilters) -> tuple[Bank, ...]:
+        """Return the filters of a stack for the modes that they control."""
+        if filters.n_modes != self._modes.size:
+            raise DimensionError(
+                f"the filters must be for the {self._modes.size} filtered modes; got "
+                f"{filters.n_modes}."
+            )
+        return tuple(bank.for_modes(self._modes) for bank in filters.banks())
+
 
 def _start_filter(given: Any, modes: int) -> SteppedController:
     """Return the filter as an object to step, of as many inputs and outputs as modes."""
     if isinstance(given, Design):
         given = given.controller
-    running = given.start() if isinstance(given, Controller | ModalFilters) else given
+    running = given.start() if isinstance(given, Controller) else given
     if not isinstance(running, SteppedController):
         raise ProblemError(
             "filter must be a design, a Controller, an object with step(y) and reset(), or None; "
             f"got {type(given).__name__}."
-        )
-    if isinstance(running, RunningBanks) and running.n_modes != modes:
-        raise DimensionError(
-            f"the filters must be for the {modes} filtered modes; got {running.n_modes}."
         )
     if isinstance(running, RunningController):
         D = running.controller.D

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.design.modal.per_mode import mode_indices, name_modes
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, integer, matrix, number, read_only, real_array
 
-_NAMED = 5  # modes that a message lists
 _EMPTY = 1e-8  # part of a mode that has to be left by a projection
 
 
@@ -225,25 +223,3 @@ def project_out(
             residual=float(overlap.max()),
         )
     return read_only(out)
-
-
-def mode_indices(indices: Any, name: str, n: int) -> np.ndarray:
-    """Return different mode numbers from 0 to n - 1 as an integer array."""
-    if isinstance(indices, str | bytes) or not np.iterable(indices):
-        raise ProblemError(f"{name} must be a list of mode numbers; got {indices!r}.")
-    out = [integer(index, name, at_least=0) for index in indices]
-    if not out:
-        raise ProblemError(f"{name} must name at least one mode; got none.")
-    if len(set(out)) != len(out) or any(index >= n for index in out):
-        raise ProblemError(f"{name} must be different mode numbers from 0 to {n - 1}; got {out}.")
-    return np.array(out, dtype=np.intp)
-
-
-def name_modes(indices: Any) -> str:
-    """Text that names some modes: "mode 3", "modes 3, 7, 8 and 12 more"."""
-    numbers = [str(int(i)) for i in indices]
-    if len(numbers) == 1:
-        return f"mode {numbers[0]}"
-    if len(numbers) > _NAMED:
-        numbers = [*numbers[:_NAMED], f"{len(numbers) - _NAMED} more"]
-    return f"modes {listing_text(numbers)}"

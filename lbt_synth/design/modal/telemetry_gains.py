@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import welch
 
-from lbt_synth.design.modal.gains import LoopInputs, ModalGains, find_gains
-from lbt_synth.design.modal.plants import number_per_mode
+from lbt_synth.design.modal.gains import ModalGains, find_gains
+from lbt_synth.design.modal.per_mode import number_per_mode
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.models.loop_hardware import past_corrections
@@ -95,7 +95,10 @@ def modal_gains_from_telemetry(
     >>> rng = np.random.default_rng(0)
     >>> noise = 5.0 * rng.standard_normal((1, 20_000))
     >>> walk = 0.99 * np.cumsum(rng.standard_normal((1, 20_000)), axis=1)
-    >>> loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators([0.3]))
+    >>> loop = lbt.design.modal.modal_loop(
+    ...     lbt.design.modal.MixedController(gains=[0.3]),
+    ...     hardware=lbt.LoopHardware(frame_rate_hz=800),
+    ... )
     >>> run = loop.run(walk, noise, all_series=True)
     >>> found = lbt.design.modal.modal_gains_from_telemetry(
     ...     run.measurements.T, run.commands.T, frame_rate_hz=800
@@ -144,5 +147,6 @@ def modal_gains_from_telemetry(
         part = np.clip((wanted - frequency[left]) / np.diff(frequency)[left], 0.0, 1.0)
         return np.asarray(table[:, left] * (1 - part) + table[:, left + 1] * part)
 
-    inputs = LoopInputs(path, density, 2 * frequency / rate, noise, gain, differenced=True)
-    return find_gains(inputs, margin)
+    known: dict[str, FloatArray] = {"noise_nm": noise, "gain": gain}
+    edges = 2 * frequency / rate
+    return find_gains(path, density, edges, **known, margin=margin, differenced=True)

@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
+from support.modal import RATE, integrator_loop
 from support.series import ar_series
 
 import lbt_synth as lbt
+from lbt_synth.design.modal import modal_gains, modal_gains_from_telemetry
 from lbt_synth.design.modal.gains import _minimise
 
-RATE = 800.0
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,))
 
 
@@ -23,7 +24,7 @@ def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_g
     table = lbt.models.TabulatedSpectrum(
         frequency_hz=[0, 1, 5, 30, 31, 32, 400], density_nm2_hz=[4e4, 4e4, 50, 1, 90, 0.5, 0.01]
     )
-    found = lbt.design.modal.modal_gains(
+    found = modal_gains(
         [air, ar1, table, ar1],
         noise_nm=noise,
         frame_rate_hz=RATE,
@@ -54,7 +55,7 @@ def test_residuals_are_those_of_the_loop():
     )
     noise, gain = 10 ** rng.uniform(0, 2, n), rng.uniform(0.3, 1.2, n)
     lines = {5: [LINE], 77: [LINE, LINE]}
-    found = lbt.design.modal.modal_gains(
+    found = modal_gains(
         air,
         noise_nm=noise,
         frame_rate_hz=RATE,
@@ -64,9 +65,7 @@ def test_residuals_are_those_of_the_loop():
     )
 
     def exact(gains):
-        loop = lbt.design.modal.modal_loop(
-            lbt.design.modal.MixedController.integrators(gains), delay_frames=2.3, sensor_gain=gain
-        )
+        loop = integrator_loop(gains, delay_frames=2.3, sensor_gain=gain)
         return loop.residual_rms_nm(air, noise_nm=noise, vibrations=lines)
 
     least = exact(found.gains)
@@ -82,17 +81,13 @@ def test_a_quiet_sensor_is_limited_by_stability():
     slow = lbt.models.ARModel(
         coefficients=[1.999, -0.99900025], driving_rms_nm=1.0, frame_rate_hz=RATE
     )
-    found = lbt.design.modal.modal_gains(
-        [slow, fast], noise_nm=[0.0, 0.5], frame_rate_hz=RATE, margin=0.5
-    )
+    found = modal_gains([slow, fast], noise_nm=[0.0, 0.5], frame_rate_hz=RATE, margin=0.5)
     assert found.limited.tolist() == [True, False]
     assert found.gains[0] == pytest.approx(0.5)
     assert np.allclose(found.limit, 0.5)
-    weak = lbt.design.modal.modal_gains(
-        [slow], noise_nm=0.0, frame_rate_hz=RATE, margin=0.5, sensor_gain=1.25
-    )
+    weak = modal_gains([slow], noise_nm=0.0, frame_rate_hz=RATE, margin=0.5, sensor_gain=1.25)
     assert weak.gains[0] == pytest.approx(0.4)
-    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators(found.gains))
+    loop = integrator_loop(found.gains)
     air = lbt.models.ModalTurbulence.of([slow, fast])
     assert np.allclose(found.rms_nm, loop.residual_rms_nm(air, noise_nm=[0.0, 0.5]), rtol=1e-6)
 
@@ -122,8 +117,8 @@ def test_sharp_peaks_of_arrays_are_those_of_models(damping):
     line = lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=200.0, direction=(1,))
     model = line.ar_model(RATE)
     known = {"noise_nm": 15.5, "frame_rate_hz": RATE}
-    single = lbt.design.modal.modal_gains([model], **known)
-    stacked = lbt.design.modal.modal_gains(lbt.models.ModalTurbulence.of([model]), **known)
+    single = modal_gains([model], **known)
+    stacked = modal_gains(lbt.models.ModalTurbulence.of([model]), **known)
     assert stacked.rms_nm[0] == pytest.approx(single.rms_nm[0], rel=1e-6)
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     truth = lbt.Truth(turbulence=model, noise_nm=15.5)
@@ -145,30 +140,23 @@ def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
     best = lbt.design.optimal_integrator(path, truth)
     loop = lbt.close_loop(path, best.controller, sensor_gain=0.8)
     known = {"delay_frames": delay, "sensor_gain": 0.8, "mirror": shell, "frame_rate_hz": RATE}
-    found = lbt.design.modal.modal_gains([slow], noise_nm=5.0, **known)
-    assert found.mirror is shell
+    found = modal_gains([slow], noise_nm=5.0, **known)
+    assert (found.hardware.mirror, found.hardware.delay_frames) == (shell, delay)
     assert found.gains[0] == pytest.approx(best.gain, rel=1e-5)
     assert found.rms_nm[0] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-6)
-    integrators = lbt.design.modal.MixedController.integrators(found.gains)
-    closed = lbt.design.modal.modal_loop(integrators, **known)
+    closed = integrator_loop(found.gains, **known)
     air = lbt.models.ModalTurbulence.of([slow])
     assert closed.residual_rms_nm(air, noise_nm=5.0)[0] == pytest.approx(found.rms_nm[0], rel=1e-6)
     limit = found.limit[0] / (1 - 0.001)
     for part, stable in ((0.999, True), (1.001, False)):
-        unit = lbt.design.modal.MixedController.integrators([part * limit])
-        assert (
-            lbt.design.modal.modal_loop(unit, **(known | {"sensor_gain": 1.0})).is_stable is stable
-        )
+        unit = integrator_loop([part * limit], **(known | {"sensor_gain": 1.0}))
+        assert unit.is_stable is stable
     # and from its telemetry
     rng = np.random.default_rng(6)
-    many = lbt.design.modal.modal_loop(
-        lbt.design.modal.MixedController.integrators(np.full(8, found.gains[0] / 2)), **known
-    )
+    many = integrator_loop(np.full(8, found.gains[0] / 2), **known)
     total = ar_series([0.99], 10.0, 8, 20_000, rng)
     run = many.run(total, 5.0 * rng.standard_normal(total.shape), all_series=True)
-    seen = lbt.design.modal.modal_gains_from_telemetry(
-        run.measurements.T, run.commands.T, noise_nm=5.0, **known
-    )
+    seen = modal_gains_from_telemetry(run.measurements.T, run.commands.T, noise_nm=5.0, **known)
     assert np.mean(seen.gains) == pytest.approx(found.gains[0], rel=0.05)
     assert np.mean(seen.rms_nm) == pytest.approx(found.rms_nm[0], rel=0.02)
 
@@ -226,11 +214,11 @@ def test_bad_input_is_refused(air):
         ),
     ):
         with pytest.raises(error, match=words):
-            lbt.design.modal.modal_gains(spectra, **(known | arguments))
+            modal_gains(spectra, **(known | arguments))
 
     nothing = lbt.models.TabulatedSpectrum(frequency_hz=[0, 1], density_nm2_hz=[0, 0])
     with pytest.raises(lbt.errors.ProblemError, match="got none in mode 0"):
-        lbt.design.modal.modal_gains([nothing], noise_nm=0, **known)
+        modal_gains([nothing], noise_nm=0, **known)
 
     series = np.zeros((3000, 2))
     for y, u, arguments, error, words in (
@@ -241,4 +229,4 @@ def test_bad_input_is_refused(air):
         (series, series, {}, lbt.errors.ProblemError, "got none in mode 0"),
     ):
         with pytest.raises(error, match=words):
-            lbt.design.modal.modal_gains_from_telemetry(y, u, **(known | arguments))
+            modal_gains_from_telemetry(y, u, **(known | arguments))

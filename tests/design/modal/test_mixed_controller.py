@@ -7,6 +7,7 @@ from support.interaction import interaction
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.design.modal import MixedController, reconstructor
 
 
 def written_out(filter_controller, gains, leak, filtered, slopes, inverse):
@@ -28,15 +29,15 @@ def written_out(filter_controller, gains, leak, filtered, slopes, inverse):
 def test_step_is_the_recursion_written_out():
     rng = np.random.default_rng(3)
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    inverse = lbt.design.modal.reconstructor(interaction(9, 5))
+    inverse = reconstructor(interaction(9, 5))
     gains, leak = rng.uniform(0, 1, 5), rng.uniform(0.9, 1, 5)
-    mixed = lbt.design.modal.MixedController(
+    mixed = MixedController(
         filter=kalman, gains=gains, filtered=(3, 1), leak=leak, reconstructor=inverse
     )
     slopes = 30 * rng.standard_normal((60, 9))
     expected = written_out(kalman.controller, gains, leak, (3, 1), slopes, inverse.matrix)
     for filters in (kalman, kalman.controller, kalman.controller.start()):
-        other = lbt.design.modal.MixedController(
+        other = MixedController(
             filter=filters, gains=gains, filtered=(3, 1), leak=leak, reconstructor=inverse
         )
         assert np.allclose([other.step(y) for y in slopes], expected, atol=1e-9)
@@ -49,7 +50,7 @@ def test_step_is_the_recursion_written_out():
 
 
 def test_commands_are_the_callers():
-    mixed = lbt.design.modal.MixedController.integrators([1.0, 1.0])
+    mixed = MixedController(gains=[1.0, 1.0])
     mixed.step([1.0, 2.0])[:] = 1e9
     assert mixed.step([0.0, 0.0]).tolist() == [1.0, 2.0]
 
@@ -60,8 +61,8 @@ def test_two_modes_in_the_loop_agree_with_the_exact_budget():
         turbulence=plant.turbulence[0], vibrations=plant.vibrations[:1], noise_nm=15.5
     )
     for mixed, gain in (
-        (lbt.design.modal.MixedController(filter=lbt.kalman(plant), gains=[0, 0]), None),
-        (lbt.design.modal.MixedController.integrators([0.4, 0.4]), 0.4),
+        (MixedController(filter=lbt.kalman(plant), gains=[0, 0]), None),
+        (MixedController(gains=[0.4, 0.4]), 0.4),
     ):
         controller = (
             lbt.kalman(plant).controller
@@ -82,12 +83,10 @@ def test_fifty_modes_in_the_loop_agree_with_the_linear_loop():
     n, q = 50, 90
     plant = lbt_axis_plant(modes=2)
     D = interaction(q, n)
-    inverse = lbt.design.modal.reconstructor(D)
+    inverse = reconstructor(D)
     hardware = lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=D)
     gains = np.linspace(0.2, 0.6, n)
-    mixed = lbt.design.modal.MixedController(
-        filter=lbt.kalman(plant), gains=gains, reconstructor=inverse
-    )
+    mixed = MixedController(filter=lbt.kalman(plant), gains=gains, reconstructor=inverse)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
     kept = {"frames": 200, "seed": 1, "settle_frames": 50}
     stepped = lbt.simulate(mixed, truth, hardware=hardware, **kept)
@@ -102,9 +101,9 @@ def test_modes_count_for_themselves_only():
     rng = np.random.default_rng(0)
     gains, order = rng.uniform(0, 1, 7), rng.permutation(7)
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    one = lbt.design.modal.MixedController(filter=kalman, gains=gains, filtered=(0, 1))
+    one = MixedController(filter=kalman, gains=gains, filtered=(0, 1))
     at = [int(np.flatnonzero(order == i)[0]) for i in (0, 1)]
-    other = lbt.design.modal.MixedController(filter=kalman, gains=gains[order], filtered=at)
+    other = MixedController(filter=kalman, gains=gains[order], filtered=at)
     for _ in range(20):
         y = rng.standard_normal(7)
         assert np.array_equal(one.step(y)[order], other.step(y[order]))
@@ -112,17 +111,14 @@ def test_modes_count_for_themselves_only():
 
 def test_a_step_of_672_modes_enters_as_many_functions_as_one_of_two():
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    few, many = (
-        lbt.design.modal.MixedController(filter=kalman, gains=np.full(modes, 0.4))
-        for modes in (2, 672)
-    )
+    few, many = (MixedController(filter=kalman, gains=np.full(modes, 0.4)) for modes in (2, 672))
     many.step(np.ones(672))  # what only the first step does
     assert count_calls(many.step, np.ones(672)) <= count_calls(few.step, np.ones(2)) < 100
 
 
 def test_bad_mixed_controllers_are_refused():
     kalman = lbt.kalman(lbt_axis_plant(modes=2))
-    inverse = lbt.design.modal.reconstructor(interaction(9, 5))
+    inverse = reconstructor(interaction(9, 5))
     gains = np.full(5, 0.4)
     cases = [
         ({"filter": kalman, "gains": 0.4}, lbt.errors.DimensionError, "gains must be a list"),
@@ -171,11 +167,11 @@ def test_bad_mixed_controllers_are_refused():
     ]
     for arguments, error, words in cases:
         with pytest.raises(error, match=words):
-            lbt.design.modal.MixedController(**arguments)
+            MixedController(**arguments)
 
 
 def test_bad_measurements_leave_the_state_alone():
-    mixed = lbt.design.modal.MixedController.integrators([1.0, 1.0])
+    mixed = MixedController(gains=[1.0, 1.0])
     mixed.step([1.0, 2.0])
     with pytest.raises(lbt.errors.DimensionError, match=r"y must have shape \(2,\)"):
         mixed.step([1.0])
@@ -192,7 +188,7 @@ def test_a_filter_without_matrices_is_stepped_but_not_linear():
         def reset(self):
             pass
 
-    mixed = lbt.design.modal.MixedController(filter=Echo(), gains=[0.5, 0.5, 0.5], filtered=(2,))
+    mixed = MixedController(filter=Echo(), gains=[0.5, 0.5, 0.5], filtered=(2,))
     assert mixed.step([1.0, 1.0, 3.0]).tolist() == [0.5, 0.5, -3.0]
     with pytest.raises(lbt.errors.ProblemError, match="only a filter with matrices"):
         mixed.as_controller()
@@ -219,7 +215,7 @@ def test_what_a_filter_returns_is_checked():
         (["a", "b"], lbt.errors.ProblemError, "commands must be an array of numbers"),
     ):
         own = Own(np.zeros(2))
-        control = lbt.design.modal.MixedController(filter=own, gains=[0.0, 0.0, 0.5])
+        control = MixedController(filter=own, gains=[0.0, 0.0, 0.5])
         assert control.step([1.0, 1.0, 1.0]).tolist() == [0.0, 0.0, 0.5]
         own.out = out
         with pytest.raises(error, match=words):
@@ -229,7 +225,7 @@ def test_what_a_filter_returns_is_checked():
 
 
 def test_measurements_that_are_no_numbers_are_refused():
-    control = lbt.design.modal.MixedController.integrators([0.5])
+    control = MixedController(gains=[0.5])
     for y, words in (("a", "array of numbers"), (["1.0"], "array of numbers"), ([1j], "real")):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             control.step(y)

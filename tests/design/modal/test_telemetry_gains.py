@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from support.modal import RATE, integrator_loop
 from support.series import ar_series
 
 import lbt_synth as lbt
-
-RATE = 800.0
+from lbt_synth.design.modal import modal_gains, modal_gains_from_telemetry
 
 
 def test_telemetry_finds_what_the_models_say():
@@ -23,37 +23,31 @@ def test_telemetry_finds_what_the_models_say():
     for k in range(frames):
         state = poles * state + white[:, k]
         total[:, k] = state
-    loop = lbt.design.modal.modal_loop(
-        lbt.design.modal.MixedController.integrators(np.full(n, 0.2)),
+    loop = integrator_loop(
+        np.full(n, 0.2),
         delay_frames=2.5,
         sensor_gain=gain,
     )
     run = loop.run(total, noise * rng.standard_normal((n, frames)), all_series=True)
     known = {"frame_rate_hz": RATE, "delay_frames": 2.5, "sensor_gain": gain}
-    exact = lbt.design.modal.modal_gains(air, noise_nm=noise, **known)
-    found = lbt.design.modal.modal_gains_from_telemetry(
-        run.measurements.T, run.commands.T, noise_nm=noise, **known
-    )
+    exact = modal_gains(air, noise_nm=noise, **known)
+    found = modal_gains_from_telemetry(run.measurements.T, run.commands.T, noise_nm=noise, **known)
 
     def cost(gains):
-        closed = lbt.design.modal.modal_loop(
-            lbt.design.modal.MixedController.integrators(gains), delay_frames=2.5, sensor_gain=gain
-        )
+        closed = integrator_loop(gains, delay_frames=2.5, sensor_gain=gain)
         return closed.residual_rms_nm(air, noise_nm=noise)
 
     # what is lost by gains from telemetry, in residual; less where the segments are longer,
     # which tell the modes that are best left alone from those that wander
     assert np.max(cost(found.gains) / exact.rms_nm - 1) < 0.02
-    longer = lbt.design.modal.modal_gains_from_telemetry(
+    longer = modal_gains_from_telemetry(
         run.measurements.T, run.commands.T, noise_nm=noise, segment_frames=4096, **known
     )
     assert np.max(cost(longer.gains) / exact.rms_nm - 1) < 0.01
     assert np.median(np.abs(found.gains / exact.gains - 1)) < 0.1
     # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high, and
     # nothing is lost by that
-    guessed = lbt.design.modal.modal_gains_from_telemetry(
-        run.measurements.T, run.commands.T, **known
-    )
+    guessed = modal_gains_from_telemetry(run.measurements.T, run.commands.T, **known)
     assert np.all(guessed.noise_nm > 0.97 * noise)
     assert np.max(cost(guessed.gains) / exact.rms_nm - 1) < 0.02
 
@@ -68,17 +62,15 @@ def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
     air = lbt.models.ModalTurbulence(
         coefficients=[[pole]], driving_rms_nm=[driving], frame_rate_hz=RATE
     )
-    exact = lbt.design.modal.modal_gains(air, noise_nm=noise, frame_rate_hz=RATE)
-    loop = lbt.design.modal.modal_loop(
-        lbt.design.modal.MixedController.integrators(np.full(modes, 0.1))
-    )
+    exact = modal_gains(air, noise_nm=noise, frame_rate_hz=RATE)
+    loop = integrator_loop(np.full(modes, 0.1))
     run = loop.run(
         ar_series([pole], driving, modes, frames, rng),
         noise * rng.standard_normal((modes, frames)),
         all_series=True,
     )
     series = run.measurements.T, run.commands.T
-    found = lbt.design.modal.modal_gains_from_telemetry(*series, frame_rate_hz=RATE, noise_nm=noise)
+    found = modal_gains_from_telemetry(*series, frame_rate_hz=RATE, noise_nm=noise)
     variances, truth = found.rms_nm**2, exact.rms_nm[0] ** 2
     error = max(np.std(variances) / np.sqrt(modes), 2e-3 * truth)
     assert abs(np.mean(variances) - truth) < 4 * error
@@ -87,7 +79,7 @@ def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
     # the scatter that the documentation states
     assert np.std(variances) < 4 * noise**2 * np.sqrt(2 / frames)
     # where the noise is put plays no part in the choice of the gain
-    guessed = lbt.design.modal.modal_gains_from_telemetry(*series, frame_rate_hz=RATE)
+    guessed = modal_gains_from_telemetry(*series, frame_rate_hz=RATE)
     assert np.quantile(np.abs(guessed.gains / found.gains - 1), 0.9) < 5e-3
 
 
@@ -98,13 +90,11 @@ def test_a_steep_spectrum_does_not_leak(segment_frames):
     air = lbt.models.ModalTurbulence(
         coefficients=[[0.9999]], driving_rms_nm=[1.0], frame_rate_hz=RATE
     )
-    exact = lbt.design.modal.modal_gains(air, noise_nm=2.0, frame_rate_hz=RATE)
+    exact = modal_gains(air, noise_nm=2.0, frame_rate_hz=RATE)
     total = ar_series([0.9999], 1.0, 6, 40_000, rng)
-    loop = lbt.design.modal.modal_loop(
-        lbt.design.modal.MixedController.integrators(np.full(6, 0.2))
-    )
+    loop = integrator_loop(np.full(6, 0.2))
     run = loop.run(total, 2.0 * rng.standard_normal(total.shape), all_series=True)
-    found = lbt.design.modal.modal_gains_from_telemetry(
+    found = modal_gains_from_telemetry(
         run.measurements.T,
         run.commands.T,
         frame_rate_hz=RATE,
@@ -119,8 +109,8 @@ def test_residuals_are_at_least_the_propagated_noise():
     """Pure noise, and more of it claimed than there is."""
     rng = np.random.default_rng(4)
     y = 5.0 * rng.standard_normal((5000, 3))
-    found = lbt.design.modal.modal_gains_from_telemetry(y, 0 * y, frame_rate_hz=RATE, noise_nm=6.0)
-    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators(found.gains))
+    found = modal_gains_from_telemetry(y, 0 * y, frame_rate_hz=RATE, noise_nm=6.0)
+    loop = integrator_loop(found.gains)
     nothing = lbt.models.ModalTurbulence(
         coefficients=np.zeros((3, 1)), driving_rms_nm=np.full(3, 1e-9), frame_rate_hz=RATE
     )
@@ -132,12 +122,10 @@ def test_noise_from_a_quiet_band():
     frames, noise = 40_000, np.array([[3.0], [30.0]])
     k = np.arange(frames)
     slow = 300 * np.sin(2 * np.pi * 0.5 * k / RATE) + 100 * np.sin(2 * np.pi * 3.1 * k / RATE)
-    loop = lbt.design.modal.modal_loop(lbt.design.modal.MixedController.integrators([0.3, 0.3]))
+    loop = integrator_loop([0.3, 0.3])
     run = loop.run(
         np.stack([slow, slow]), noise * rng.standard_normal((2, frames)), all_series=True
     )
-    found = lbt.design.modal.modal_gains_from_telemetry(
-        run.measurements.T, run.commands.T, frame_rate_hz=RATE
-    )
+    found = modal_gains_from_telemetry(run.measurements.T, run.commands.T, frame_rate_hz=RATE)
     assert np.allclose(found.noise_nm, noise[:, 0], rtol=0.02)
     assert found.gains[0] > found.gains[1]
