@@ -14,19 +14,19 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 5135,
-    "config": 2227,
-    "design": 8674,
-    "files": 1673,
-    "identification": 14998,
-    "interop": 5590,
-    "linear": 5971,
-    "loop": 4995,
-    "methods": 1477,
-    "models": 4241,
-    "report": 7098,
-    "storage": 1227,
-    "studies": 5243,
+    "cli": 5119,
+    "config": 2222,
+    "design": 8361,
+    "files": 1678,
+    "identification": 14999,
+    "interop": 5576,
+    "linear": 6001,
+    "loop": 5014,
+    "methods": 1109,
+    "models": 4465,
+    "report": 7083,
+    "storage": 1246,
+    "studies": 5259,
     "errors, validation": 638,
 }
 COUNTS = {

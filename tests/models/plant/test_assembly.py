@@ -148,11 +148,11 @@ def test_noise_of_a_reading_is_that_of_nothing_else():
     [
         (lambda: example_plant().with_sensors((SLOW,)), ProblemError, "suite must be a"),
         (
-            lambda: example_plant().with_sensors(SensorSuite(sensors=(FAST,)), ({},)),
+            lambda: example_plant().with_sensors(SensorSuite(sensors=(FAST,)), MOTIONS[:1]),
             DimensionError,
             "one mapping per vibration",
         ),
-        (lambda: replace(example_plant().parts(), motions=({},)), DimensionError, "one mapping"),
+        (lambda: replace(example_plant().parts(), motions=MOTIONS[:1]), DimensionError, "one mapping"),
         (
             lambda: example_plant().controller(np.zeros((1, 2, 3))),
             DimensionError,
