@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize.elementwise import find_root
 
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.loop.budget import resonance_edges
@@ -168,31 +168,34 @@ def _examine(
     """Return the broken loop of measurements with the same response."""
     own = responses[:, group[0]]
 
-    def at(frequency_hz: float) -> complex:
-        return complex(broken(np.array([frequency_hz]))[0, group[0]])
+    def at(frequency_hz: FloatArray) -> ComplexArray:
+        return broken(frequency_hz)[:, group[0]]
 
-    def crossings(value: Callable[[complex], float], level: FloatArray) -> list[MarginPoint]:
+    def crossings(
+        value: Callable[[ComplexArray], FloatArray], level: FloatArray
+    ) -> list[MarginPoint]:
         """Refine where a value of the response, (f,) on the grid, changes its sign."""
-        found = []
-        for i in np.flatnonzero(level[1:] * level[:-1] < 0):
-            ends = float(grid[i]), float(grid[i + 1])
-            sizes = [value(at(f)) for f in ends]
-            if sizes[0] * sizes[1] < 0:
-                f = brentq(lambda f: value(at(f)), *ends, xtol=1e-12)
-            else:  # only rounding had changed its sign
-                f = ends[int(abs(sizes[1]) < abs(sizes[0]))]
-            found.append(MarginPoint(frequency_hz=f, response=at(f)))
-        return found
+        (starts,) = np.nonzero(level[1:] * level[:-1] < 0)
+        if not starts.size:
+            return []
+        ends = grid[starts], grid[starts + 1]
+        root = find_root(lambda f: value(at(f)), ends, tolerances={"xatol": 1e-12, "xrtol": 0.0})
+        sizes = [np.abs(value(at(end))) for end in ends]
+        nearer = np.where(sizes[0] <= sizes[1], *ends)  # where only rounding had changed the sign
+        frequency_hz = np.where(root.success, root.x, nearer)
+        pairs = zip(frequency_hz.tolist(), at(frequency_hz).tolist(), strict=True)
+        return [MarginPoint(frequency_hz=f, response=response) for f, response in pairs]
 
     across = crossings(lambda response: response.imag, own.imag[:-1])
     for end in (0.0, float(grid[-1])):  # where a response is real
         with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is infinite
-            across.append(MarginPoint(frequency_hz=end, response=at(end).real))
+            response = complex(at(np.array([end]))[0]).real
+        across.append(MarginPoint(frequency_hz=end, response=response))
     return BrokenLoop(
         measurements=tuple(group),
         frequency_hz=grid,
         response=read_only(own.copy()),
-        gain_crossings=tuple(crossings(lambda response: abs(response) - 1, np.abs(own) - 1)),
+        gain_crossings=tuple(crossings(lambda response: np.abs(response) - 1, np.abs(own) - 1)),
         phase_crossings=tuple(
             sorted(
                 (point for point in across if 1 / _LARGEST < -point.response.real < _LARGEST),
