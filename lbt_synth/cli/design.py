@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -52,6 +53,8 @@ def run(arguments: Namespace) -> Report:
 
 
 _SMALL_MODULUS = 0.3
+_FRAGILE_FRAMES = 0.1  # of delay: what a camera's clock or a busy computer adds
+_FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
 
 
 def describe_design(design: Design, *, matrices: bool = False) -> Report:
@@ -110,6 +113,26 @@ def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
     return facts
 
 
+def _fragile_notes(margins: Mapping[str, float]) -> list[str]:
+    """Warn of a delay or a gain that is hardly off and makes the loop unstable."""
+    if not margins:
+        return []
+    notes = []
+    if margins["delay_frames"] < _FRAGILE_FRAMES:
+        microseconds = 1e6 * margins["delay_s"]
+        notes.append(
+            f"warning: {margins['delay_frames']:.2g} frames ({microseconds:.2g} us) more delay make "
+            "this loop unstable. Do not close it so: take another method, or robust with "
+            "delay_error_frames."
+        )
+    decibels = 20 * np.log10([margins["gain_high"], 1 / max(margins["gain_low"], 1e-300)])
+    if (least := float(np.min(decibels))) < _FRAGILE_DB:
+        notes.append(
+            f"warning: a sensor gain that is off by {least:.2g} dB makes this loop unstable."
+        )
+    return notes
+
+
 def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:
     notes = []
     alone = data["controller_spectral_radius"]
@@ -123,6 +146,7 @@ def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) ->
             f"note: the modulus margin {modulus:.3g} is small; a loop is usually asked for "
             f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
         )
+    notes += _fragile_notes(data.get("margins", {}))
     if not np.array_equal(hardware.sensor, np.eye(len(hardware.sensor))):
         notes.append(
             "note: sensor gains here are factors on the gain that the design assumes, which is in "

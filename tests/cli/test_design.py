@@ -185,3 +185,19 @@ def test_an_option_of_another_method_is_refused(tmp_path, capsys, method, option
     target = str(tmp_path / "p.fits")
     assert main(["design", CONFIG, "--method", method, option, value, "-o", target]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_a_fragile_design_does_not_pass_without_a_word(tmp_path, capsys):
+    """The LQG controller of least residual at half a frame is 6 us from instability."""
+    config, gain = tmp_path / "half.yaml", tmp_path / "g.fits"
+    config.write_text(LBT_YAML.read_text().replace("delay_frames: 2.0", "delay_frames: 2.5"))
+    design = ("design", config, "--method", "lqg", "--command-weight", "1e-4", "-o", gain)
+    status, out, _ = run(capsys, *design)
+    assert status == 0
+    assert "warning: 0.0047 frames (5.9 us) more delay make this loop unstable." in out
+    assert "off by" not in out
+    assert "5.9 us" in run(capsys, "show", gain)[1]
+    status, out, _ = run(capsys, "design", config, "--method", "kalman", "-o", gain)
+    assert "make this loop unstable" not in out
+    status, out, _ = run(capsys, "design", LBT_YAML, "--method", "integrator", "-o", gain)
+    assert "a sensor gain that is off by 0.78 dB makes this loop unstable" in out
