@@ -108,10 +108,12 @@ def matrix(
     return out
 
 
-def square(value: Any, name: str, *, stacked: bool = False) -> FloatArray:
-    """Return a finite square matrix with at least one row."""
+def square(
+    value: Any, name: str, *, stacked: bool = False, may_be_empty: bool = False
+) -> FloatArray:
+    """Return a finite square matrix, with at least one row unless it may be empty."""
     out = matrix(value, name, stacked=stacked)
-    if out.shape[-2] != out.shape[-1] or out.shape[-1] == 0:
+    if out.shape[-2] != out.shape[-1] or not (may_be_empty or out.shape[-1]):
         raise DimensionError(f"{name} must be square; got {out.shape}.")
     return out
 

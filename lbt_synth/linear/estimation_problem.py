@@ -94,6 +94,8 @@ class EstimationProblem(LinearSystem):
 
     def __post_init__(self) -> None:
         LinearSystem.__post_init__(self)
+        if not self.n_states:
+            raise DimensionError("a problem without states has nothing to estimate; got A (0, 0).")
         L = matrix(self.L, "L", cols=(self.n_states, f"to match A {self.A.shape}"))
         q = self.n_measurements
         given = np.full((1, q), True) if self.read is None else self.read

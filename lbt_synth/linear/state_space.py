@@ -63,7 +63,7 @@ class LinearSystem(Summarised):
     dt_s: float = 1.0
 
     def __post_init__(self) -> None:
-        A = square(self.A, "A", stacked=True)
+        A = square(self.A, "A", stacked=True, may_be_empty=True)
         n, why = A.shape[-1], f"to match A {A.shape}"
         B = matrix(self.B, "B", rows=(n, why), stacked=True)
         C = matrix(self.C, "C", cols=(n, why), stacked=True)
@@ -127,7 +127,7 @@ class LinearSystem(Summarised):
             inputs=self.D.shape[-1],
             outputs=self.D.shape[-2],
             frame_rate_hz=None if self.dt_s == 1 else 1 / self.dt_s,
-            spectral_radius=float(np.max(np.abs(np.linalg.eigvals(self.monodromy)))),
+            spectral_radius=float(np.max(np.abs(np.linalg.eigvals(self.monodromy)), initial=0.0)),
         )
         system, caption = self._shown_system()
         curve = sigma_sparkline(system.lifted(), caption)
@@ -216,6 +216,8 @@ class StateSpace(LinearSystem):
         """
         self.require_one_phase("balancing", "lifted().balanced()")
         n = self.n_states
+        if n == 0:
+            return self
         scale = max(float(np.abs(self.A).max()), 1e-300)
         entry, leaving = np.linalg.norm(self.B, axis=1), np.linalg.norm(self.C, axis=0)
         scaling = balancing_scales(self.A, _rescale(entry, scale), _rescale(leaving, scale))
@@ -237,7 +239,7 @@ class StateSpace(LinearSystem):
     @property
     def spectral_radius(self) -> float:
         """Largest modulus of the poles: over a period, not over a sample."""
-        return float(np.max(np.abs(self.poles)))
+        return float(np.max(np.abs(self.poles), initial=0.0))
 
     @property
     def radius_per_frame(self) -> float:
@@ -396,6 +398,8 @@ def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     U is unitary, so nothing is lost when A is defective, as with every delay. The smaller of inputs
     and outputs is carried through. The system should be balanced; at a pole nothing is finite.
     """
+    if not system.n_states:
+        return np.broadcast_to(system.D.astype(np.complex128), (z.size, *system.D.shape))
     if len(system.C) > system.B.shape[1]:
         dual = StateSpace(A=system.A.T, B=system.C.T, C=system.B.T, D=system.D.T)
         return np.swapaxes(schur_response(dual, z), 1, 2)

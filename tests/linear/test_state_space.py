@@ -249,3 +249,26 @@ def test_sizes_that_clash(changes, words):
     one = {name: [[1.0]] for name in "ABCD"}
     with pytest.raises(lbt.errors.DimensionError, match=words):
         lbt.linear.StateSpace(**(one | changes))
+
+
+def test_a_system_without_states_is_a_system():
+    """A static gain of python-control: it has a response, a norm and a loop of its own."""
+    for static in (control.ss([], [], [], [[3.0, 4.0]], 0.1), control.tf([5.0], [1], 0.1)):
+        gain = lbt.linear.StateSpace.of(static)
+        assert gain.n_states == 0
+        assert gain.spectral_radius == 0
+        assert np.array_equal(gain.frequency_response([0.0, 1.0]), np.stack([gain.D] * 2))
+        assert lbt.linear.hinf_norm(gain).value == pytest.approx(5, rel=1e-9)
+        assert gain.output_covariances()[0, 0, 0] == 25
+        assert "0 states" in repr(gain)
+        assert "largest singular value" in str(gain)
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    empty = np.zeros((0, 0))
+    held = lbt.Controller(A=empty, B=np.zeros((0, 1)), C=np.zeros((1, 0)), D=0.3, dt_s=1 / 800)
+    loop = lbt.close_loop(path, held)
+    assert loop.is_stable
+    assert lbt.loop_margins(loop).modulus == pytest.approx(0.7, rel=1e-6)
+    with pytest.raises(lbt.errors.DimensionError, match="without states has nothing to estimate"):
+        lbt.linear.EstimationProblem(
+            A=empty, B=np.zeros((0, 1)), C=np.zeros((1, 0)), D=1.0, L=np.zeros((1, 0))
+        )
