@@ -11,6 +11,9 @@ import numpy as np
 from lbt_synth.errors import NumericalError
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy
 
+_NARROWEST = 1e-10  # pole width that panels are still refined to, as a fraction of Nyquist
+_PANEL = 2.0  # length of a panel over its distance from a pole, or over the pole's width
+
 
 def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
     """Nodes and weights (panels * order,) of a Gauss-Legendre rule on consecutive panels."""
@@ -151,6 +154,32 @@ def panel_edges(poles: ComplexArray, frame_rate_hz: float) -> FloatArray:
     """Panels of (0, Nyquist) [Hz]: geometric, and more of them around each pole."""
     edges = [np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(poles)]
     return frozen_copy(distinct_edges(np.concatenate(edges)) * (frame_rate_hz / 2))
+
+
+def graded_edges(poles: ComplexArray) -> FloatArray:
+    """Panels of (0, 1), as fractions of Nyquist, that are short where a pole is near.
+
+    A panel is halved while it is longer than twice its distance from a pole, or than twice
+    the width of a pole that it holds. Poles that differ by less than a quarter of their width count
+    once.
+    """
+    upper = poles[poles.imag >= 0]
+    centre = np.abs(np.angle(upper)) / np.pi
+    width = np.maximum(1 - np.abs(upper), np.pi * _NARROWEST) / np.pi
+    size = np.exp2(np.floor(np.log2(width)))
+    distinct = np.unique(size + 1j * np.floor(4 * centre / size), return_index=True)[1]
+    centre, width = centre[distinct], width[distinct]
+    grid = np.concatenate([[0.0], np.geomspace(1e-6, 1, 24)])
+    low, high = grid[:-1], grid[1:]
+    done = [np.ones(1)]
+    while low.size:
+        outside = np.maximum(low[:, None] - centre, centre - high[:, None])
+        nearest = np.min(np.maximum(outside, width), axis=1, initial=1.0)
+        long = high - low > _PANEL * nearest
+        done.append(low[~long])
+        middle = (low[long] + high[long]) / 2
+        low, high = np.concatenate([low[long], middle]), np.concatenate([middle, high[long]])
+    return np.sort(np.concatenate(done))
 
 
 def pole_edges(poles: ComplexArray) -> FloatArray:

@@ -37,6 +37,8 @@ from lbt_synth.validation import (
     square,
 )
 
+_PROBES = 5  # points at which partial fractions are checked by solving linear systems
+_AGREEMENT = 1e-9
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
 _PHASE_CHUNK = 2_000_000  # and that of all phases
 
@@ -417,6 +419,36 @@ def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
                 left[i] = (sums / (part - T[i, i])).ravel()
             solved = left.reshape(n, p, part.size).transpose(2, 1, 0)
             out[start : start + step] = solved @ B + system.D
+    return out
+
+
+def stacked_response(matrices: tuple[FloatArray, ...], z: ComplexArray) -> ComplexArray:
+    """Transfer matrices (f, k, m, q) at points z of k balanced systems ``A, B, C, D``.
+
+    Several have partial fractions. Where those of one, whose eigenvectors are nearly dependent,
+    fail at some probes, its points are solved one by one.
+    """
+    A, B, C, D = matrices
+    if len(A) == 1 and A.size:
+        return schur_response(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0]), z)[:, None]
+    planes = np.zeros((*D.shape[1:], z.size, len(A)), dtype=np.complex128)
+    planes += np.moveaxis(D, 0, -1)[:, :, None]
+    out = np.moveaxis(planes, (0, 1), (2, 3))
+    if not A.size:
+        return out
+    poles, vectors = np.linalg.eig(A)
+    with np.errstate(all="ignore"):  # what is not finite fails the probes
+        entries = solve_stack(vectors.astype(np.complex128), B.astype(np.complex128))
+        residues = np.einsum("kms,ksq->smqk", C @ vectors, entries)
+        for pole, residue in zip(poles.T, residues, strict=True):
+            planes += residue[:, :, None] * (1 / (z[:, None] - pole))
+    probes = np.linspace(0, z.size - 1, _PROBES).astype(np.int64)
+    pencils = z[probes, None, None, None] * np.eye(A.shape[1]) - A
+    direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
+    apart = np.max(np.abs(out[probes] - direct), axis=(0, 2, 3))
+    agree = apart <= _AGREEMENT * np.max(np.abs(direct), axis=(0, 2, 3))
+    for k in np.flatnonzero(~agree):
+        out[:, k] = pointwise_response(StateSpace(A=A[k], B=B[k], C=C[k], D=D[k]), z)
     return out
 
 

@@ -14,7 +14,7 @@ from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
 from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
-from lbt_synth.loop.ensemble.closed_loops import ClosedLoops
+from lbt_synth.loop.ensemble.closed_loops import close_loops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, fact_table, table_row
@@ -298,7 +298,8 @@ def _delay_margin_frames(loop: ClosedLoop) -> float:
         further = np.unique(np.concatenate([np.linspace(low, high, _DIVISION + 1), peaks]))
         gains = np.full(further.size - 1, loop.sensor_gain)
         delays = hardware.delay_frames + further[1:]
-        unstable = np.flatnonzero(~ClosedLoops.of(matrices, hardware, gains, delays).stable)
+        stable, _ = close_loops(matrices, hardware, gains, delays)
+        unstable = np.flatnonzero(~stable)
         return None if unstable.size == 0 else tuple(further[unstable[0] : unstable[0] + 2])
 
     low, high, longest = 0.0, 1.0, _LONGEST - hardware.delay_frames

@@ -9,6 +9,7 @@ from lbt_synth.linear.quadrature import (
     compress_rule,
     distinct_edges,
     gauss_panels,
+    graded_edges,
     pole_edges,
     refine_panels,
 )
@@ -62,3 +63,21 @@ def test_a_peak_upon_much_that_is_flat(distance):
     edges = np.concatenate([[0.0], np.geomspace(1e-6, 1, 40), pole_edges(poles)])
     found = adaptive_integral(density, distinct_edges(edges))
     assert found[0, 0] == pytest.approx(1002, rel=3e-7)
+
+
+def test_panels_reach_the_narrowest_poles():
+    pole = (1 - 1e-8) * np.exp(0.3j)
+    edges = graded_edges(np.array([pole, pole.conj()]))
+    inside = np.searchsorted(edges, 0.3 / np.pi)
+    assert edges[inside] - edges[inside - 1] <= 2.1e-8 / np.pi
+
+
+def test_panels_are_short_where_a_pole_is_near():
+    poles = np.array([0.999 * np.exp(0.3j), 0.999 * np.exp(-0.3j), 1 - 1e-5, 0.2])
+    edges = graded_edges(poles)
+    assert edges[0] == 0
+    assert edges[-1] == 1
+    assert np.all(np.diff(edges) > 0)
+    inside = np.searchsorted(edges, 0.3 / np.pi)
+    assert edges[inside] - edges[inside - 1] <= 2 * 0.001 / np.pi
+    assert edges.size < 100

@@ -1,8 +1,7 @@
-"""Closed loops at many sensor gains and delays, by independent subloop such as tip and tilt.
+"""Stacks of closed loops at many sensor gains and delays, by independent part such as tip or tilt.
 
-They are arrays of state matrices. Between two whole delays a settled mirror shows the commands of
-two frames within an exposure, so that every matrix of the loop is affine in the fraction, as it is
-in the sensor gain.
+Between two whole delays a settled mirror shows the commands of two frames within an exposure, so
+that every matrix of the loop is affine in the fraction, as it is in the sensor gain.
 """
 
 from __future__ import annotations
@@ -13,75 +12,114 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from lbt_synth.linear import StateSpace
-from lbt_synth.linear.state_space import schur_response
+from lbt_synth.linear.state_space import stacked_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response, mirror_system, tapped_mirror
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
-_SAME = 1e-11  # relative difference up to which two subloops are the same
-_SHARED, _OWN = 1024, 256  # loops that share frequencies, and a controller or not
-_PER_LOOP = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Subloop:
-    """Some modes of a loop, and all that depends on them.
+class LoopPart:
+    """Some modes of a loop, and all that depends on them; c of them that are equal are one part.
 
     The controllers ``A, B, C, D`` are in textbook form, (N, ., .) each: one for all loops, or one
     per loop.
     """
 
-    modes: IntArray  # indices in the whole loop
-    measurements: IntArray
+    modes: IntArray  # indices in the whole loop, (c, n)
+    measurements: IntArray  # (c, q)
     matrices: tuple[FloatArray, ...]  # of the controllers
     sensor: FloatArray  # (q, n)
     influence: FloatArray  # (n, m)
 
-    @property
-    def is_shared(self) -> bool:
-        """Whether one controller serves all loops."""
-        return len(self.matrices[0]) == 1
-
-    @property
-    def is_scalar(self) -> bool:
-        """Whether it has one mode, one measurement and one command."""
-        return self.sensor.shape == self.influence.shape == (1, 1)
-
-    def unit_loop(
-        self,
-        controller: ComplexArray,
-        first: ComplexArray,
-        second: ComplexArray,
-        delay: ComplexArray,
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Return the scalar loop at unit gain, as one part and what the fraction multiplies.
-
-        Controller, mirrors and delay are responses at the same frequencies.
-        """
-        unit = self.influence[0, 0] * self.sensor[0, 0] * controller * delay
-        return unit * first, unit * (second - first)
-
     def controllers(self, rows: IntArray) -> tuple[FloatArray, ...]:
         """Return the controllers ``A, B, C, D`` of some loops, or the one that serves all."""
-        return self.matrices if self.is_shared else tuple(each[rows] for each in self.matrices)
-
-    def equals(self, other: Subloop) -> bool:
-        """Whether another subloop behaves the same, to rounding."""
-        own, others = ((*x.matrices, x.sensor, x.influence) for x in (self, other))
-        return all(
-            one.shape == two.shape
-            and np.allclose(one, two, rtol=0, atol=_SAME * np.max(np.abs(one), initial=0.0))
-            for one, two in zip(own, others, strict=True)
-        )
+        one = len(self.matrices[0]) == 1
+        return self.matrices if one else tuple(matrix[rows] for matrix in self.matrices)
 
 
-def split_into_subloops(
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopStack:
+    """k loops of one part, from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``.
+
+    Their mirrors are ``(1 - fraction) first + fraction second``.
+    """
+
+    part: LoopPart
+    mirrors: tuple[Response, Response]  # first and second, with the same states
+    rows: IntArray  # which loops, (k,)
+    fraction: FloatArray  # (k,)
+    sensor_gains: FloatArray  # (k,)
+    A: FloatArray  # (k, s, s)
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    poles: ComplexArray  # (k, s)
+
+    def take(self, which: IntArray) -> LoopStack:
+        """Return some of the loops."""
+        names = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
+        return replace(self, **{name: getattr(self, name)[which] for name in names})
+
+    def responses(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+        """Rejection (n, n, f, k) at f points and negative response to noise (n, q, f, k).
+
+        Both lack a common denominator; the inverse of its square (f, k) is returned, too.
+        """
+        part = self.part
+        controller = np.moveaxis(stacked_response(part.controllers(self.rows), z), (2, 3), (0, 1))
+        unit = np.einsum("nm,mq...->nq...", part.influence, controller)
+        first, second = (unit * _mirror_response(one, z)[:, None] for one in self.mirrors)
+        path, turn = first + self.fraction * (second - first), self.sensor_gains / z[:, None]
+        sensor, modes = part.sensor[..., None, None], range(len(part.influence))
+        loop = np.eye(len(modes), dtype=np.complex128)[:, :, None, None]
+        for j in range(path.shape[1]):
+            loop = loop + path[:, j, None] * (sensor[j] * turn)
+        rejection, denominator = _inverses(loop)
+        if len(modes) > 1:
+            path = np.asarray(sum(rejection[:, j, None] * path[j] for j in modes))
+        scale = 1 / (denominator.real**2 + denominator.imag**2)
+        return rejection, path, scale
+
+    def rejections(self, turn: FloatArray) -> ComplexArray:
+        """Rejection (k, n, n) of each loop at its own frequency [radians per frame]."""
+        n = self.C.shape[1]
+        pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
+        states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
+        return np.asarray(self.C @ states + self.D[..., :n])
+
+
+def close_loops(
+    matrices: tuple[FloatArray, ...],
+    hardware: LoopHardware,
+    sensor_gains: FloatArray,
+    delay_frames: FloatArray,
+) -> tuple[BoolArray, list[list[LoopStack]]]:
+    """Close the loops of controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each.
+
+    Return which of the p loops are stable, and by whole delay the stacks of all parts.
+    """
+    stable = np.ones(sensor_gains.size, dtype=np.bool_)
+    parts, rest = split_into_parts(matrices, hardware)
+    for A in rest:
+        stable &= _are_stable(np.linalg.eigvals(A).astype(np.complex128))
+    groups = []
+    for rows, fraction, mirrors in _mirrors_by_delay(hardware, delay_frames):
+        gains = sensor_gains[rows]
+        stacks = [_close_part(part, rows, fraction, gains, mirrors) for part in parts]
+        for stack in stacks:
+            stable[rows] &= _are_stable(stack.poles)
+        groups.append(stacks)
+    return stable, groups
+
+
+def split_into_parts(
     matrices: tuple[FloatArray, ...], hardware: LoopHardware
-) -> tuple[list[Subloop], list[FloatArray]]:
-    """Split a loop into independent subloops, and the state matrices that reach no mode."""
+) -> tuple[list[LoopPart], list[FloatArray]]:
+    """Split a loop into independent parts, equal ones once, and what reaches no mode."""
     A, B, C, D = matrices
     sensor, influence = hardware.sensor, hardware.influence
     s, q, m, n = A.shape[-1], B.shape[-1], C.shape[-2], hardware.modes
@@ -90,21 +128,23 @@ def split_into_subloops(
     controller = (x, x, A), (x, y, B), (u, x, C), (u, y, D)
     for rows, columns, entries in (*controller, (y, r, sensor[None]), (r, u, influence[None])):
         links[np.ix_(rows, columns)] = _nonzero_entries(entries)
-    _, label = connected_components(links)
-    subloops, rest = [], []
-    for each in np.unique(label):
-        own = label == each
-        states, modes = np.flatnonzero(own[x]), np.flatnonzero(own[r])
-        inputs, commands = np.flatnonzero(own[y]), np.flatnonzero(own[u])
+    count, label = connected_components(links)
+    parts: dict[tuple[bytes, ...], LoopPart] = {}
+    rest = []
+    for i in range(count):
+        states, inputs, commands, modes = (np.flatnonzero(label[k] == i) for k in (x, y, u, r))
         entry, leaving = states[:, None], commands[:, None]
-        if modes.size == 0:
-            rest.append(A[:, entry, states])
-            continue
-        dynamics = A[:, entry, states], B[:, entry, inputs]
-        output = C[:, leaving, states], D[:, leaving, inputs]
-        measure, act = sensor[np.ix_(inputs, modes)], influence[np.ix_(modes, commands)]
-        subloops.append(Subloop(modes, inputs, (*dynamics, *output), measure, act))
-    return subloops, rest
+        own = A[:, entry, states], B[:, entry, inputs], C[:, leaving, states], D[:, leaving, inputs]
+        path = sensor[np.ix_(inputs, modes)], influence[np.ix_(modes, commands)]
+        key = tuple(matrix.tobytes() for matrix in (*own, *path))
+        if modes.size and key in parts:
+            modes = np.vstack([parts[key].modes, modes])
+            inputs = np.vstack([parts[key].measurements, inputs])
+        if modes.size:
+            parts[key] = LoopPart(np.atleast_2d(modes), np.atleast_2d(inputs), own, *path)
+        elif states.size:
+            rest.append(own[0])
+    return list(parts.values()), rest
 
 
 def _nonzero_entries(entries: FloatArray) -> BoolArray:
@@ -114,148 +154,31 @@ def _nonzero_entries(entries: FloatArray) -> BoolArray:
     return np.asarray(np.any(sizes > _ROUNDING * largest, axis=0))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopPoints:
-    """Where k loops of one subloop differ.
-
-    Their mirrors are ``(1 - fraction) first + fraction second``.
-    """
-
-    subloop: Subloop
-    first: Response  # the two mirrors have the same states
-    second: Response
-    rows: IntArray  # which loops, (k,)
-    fraction: FloatArray  # (k,)
-    sensor_gains: FloatArray  # (k,)
-    poles: ComplexArray  # (k, s)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopGroup(LoopPoints):
-    """k loops of one subloop, from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``."""
-
-    A: FloatArray  # (k, s, s)
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-    def take(self, which: IntArray) -> LoopGroup:
-        """Return some of the loops."""
-        return replace(self, **{name: getattr(self, name)[which] for name in _PER_LOOP})
-
-    def batches(self, stable: BoolArray) -> Iterator[LoopPoints]:
-        """Yield batches of the stable loops, sorted by their distance from instability."""
-        found = np.flatnonzero(stable[self.rows])
-        order = found[np.argsort(_radius(self.poles[found]), kind="stable")]
-        most = _SHARED if self.subloop.is_shared else _OWN
-        for start in range(0, order.size, most):
-            which = order[start : start + most]
-            yield LoopPoints(
-                subloop=self.subloop,
-                first=self.first,
-                second=self.second,
-                rows=self.rows[which],
-                fraction=self.fraction[which],
-                sensor_gains=self.sensor_gains[which],
-                poles=self.poles[which],
-            )
-
-    def rejections(self, turn: FloatArray) -> ComplexArray:
-        """Rejection (k, n, n) of each loop at its own frequency [radians per frame]."""
-        z, subloop = np.exp(1j * turn), self.subloop
-        if subloop.is_shared and subloop.is_scalar:
-            A, B, C, D = (part[0] for part in subloop.matrices)
-            controller = system_response(A, B, C, D, z)[:, 0, 0]
-            one, other = (mirror_response(end, z) for end in (self.first, self.second))
-            with np.errstate(all="ignore"):  # at a pole of the controller, nothing is left
-                first, second = subloop.unit_loop(controller, one, other, 1 / z)
-                loop = self.sensor_gains * (first + self.fraction * second)
-                return np.where(np.isfinite(loop), 1 / (1 + loop), 0)[:, None, None]
-        n = self.C.shape[1]
-        pencil = z[:, None, None] * np.eye(self.A.shape[1]) - self.A
-        states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
-        return np.asarray(self.C @ states + self.D[..., :n])
-
-
-def system_response(
-    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, z: ComplexArray
-) -> ComplexArray:
-    """Transfer matrices (f, m, q) of one system, which may have no state."""
-    if len(A) == 0:
-        return np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
-    return schur_response(StateSpace(A=A, B=B, C=C, D=D).balanced(), z)
-
-
-def mirror_response(mirror: Response, z: ComplexArray) -> ComplexArray:
-    """Response of a mirror, (f,)."""
-    if mirror.is_tapped:
-        return np.asarray(np.polyval([*mirror.C[::-1], mirror.D], 1 / z))
-    direct = np.array([[mirror.D]])
-    return system_response(mirror.A, mirror.B[:, None], mirror.C[None], direct, z)[:, 0, 0]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ClosedLoops:
-    """Loops with the same sensor and mirror, at p sensor gains and delays."""
-
-    hardware: LoopHardware
-    stable: BoolArray  # (p,)
-    subloops: list[list[LoopGroup]]  # the groups of each subloop, with the same rows in all
-
-    @classmethod
-    def of(
-        cls,
-        matrices: tuple[FloatArray, ...],
-        hardware: LoopHardware,
-        sensor_gains: FloatArray,
-        delay_frames: FloatArray,
-    ) -> ClosedLoops:
-        """Close the loops of controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
-        stable = np.ones(sensor_gains.size, dtype=np.bool_)
-        subloops, rest = split_into_subloops(matrices, hardware)
-        for A in rest:
-            if A.shape[-1]:
-                stable &= _radius(np.linalg.eigvals(A).astype(np.complex128)) < 1 - STABILITY_MARGIN
-        closed: list[list[LoopGroup]] = []
-        for subloop in subloops:  # equal ones are closed only once
-            known = next((groups for groups in closed if groups[0].subloop.equals(subloop)), None)
-            if known is None:
-                groups = list(_close_subloop(subloop, hardware, sensor_gains, delay_frames))
-                for group in groups:
-                    stable[group.rows] &= _radius(group.poles) < 1 - STABILITY_MARGIN
-            else:
-                groups = [replace(group, subloop=subloop) for group in known]
-            closed.append(groups)
-        return cls(hardware=hardware, stable=stable, subloops=closed)
-
-
-def _close_subloop(
-    subloop: Subloop, hardware: LoopHardware, sensor_gains: FloatArray, delay_frames: FloatArray
-) -> Iterator[LoopGroup]:
-    """Close a subloop at all sensor gains and delays, by whole delay."""
-    for rows, fraction, mirrors in _mirrors_by_delay(hardware, delay_frames):
-        parts = {"sensor": subloop.sensor, "influence": subloop.influence}
-        ends = [loop_matrices(*subloop.controllers(rows), mirror=m, **parts) for m in mirrors]
-        share, gain = fraction[:, None, None], sensor_gains[rows][:, None, None]
-        A0, A1, B, C0, C1, D = (
-            one if not fraction.any() or np.array_equal(one, two) else one + share * (two - one)
-            for one, two in zip(*ends, strict=True)
-        )
-        n, A = subloop.modes.size, A0 + gain * A1
-        B, D = (np.broadcast_to(m, (rows.size, *m.shape[1:])) for m in (B, D[:, :n]))
-        yield LoopGroup(
-            subloop=subloop,
-            first=mirrors[0],
-            second=mirrors[1],
-            rows=rows,
-            fraction=fraction,
-            sensor_gains=sensor_gains[rows],
-            A=A,
-            B=B,
-            C=(C0 + gain * C1)[:, :n],
-            D=D,
-            poles=np.linalg.eigvals(A).astype(np.complex128),
-        )
+def _close_part(
+    part: LoopPart,
+    rows: IntArray,
+    fraction: FloatArray,
+    gains: FloatArray,
+    mirrors: tuple[Response, Response],
+) -> LoopStack:
+    """Close the loops of a part at one whole delay."""
+    path = {"sensor": part.sensor, "influence": part.influence}
+    ends = [loop_matrices(*part.controllers(rows), mirror=mirror, **path) for mirror in mirrors]
+    share, gain, n = fraction[:, None, None], gains[:, None, None], len(part.influence)
+    A0, A1, B, C0, C1, D = (one + share * (two - one) for one, two in zip(*ends, strict=True))
+    A = A0 + gain * A1
+    return LoopStack(
+        part=part,
+        mirrors=mirrors,
+        rows=rows,
+        fraction=fraction,
+        sensor_gains=gains,
+        A=A,
+        B=B,
+        C=(C0 + gain * C1)[:, :n],
+        D=D[:, :n],
+        poles=np.linalg.eigvals(A).astype(np.complex128),
+    )
 
 
 def _mirrors_by_delay(
@@ -277,5 +200,24 @@ def _mirrors_by_delay(
         yield rows, fraction[rows], (tapped_mirror(taps[0]), tapped_mirror(taps[1]))
 
 
-def _radius(poles: ComplexArray) -> FloatArray:
-    return np.asarray(np.max(np.abs(poles), axis=-1))
+def _are_stable(poles: ComplexArray) -> BoolArray:
+    return np.asarray(np.max(np.abs(poles), axis=-1) < 1 - STABILITY_MARGIN)
+
+
+def _mirror_response(mirror: Response, z: ComplexArray) -> ComplexArray:
+    """Response of a mirror, (f,)."""
+    if mirror.is_tapped:
+        return np.asarray(np.polyval([*mirror.C[::-1], mirror.D], 1 / z))
+    parts = (mirror.A, mirror.B[:, None], mirror.C[None], np.array([[mirror.D]]))
+    return stacked_response(tuple(part[None] for part in parts), z)[:, 0, 0, 0]
+
+
+def _inverses(planes: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Inverses of many matrices (n, n, ...), as numerators and a denominator (...)."""
+    if len(planes) == 1:
+        return np.ones((1, 1, 1, 1), dtype=np.complex128), planes[0, 0]
+    if len(planes) > 2:
+        inverse = np.asarray(np.linalg.inv(np.moveaxis(planes, (0, 1), (-2, -1))), planes.dtype)
+        return np.moveaxis(inverse, (-2, -1), (0, 1)), np.ones_like(planes[0, 0])
+    (a, b), (c, d) = planes
+    return np.array([[d, -b], [-c, a]]), np.asarray(a * d - b * c)

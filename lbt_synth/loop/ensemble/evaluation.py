@@ -6,7 +6,7 @@ sinusoids through the loops' responses.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -18,7 +18,7 @@ from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.linear.lyapunov import stationary_covariances, stationary_root
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
-from lbt_synth.loop.ensemble.closed_loops import ClosedLoops, LoopGroup, LoopPoints
+from lbt_synth.loop.ensemble.closed_loops import LoopStack, close_loops
 from lbt_synth.loop.ensemble.loop_ensemble import (
     EnsembleVibration,
     LoopEnsemble,
@@ -41,6 +41,7 @@ from lbt_synth.validation import (
 Process: TypeAlias = ARModel | ModalTurbulence
 
 _AT_ONCE = 1024  # loops with vibrations
+_TOGETHER = 256  # loops with the same frequencies; more do not fit the processor's cache
 _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 _ROUNDING = 1e-8  # of the terms of a variance, the least part that it is computed from
 
@@ -80,12 +81,9 @@ class EnsembleResiduals:
     def strehl(self, imaging: Imaging) -> FloatArray:
         """Strehl ratio of each loop."""
         gaussian = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
-        lines = self.line_amplitudes_nm
-        out = np.full(self.stable.shape, np.nan)
-        found = np.flatnonzero(self.stable)
-        out[found] = 0.0
-        spread = jitter_spread_nm(gaussian[found], lines[found])
-        near = found[spread <= widest_jitter_nm(imaging)]
+        lines, out = self.line_amplitudes_nm, np.where(self.stable, 0.0, np.nan)
+        spread = jitter_spread_nm(gaussian[self.stable], lines[self.stable])
+        near = np.flatnonzero(self.stable)[spread <= widest_jitter_nm(imaging)]
         out[near] = jitter_strehls(gaussian[near], imaging=imaging, line_amplitudes_nm=lines[near])
         return out
 
@@ -104,9 +102,8 @@ def ensemble_residuals(
     """Evaluate a controller exactly in many loops, or many controllers in one loop each.
 
     The answers are those of :func:`residual_budget`, loop by loop: stability by eigenvalues,
-    spectra and noise by quadrature refined around the closed loops' poles, auto-regressive
-    processes by Lyapunov equations, sinusoids by the closed loops' response. Independent tip and
-    tilt are evaluated separately, and only once if they are equal.
+    spectra and noise by adaptive quadrature, auto-regressive processes by Lyapunov equations,
+    sinusoids by the closed loops' response. Independent tip and tilt are evaluated separately.
 
     Parameters
     ----------
@@ -167,18 +164,38 @@ def residuals_from_matrices(
 ) -> EnsembleResiduals:
     """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
     turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
+    for spectrum, _ in turbulence:
+        if isinstance(spectrum, Process):
+            require_loop_rate(spectrum.frame_rate_hz, hardware)
     # loops that differ only in their vibrations are closed once
     points, which = ensemble.distinct(hardware, apart=len(matrices[0]) > 1)
     gains, delays = ensemble.gains()[points], ensemble.delays(hardware)[points]
-    loops = ClosedLoops.of(matrices, hardware, gains, delays)
+    stable, groups = close_loops(matrices, hardware, gains, delays)
     distinct = [(turbulence_rows(spectrum, points), modes) for spectrum, modes in turbulence]
-    noise_nm = ensemble.noise(hardware)[points]
-    turbulence_nm2, noise_nm2 = turbulence_and_noise_nm2(loops, distinct, noise_nm)
-    random_nm2, amplitudes = vibration_residuals(loops, which, lines)
+    noise_nm, n = ensemble.noise(hardware)[points], hardware.modes
+    left = np.where(stable[:, None, None, None], 0.0, np.full((2, n, n), np.nan))
+    resonances = [line for line in lines if line.damping is not None]
+    sinusoids = [line for line in lines if line.damping is None]
+    here = stable[which]
+    random_nm2 = np.where(here[:, None, None], 0.0, np.full((n, n), np.nan))
+    amplitudes = np.where(here[:, None, None], 0j, np.full((len(sinusoids), n), np.nan))
+    for stacks in groups:
+        place = np.full(stable.size, -1)
+        place[stacks[0].rows] = np.arange(stacks[0].rows.size)
+        for rows in _batches(np.flatnonzero(stable & (place >= 0)), stacks, place):
+            chosen = [stack.take(place[rows]) for stack in stacks]
+            left[rows] += _turbulence_and_noise_nm2(chosen, distinct, noise_nm, hardware)
+        met = np.flatnonzero(here & (place[which] >= 0))
+        for rows in _split(met, _AT_ONCE):
+            chosen = [stack.take(place[which[rows]]) for stack in stacks]
+            for line in resonances:
+                random_nm2[rows] += _resonance_nm2(chosen, line, rows, hardware)
+            for i, line in enumerate(sinusoids):
+                amplitudes[rows, i] = _sinusoid_nm(chosen, line, rows, hardware)
     return EnsembleResiduals(
-        stable=read_only(loops.stable[which]),
-        turbulence_nm2=turbulence_nm2[which],
-        noise_nm2=noise_nm2[which],
+        stable=read_only(here),
+        turbulence_nm2=left[which, 0],
+        noise_nm2=left[which, 1],
         random_vibration_nm2=random_nm2,
         line_amplitudes_nm=amplitudes,
     )
@@ -194,205 +211,96 @@ def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ..
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
 
 
-def turbulence_and_noise_nm2(
-    loops: ClosedLoops, turbulence: list[tuple[Turbulence, tuple[int, ...]]], noise_nm: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Covariances (p, n, n) of the residual from turbulence, and from noise (p, q).
-
-    ``turbulence`` pairs each spectrum with its modes. Unstable loops have nan.
-    """
-    hardware, stable = loops.hardware, loops.stable
-    for spectrum, _ in turbulence:
-        if isinstance(spectrum, Process):
-            require_loop_rate(spectrum.frame_rate_hz, hardware)
-    n, rate = hardware.modes, hardware.frame_rate_hz
-    both = np.full((2, stable.size, n, n), np.nan)
-    both[:, stable] = 0.0
-    turbulence_nm2, noise_nm2 = both
-    spectra = [pair for pair in turbulence if not isinstance(pair[0], Process)]
-    for same_delay in zip(*loops.subloops, strict=True):
-        done: list[_SpectralPart] = []
-        for group in same_delay:
-            part = _SpectralPart.of(group, spectra, noise_nm)
-            rows, twin = group.rows[:, None, None], next(filter(part.equals, done), None)
-            if twin is None:
-                for batch, turbulence_left, noise_left in part.covariances(stable, rate):
-                    at = (batch.rows[:, None, None], *np.ix_(part.modes, part.modes))
-                    turbulence_nm2[at], noise_nm2[at] = turbulence_left, noise_left
-                done.append(part)
-            else:
-                own, other = np.ix_(part.modes, part.modes), np.ix_(twin.modes, twin.modes)
-                both[:, rows, *own] = both[:, rows, *other]
-    for spectrum, modes in turbulence:
-        if not isinstance(spectrum, Process):
-            continue
-        for same_delay in zip(*loops.subloops, strict=True):
-            found = np.flatnonzero(stable[same_delay[0].rows])
-            if found.size:
-                chosen = [group.take(found) for group in same_delay]
-                process = turbulence_rows(spectrum, chosen[0].rows)
-                assert isinstance(process, Process)
-                for mode in modes:
-                    axis = np.eye(n)[mode]
-                    _add_process(turbulence_nm2, chosen[0].rows, chosen, process, axis, {})
-    return turbulence_nm2, noise_nm2
+def _batches(found: IntArray, stacks: list[LoopStack], place: IntArray) -> list[IntArray]:
+    """Split loops into batches; those next to instability, which need short panels, together."""
+    poles = np.concatenate([stack.poles for stack in stacks], axis=1)[place[found]]
+    found = found[np.argsort(np.max(np.abs(poles), axis=1), kind="stable")]
+    return _split(found, _TOGETHER)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _SpectralPart:
-    """The loops of a subloop with the same whole delay, and the spectra and noise they meet."""
-
-    group: LoopGroup
-    spectra: list[tuple[Turbulence, list[int]]]  # with their places among the modes
-    noise_nm: FloatArray  # (p, q)
-
-    @classmethod
-    def of(
-        cls,
-        group: LoopGroup,
-        spectra: list[tuple[Turbulence, tuple[int, ...]]],
-        noise_nm: FloatArray,
-    ) -> _SpectralPart:
-        """Choose what reaches a subloop of all spectra, with their modes, and all noise."""
-        own = group.subloop.modes
-        places = [(s, np.flatnonzero(np.isin(own, modes)).tolist()) for s, modes in spectra]
-        reached = [(spectrum, place) for spectrum, place in places if place]
-        return cls(group, reached, noise_nm[:, group.subloop.measurements])
-
-    @property
-    def modes(self) -> IntArray:
-        """Modes of the subloop."""
-        return self.group.subloop.modes
-
-    def equals(self, other: _SpectralPart) -> bool:
-        """Whether another part is left the same: equal subloops are closed only once."""
-        own, others = ([(id(s), places) for s, places in each.spectra] for each in (self, other))
-        return (
-            self.group.poles is other.group.poles
-            and own == others
-            and np.array_equal(self.noise_nm, other.noise_nm)
-        )
-
-    def covariances(
-        self, stable: BoolArray, frame_rate_hz: float
-    ) -> Iterator[tuple[LoopPoints, FloatArray, FloatArray]]:
-        """Yield batches of the stable loops, and the covariances (k, n, n) that both leave."""
-        for batch in self.group.batches(stable):
-            own = [(turbulence_rows(s, batch.rows), places) for s, places in self.spectra]
-            noise = self.noise_nm[batch.rows]
-            yield batch, *spectral_covariances(batch, own, noise, frame_rate_hz)
+def _split(rows: IntArray, most: int) -> list[IntArray]:
+    """Split rows into batches of at most so many, none of them empty."""
+    return [rows[i : i + most] for i in range(0, rows.size, most)]
 
 
-def vibration_residuals(
-    loops: ClosedLoops, which: IntArray, lines: list[EnsembleVibration]
-) -> tuple[FloatArray, ComplexArray]:
-    """Covariances (p, n, n) from resonances, and amplitudes (p, s, n) that sinusoids leave.
-
-    ``which`` (p,) is the closed loop of each row of the vibrations.
-    """
-    n, count, rate = loops.hardware.modes, which.size, loops.hardware.frame_rate_hz
-    stable = loops.stable[which]
-    random = [line for line in lines if line.damping is not None]
-    sinusoids = [line for line in lines if line.damping is None]
-    random_nm2 = np.full((count, n, n), np.nan)
-    amplitudes_nm = np.full((count, len(sinusoids), n), np.nan + 0j)
-    random_nm2[stable], amplitudes_nm[stable] = 0.0, 0.0
-    for groups in zip(*loops.subloops, strict=True):
-        place = np.full(loops.stable.size, -1)
-        place[groups[0].rows] = np.arange(groups[0].rows.size)
-        found = np.flatnonzero(stable & (place[which] >= 0))
-        for rows in (found[i : i + _AT_ONCE] for i in range(0, found.size, _AT_ONCE)):
-            chosen = [group.take(place[which[rows]]) for group in groups]
-            for i, line in enumerate(sinusoids):
-                peak = line.direction[rows] * np.sqrt(2) * line.rms_nm[rows][:, None]
-                turn = 2 * np.pi * line.frequency_hz[rows] / rate
-                for group in chosen:
-                    modes = group.subloop.modes
-                    if not np.any(peak[:, modes]):
-                        continue
-                    left = group.rejections(turn) @ peak[:, modes, None]
-                    amplitudes_nm[rows[:, None], i, modes] = left[..., 0]
-            alike: dict[tuple[bool, ...], list[EnsembleVibration]] = {}  # by the subloops reached
-            for line in random:
-                reached = (bool(np.any(line.direction[rows][:, g.subloop.modes])) for g in chosen)
-                alike.setdefault(tuple(reached), []).append(line)
-            known: dict[tuple[bytes, ...], FloatArray] = {}  # equal axes are computed once
-            for same in alike.values():
-                frequency_hz, damping, rms_nm, along = (
-                    np.concatenate([getattr(line, name)[rows] for line in same])
-                    for name in ("frequency_hz", "damping", "rms_nm", "direction")
-                )
-                a, drive = sampled_lines(frequency_hz, damping, rms_nm, rate)
-                process = ModalTurbulence(coefficients=a, driving_rms_nm=drive, frame_rate_hz=rate)
-                _add_process(random_nm2, rows, chosen, process, along, known)
-    return random_nm2, amplitudes_nm
-
-
-def _add_process(
-    total: FloatArray,
-    rows: IntArray,
-    groups: list[LoopGroup],
-    process: Process,
-    along: FloatArray,
-    known: dict[tuple[bytes, ...], FloatArray],
-) -> None:
-    """Add to ``total[rows]`` (p, n, n) what a process leaves in all subloops that it reaches.
-
-    The direction ``along`` is (n,), or (l k, n) for l processes of all loops in turn.
-    """
-    reached = [group for group in groups if np.any(along[..., group.subloop.modes])]
-    if reached:
-        modes = np.concatenate([group.subloop.modes for group in reached])
-        at = (rows[:, None, None], *np.ix_(modes, modes))
-        turns = len(along) // rows.size if along.ndim == 2 else 1
-        loops = tuple(np.tile(part, (turns, 1, 1)) for part in _join(reached))
-        own = along[..., modes]
-        numbers = (*loops, process.coefficients, process.driving_rms_nm, own)
-        key = tuple(np.asarray(part).tobytes() for part in numbers)
-        if key not in known:
-            known[key] = _process_covariances(loops, process, own)
-        found = known[key].reshape(turns, rows.size, modes.size, modes.size)
-        total[at] += np.sum(found, axis=0)
-
-
-def _join(groups: list[LoopGroup]) -> tuple[FloatArray, ...]:
-    """Matrices ``A, B, C, D`` of independent subloops as one, driven by the total phase only."""
-    n = [group.C.shape[1] for group in groups]
-    parts = [(g.A, g.B[..., :m], g.C, g.D[..., :m]) for g, m in zip(groups, n, strict=True)]
-    if len(parts) == 1:
-        return parts[0]
-    states = np.cumsum([0] + [group.A.shape[1] for group in groups])
-    modes, count = np.cumsum([0, *n]), len(groups[0].A)
-    A, B = np.zeros((count, states[-1], states[-1])), np.zeros((count, states[-1], modes[-1]))
-    C, D = np.zeros((count, modes[-1], states[-1])), np.zeros((count, modes[-1], modes[-1]))
-    for i, part in enumerate(parts):
-        x, r = slice(*states[i : i + 2]), slice(*modes[i : i + 2])
-        A[:, x, x], B[:, x, r], C[:, r, x], D[:, r, r] = part
-    return A, B, C, D
-
-
-def _process_covariances(
-    loops: tuple[FloatArray, ...], process: Process, directions: FloatArray
+def _turbulence_and_noise_nm2(
+    stacks: list[LoopStack],
+    turbulence: list[tuple[Turbulence, tuple[int, ...]]],
+    noise_nm: FloatArray,
+    hardware: LoopHardware,
 ) -> FloatArray:
-    """Covariance (k, n, n) of the residual that a process, or one per loop, leaves.
+    """Covariances (k, 2, n, n) of the residual from turbulence, and from noise (p, q).
 
-    ``directions`` is (n,), or (k, n) with one per loop.
+    ``turbulence`` pairs each spectrum of the p loops with its modes.
     """
-    if isinstance(process, ARModel):
-        coefficients, drive = process.coefficients[None], np.array([process.driving_rms_nm])
-    else:
-        coefficients, drive = process.coefficients, process.driving_rms_nm
-    entry, through = loops[1], loops[3]
-    order, (k, s, n) = coefficients.shape[1], entry.shape
-    along = np.broadcast_to(directions, (k, n))[:, :, None]
+    n, rows = hardware.modes, stacks[0].rows
+    total = np.zeros((rows.size, 2, n, n))
+    met = [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in turbulence]
+    spectra = [pair for pair in met if not isinstance(pair[0], Process)]
+    for stack in stacks:
+        total += spectral_covariances(stack, spectra, noise_nm[rows], hardware)
+    for spectrum, modes in met:
+        if isinstance(spectrum, Process):
+            for mode in modes:
+                total[:, 0] += _process_nm2(stacks, spectrum, np.eye(n)[[mode]])
+    return total
+
+
+def _resonance_nm2(
+    stacks: list[LoopStack], line: EnsembleVibration, rows: IntArray, hardware: LoopHardware
+) -> FloatArray:
+    """Covariances (k, n, n) of the residual from a damped vibration."""
+    rate = hardware.frame_rate_hz
+    numbers = line.frequency_hz[rows], line.damping[rows], line.rms_nm[rows]
+    a, drive = sampled_lines(*numbers, rate)
+    process = ModalTurbulence(coefficients=a, driving_rms_nm=drive, frame_rate_hz=rate)
+    return _process_nm2(stacks, process, line.direction[rows])
+
+
+def _sinusoid_nm(
+    stacks: list[LoopStack], line: EnsembleVibration, rows: IntArray, hardware: LoopHardware
+) -> ComplexArray:
+    """Complex amplitudes (k, n) that a sinusoid leaves."""
+    peak = line.direction[rows] * np.sqrt(2) * line.rms_nm[rows][:, None]
+    turn = 2 * np.pi * line.frequency_hz[rows] / hardware.frame_rate_hz
+    out = np.zeros(peak.shape, dtype=np.complex128)
+    for stack, modes in _reached(stacks, peak):
+        out[:, modes] = (stack.rejections(turn) @ peak[:, modes, None])[..., 0]
+    return out
+
+
+def _reached(stacks: list[LoopStack], along: FloatArray) -> list[tuple[LoopStack, IntArray]]:
+    """Return the stacks that directions (k, n) reach, and the modes that each stands for."""
+    pairs = [(stack, modes) for stack in stacks for modes in stack.part.modes]
+    return [(stack, modes) for stack, modes in pairs if np.any(along[:, modes])]
+
+
+def _process_nm2(stacks: list[LoopStack], process: Process, along: FloatArray) -> FloatArray:
+    """Covariances (k, n, n) of the residual that a process, or one per loop, leaves.
+
+    Its direction ``along`` is (1, n), or (k, n) with one per loop.
+    """
+    reached, coefficients = _reached(stacks, along), np.atleast_2d(process.coefficients)
+    places = np.concatenate([modes for _, modes in reached])
+    s, order, k = (
+        sum(stack.A.shape[1] for stack, _ in reached),
+        coefficients.shape[1],
+        len(stacks[0].A),
+    )
     A, Q = np.zeros((2, k, s + order, s + order))
-    A[:, :s, :s] = loops[0]
-    A[:, :s, s : s + 1] = entry @ along  # the newest sample acts on its frame
+    C = np.zeros((k, places.size, s + order))
     A[:, s, s:] = coefficients
     A[:, s + 1 :, s:-1] = np.eye(order - 1)
-    Q[:, s, s] = drive**2
-    C = np.zeros((k, n, s + order))
-    C[..., :s], C[..., s : s + 1] = loops[2], through @ along
+    Q[:, s, s] = np.square(process.driving_rms_nm)
+    x = r = 0
+    for stack, modes in reached:
+        n, size, direction = modes.size, stack.A.shape[1], along[:, modes, None]
+        own, seen = slice(x, x + size), slice(r, r + n)
+        A[:, own, own], C[:, seen, own] = stack.A, stack.C
+        # the newest sample acts on its frame
+        A[:, own, s] = (stack.B[..., :n] @ direction)[..., 0]
+        C[:, seen, s] = (stack.D[..., :n] @ direction)[..., 0]
+        x, r = x + size, r + n
     X, residuals = stationary_covariances(A, Q)
     left = np.asarray(C @ X @ transpose(C))
     # digits that a small difference of large terms keeps; roots keep theirs
@@ -406,4 +314,6 @@ def _process_covariances(
             "the covariance of a process in a loop was not found. The process or the loop is "
             "nearly a random walk; damp it."
         )
-    return left
+    out = np.zeros((k, along.shape[1], along.shape[1]))
+    out[:, places[:, None], places] = left
+    return out

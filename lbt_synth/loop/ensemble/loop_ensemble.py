@@ -23,6 +23,7 @@ from lbt_synth.validation import (
     FloatArray,
     IntArray,
     frozen_copy,
+    positive,
     real_array,
     require_instance,
     sequence,
@@ -66,15 +67,11 @@ class EnsembleVibration:
     damping: Any = None
 
     def __post_init__(self) -> None:
-        for name, high in (("frequency_hz", np.inf), ("rms_nm", np.inf), ("damping", 1.0)):
-            if getattr(self, name) is None:
-                continue
-            value = real_array(getattr(self, name), name)
-            if np.any(value <= 0) or np.any(value >= high):
-                allowed = "above 0" if high == np.inf else "between 0 and 1"
-                got = f"{value.min():.6g} to {value.max():.6g}"
-                raise ProblemError(f"{name} must be {allowed}; got {got}.")
-            set_fields(self, **{name: value})
+        for name in ("frequency_hz", "rms_nm", "damping"):
+            if getattr(self, name) is not None:
+                set_fields(self, **{name: positive(getattr(self, name), name)})
+        if self.damping is not None and np.any(self.damping >= 1):
+            raise ProblemError(f"damping must be between 0 and 1; got {self.damping.max():.6g}.")
         direction = real_array(self.direction, "direction")
         size = np.linalg.norm(np.atleast_1d(direction), axis=-1, keepdims=True)
         if direction.ndim not in (1, 2) or not np.all(size > 0):
@@ -139,50 +136,39 @@ class LoopEnsemble:
         set_fields(self, vibrations=sequence(self.vibrations, "vibrations"))
         for line in self.vibrations:
             require_instance(line, EnsembleVibration)
-        for name, bound in (("sensor_gain", 0.0), ("noise_nm", 0.0), ("delay_frames", 1.0)):
-            if name == "delay_frames" and self.delay_frames is None:
-                continue
-            value = real_array(getattr(self, name), name)
-            if name == "delay_frames" and np.any(value > LONGEST_DELAY):
-                raise ProblemError(f"{name} must be at most {LONGEST_DELAY}; got {value.max():g}.")
-            if np.any(value < bound) or (name == "sensor_gain" and np.any(value == 0)):
-                word = "above" if name == "sensor_gain" else "at least"
-                raise ProblemError(f"{name} must be {word} {bound:g}; got {value.min():.6g}.")
-            set_fields(self, **{name: value})
-        lengths = {name: len(values) for name, values in self._arrays().items()}
-        lengths |= {} if self.loops == 0 else {"loops": self.loops}
-        if len(set(lengths.values()) - {1}) > 1:
-            text = ", ".join(f"{name} {length}" for name, length in lengths.items())
-            raise DimensionError(f"all must have one entry per loop; got {text}.")
-        if 0 in lengths.values():
+        noise = real_array(self.noise_nm, "noise_nm")
+        if np.any(noise < 0):
+            raise ProblemError(f"noise_nm must be at least 0; got {noise.min():.6g}.")
+        set_fields(self, sensor_gain=positive(self.sensor_gain, "sensor_gain"), noise_nm=noise)
+        if self.delay_frames is not None:
+            delay = real_array(self.delay_frames, "delay_frames")
+            if np.any((delay < 1) | (delay > LONGEST_DELAY)):
+                bounds, got = f"at least 1 and at most {LONGEST_DELAY}", delay.ravel().tolist()
+                raise ProblemError(f"delay_frames must be {bounds}; got {got}.")
+            set_fields(self, delay_frames=delay)
+        lengths = {len(values) for values in self._values_per_loop()} | ({self.loops} - {0})
+        if len(lengths - {1}) > 1:
+            raise DimensionError(
+                f"all must have one entry per loop; got {sorted(lengths)} entries."
+            )
+        if 0 in lengths:
             raise DimensionError("an ensemble needs at least one loop; got none.")
-        set_fields(self, loops=max(lengths.values(), default=1))
+        set_fields(self, loops=max(lengths, default=1))
 
-    def _arrays(self) -> dict[str, Any]:
-        """Return what has one entry per loop, by name."""
-        names = ("sensor_gain", "noise_nm", "delay_frames")
-        out = {name: getattr(self, name) for name in names if np.ndim(getattr(self, name))}
-        for i, line in enumerate(self.vibrations):
-            for name in ("frequency_hz", "rms_nm", "damping", "direction"):
-                value = getattr(line, name)
-                if value is not None and np.ndim(value) > (name == "direction"):
-                    out[f"{name} of vibration {i}"] = value
-        for part in self._each_turbulence(1):
-            if isinstance(part, FrozenFlows):
-                out["turbulence"] = part
-            elif isinstance(part, ModalTurbulence):
-                out["turbulence"] = part.coefficients
-            elif part is not None and not isinstance(part, Spectrum):
-                raise ProblemError(
-                    "turbulence must be a spectrum, FrozenFlows, ModalTurbulence or None, or a "
-                    f"sequence of these; got {type(part).__name__}."
-                )
-        return out
+    def _values_per_loop(self) -> list[FloatArray]:
+        """Return all arrays that have one entry per loop."""
+        values = [self.sensor_gain, self.noise_nm, self.delay_frames]
+        for line in self.vibrations:
+            values += [line.frequency_hz, line.rms_nm, line.damping]
+            values += [line.direction] if line.direction.ndim == 2 else []
+        for part in self._turbulence_parts(1):
+            values += _turbulence_values(part)
+        return [value for value in values if np.ndim(value)]
 
-    def _each_turbulence(self, modes: int) -> tuple[Any, ...]:
-        """Return the turbulence as it was given per mode, or for each of some modes."""
-        given = self.turbulence
-        return tuple(given) if isinstance(given, Sequence) else (given,) * modes
+    def _turbulence_parts(self, modes: int) -> tuple[Any, ...]:
+        """Return the turbulence as it is per mode, or for each of some modes."""
+        one = not isinstance(self.turbulence, Sequence)
+        return (self.turbulence,) * modes if one else tuple(self.turbulence)
 
     def delays(self, hardware: LoopHardware) -> FloatArray:
         """Return the total delay of each loop [frames], (p,)."""
@@ -204,15 +190,17 @@ class LoopEnsemble:
 
     def groups(self, hardware: LoopHardware) -> list[tuple[Turbulence, tuple[int, ...]]]:
         """Return the turbulence with the modes that have it."""
-        n, each = hardware.modes, self._each_turbulence(hardware.modes)
-        if len(each) != n:
-            raise DimensionError(f"turbulence must have one entry per mode ({n}); got {len(each)}.")
-        found: dict[object, tuple[Turbulence, tuple[int, ...]]] = {}
-        for mode, part in enumerate(each):
+        n, parts = hardware.modes, self._turbulence_parts(hardware.modes)
+        if len(parts) != n:
+            raise DimensionError(
+                f"turbulence must have one entry per mode ({n}); got {len(parts)}."
+            )
+        groups: dict[object, tuple[Turbulence, tuple[int, ...]]] = {}
+        for mode, part in enumerate(parts):
             if part is not None:
-                first, modes = found.get(spectrum_key(part), (part, ()))
-                found[spectrum_key(part)] = (first, (*modes, mode))
-        return list(found.values())
+                first, modes = groups.get(spectrum_key(part), (part, ()))
+                groups[spectrum_key(part)] = (first, (*modes, mode))
+        return list(groups.values())
 
     def distinct(self, hardware: LoopHardware, *, apart: bool) -> tuple[IntArray, IntArray]:
         """Return rows that differ by more than their vibrations, and which of them each loop has.
@@ -224,36 +212,43 @@ class LoopEnsemble:
             return rows, rows
         columns = [self.gains(), self.delays(hardware), *self.noise(hardware).T]
         for part, _ in self.groups(hardware):
-            if isinstance(part, FrozenFlows) and len(part) > 1:
-                columns += [part.seeing_arcsec, part.wind_speed_m_s]
-                columns += [] if part.outer_scale_m is None else [part.outer_scale_m]
-            elif isinstance(part, ModalTurbulence) and part.n_modes > 1:
-                columns += [*part.coefficients.T, part.driving_rms_nm]
-        varying = [column for column in columns if np.ptp(column) > 0]
-        if not varying:
-            return rows[:1], np.zeros(self.loops, dtype=np.int64)
-        if any(np.unique(column).size == self.loops for column in varying):
-            return rows, rows
-        table = np.stack(varying, axis=1)
+            columns += _turbulence_values(part)
+        table = np.stack(np.broadcast_arrays(*columns), axis=1)
         _, first, which = np.unique(table, axis=0, return_index=True, return_inverse=True)
-        return (rows, rows) if first.size == self.loops else (first, which.reshape(-1))
+        return first, which.reshape(-1)
 
     def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:
         """Return the vibrations with all their arrays (p,), and directions (p, n)."""
-        out, p, nyquist = [], self.loops, hardware.frame_rate_hz / 2
+        out, p, n, nyquist = [], self.loops, hardware.modes, hardware.frame_rate_hz / 2
         for line in self.vibrations:
-            if line.direction.shape[-1] != hardware.modes:
-                wanted = f"{hardware.modes} components, one per mode"
+            if line.direction.shape[-1] != n:
                 got = line.direction.shape[-1]
-                raise DimensionError(f"the direction of a vibration must have {wanted}; got {got}.")
+                raise DimensionError(
+                    f"the direction of a vibration must have {n} components, one per mode; got "
+                    f"{got}."
+                )
             if not np.max(line.frequency_hz) < nyquist:
                 limit, got = f"the Nyquist frequency {nyquist:.6g} Hz", np.max(line.frequency_hz)
                 raise ProblemError(f"a vibration must lie below {limit}; got {got:.6g} Hz.")
-            given = {name: getattr(line, name) for name in ("frequency_hz", "rms_nm", "damping")}
-            filled = {k: np.broadcast_to(v, (p,)) for k, v in given.items() if v is not None}
-            direction = np.broadcast_to(line.direction, (p, hardware.modes))
-            out.append(replace(line, **filled, direction=direction))
+            values = {name: getattr(line, name) for name in ("frequency_hz", "rms_nm", "damping")}
+            whole = {k: np.broadcast_to(v, (p,)) for k, v in values.items() if v is not None}
+            out.append(replace(line, **whole, direction=np.broadcast_to(line.direction, (p, n))))
         return out
+
+
+def _turbulence_values(turbulence: Turbulence | None) -> list[FloatArray]:
+    """Return the arrays of a turbulence that have one entry per loop."""
+    if isinstance(turbulence, FrozenFlows):
+        values = turbulence.seeing_arcsec, turbulence.wind_speed_m_s, turbulence.outer_scale_m
+        return [value for value in values if value is not None]
+    if isinstance(turbulence, ModalTurbulence):
+        return [*turbulence.coefficients.T, turbulence.driving_rms_nm]
+    if turbulence is not None and not isinstance(turbulence, Spectrum):
+        raise ProblemError(
+            "turbulence must be a spectrum, FrozenFlows, ModalTurbulence or None, or a sequence of "
+            f"these; got {type(turbulence).__name__}."
+        )
+    return []
 
 
 def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:

@@ -1,27 +1,21 @@
-"""How a loop is split into independent subloops."""
+"""How a loop is split into independent parts."""
 
 import numpy as np
 import pytest
 from support.ensembles import AIR, LINE, RATE, plant
 
 import lbt_synth as lbt
-from lbt_synth.loop.ensemble.closed_loops import split_into_subloops
+from lbt_synth.loop.ensemble.closed_loops import split_into_parts
+from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 
 
-def test_a_loop_is_split_into_subloops(kalman, coupled):
-    def split(design):
-        system = design.controller.to_statespace()
-        matrices = tuple(m[None] for m in (system.A, system.B, system.C, system.D))
-        return split_into_subloops(matrices, design.hardware)
-
-    parts, rest = split(kalman)
-    assert [part.modes.tolist() for part in parts] == [[0], [1]]
-    assert parts[0].equals(parts[1])
-    assert rest == []
-    assert [part.modes.tolist() for part in split(coupled)[0]] == [[0, 1]]
-    # an axis without a vibration is another subloop than one with
-    parts, _ = split(lbt.kalman(plant(vibrations=[LINE])))
-    assert not parts[0].equals(parts[1])
+def test_a_loop_is_split_into_parts(kalman, coupled):
+    # an axis without a vibration is another part than one with
+    uneven = lbt.kalman(plant(vibrations=[LINE]))
+    for design, modes in ((kalman, [[[0], [1]]]), (coupled, [[[0, 1]]]), (uneven, [[[0]], [[1]]])):
+        parts, rest = split_into_parts(textbook_matrices([design.controller]), design.hardware)
+        assert [part.modes.tolist() for part in parts] == modes
+        assert rest == []
 
 
 def test_states_in_odd_units_stay_coupled(coupled):

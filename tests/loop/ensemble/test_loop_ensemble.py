@@ -13,7 +13,7 @@ WRONG = [
     ({"sensor_gain": [np.nan, 1]}, ProblemError, "finite"),
     ({"noise_nm": -1.0}, ProblemError, "noise_nm must be at least 0"),
     ({"delay_frames": [0.5, 2]}, ProblemError, "delay_frames must be at least 1"),
-    ({"delay_frames": [2, 20.5]}, ProblemError, "delay_frames must be at most 20"),
+    ({"delay_frames": [2, 20.5]}, ProblemError, "at least 1 and at most 20"),
     ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, DimensionError, "one entry per loop"),
     ({"sensor_gain": []}, DimensionError, "at least one loop"),
     ({"turbulence": "von Karman"}, ProblemError, "turbulence must be"),
