@@ -14,20 +14,20 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 5119,
+    "cli": 5143,
     "config": 2222,
     "design": 8361,
     "files": 1678,
     "identification": 14999,
     "interop": 5576,
-    "linear": 6001,
-    "loop": 5014,
+    "linear": 6068,
+    "loop": 4555,
     "methods": 1109,
     "models": 4465,
     "report": 7083,
     "storage": 1246,
     "studies": 5259,
-    "errors, validation": 638,
+    "errors, validation": 640,
 }
 COUNTS = {
     "files of the package": 407,

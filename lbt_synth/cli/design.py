@@ -121,8 +121,8 @@ def _fragile_notes(margins: Mapping[str, float]) -> list[str]:
     if margins["delay_frames"] < _FRAGILE_FRAMES:
         microseconds = 1e6 * margins["delay_s"]
         notes.append(
-            f"warning: {margins['delay_frames']:.2g} frames ({microseconds:.2g} us) more delay make "
-            "this loop unstable. Do not close it so: take another method, or robust with "
+            f"warning: {margins['delay_frames']:.2g} frames ({microseconds:.2g} us) more delay "
+            "make this loop unstable. Do not close it so: take another method, or robust with "
             "delay_error_frames."
         )
     decibels = 20 * np.log10([margins["gain_high"], 1 / max(margins["gain_low"], 1e-300)])
