@@ -19,7 +19,7 @@ from lbt_synth.report.designs.report import count_steps
 from lbt_synth.report.designs.tables import AssessmentRow, assessment_row, good_range, verdict
 from lbt_synth.report.page.page_files import require_page_names
 from lbt_synth.report.provenance import require_letters, time_text
-from lbt_synth.report.several_sensors import write_sensors_report
+from lbt_synth.report.sensors import write_sensors_report
 from lbt_synth.storage.rows import json_record, json_units, row_table
 
 _IN_MARGINS = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz")
@@ -38,7 +38,7 @@ def run(arguments: Namespace) -> Report:
     several = [name for name, design in designs.items() if design.other_sensors]
     files = dict(zip(designs, arguments.gains, strict=True))
     if several:
-        return _report_several_sensors(arguments, config, designs, several, files)
+        return _report_sensors(arguments, config, designs, several, files)
     total = count_steps(len(designs)) + 1
     with count_progress(total=total, what="report", quiet=arguments.json) as count:
         found = design_report(config, designs, gain_files=files, advance=count)
@@ -68,7 +68,7 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def _report_several_sensors(
+def _report_sensors(
     arguments: Namespace,
     config: Config,
     designs: Mapping[str, Design],

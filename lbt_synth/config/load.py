@@ -22,7 +22,7 @@ from lbt_synth.config.plant_and_truth import (
 )
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.schema_errors import describe_error
-from lbt_synth.config.several_sensors import build_sensors, build_true_motions
+from lbt_synth.config.sensors import build_sensors, build_true_motions
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request

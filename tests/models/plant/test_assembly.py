@@ -152,7 +152,11 @@ def test_noise_of_a_reading_is_that_of_nothing_else():
             DimensionError,
             "one mapping per vibration",
         ),
-        (lambda: replace(example_plant().parts(), motions=MOTIONS[:1]), DimensionError, "one mapping"),
+        (
+            lambda: replace(example_plant().parts(), motions=MOTIONS[:1]),
+            DimensionError,
+            "one mapping",
+        ),
         (
             lambda: example_plant().controller(np.zeros((1, 2, 3))),
             DimensionError,

@@ -7,7 +7,7 @@ from support.commands import run
 from support.several_sensors import write_config
 
 import lbt_synth as lbt
-from lbt_synth.report.several_sensors import write_sensors_report
+from lbt_synth.report.sensors import write_sensors_report
 
 
 def test_a_page_has_the_table_of_failures_and_a_run(
