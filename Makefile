@@ -44,7 +44,7 @@ demo: $(VENV)/.ready     ## design both filters for the LBT, close the loop, wri
 	@mkdir -p $(OUT)
 	$(BIN)/lbt-synth design examples/lbt.yaml --method kalman -o $(OUT)/kalman.fits
 	$(BIN)/lbt-synth design examples/lbt.yaml --method hinf --gamma-ratio 1.2 -o $(OUT)/hinf.fits
-	$(BIN)/lbt-synth sigma $(OUT)/kalman.fits $(OUT)/hinf.fits -o $(OUT)/sigma.png
+	$(BIN)/lbt-synth plot sigma $(OUT)/kalman.fits $(OUT)/hinf.fits -o $(OUT)/sigma.png
 	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/kalman.fits -o $(OUT)/kalman_loop.png
 	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/hinf.fits -o $(OUT)/hinf_loop.png
 	$(BIN)/lbt-synth robustness examples/lbt.yaml -o $(OUT)/robustness.csv -o $(OUT)/robustness.png

@@ -128,33 +128,14 @@ def _add_target(parser: ArgumentParser) -> None:
     )
 
 
-def sigma(parser: ArgumentParser) -> None:
-    """Plot singular values of one or several designs."""
-    _add_view(parser)
-
-
-def bode(parser: ArgumentParser) -> None:
-    """Plot gain and phase of loops over frequency, with their margins."""
-    _add_view(parser)
-
-
-def nyquist(parser: ArgumentParser) -> None:
-    """Plot loops in the complex plane, with their modulus and disk margins."""
-    _add_view(parser)
-
-
-def nichols(parser: ArgumentParser) -> None:
-    """Plot gain over phase of loops, with their margins."""
-    _add_view(parser)
-
-
-def step(parser: ArgumentParser) -> None:
-    """Plot residual and command of loops after a step of the wavefront."""
-    _add_view(parser)
-
-
-def _add_view(parser: ArgumentParser) -> None:
+def plot(parser: ArgumentParser) -> None:
+    """Plot loops of one or several designs in a classical view, and print their margins."""
     add_unit(parser)
+    text = (
+        "sigma: largest singular values; bode: gain and phase over frequency; nyquist: loops in "
+        "the complex plane; nichols: gain over phase; step: residual and command after a step"
+    )
+    add_option(parser, "kind", ("sigma", "bode", "nyquist", "nichols", "step"), text)
     add_gains(parser, "+")
     text = "real sensor gain, as a factor on the one that each design assumes"
     add_option(parser, "--sensor-gain", float, text, 1.0)

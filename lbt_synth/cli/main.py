@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # slow to import for --help
     from lbt_synth.cli.output import Report
 
 DONE, FAILED, WRONG = 0, 1, 2
-_SHARED_MODULES = dict.fromkeys(("bode", "nyquist", "nichols", "sigma", "step"), "loop_views") | {
+_SHARED_MODULES = {
     "completion": "help",
     "end-to-end-table": "end_to_end",
     "verify": "show",

@@ -19,7 +19,7 @@ COMMANDS = {
         arguments.init,
         *(arguments.design, arguments.show, arguments.verify),
         *(arguments.export, arguments.rehearse),
-        *(arguments.sigma, arguments.bode, arguments.nyquist, arguments.nichols, arguments.step),
+        arguments.plot,
         *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
         arguments.diagnose,
         *(arguments.robustness, arguments.tradeoff, arguments.limits, arguments.report),

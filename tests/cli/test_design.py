@@ -88,7 +88,7 @@ def test_design_show_verify_sigma_and_simulate_take_a_robust_design(small, tmp_p
     assert shown["limit_nm"] < shown["objective_nm"][0] * np.sqrt(2)
     assert len(shown["terms"]) == 4
     assert main(["verify", gain]) == 0
-    assert main(["sigma", gain, "-o", picture]) == 0
+    assert main(["plot", "sigma", gain, "-o", picture]) == 0
     assert Path(picture).stat().st_size > 10_000
     assert main(["simulate", config, gain, "--frames", "500", "--cases", "1"]) == 0
     assert "Strehl ratio" in capsys.readouterr().out

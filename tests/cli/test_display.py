@@ -32,9 +32,9 @@ COMMANDS = {
     "simulate": ("{}/c.yaml", "{}/k.fits", "-o", "{}/s.svg"),
     "limits": ("{}/c.yaml", "{}/k.fits", "-o", "{}/l.svg"),
     "robustness": ("{}/c.yaml",),
-    "sigma": ("{}/k.fits", "-o", "{}/g.svg"),
-    "bode": ("{}/k.fits",),
-    "step": ("{}/k.fits", "-o", "{}/t.svg"),
+    "plot sigma": ("{}/k.fits", "-o", "{}/g.svg"),
+    "plot bode": ("{}/k.fits",),
+    "plot step": ("{}/k.fits", "-o", "{}/t.svg"),
     "identify": ("{}/n.fits", "-o", "{}/i.yaml", "--no-figure"),
     "rehearse": ("{}/k.fits", "--for", "matlab", "--frames", "600"),
 }
@@ -42,7 +42,7 @@ COMMANDS = {
 
 def run(capsys, files, command, *options):
     words = [word.format(files) for word in COMMANDS[command]]
-    assert main([command, *words, *options]) == 0
+    assert main([*command.split(), *words, *options]) == 0
     return capsys.readouterr().out
 
 

@@ -37,10 +37,10 @@ BAD = [
     ("show none.fits", 2, "cannot read none.fits"),
     ("show CONFIG", 2, "is a configuration, expected a gain file"),
     ("verify DAMAGED.fits", 2, "damaged"),
-    ("sigma DAMAGED.fits -o OUT.png", 2, "damaged"),
-    ("sigma KALMAN -o OUT.gif", 2, "must end in .csv, .png"),
-    ("sigma KALMAN KALMAN -o OUT.png", 2, "given once"),
-    ("sigma KALMAN --sensor-gain -1 -o OUT.png", 2, "above 0"),
+    ("plot sigma DAMAGED.fits -o OUT.png", 2, "damaged"),
+    ("plot sigma KALMAN -o OUT.gif", 2, "must end in .csv, .png"),
+    ("plot sigma KALMAN KALMAN -o OUT.png", 2, "given once"),
+    ("plot sigma KALMAN --sensor-gain -1 -o OUT.png", 2, "above 0"),
     ("simulate CONFIG KALMAN --frames 0", 2, "at least 1"),
     ("simulate CONFIG KALMAN --frames many", 2, "invalid int"),
     ("simulate CONFIG KALMAN -o OUT.doc", 2, "must end in .png"),
@@ -88,7 +88,7 @@ def test_version_and_help(capsys):
     assert run(capsys, "--version")[1] == f"lbt-synth {lbt.__version__}\n"
     status, text, _ = run(capsys, "--help")
     assert status == 0
-    for command in ("design", "show", "verify", "sigma", "simulate", "robustness", "paper"):
+    for command in ("design", "show", "verify", "plot", "simulate", "robustness", "paper"):
         assert command in text
 
 
@@ -253,7 +253,7 @@ def test_every_command_runs(tmp_path, capsys, model, ending):
     shown = checked_output(capsys, "show", gain)
     assert "nm" in shown
     assert "nan" not in shown
-    sigma = answer(capsys, "sigma", gain, integrator, "-o", tmp_path / f"s.{ending}")
+    sigma = answer(capsys, "plot", "sigma", gain, integrator, "-o", tmp_path / f"s.{ending}")
     assert all(design["stable"] for design in sigma["designs"].values())
     simulated = answer(
         capsys,

@@ -33,7 +33,7 @@ def test_commands(tmp_path, capsys):
     assert [row["stable"] for row in data["rows"]] == [True, False, True, True]
     status, data, _ = run(capsys, "simulate", SLOW_YAML, gain, "--frames", 500, "--cases", 1)
     assert status == 0
-    assert run(capsys, "sigma", gain, "-o", tmp_path / "s.png")[0] == 0
+    assert run(capsys, "plot", "sigma", gain, "-o", tmp_path / "s.png")[0] == 0
 
 
 def test_wrong_commands(tmp_path, capsys):

@@ -145,14 +145,14 @@ def test_a_design_of_one_sensor_has_nothing_to_drop(capsys, config_file, gains):
 @pytest.mark.parametrize(
     "command",
     [
-        ("sigma",),
-        ("bode",),
-        ("step",),
+        ("plot sigma",),
+        ("plot bode",),
+        ("plot step",),
         ("rehearse", "--for", "c"),
     ],
 )
 def test_commands_for_one_sensor_say_so(capsys, sensors_file, command):
-    status, out, error = run(capsys, command[0], sensors_file, *command[1:])
+    status, out, error = run(capsys, *command[0].split(), sensors_file, *command[1:])
     assert (status, out) == (2, "")
     assert "is a design of several sensors" in error
 

@@ -62,7 +62,7 @@ def test_names_of_files_cannot_command_the_terminal(tmp_path, capsys, monkeypatc
     )
     design = lbt.integrator(lbt.load_config(LBT_YAML).hardware, gain=0.4)
     lbt.save_gain(name, design)
-    status, out, _ = run(capsys, "sigma", name, "-o", "a.png")
+    status, out, _ = run(capsys, "plot", "sigma", name, "-o", "a.png")
     assert status == 0
     assert printable(name.removesuffix(".fits")) in out
     status, _, error = run(capsys, "design", LBT_YAML, "--method", name, "-o", "a.fits")

@@ -79,7 +79,7 @@ SAID = [
     (("identify", "CONFIG", "-o", "OUT.yaml"), ("is a configuration, expected a record.\n",)),
     (("study", "CONFIG", "-o", "OUT"), ("CONFIG is a configuration, expected a study file.\n",)),
     (("limits", "STUDY"), ("STUDY is a study file, expected a configuration.\n",)),
-    (("sigma", "FIGURE.png", "-o", "OUT.png"), ("is a figure, expected a gain file.\n",)),
+    (("plot", "sigma", "FIGURE.png", "-o", "OUT.png"), ("is a figure, expected a gain file.\n",)),
 ]
 
 

@@ -83,7 +83,7 @@ def test_every_command_takes_a_method_of_the_folder(leaky, tmp_path, capsys, mon
     assert (status, shown["leak_per_s"], shown["gain"]) == (0, 5.0, 0.3)
     assert shown["matrices"]["A"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))
     assert run(capsys, "verify", gain)[0] == 0
-    assert run(capsys, "sigma", gain, "-o", "sigma.png")[0] == 0
+    assert run(capsys, "plot", "sigma", gain, "-o", "sigma.png")[0] == 0
     status, out, _ = run(capsys, "simulate", small, gain, "--frames", "400", "--cases", "1")
     assert (status, "Strehl ratio" in out) == (0, True)
     assert run(capsys, "report", small, gain, "-o", "report.html")[0] == 0

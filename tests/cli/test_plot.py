@@ -1,4 +1,4 @@
-"""The commands bode, nyquist, nichols, step and sigma: figures, tables and curves."""
+"""The command plot: figures, tables and curves."""
 
 import csv
 import json
@@ -14,12 +14,12 @@ VIEWS = ("bode", "nyquist", "nichols", "step", "sigma")
 def test_a_view_writes_its_figure_and_its_points(view, tmp_path, capsys, gains):
     figure, table = tmp_path / f"{view}.png", tmp_path / f"{view}.csv"
     status, text, _ = run(
-        capsys, view, gains["kalman"], gains["integrator"], "-o", figure, "-o", table
+        capsys, "plot", view, gains["kalman"], gains["integrator"], "-o", figure, "-o", table
     )
     assert status == 0
     assert "phase margin" in text
     assert figure.read_bytes().startswith(b"\x89PNG")
-    data = json.loads(run(capsys, view, gains["kalman"], gains["integrator"], "--json")[1])
+    data = json.loads(run(capsys, "plot", view, gains["kalman"], gains["integrator"], "--json")[1])
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["design"] for row in rows} == set(data["curves"]) == {"kalman", "integrator"}
@@ -32,7 +32,7 @@ def test_a_view_writes_its_figure_and_its_points(view, tmp_path, capsys, gains):
 
 
 def test_points_of_a_loop_are_those_of_an_integrator(capsys, gains):
-    data = json.loads(run(capsys, "nyquist", gains["integrator"], "--json")[1])
+    data = json.loads(run(capsys, "plot", "nyquist", gains["integrator"], "--json")[1])
     found = {name: np.array(values) for name, values in data["curves"]["integrator"].items()}
     z = np.exp(2j * np.pi * found["frequency_hz"] / 800)
     expected = 0.5 * z**-2 / (1 - 1 / z)
@@ -42,29 +42,31 @@ def test_points_of_a_loop_are_those_of_an_integrator(capsys, gains):
 
 
 def test_overshoot_and_settling_time(capsys, gains):
-    status, text, _ = run(capsys, "step", gains["integrator"])
+    status, text, _ = run(capsys, "plot", "step", gains["integrator"])
     assert status == 0
     assert "settling time, to 5 % [ms]" in text
-    (row,) = json.loads(run(capsys, "step", gains["integrator"], "--json")[1])["steps"]
+    (row,) = json.loads(run(capsys, "plot", "step", gains["integrator"], "--json")[1])["steps"]
     assert row["overshoot_percent"] == pytest.approx(25.0)  # 1, 1, 0.5, 0, -0.25, -0.25, ...
 
 
 def test_without_a_stable_loop_there_is_nothing_to_draw(tmp_path, capsys, gains):
     out = tmp_path / "bode.csv"
-    status, _, error = run(capsys, "bode", gains["integrator"], "--sensor-gain", 3, "-o", out)
+    status, _, error = run(
+        capsys, "plot", "bode", gains["integrator"], "--sensor-gain", 3, "-o", out
+    )
     assert (status, out.exists()) == (1, False)
     assert "no loop is stable at sensor gain 3" in error
 
 
 def test_sigma(tmp_path, capsys, gains):
     out = tmp_path / "sigma.pdf"
-    status, text, _ = run(capsys, "sigma", *gains.values(), "-o", out)
+    status, text, _ = run(capsys, "plot", "sigma", *gains.values(), "-o", out)
     assert status == 0
     assert out.read_bytes().startswith(b"%PDF")
     lines = {words[0]: words[1:] for words in map(str.split, text.splitlines()) if words}
     assert lines["quantity"] == ["kalman", "hinf", "integrator", "unit"]
     assert lines["norm"][-1] == "nm"
     assert "phase margin" in text
-    data = json.loads(run(capsys, "sigma", gains["hinf"], "-o", out, "--json")[1])
+    data = json.loads(run(capsys, "plot", "sigma", gains["hinf"], "-o", out, "--json")[1])
     assert data["designs"]["hinf"]["stable"] is True
     assert data["units"]["phase_deg"] == "deg"

@@ -1,13 +1,9 @@
-"""The commands that draw loops: bode, nyquist, nichols, sigma and step.
-
-They print the margins of the loops, and write the curves as data.
-"""
+"""The command plot: margins of loops, and sigma, bode, nyquist, nichols or step curves."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,6 +16,7 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
 from lbt_synth.report.figures import (
     bode_figure,
     nichols_figure,
@@ -31,7 +28,15 @@ from lbt_synth.report.figures.open_loops import axes_name, open_loops
 from lbt_synth.report.figures.sigma import sigma_curves
 from lbt_synth.report.figures.step import design_steps
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import column, columns, json_record, json_units, table_row
+from lbt_synth.storage.rows import (
+    column,
+    columns,
+    fill_row,
+    json_record,
+    json_units,
+    table_row,
+)
+from lbt_synth.validation import FloatArray
 
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
 
@@ -88,142 +93,131 @@ class StepFacts:
 
 def run(arguments: Namespace) -> Report:
     """Print the margins of designs, and write their figure and their points."""
-    figure, points, kind = _VIEWS[arguments.command]
+    figure, points, kind = _VIEWS[arguments.kind]
     require_outputs(arguments.output, inputs=arguments.gains)
     designs, gain = load_designs(arguments.gains), arguments.sensor_gain
     choose_design_unit(arguments, *designs.values())
     report = Report()
     with show_spinner("drawing", quiet=arguments.json):
-        add_margins(report, designs, gain)
-        found = points(designs, gain)
-        if not found:
+        _add_margins(report, designs, gain)
+        drawn = points(designs, gain)
+        if not drawn:
             raise UnstableLoopError(
                 f"no loop is stable at sensor gain {gain:g}, and there is nothing to draw; "
                 "lbt-synth show prints the gains that are stable."
             )
-        report.data["curves"] = _curves(found, kind)
+        report.data["curves"] = _curves(drawn)
         report.data["units"] |= json_units(kind)
         write_outputs(
-            report, arguments.output, found, figure=lambda: figure(designs, sensor_gain=gain)
+            report, arguments.output, drawn, figure=lambda: figure(designs, sensor_gain=gain)
         )
-    if arguments.command == "step":
+    if arguments.kind == "step":
         _add_step_facts(report, designs, gain)
     return report
 
 
-def _curves(points: Sequence[Any], kind: type[Any]) -> dict[str, dict[str, list[float]]]:
+def _curves(points: Sequence[Any]) -> dict[str, dict[str, list[float]]]:
     """Return lists of the numbers of each design; what it has none of is left out."""
-    names = [field.name for field in fields(kind) if field.name != "design"]
     curves: dict[str, dict[str, list[float]]] = {}
     for point in points:
-        own = curves.setdefault(point.design, {name: [] for name in names})
-        for name in names:
-            own[name].append(getattr(point, name))
+        record = json_record(point)
+        lists = curves.setdefault(record.pop("design"), {name: [] for name in record})
+        for name, value in record.items():
+            lists[name].append(value)
     return {
-        design: {name: values for name, values in own.items() if not np.isnan(values).all()}
-        for design, own in curves.items()
+        design: {name: values for name, values in lists.items() if not np.isnan(values).all()}
+        for design, lists in curves.items()
     }
 
 
-def add_margins(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:
+def _add_margins(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:
     """Add the margins of designs, side by side."""
     margins = {name: _margins(design, sensor_gain) for name, design in designs.items()}
     physical = all(design.hardware is not None for design in designs.values())
     units = json_units(LoopMargins) | ({"gamma": "nm", "rms": "nm"} if physical else {})
     report.data |= {"designs": margins, "units": units, "sensor_gain": sensor_gain}
-    shown = [each for each in columns(LoopMargins) if each.heading]
     unit, factor = shown_unit(units.get("gamma", ""))
-    norms = [factor * known["gamma"] if "gamma" in known else None for known in margins.values()]
+    norms = [factor * record["gamma"] if "gamma" in record else None for record in margins.values()]
     quantities = [("stable", "stable", "")]
-    quantities += [(each.heading, each.key, each.shown_unit) for each in shown]
+    quantities += [(c.heading, c.key, c.shown_unit) for c in columns(LoopMargins) if c.heading]
     report.add_table(
         f"Margins at sensor gain {sensor_gain:g}",
         ("quantity", *margins, "unit"),
         [("norm", *norms, unit)]
         + [
-            (heading, *(known.get(key) for known in margins.values()), unit)
+            (heading, *(record.get(key) for record in margins.values()), unit)
             for heading, key, unit in quantities
         ],
     )
 
 
 def _margins(design: Design, sensor_gain: float) -> dict[str, Any]:
-    """Return what is known of a design: its norm in its model, and the margins of its loop."""
-    known: dict[str, Any] = {"method": design.method}
+    """Return the method of a design, its norm in its model, and the margins of its loop."""
+    record: dict[str, Any] = {"method": design.method}
     if design.is_estimator:
-        known |= {"gamma": design.gamma, "rms": design.rms}
+        record |= {"gamma": design.gamma, "rms": design.rms}
     if design.hardware is not None:
         loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
-        known["stable"] = loop.is_stable
+        record["stable"] = loop.is_stable
         if loop.is_stable:
-            known |= json_record(loop_margins(loop))
-    return known
+            record |= json_record(loop_margins(loop))
+    return record
+
+
+def _points(kind: type[Any], design: str, *series: FloatArray) -> list[Any]:
+    """Return rows of a kind, of which the series are the numbers in the order of its fields."""
+    names = [each.name for each in columns(kind)][1:]
+    return [
+        kind(design=design, **dict(zip(names, map(float, numbers), strict=True)))
+        for numbers in zip(*series, strict=True)
+    ]
 
 
 def _loop_points(designs: Mapping[str, Design], sensor_gain: float) -> list[LoopPoint]:
     """Return the points of the loops of designs."""
     return [
-        LoopPoint(
-            design=each.name,
-            frequency_hz=float(frequency),
-            gain_db=float(gain),
-            phase_deg=float(phase),
-            real=float(value.real),
-            imaginary=float(value.imag),
-        )
-        for each in open_loops(designs, sensor_gain=sensor_gain)
-        for frequency, gain, phase, value in zip(*each.points, strict=True)
+        point
+        for loop in open_loops(designs, sensor_gain=sensor_gain)
+        for *curves, response in [loop.points]
+        for point in _points(LoopPoint, loop.name, *curves, response.real, response.imag)
     ]
 
 
 def _sigma_points(designs: Mapping[str, Design], sensor_gain: float) -> list[SigmaPoint]:
     """Return the points of the curves of designs."""
-    points = []
-    for name, curves in sigma_curves(designs, sensor_gain=sensor_gain).items():
-        f, *parts = curves
-        values = [np.full(f.size, np.nan) if part is None else part for part in parts]
-        points += [
-            SigmaPoint(
-                design=name,
-                frequency_hz=float(frequency),
-                error=float(error),
-                rejection=float(rejection),
-                noise_transfer=float(noise),
-            )
-            for frequency, error, rejection, noise in zip(f, *values, strict=True)
-        ]
-    return points
+    return [
+        point
+        for name, (f, *parts) in sigma_curves(designs, sensor_gain=sensor_gain).items()
+        for point in _points(
+            SigmaPoint, name, f, *(np.full(f.size, np.nan) if p is None else p for p in parts)
+        )
+    ]
+
+
+def _named_steps(
+    designs: Mapping[str, Design], sensor_gain: float, frames: int = SHOWN_FRAMES
+) -> list[tuple[str, LoopStep]]:
+    """Return the step responses of designs, named with their axes where these differ."""
+    return [
+        (axes_name(name, [step.axis], alone=len(steps) == 1), step)
+        for name, steps in design_steps(designs, sensor_gain=sensor_gain, frames=frames).items()
+        for step in steps
+    ]
 
 
 def _add_step_facts(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:
     """Add how the loops follow a step."""
-    facts = [
-        StepFacts(
-            design=axes_name(name, [each.axis], alone=len(found) == 1),
-            overshoot_percent=each.overshoot_percent,
-            settling_s=each.settling_s,
-        )
-        for name, found in design_steps(
-            designs, sensor_gain=sensor_gain, frames=_SETTLING_FRAMES
-        ).items()
-        for each in found
-    ]
-    if facts:
-        report.add_rows("steps", "After a step of the wavefront", facts)
+    steps = _named_steps(designs, sensor_gain, frames=_SETTLING_FRAMES)
+    facts = [fill_row(StepFacts, step, design=name) for name, step in steps]
+    report.add_rows("steps", "After a step of the wavefront", facts)
 
 
 def _step_points(designs: Mapping[str, Design], sensor_gain: float) -> list[StepPoint]:
     """Return the points of the step responses."""
     return [
-        StepPoint(
-            design=axes_name(name, [each.axis], alone=len(found) == 1),
-            time_s=float(time),
-            residual=float(residual),
-            command=float(command),
-        )
-        for name, found in design_steps(designs, sensor_gain=sensor_gain).items()
-        for each in found
-        for time, residual, command in zip(each.time_s, each.residual, each.command, strict=True)
+        point
+        for name, step in _named_steps(designs, sensor_gain)
+        for point in _points(StepPoint, name, step.time_s, step.residual, step.command)
     ]
 
 
@@ -231,9 +225,9 @@ _View: TypeAlias = tuple[
     Callable[..., Any], Callable[[Mapping[str, Design], float], Sequence[Any]], type[Any]
 ]
 _VIEWS: Mapping[str, _View] = {  # the figure, the points of its curves, and their type
+    "sigma": (sigma_figure, _sigma_points, SigmaPoint),
     "bode": (bode_figure, _loop_points, LoopPoint),
     "nyquist": (nyquist_figure, _loop_points, LoopPoint),
     "nichols": (nichols_figure, _loop_points, LoopPoint),
-    "sigma": (sigma_figure, _sigma_points, SigmaPoint),
     "step": (step_figure, _step_points, StepPoint),
 }
