@@ -3,11 +3,38 @@
 from __future__ import annotations
 
 from argparse import Action, ArgumentError, ArgumentParser, Namespace, _ActionsContainer
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from lbt_synth.storage.display_unit import UNITS
 
 GAIN_FILE = "gain file (.fits or .npz)"
 FIGURE = "figure (.png, .pdf or .svg)"
+_SHARED: Mapping[str, dict[str, Any]] = {
+    "config": {"help": "configuration file (YAML)"},
+    "gain": {"help": GAIN_FILE},
+    "--unit": {
+        "choices": UNITS,
+        "help": "what tables, figures and pages show wavefronts in (default nm; JSON and CSV stay "
+        "in nm)",
+    },
+    "--output": {
+        "action": "append",
+        "default": [],
+        "help": "table (.csv) or figure (.png, .pdf, .svg); repeatable",
+    },
+    "--pdf": {"metavar": "FILE", "help": "write the same as a PDF, too (.pdf)"},
+    "--jobs": {"type": int, "default": 1, "help": "processes (default 1)"},
+    "--stroke": {"type": float, "help": "largest command that the mirror applies [nm]"},
+    "--wavelength-um": {"type": float, "help": "of Strehl ratios (default: the file's, or 2.2)"},
+}
+
+
+def add_shared(parser: _ActionsContainer, *names: str) -> None:
+    """Add arguments that are the same in several commands."""
+    for name in names:
+        flags = ("-o", name) if name == "--output" else (name,)
+        parser.add_argument(*flags, **_SHARED[name])
 
 
 def add_option(
@@ -25,6 +52,11 @@ def add_option(
     parser.add_argument(name, help=text, default=default, **more)
 
 
+def add_switch(parser: _ActionsContainer, name: str, text: str) -> None:
+    """Add an option without a value."""
+    parser.add_argument(name, action="store_true", help=text)
+
+
 def option_name(argument: str) -> str:
     """Return an option as people write it, by the name of its argument."""
     return f"--{argument.replace('_', '-')}"
@@ -33,21 +65,6 @@ def option_name(argument: str) -> str:
 def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
     """Return the options of those names that the command line gives."""
     return {name: value for name in names if (value := getattr(arguments, name)) is not None}
-
-
-def add_switch(parser: _ActionsContainer, name: str, text: str) -> None:
-    """Add an option without a value."""
-    parser.add_argument(name, action="store_true", help=text)
-
-
-def add_config(parser: ArgumentParser) -> None:
-    """Add a configuration."""
-    parser.add_argument("config", help="configuration file (YAML)")
-
-
-def add_gain(parser: ArgumentParser) -> None:
-    """Add one gain file."""
-    parser.add_argument("gain", help=GAIN_FILE)
 
 
 def add_gains(parser: ArgumentParser, nargs: str = "*", text: str = GAIN_FILE) -> None:
@@ -59,13 +76,7 @@ def add_gains(parser: ArgumentParser, nargs: str = "*", text: str = GAIN_FILE) -
 class OnlyOutput(Action):
     """Take the name of the output; refuse a second one, which would not be written."""
 
-    def __call__(
-        self,
-        parser: ArgumentParser,
-        namespace: Namespace,
-        values: str | Sequence[Any] | None,
-        option_string: str | None = None,
-    ) -> None:
+    def __call__(self, _: Any, namespace: Namespace, values: Any, option: Any = None) -> None:
         """Store the name."""
         if getattr(namespace, self.dest) is not self.default:
             raise ArgumentError(self, "give it once")
@@ -81,69 +92,26 @@ def add_output(
     )
 
 
-def add_unit(parser: ArgumentParser) -> None:
-    """Add the unit of wavefronts in tables, texts, figures and pages."""
-    from lbt_synth.storage.display_unit import UNITS
-
-    text = "what tables, figures and pages show wavefronts in (default nm; JSON and CSV stay in nm)"
-    add_option(parser, "--unit", UNITS, text)
-
-
-def add_outputs(parser: ArgumentParser) -> None:
-    """Add any number of tables and figures."""
-    text = "table (.csv) or figure (.png, .pdf, .svg); repeatable"
-    parser.add_argument("-o", "--output", action="append", default=[], help=text)
-
-
 class TargetChoice(Action):
     """Take the name of a target; without one, print all of them and end."""
 
     def __call__(
-        self,
-        parser: ArgumentParser,
-        namespace: Namespace,
-        values: str | Sequence[Any] | None,
-        option_string: str | None = None,
+        self, parser: ArgumentParser, namespace: Namespace, values: Any, option: Any = None
     ) -> None:
-        """Store the name, or print the targets."""
-        if values is None:
-            _list_targets()
-            parser.exit()
-        setattr(namespace, self.dest, values)
+        """Store the name, or print how each target computes."""
+        if values is not None:
+            setattr(namespace, self.dest, values)
+            return
+        from lbt_synth.cli.output import Report  # needs what makes help slow
+        from lbt_synth.interop import target_named
+        from lbt_synth.interop.target import target_names
+        from lbt_synth.storage.rows import fact_table
 
-
-def _list_targets() -> None:
-    """Print how each target computes."""
-    from lbt_synth.cli.output import Report  # needs what makes help slow
-    from lbt_synth.interop import target_named
-    from lbt_synth.interop.target import target_names
-    from lbt_synth.storage.rows import fact_table
-
-    report = Report()
-    for name in target_names():
-        target = target_named(name)
-        report.tables.append(fact_table(f"{name}: {target.file}", target.arithmetic))
-    report.print(as_json=False)
-
-
-def add_faults(parser: ArgumentParser) -> None:
-    """Add the options of a mirror of little stroke, and of sensors that fail, in a run."""
-    add_option(parser, "--stroke", float, "largest command that the mirror applies [nm]")
-    parser.add_argument(
-        "--drop",
-        action="append",
-        metavar="SENSOR@START[..END][:READING]",
-        help="a sensor or channel that fails [s], as in m2@10s or wavefront@20s..20.2s; READING "
-        "missing (seen, default), zero or frozen (believed)",
-    )
-
-
-def add_engine(parser: ArgumentParser) -> None:
-    """Add what runs the samples of a study."""
-    engine = parser.add_mutually_exclusive_group()
-    add_option(engine, "--jobs", int, "processes", 1)
-    text = "Dask scheduler that runs it instead, as tcp://host:8786; it can run code here: trust it"
-    add_option(engine, "--dask", str, text, metavar="ADDRESS")
-    text = "files of the authority, certificate and key for a scheduler at tls://host:8786"
-    metavar = ("CA", "CERT", "KEY")
-    add_option(parser, "--dask-tls", str, text, nargs=3, metavar=metavar)
+        targets = {name: target_named(name) for name in target_names()}
+        Report(
+            tables=[
+                fact_table(f"{name}: {target.file}", target.arithmetic)
+                for name, target in targets.items()
+            ]
+        ).print(as_json=False)
+        parser.exit()

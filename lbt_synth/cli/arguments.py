@@ -6,28 +6,28 @@ The docstring of a function that adds the arguments of a command is the help of 
 from __future__ import annotations
 
 from argparse import ArgumentParser
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from lbt_synth.cli.argument_kinds import (
     FIGURE,
     GAIN_FILE,
     TargetChoice,
-    add_config,
-    add_engine,
-    add_faults,
-    add_gain,
     add_gains,
     add_option,
     add_output,
-    add_outputs,
+    add_shared,
     add_switch,
-    add_unit,
+    option_name,
 )
-from lbt_synth.cli.record_arguments import (
-    add_missing_facts,
-    add_record,
-    add_repairs,
-    add_series,
-)
+from lbt_synth.identification.accelerometers.units import M_S2
+from lbt_synth.storage.display_unit import UNITS
+
+if TYPE_CHECKING:  # slow to import for --help
+    from pydantic.fields import FieldInfo
+
+    from lbt_synth.methods.method import Method
+
+_LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
 def init(parser: ArgumentParser) -> None:
@@ -46,29 +46,90 @@ def init(parser: ArgumentParser) -> None:
 
 def design(parser: ArgumentParser) -> None:
     """Design a controller and write its gain file."""
-    from lbt_synth.cli.method_options import add_method_options
-
-    add_unit(parser)
-    add_config(parser)
-    add_method_options(parser)
+    add_shared(parser, "--unit", "config")
+    _add_method_options(parser)
     add_output(parser, GAIN_FILE)
+
+
+def _add_method_options(parser: ArgumentParser) -> None:
+    """Add ``--method`` and the options of all methods; each method checks its own."""
+    from lbt_synth.methods.registry import all_methods, option_names
+
+    methods = all_methods()
+    parser.add_argument(
+        "--method",
+        choices=tuple(methods),
+        required=True,
+        help="; ".join(
+            name if name == method.title else f"{name}: {method.title}"
+            for name, method in methods.items()
+        ),
+    )
+    for name in option_names():
+        owners = [method for method in methods.values() if name in method.options.model_fields]
+        helps: dict[str, list[str]] = {}
+        for method in owners:
+            helps.setdefault(_help_text(method, name), []).append(method.name)
+        text = "; ".join(f"{', '.join(names)}: {text}" for text, names in helps.items())
+        if others := sorted({o for m in owners if name in m.exclusive for o in m.exclusive}):
+            text += f"; at most one of {', '.join(map(option_name, others))}"
+        kinds = _kinds(owners[0].options.model_fields[name])
+        words = dict.fromkeys(c for m in owners for c in _choices(m.options.model_fields[name]))
+        parser.add_argument(
+            option_name(name),
+            type=next((kind for kind in (int, float) if kind in kinds), str),
+            metavar=f"{{{','.join(words)}}}" if words else None,
+            help=text.replace("%", "%%"),
+        )
+
+
+def _kinds(option: FieldInfo) -> tuple[Any, ...]:
+    """Return the types of an option, one or those of a union."""
+    if get_origin(option.annotation) is Literal:
+        return (option.annotation,)
+    return get_args(option.annotation) or (option.annotation,)
+
+
+def _choices(option: FieldInfo) -> list[str]:
+    return [c for kind in _kinds(option) if get_origin(kind) is Literal for c in get_args(kind)]
+
+
+def _help_text(method: Method, name: str) -> str:
+    """Return the description of an option with its choices or its range, and its default."""
+    option = method.options.model_fields[name]
+    choices = _choices(option)
+    limits = {
+        end: getattr(limit, end)
+        for limit in option.metadata
+        for end in _LIMITS
+        if getattr(limit, end, None) is not None
+    }
+    text = option.description or ""
+    if choices and not all(choice in text for choice in choices):
+        text += f", {' or '.join(choices)}"
+    if limits:
+        text += f", {' and '.join(f'{_LIMITS[end]} {limit:g}' for end, limit in limits.items())}"
+    if option.is_required() or option.default is None:
+        return text
+    if name in method.configurable:
+        return f"{text} (default: the configuration's, else {option.default:g})"
+    return f"{text} (default {option.default})"
 
 
 def show(parser: ArgumentParser) -> None:
     """Show a gain file: design, loop, margins, certificate."""
-    add_unit(parser)
-    add_gain(parser)
+    add_shared(parser, "--unit", "gain")
     add_switch(parser, "--matrices", "print the gains and the controller")
 
 
 def verify(parser: ArgumentParser) -> None:
     """Recompute the certificate of a gain file."""
-    add_gain(parser)
+    add_shared(parser, "gain")
 
 
 def export(parser: ArgumentParser) -> None:
     """Write the controller of a gain file for a real-time computer or another program."""
-    add_gain(parser)
+    add_shared(parser, "gain")
     _add_target(parser)
     types = ("double", "single")
     _add_form(parser, "c")
@@ -97,17 +158,17 @@ def _add_form(parser: ArgumentParser, whose: str) -> None:
 
 def rehearse(parser: ArgumentParser) -> None:
     """Run a gain file in the arithmetic of another program, in the loop, on a record."""
-    add_gain(parser)
+    add_shared(parser, "gain")
     _add_target(parser)
     text = "what a loop recorded (default: a disturbance drawn from the file's own truth)"
     add_option(parser, "--record", str, text, metavar="FILE", dest="file")
-    add_missing_facts(parser)
-    add_repairs(parser)
+    _add_missing_facts(parser)
+    _add_repairs(parser)
     add_option(parser, "--sensor-gain", float, "sensor gain of the record", 1.0)
-    add_option(parser, "--stroke", float, "largest command that the mirror applies [nm]")
+    add_shared(parser, "--stroke")
     add_option(parser, "--frames", int, "frames to draw where there is no record (default 8000)")
     add_option(parser, "--seed", int, "seed of what is drawn", 1)
-    add_option(parser, "--wavelength-um", float, "of Strehl ratios (default: the file's, or 2.2)")
+    add_shared(parser, "--wavelength-um")
     add_output(parser, FIGURE, required=False)
 
 
@@ -130,7 +191,7 @@ def _add_target(parser: ArgumentParser) -> None:
 
 def plot(parser: ArgumentParser) -> None:
     """Plot loops of one or several designs in a classical view, and print their margins."""
-    add_unit(parser)
+    add_shared(parser, "--unit")
     text = (
         "sigma: largest singular values; bode: gain and phase over frequency; nyquist: loops in "
         "the complex plane; nichols: gain over phase; step: residual and command after a step"
@@ -139,23 +200,21 @@ def plot(parser: ArgumentParser) -> None:
     add_gains(parser, "+")
     text = "real sensor gain, as a factor on the one that each design assumes"
     add_option(parser, "--sensor-gain", float, text, 1.0)
-    add_outputs(parser)
+    add_shared(parser, "--output")
 
 
 def report(parser: ArgumentParser) -> None:
     """Write a page about designs in the loop of a configuration."""
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     add_gains(parser, "+")
     add_option(parser, "--title", str, "heading of the page (default: names the configuration)")
-    add_option(parser, "--pdf", str, "write the same as a PDF, too (.pdf)", metavar="FILE")
+    add_shared(parser, "--pdf")
     add_output(parser, "page to write, one file that opens offline (.html)")
 
 
 def explore(parser: ArgumentParser) -> None:
     """Open a page of sliders in the browser, to see designs while the loop and the sky change."""
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     add_gains(parser, text="gain files to show beside the design of the sliders")
     text = "name or address to serve at (default localhost: this machine only; others can write "
     add_option(parser, "--host", str, text + "files with the page)")
@@ -169,14 +228,19 @@ def explore(parser: ArgumentParser) -> None:
 
 def simulate(parser: ArgumentParser) -> None:
     """Close the loop in the time domain, beside the exact answer."""
-    add_unit(parser)
-    add_config(parser)
-    add_gain(parser)
+    add_shared(parser, "--unit", "config", "gain")
     add_option(parser, "--frames", int, "frames to keep")
     add_option(parser, "--cases", int, "independent runs")
     add_option(parser, "--seed", int, "seed of the random series")
     add_option(parser, "--sensor-gain", float, "real sensor gain")
-    add_faults(parser)
+    add_shared(parser, "--stroke")
+    parser.add_argument(
+        "--drop",
+        action="append",
+        metavar="SENSOR@START[..END][:READING]",
+        help="a sensor or channel that fails [s], as in m2@10s or wavefront@20s..20.2s; READING "
+        "missing (seen, default), zero or frozen (believed)",
+    )
     _add_form(parser, "of the controller")
     add_output(parser, FIGURE, required=False)
     add_option(parser, "--telemetry", str, "write the first run (.fits, .npz)", metavar="FILE")
@@ -185,7 +249,7 @@ def simulate(parser: ArgumentParser) -> None:
 def telemetry(parser: ArgumentParser) -> None:
     """Show what a telemetry file holds, and write it in another format."""
     parser.add_argument("file", help="telemetry (.fits or .npz; FITS of the AOT standard, too)")
-    add_unit(parser)
+    add_shared(parser, "--unit")
     add_output(parser, "file to write (.fits, .npz or .aot.fits)", required=False)
     endings = ("fits", "npz", "aot")
     add_option(parser, "--format", endings, "of the file to write (default: its ending)")
@@ -196,14 +260,14 @@ def telemetry(parser: ArgumentParser) -> None:
 def end_to_end(parser: ArgumentParser) -> None:
     """Close the loop end to end: pyramid, mirror and moving air."""
     _add_simulator(parser)
-    add_gain(parser)
+    add_shared(parser, "gain")
 
 
 def end_to_end_table(parser: ArgumentParser) -> None:
     """Run Tables II and III of Agapito et al. 2008 end to end."""
     _add_simulator(parser)
     add_gains(parser, text="gain files to run beside the paper's filters")
-    add_option(parser, "--jobs", int, "processes", 1)
+    add_shared(parser, "--jobs")
     add_option(parser, "--seeds", int, "seeds of Table II and of 20 Hz", 3)
     add_option(parser, "--row-seeds", int, "seeds of the other rows", 1)
     parser.add_argument(
@@ -212,8 +276,7 @@ def end_to_end_table(parser: ArgumentParser) -> None:
 
 
 def _add_simulator(parser: ArgumentParser) -> None:
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     add_option(parser, "--pixels", int, "pixels across the pupil, even")
     add_option(parser, "--frames", int, "frames of an exposure")
     add_option(parser, "--settle-frames", int, "frames to settle before, at least 200")
@@ -222,9 +285,87 @@ def _add_simulator(parser: ArgumentParser) -> None:
     add_output(parser, "directory to write into")
 
 
+def _add_missing_facts(parser: ArgumentParser) -> None:
+    """Add what a record's file may not say."""
+    facts = parser.add_argument_group("what the file does not say")
+    add_option(facts, "--kind", ("closed-loop", "open-loop", "spectrum"))
+    add_option(facts, "--frame-rate-hz", float, "frame rate [Hz]")
+    add_option(facts, "--delay-frames", float, "total delay [frames]")
+    text = "of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too"
+    add_option(facts, "--unit", str, text)
+    add_option(facts, "--show-unit", UNITS, "what results are shown in (JSON and CSV stay in nm)")
+    add_option(facts, "--command-unit", str, "of the commands (default: --unit)")
+    add_option(facts, "--diameter-m", float, "telescope diameter [m], for angles")
+    add_option(facts, "--obstruction", float, "as a fraction of the diameter")
+    add_option(facts, "--averages", int, "periodograms that a spectrum is the mean of")
+    add_option(facts, "--commands", str, "another file, with the commands")
+    text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4"
+    add_option(facts, "--columns", str, text, nargs="+", metavar="ROLE=NAME")
+    add_option(facts, "--axes", int, "which of several columns or modes, from 0", nargs="+")
+
+
+def _add_repairs(parser: ArgumentParser) -> None:
+    """Add what the commands of a record need."""
+    text = "what the commands need, in this order, to be those that the mirror followed"
+    needs = parser.add_argument_group("what the commands need", text)
+    add_switch(needs, "--command-increments", "they are increments: add them up")
+    text = "frames by which they move to later frames, or to earlier ones below 0"
+    add_option(needs, "--command-shift-frames", int, text, 0)
+    add_switch(needs, "--swap-axes", "exchange those of the two axes")
+    add_option(needs, "--command-sign", int, "1 or -1, of both axes or of each", nargs="+")
+    text = "matrix from them to the axes of the measurements, row after row"
+    add_option(needs, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
+    text = "factor, of both axes or of each; 1 says that they were recorded as large as applied"
+    add_option(needs, "--command-scale", float, text, nargs="+")
+
+
+def _add_prior_knowledge(parser: ArgumentParser) -> None:
+    """Add what is known before an identification."""
+    known = parser.add_argument_group("what is known beforehand")
+    add_option(known, "--sensor-gain", float, "sensor gain, of both axes or of each", nargs="+")
+    text = "sensor gain where the data do not determine it"
+    add_option(known, "--assumed-gain", float, text, 1.0)
+    add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
+    add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
+    add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")
+    text = (
+        "NPY or CSV with one column per channel and one row per frame of the record: what is "
+        "coherent with it is expected as a line"
+    )
+    add_option(known, "--accelerometers", str, text)
+    text = "their rate (default: that of the file's times or header, else the frame rate) [Hz]"
+    add_option(known, "--accelerometer-rate-hz", float, text)
+    text = f"their unit: {', '.join(M_S2)} (default: that of the headings, else m/s2)"
+    add_option(known, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
+    add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
+    add_option(known, "--most-lines", int, "most vibrations per axis", 20)
+
+
+def _add_series(parser: ArgumentParser) -> None:
+    """Add a record, or a series, and all that it may not say."""
+    parser.add_argument(
+        "file",
+        help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
+        "and commands, or an open-loop series (identify: or a spectrum)",
+    )
+    _add_missing_facts(parser)
+    _add_repairs(parser)
+    _add_prior_knowledge(parser)
+    add_shared(parser, "--wavelength-um")
+
+
+def _add_record(parser: ArgumentParser) -> None:
+    """Add a record that is fitted, and its figure."""
+    _add_series(parser)
+    text = "go on although the commands do not reach the measurements as given"
+    add_switch(parser, "--accept-record", text)
+    add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
+    add_switch(parser, "--no-figure", "write no figure")
+
+
 def identify(parser: ArgumentParser) -> None:
     """Identify turbulence, vibrations, noise and sensor gain from a record."""
-    add_record(parser)
+    _add_record(parser)
     add_output(parser, "configuration to write (.yaml)")
 
 
@@ -232,7 +373,7 @@ def auto(parser: ArgumentParser) -> None:
     """Go from a record to a gain file: identify, design, certify, test on unseen data."""
     from lbt_synth.methods.registry import default_method, record_methods
 
-    add_record(parser)
+    _add_record(parser)
     text = (
         f"default: {default_method()}, unless another of the quick ones leaves clearly less of the "
         "frames after its training"
@@ -246,10 +387,10 @@ def auto(parser: ArgumentParser) -> None:
 
 def diagnose(parser: ArgumentParser) -> None:
     """Say what ran in a record, what is wrong, what it costs, and what to change first."""
-    add_series(parser)
+    _add_series(parser)
     parser.add_argument("gain", nargs="?", help=f"{GAIN_FILE} to try on the record")
     add_output(parser, "page to write, one file that opens offline (.html)", required=False)
-    add_option(parser, "--pdf", str, "write the same as a PDF, too (.pdf)", metavar="FILE")
+    add_shared(parser, "--pdf")
 
 
 def robustness(parser: ArgumentParser) -> None:
@@ -258,8 +399,7 @@ def robustness(parser: ArgumentParser) -> None:
     It is that of filters redesigned at each error, or of the designs of gain files at many sensor
     gains.
     """
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     add_gains(parser)
     redesigned = parser.add_argument_group("without gain files")
     add_option(redesigned, "--gamma-ratio", float, "H-infinity bound of each row")
@@ -274,55 +414,57 @@ def robustness(parser: ArgumentParser) -> None:
     text = "real delay less that of the design [frames] (default: the configuration's, else 0)"
     name, dest = "--delay-errors", "delay_errors_frames"
     add_option(fixed, name, float, text, nargs="+", dest=dest, metavar="FRAMES")
-    add_outputs(parser)
+    add_shared(parser, "--output")
 
 
 def tradeoff(parser: ArgumentParser) -> None:
     """Design filters from the least norm to the least variance, and compare their sensor gains."""
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     text = "levels of the norm, from the least of any filter to that of the Kalman filter, 2 to 200"
     add_option(parser, "--points", int, text, 9)
     text = "past innovations that the mixed filters (least variance at each norm) weigh, 1 to 64"
     add_option(parser, "--taps", int, text, 16)
-    add_outputs(parser)
+    add_shared(parser, "--output")
 
 
 def limits(parser: ArgumentParser) -> None:
     """Show how far designs are from the least residual of any linear controller."""
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     add_gains(
         parser,
         text="gain files to add to the integrator, the Kalman and the H-infinity filter of the "
         "configuration",
     )
-    add_outputs(parser)
+    add_shared(parser, "--output")
 
 
 def mirror(parser: ArgumentParser) -> None:
     """Show the step of the mirror's local loop, and what ignoring its dynamics costs."""
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     text = "half width of the band in which the mirror counts as settled"
     add_option(parser, "--tolerance", float, text, 0.1)
-    add_outputs(parser)
+    add_shared(parser, "--output")
 
 
 def modal(parser: ArgumentParser) -> None:
     """Compare integrators, optimised gains and Kalman filters for all modes of the mirror."""
-    add_unit(parser)
-    add_config(parser)
+    add_shared(parser, "--unit", "config")
     add_option(parser, "--modes", int, "number of modes, at least 2 (default: mirror.modes)")
-    add_outputs(parser)
+    add_shared(parser, "--output")
 
 
 def study(parser: ArgumentParser) -> None:
     """Try controllers on many samples of what the loop may meet; resumes if started again."""
-    add_unit(parser)
+    add_shared(parser, "--unit")
     parser.add_argument("study", metavar="file", help="study file (YAML)")
     add_output(parser, "directory of the study")
-    add_engine(parser)
+    engine = parser.add_mutually_exclusive_group()
+    add_shared(engine, "--jobs")
+    text = "Dask scheduler that runs it instead, as tcp://host:8786; it can run code here: trust it"
+    add_option(engine, "--dask", str, text, metavar="ADDRESS")
+    text = "files of the authority, certificate and key for a scheduler at tls://host:8786"
+    metavar = ("CA", "CERT", "KEY")
+    add_option(parser, "--dask-tls", str, text, nargs=3, metavar=metavar)
     add_switch(parser, "--pdf", "write the page as a PDF, too (summary.pdf)")
     instead = parser.add_mutually_exclusive_group()
     add_switch(instead, "--dry-run", "say how many samples and how long, and write nothing")
@@ -331,7 +473,7 @@ def study(parser: ArgumentParser) -> None:
 
 def paper(parser: ArgumentParser) -> None:
     """Compute the tables and figures of Agapito et al. 2008, ours beside theirs."""
-    add_unit(parser)
+    add_shared(parser, "--unit")
     add_output(parser, "directory to write into")
 
 

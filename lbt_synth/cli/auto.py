@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from lbt_synth.cli import command_repairs, loop_records
+from lbt_synth.cli import loop_records
 from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
@@ -29,7 +29,7 @@ def run(arguments: Namespace) -> Report:
     imaging = loop_records.record_imaging(arguments, record)
     with (
         count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count,
-        command_repairs.explain_refusals(arguments),
+        loop_records.explain_refusals(arguments),
     ):
         found = design_from_record(
             record,
@@ -37,11 +37,11 @@ def run(arguments: Namespace) -> Report:
             gamma_ratio=arguments.gamma_ratio,
             imaging=imaging,
             accept_record=arguments.accept_record,
-            command_scale_known=command_repairs.is_scale_known(arguments),
+            command_scale_known=loop_records.is_scale_known(arguments),
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
-    found = command_repairs.with_repair(arguments, found)
+    found = loop_records.with_repair(arguments, found)
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, found.model)

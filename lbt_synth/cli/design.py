@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import add_truth
-from lbt_synth.config import load_config
 from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
@@ -35,8 +34,7 @@ def run(arguments: Namespace) -> Report:
     given = given_options(arguments, *option_names())
     request = design_request(arguments.method, given, _WORDING)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     with show_spinner(f"designing ({request.method.name})", quiet=arguments.json):
         design = config.design(request)
     path = save_gain(arguments.output, design)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lbt_synth.config import Config
+from lbt_synth.config import Config, load_config
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -36,9 +36,15 @@ def choose_unit(
     show_in(DisplayUnit(name=name, nm=mas if name == "mas" else mas * _MAS_PER_URAD))
 
 
-def choose_config_unit(arguments: Namespace, config: Config) -> None:
+def choose_config_unit(arguments: Namespace, config: Config) -> Config:
     """Show wavefronts in the unit that was asked for, or in that of a configuration."""
     choose_unit(arguments, config.imaging.diameter_m, config.settings.units)
+    return config
+
+
+def load_shown(arguments: Namespace) -> Config:
+    """Load the configuration of a command, and show wavefronts in its unit."""
+    return choose_config_unit(arguments, load_config(arguments.config))
 
 
 def choose_wavefront_unit(arguments: Namespace) -> None:

@@ -7,10 +7,9 @@ import sys
 from argparse import Namespace
 from pathlib import Path
 
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
-from lbt_synth.config import load_config
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.explore.exploration import explore, first_wish, quick_view, whole_view
 from lbt_synth.storage.atomic_files import require_writable
@@ -30,8 +29,7 @@ def run(arguments: Namespace) -> Report:
             raise ProblemError(f"--origin must be HOST:PORT, as localhost:8080; got {origin!r}.")
     folder = Path(arguments.output)
     require_writable(folder / "explored-1.yaml")
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     exploration = explore(config, load_designs(arguments.gains))
     first = whole_view(exploration, quick_view(exploration, first_wish()))
 
@@ -52,11 +50,7 @@ def run(arguments: Namespace) -> Report:
         served.append(url)
 
     serve(
-        site,
-        host=arguments.host,
-        port=arguments.port,
-        origins=arguments.origin,
-        announce=announce,
+        site, host=arguments.host, port=arguments.port, origins=arguments.origin, announce=announce
     )
     report = Report(data={"url": served[0]})
     report.note_files(site.saved)

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from lbt_synth.cli import command_repairs, loop_records
+from lbt_synth.cli import loop_records
 from lbt_synth.cli.display import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.identification import (
-    LoopRecord,
-    SpectrumRecord,
-    accelerometer_transfers,
-    identify,
-)
+from lbt_synth.identification import LoopRecord, SpectrumRecord, accelerometer_transfers, identify
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 
 
@@ -25,7 +20,7 @@ def run(arguments: Namespace) -> Report:
     options = loop_records.identification_options(arguments, record)
     notes: tuple[str, ...] = ()
     if isinstance(record, LoopRecord):
-        notes = command_repairs.judge_record(arguments, record)
+        notes = loop_records.judge_record(arguments, record)
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
     with show_spinner("identifying", quiet=arguments.json):

@@ -5,13 +5,13 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth import studies
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import load_designs, named_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.cli.truth_table import say_limit
-from lbt_synth.config import Config, load_config
+from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.report.figures.studies import limits_figure
@@ -22,18 +22,13 @@ from lbt_synth.studies.limits import LimitStudy
 def run(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
     require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     files = load_designs(arguments.gains, any_sensors=True)
     with show_spinner("comparing", quiet=arguments.json):
         designs = _config_designs(config)
         designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
         study = studies.limits(
-            designs,
-            config.hardware,
-            config.truth,
-            config.imaging,
-            errors_hz=config.errors_hz,
+            designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
         )
     no_band = () if study.band is not None else ("above_band_limit_percent",)
     report = Report()

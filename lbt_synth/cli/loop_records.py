@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lbt_synth.cli.argument_kinds import given_options, option_name
-from lbt_synth.cli.command_repairs import given_repair
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import config_text
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import ProblemError, RecordError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
     IdentifiedAxis,
@@ -26,13 +26,10 @@ from lbt_synth.identification import (
     load_record,
     require_length,
 )
-from lbt_synth.identification.accelerometers.readings import (
-    Readings,
-    fill_missing,
-    load_readings,
-)
+from lbt_synth.identification.accelerometers.readings import Readings, fill_missing, load_readings
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
-from lbt_synth.identification.commands.repair import repair_commands
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
+from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import LEAST_SECONDS
@@ -43,7 +40,7 @@ from lbt_synth.storage.atomic_files import require_ending, require_writable, wri
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import number
 
-if TYPE_CHECKING:  # as in command_repairs
+if TYPE_CHECKING:  # it loads the methods of synthesis, which identify does not need
     from lbt_synth.identification.auto import RecordedDesign
 
 _FACTS = (  # that a file may not hold
@@ -87,12 +84,66 @@ def load_series(
         columns=_parse_columns(arguments.columns),
         **facts,
     )
-    repair = given_repair(arguments)
+    repair = _given_repair(arguments)
     if not repair.options:
         return record
     if isinstance(record, SpectrumRecord):
         raise ProblemError(f"a spectrum has no commands; leave {repair.options} out.")
     return repair_commands(record, repair)
+
+
+def _given_repair(arguments: Namespace) -> CommandRepair:
+    """Return what the command line says that the commands need."""
+    return CommandRepair(
+        increments=arguments.command_increments,
+        shift_frames=arguments.command_shift_frames,
+        swap_axes=arguments.swap_axes,
+        sign=tuple(arguments.command_sign or ()),
+        matrix=tuple(arguments.command_matrix or ()),
+        scale=arguments.command_scale or 1.0,
+    )
+
+
+def is_scale_known(arguments: Namespace) -> bool:
+    """Return whether the command line says at which size commands were recorded."""
+    return arguments.command_scale is not None or arguments.command_matrix is not None
+
+
+@contextmanager
+def explain_refusals(arguments: Namespace) -> Iterator[None]:
+    """Refuse a record in the words of the command line, with the options that repair it."""
+    try:
+        yield
+    except RecordError as error:
+        advice = f"{error.options}, or " if error.options else ""
+        raise RecordError(
+            f"the commands of {arguments.file} do not reach its measurements as given: "
+            f"{error.explanation}. Try {advice}--accept-record to go on as it is.",
+            explanation=error.explanation,
+            options=error.options,
+        ) from error
+
+
+def judge_record(arguments: Namespace, record: LoopRecord) -> tuple[str, ...]:
+    """Refuse a record whose commands do not reach its measurements; return notes on others."""
+    if record.commands is None:
+        return ()
+    gains = arguments.sensor_gain
+    with explain_refusals(arguments):
+        verdict = explain_commands(record, sensor_gain=gains)
+        if not arguments.accept_record:
+            verdict.require_accepted()
+    return (*verdict.notes, *(f"warning: it is assumed that {word}" for word in verdict.overruled))
+
+
+def with_repair(arguments: Namespace, made: RecordedDesign) -> RecordedDesign:
+    """Return what was made of a record, with the repair of its commands as an assumption."""
+    options = _given_repair(arguments).options
+    if not options:
+        return made
+    words = f"the commands of the record were read with {options}"
+    design = replace(made.design, assumptions=(words, *made.design.assumptions))
+    return replace(made, design=design)
 
 
 def record_imaging(arguments: Namespace, record: LoopRecord) -> Imaging:
@@ -168,10 +219,7 @@ def _expected_lines(
             )
         values, known = fill_missing(read_accelerations(arguments, record).beside(record.frames))
         lines += accelerometer_lines(
-            values,
-            record.pseudo_open_loop(),
-            record.frame_rate_hz,
-            usable=record.usable & known,
+            values, record.pseudo_open_loop(), record.frame_rate_hz, usable=record.usable & known
         )
     return tuple(lines)
 

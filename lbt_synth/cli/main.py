@@ -2,6 +2,9 @@
 
 Exit status: 0 done, 1 a design or a verification failed, 2 wrong usage or bad input.
 Nothing heavy is imported before a command runs.
+
+Errors name the arguments of functions in three forms: ``name=value``, a name before "must" or after
+"give", and names of several words. The option of the command that has such a name is said instead.
 """
 
 from __future__ import annotations
@@ -9,28 +12,39 @@ from __future__ import annotations
 import gc
 import importlib
 import json
+import re
 import signal
 import sys
 import threading
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lbt_synth.cli.parser import build_parser, command_module, command_options
 from lbt_synth.cli.streams import discard, print_error
-from lbt_synth.errors import LbtSynthError, SynthesisError
+from lbt_synth.errors import ConfigError, LbtSynthError, OutputError, SynthesisError
+from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.thread_limits import limit_threads
 
 if TYPE_CHECKING:  # slow to import for --help
     from lbt_synth.cli.output import Report
 
 DONE, FAILED, WRONG = 0, 1, 2
-_SHARED_MODULES = {
-    "completion": "help",
-    "end-to-end-table": "end_to_end",
-    "verify": "show",
-}
 INTERRUPTED, BROKEN_PIPE, TERMINATED = 130, 141, 143  # as shells count signals
+_WORD = r"[a-z]+(?:_[a-z]+)*"
+_VALUE = r"""\{[^}]*\}|'[^']*'|"[^"]*"|-?\w(?:[\w.+-]*\w)?"""
+_SETTING = re.compile(rf"""(?<![\w.'"/-])({_WORD})=({_VALUE})""")
+_NAME = re.compile(
+    rf"(?<![\w.'\"/-])(?:(?:(?<=^)|(?<=: )|(?<=; )){_WORD}(?= must )|(?<=give ){_WORD}"
+    r"|[a-z]+(?:_[a-z]+)+)(?!\w|=|\(|\[|\.\w)"
+)
+_CONFIGURATION, _GAIN, _STUDY, _TELEMETRY = "configuration", "gain file", "study file", "telemetry"
+_RECORD = "record"  # telemetry, or what no other kind is
+_EXPECTED = {"config": _CONFIGURATION, "gain": _GAIN, "gains": _GAIN, "study": _STUDY}
+_EXPECTED |= dict.fromkeys(("file", "files", "source"), _RECORD)
+_ENDINGS = {".png": "figure", ".pdf": "figure", ".svg": "figure", ".html": "page"}
 
 
 class Terminated(KeyboardInterrupt):
@@ -41,19 +55,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = sys.argv[1:] if argv is None else list(argv)
     named = next((word for word in words if not word.startswith("-")), "")
-    from lbt_synth.cli.parser import build_parser
-
     arguments = build_parser(named).parse_args(words)
-    from lbt_synth.storage.display_unit import own_display_unit
-
     try:
         run = _find_command(arguments.command)
         with _terminable(), own_display_unit():
             report = run(arguments)
     except LbtSynthError as error:
-        from lbt_synth.cli.surface import say_error  # after what it says may have failed
-
-        return _fail(error, say_error(error, arguments), arguments)
+        return _fail(error, _say_error(error, arguments), arguments)
     except MemoryError:
         print_error("error: not enough memory; ask for less.")
         return WRONG
@@ -68,10 +76,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _find_command(command: str) -> Callable[[Namespace], Report]:
-    """Return what runs a command, from its module or from one that it shares."""
-    name = command.replace("-", "_")
-    module = importlib.import_module(f"lbt_synth.cli.{_SHARED_MODULES.get(command, name)}")
-    run: Callable[[Namespace], Report] = getattr(module, f"run_{name}", None) or module.run
+    """Return what runs a command, from its module."""
+    module = importlib.import_module(f"lbt_synth.cli.{command_module(command)}")
+    named = f"run_{command.replace('-', '_')}"
+    run: Callable[[Namespace], Report] = getattr(module, named, None) or module.run
     return run
 
 
@@ -81,6 +89,82 @@ def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:
         print(json.dumps({"error": type(error).__name__, "message": message}))
     print_error(f"error: {message}")
     return FAILED if isinstance(error, SynthesisError) else WRONG
+
+
+def _say_error(error: LbtSynthError, arguments: Namespace) -> str:
+    """Return the message of an error in the words of a command that was run."""
+    if not isinstance(error, OutputError) and (misplaced := _misplaced_files(arguments)):
+        return misplaced
+    message = str(error)
+    cause: BaseException | None = error
+    while cause is not None:
+        if advice := getattr(cause, "in_python", ""):
+            message = message.replace(f" {advice}", "")
+        if advice := getattr(cause, "at_terminal", ""):
+            message = f"{message} {advice}"
+        cause = cause.__cause__
+    return message if isinstance(error, ConfigError) else _say_names(message, arguments)
+
+
+def _say_names(message: str, arguments: Namespace) -> str:
+    """Name options where a message names arguments of functions."""
+    options = {name: said for name, (said, _) in command_options(arguments.command).items()}
+
+    def name(found: re.Match[str]) -> str:
+        return options.get(found[0], found[0])
+
+    def setting(found: re.Match[str]) -> str:
+        word, value = found.groups()
+        if word not in options:
+            return found[0]
+        pairs = re.findall(r"'(\w+)': ([^,}]+)", value)
+        words = [f"{key}={entry}" for key, entry in pairs] or [value.strip("'\"")]
+        return " ".join([options[word], *words])
+
+    return _NAME.sub(name, _SETTING.sub(setting, message))
+
+
+def _misplaced_files(arguments: Namespace) -> str:
+    """Return which files of a command are of another kind than they stand for, if any are."""
+    wrong = [
+        (path, kind, wanted)
+        for place, wanted in _EXPECTED.items()
+        for path in _as_list(getattr(arguments, place, None))
+        if (kind := file_kind(Path(path))) not in ("", wanted)
+        and (kind, wanted) != (_TELEMETRY, _RECORD)
+    ]
+    text = "; ".join(f"{path} is a {kind}, expected a {wanted}" for path, kind, wanted in wrong)
+    text = text.replace("is a telemetry", "is telemetry")
+    exchanged = len(wrong) == 2 and wrong[0][1:] == wrong[1][:0:-1]
+    return f"{text}.{' Exchange them.' if exchanged else ''}" if text else ""
+
+
+def _as_list(given: object) -> list[str]:
+    words = given if isinstance(given, list) else [given]
+    return [word for word in words if isinstance(word, str)]  # some options have such names, too
+
+
+def file_kind(path: Path) -> str:
+    """Return what a file is, as far as this package knows its kind."""
+    from lbt_synth.config.load import read_mapping
+    from lbt_synth.files import load_gain
+    from lbt_synth.identification.records.from_file import is_telemetry
+
+    if path.suffix.lower() in (".yaml", ".yml"):
+        try:
+            content = read_mapping(path)
+        except ConfigError:
+            return ""
+        return _STUDY if "controllers" in content else _CONFIGURATION if "loop" in content else ""
+    if path.suffix.lower() in _ENDINGS and path.is_file():
+        return _ENDINGS[path.suffix.lower()]
+    if is_telemetry(path):
+        return _TELEMETRY
+    try:
+        load_gain(path)
+    except LbtSynthError:
+        return ""
+    return _GAIN
 
 
 @contextmanager

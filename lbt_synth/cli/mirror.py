@@ -5,11 +5,11 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth import studies
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.config import Config, load_config
+from lbt_synth.config import Config
 from lbt_synth.errors import ConfigError
 from lbt_synth.loop import least_residual
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
@@ -39,8 +39,7 @@ class MirrorFacts:
 def run(arguments: Namespace) -> Report:
     """Show how the mirror of a configuration settles, and compare designs on it."""
     require_outputs(arguments.output, inputs=[arguments.config])
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     plant, shell = config.plant.own_sensor_alone(), _require_local_loop(config)
     hardware = plant.hardware
     step = shell.step_response(arguments.tolerance)

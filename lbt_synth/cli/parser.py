@@ -12,7 +12,7 @@ from lbt_synth.cli.streams import printable
 from lbt_synth.errors import ProblemError, suggest_word
 
 # In the order of the help, each with the function that adds its arguments, whose docstring is its
-# help. A command runs in the module of its name, with underscores for dashes.
+# help.
 COMMANDS = {
     add_arguments.__name__.replace("_", "-"): add_arguments
     for add_arguments in (
@@ -29,6 +29,14 @@ COMMANDS = {
         *(arguments.help, arguments.completion),
     )
 }
+
+
+_SHARED_MODULES = {"completion": "help", "end-to-end-table": "end_to_end", "verify": "show"}
+
+
+def command_module(name: str) -> str:
+    """Return the module in which a command runs: that of its name, or one that it shares."""
+    return _SHARED_MODULES.get(name, name.replace("-", "_"))
 
 
 class Parser(argparse.ArgumentParser):

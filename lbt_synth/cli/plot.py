@@ -28,14 +28,7 @@ from lbt_synth.report.figures.open_loops import axes_name, open_loops
 from lbt_synth.report.figures.sigma import sigma_curves
 from lbt_synth.report.figures.step import design_steps
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import (
-    column,
-    columns,
-    fill_row,
-    json_record,
-    json_units,
-    table_row,
-)
+from lbt_synth.storage.rows import column, columns, fill_row, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
 
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn

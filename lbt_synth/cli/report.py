@@ -6,11 +6,11 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import load_designs, named_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
-from lbt_synth.config import Config, load_config
+from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import design_report, write_report
@@ -32,8 +32,7 @@ def run(arguments: Namespace) -> Report:
     if arguments.title is not None and not arguments.title.strip():
         raise ProblemError("--title must hold at least one letter; got an empty text.")
     require_letters(arguments.title or "", "--title")
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     designs = load_designs(arguments.gains, any_sensors=True)
     several = [name for name, design in designs.items() if design.other_sensors]
     files = dict(zip(designs, arguments.gains, strict=True))

@@ -10,13 +10,13 @@ import numpy as np
 
 from lbt_synth import studies
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import load_designs, own_sensor_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import count_progress, track_progress
-from lbt_synth.config import Config, load_config
+from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
@@ -39,8 +39,7 @@ def run(arguments: Namespace) -> Report:
     """Compute the Strehl ratio over an error of the vibration frequency."""
     require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     _refuse_unused_options(arguments)
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     return (_map_designs if arguments.gains else _redesign)(config, arguments)
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.config import Config, load_config
+from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
@@ -137,8 +137,7 @@ def run(arguments: Namespace) -> Report:
     if arguments.telemetry is not None:
         require_telemetry_name(arguments.telemetry)
         require_writable(arguments.telemetry, inputs=inputs)
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     design = load_gain(arguments.gain)
     if design.other_sensors:
         return run_all_sensors(arguments, config, design)
@@ -165,11 +164,7 @@ def run(arguments: Namespace) -> Report:
         )
         strehls = simulation.strehl(config.imaging)
     report = _describe_simulation(
-        simulation,
-        strehls,
-        _exact_answers(loop, config, truth),
-        design,
-        config.imaging,
+        simulation, strehls, _exact_answers(loop, config, truth), design, config.imaging
     )
     report.data["sensor_gain"] = config.sensor_gain * truth.sensor_gain
     report.notes += _simulation_notes(config, design, strehls, settle, drifts=truth.drifts)

@@ -79,12 +79,7 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
 
 
 def _compute(
-    loaded: studies.Study,
-    folder: Path,
-    files: Sequence[Path],
-    arguments: Namespace,
-    *,
-    draws: bool,
+    loaded: studies.Study, folder: Path, files: Sequence[Path], arguments: Namespace, *, draws: bool
 ) -> tuple[StudyRun, StudyStatistics, bool]:
     """Run a study; return also whether anything was left to compute.
 

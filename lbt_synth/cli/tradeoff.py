@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from lbt_synth.cli.display import choose_config_unit
+from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import own_sensor_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import track_progress
-from lbt_synth.config import load_config
 from lbt_synth.report.figures.studies import tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import tradeoff
@@ -22,8 +21,7 @@ def run(arguments: Namespace) -> Report:
     require_outputs(arguments.output, inputs=[arguments.config])
     count = integer(arguments.points, "--points", at_least=2)
     taps = integer(arguments.taps, "--taps", at_least=1)
-    config = load_config(arguments.config)
-    choose_config_unit(arguments, config)
+    config = load_shown(arguments)
     points = list(
         track_progress(
             tradeoff(config.plant.own_sensor_alone(), points=count, taps=taps),
