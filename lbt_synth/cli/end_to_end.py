@@ -7,9 +7,9 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
-from lbt_synth.cli.argument_kinds import given_options
+from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.display import choose_wavefront_unit
-from lbt_synth.cli.engine import keep_finished, require_counts
+from lbt_synth.cli.engine import keep_finished
 from lbt_synth.cli.loop_inputs import load_design, load_designs
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.progress import count_progress
@@ -44,6 +44,7 @@ from lbt_synth.studies.paper.end_to_end import (
     rms_modal_difference,
     run_tables,
 )
+from lbt_synth.validation import integer
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
 _FILES = ("run.png", "telemetry.fits", "summary.json")
@@ -188,7 +189,8 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     choose_wavefront_unit(arguments)
     setup = load_setup(arguments)
     designs = load_designs(arguments.gains)
-    require_counts(arguments, "seeds", "row_seeds", "jobs")
+    for count in ("seeds", "row_seeds", "jobs"):
+        integer(getattr(arguments, count), option_name(count), at_least=1)
     cases = {_case_name(name): design for name, design in designs.items()}
     if len(cases) < len(designs):
         raise ProblemError(
@@ -208,11 +210,11 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
     with (
-        count_progress(total=total, what="runs", quiet=arguments.json) as count,
+        count_progress(total=total, what="runs", quiet=arguments.json) as advance,
         keep_finished(case_folder),
     ):
         table = run_tables(
-            setup, rows, case_folder, jobs=arguments.jobs, cache=arguments.cache, progress=count
+            setup, rows, case_folder, jobs=arguments.jobs, cache=arguments.cache, progress=advance
         )
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]

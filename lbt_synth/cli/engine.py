@@ -10,18 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import lbt_synth
-from lbt_synth.cli.argument_kinds import option_name
 from lbt_synth.cli.streams import print_error
 from lbt_synth.errors import MissingExtraError, ProblemError
-from lbt_synth.validation import integer
 
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
-
-
-def require_counts(arguments: Namespace, *names: str) -> None:
-    """Refuse options that count something, such as ``jobs``, below 1."""
-    for name in names:
-        integer(getattr(arguments, name), option_name(name), at_least=1)
 
 
 def choose_engine(

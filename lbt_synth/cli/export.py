@@ -16,23 +16,10 @@ from lbt_synth.interop.export_checks import Exported
 from lbt_synth.interop.target import CERTIFICATE, target_names
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, table_row
+from lbt_synth.storage.rows import fact, fact_table, facts, json_record
 
 _SINGLE_SUFFICES = 1e-3  # of the largest command
 _OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
-
-
-@table_row
-class ExportFacts:
-    """What was exported, and how far it is from the controller."""
-
-    method: str = column("method")
-    n_states: int = column("states of the controller")
-    measurements: int = column("measurements")
-    commands: int = column("commands")
-    error: float = column("difference from the controller", unit="of the largest command")
-    error_single: float = column("  in single precision", unit="of the largest command")
-    stable_single: bool = column("  stable in single precision")
 
 
 def run(arguments: Namespace) -> Report:
@@ -62,17 +49,18 @@ def run(arguments: Namespace) -> Report:
         data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
     )
     commands, measurements = design.controller.D.shape[-2:]
-    facts = fill_row(
-        ExportFacts,
-        written,
-        design,
-        measurements=measurements,
-        commands=commands,
-        n_states=design.controller.n_states,
-        stable_single=math.isfinite(written.error_single),
+    largest = {"unit": "of the largest command"}
+    what = facts(
+        method=fact(design.method, "method"),
+        n_states=fact(design.controller.n_states, "states of the controller"),
+        measurements=fact(measurements, "measurements"),
+        commands=fact(commands, "commands"),
+        error=fact(written.error, "difference from the controller", **largest),
+        error_single=fact(written.error_single, "  in single precision", **largest),
+        stable_single=fact(math.isfinite(written.error_single), "  stable in single precision"),
     )
-    report.data |= {"frame_cost": json_record(cost), **json_record(facts)}
-    report.tables.append(fact_table("Export", facts, *([cost] if written.cost else [])))
+    report.data |= {"frame_cost": json_record(cost), **json_record(what)}
+    report.tables.append(fact_table("Export", what, *([cost] if written.cost else [])))
     if written.checks:
         report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
     report.notes += _precision_notes(arguments, written)

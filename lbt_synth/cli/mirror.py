@@ -15,25 +15,9 @@ from lbt_synth.loop import least_residual
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.models import PositionLoop
 from lbt_synth.report.figures.studies import mirror_figure
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import fact, facts
 
 _SHOWN_TAPS = 8
-
-
-@table_row
-class MirrorFacts:
-    """How the mirror follows a step of its command."""
-
-    rise_s: float = column("rise, 10 % to 90 %", unit="ms", scale=1e3)
-    overshoot: float = column("overshoot", unit="%", scale=100)
-    tolerance: float = column("tolerance of the settling time", unit="%", scale=100)
-    settling_s: float = column("settling time", unit="ms", scale=1e3)
-    settling_frames: float = column("  in frames", unit="frames")
-    bandwidth_hz: float = column("bandwidth, -3 dB", unit="Hz")
-    frame_s: float = column("one frame", unit="ms", scale=1e3)
-    limit_nm: float = column(
-        "least residual of any linear controller in the truth", unit="nm rms", format=".2f"
-    )
 
 
 def run(arguments: Namespace) -> Report:
@@ -53,15 +37,20 @@ def run(arguments: Namespace) -> Report:
     taps = hardware.mirror_taps
     shown = [f"{tap:.4f}" for tap in taps[:_SHOWN_TAPS]] + ["..."] * (taps.size > _SHOWN_TAPS)
     report = Report(data={"taps": taps})
+    limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
+    least = "least residual of any linear controller in the truth"
+    per_cent, ms = {"unit": "%", "scale": 100}, {"unit": "ms", "scale": 1e3}
     report.add_facts(
         "The mirror after a step of its command",
-        fill_row(
-            MirrorFacts,
-            step,
-            shell,
-            settling_frames=step.settling_s / hardware.dt_s,
-            frame_s=hardware.dt_s,
-            limit_nm=limit_or_nan(lambda: least_residual(hardware, config.truth)),
+        facts(
+            rise_s=fact(step.rise_s, "rise, 10 % to 90 %", **ms),
+            overshoot=fact(step.overshoot, "overshoot", **per_cent),
+            tolerance=fact(step.tolerance, "tolerance of the settling time", **per_cent),
+            settling_s=fact(step.settling_s, "settling time", **ms),
+            settling_frames=fact(step.settling_s / hardware.dt_s, "  in frames", unit="frames"),
+            bandwidth_hz=fact(shell.bandwidth_hz, "bandwidth, -3 dB", unit="Hz"),
+            frame_s=fact(hardware.dt_s, "one frame", **ms),
+            limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
     )
     report.add_rows("rows", f"Designs on this mirror; {config.imaging.label}", rows)

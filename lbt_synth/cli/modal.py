@@ -20,37 +20,16 @@ from lbt_synth.errors import ConfigError
 from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.report.figures import modal_figure
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, nm_column, row_table, table_row
+from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.validation import FloatArray, integer
 
 _MOST_MODES = 20_000
+_RMS: dict[str, Any] = {"unit": "nm", "format": ".1f"}
 _MIRROR_NOTE = (
     "mirror: its local loop on every mode; the Kalman filters know its real positions, but command "
     "their estimates as if it were there at once (lbt-synth mirror, design lqg: tip and tilt "
     "without this lag)."
 )
-
-
-@table_row
-class ControllerRow:
-    """What a controller leaves of all modes."""
-
-    controller: str = column("controller")
-    residual_nm: float = nm_column("residual", format=".1f")
-
-
-@table_row
-class OrderRow:
-    """One radial order: root sums of squares over its modes."""
-
-    radial_order: int = column("radial order")
-    modes: int = column("modes")
-    turbulence_nm: float = nm_column("turbulence")
-    noise_nm: float = nm_column("noise per mode", format=".2f")
-    gain: float = column("mean gain", format=".3f")
-    uniform_nm: float = nm_column("one gain")
-    optimised_nm: float = nm_column("optimised gains")
-    kalman_nm: float = nm_column("Kalman")
 
 
 def run(arguments: Namespace) -> Report:
@@ -75,7 +54,10 @@ def run(arguments: Namespace) -> Report:
         data={"modes": count, "uniform_gain": uniform, "residual_nm": whole, "turbulence_nm": alone}
     )
     left = {"none, turbulence alone": alone, **whole}
-    totals = [ControllerRow(controller=name, residual_nm=rms) for name, rms in left.items()]
+    totals = [
+        facts(controller=fact(name, "controller"), residual_nm=fact(rms, "residual", **_RMS))
+        for name, rms in left.items()
+    ]
     report.tables.append(row_table("All modes", totals))
     report.add_rows("rows", "By radial order, residuals over its modes", rows)
     report.notes += [
@@ -176,22 +158,23 @@ def _total_rms(rms: FloatArray) -> float:
 
 def _order_rows(
     turbulence: FloatArray, noise: FloatArray, gains: FloatArray, *residuals: FloatArray
-) -> list[OrderRow]:
+) -> list[Facts]:
+    """Return a row for each radial order: root sums of squares over its modes."""
     radial, _ = noll_orders(noise.size)
     rows = []
     for order in np.unique(radial):
         which = radial == order
         uniform, optimised, filtered = (_total_rms(rms[which]) for rms in residuals)
         rows.append(
-            OrderRow(
-                radial_order=int(order),
-                modes=int(which.sum()),
-                turbulence_nm=_total_rms(turbulence[which]),
-                noise_nm=float(noise[which][0]),
-                gain=float(gains[which].mean()),
-                uniform_nm=uniform,
-                optimised_nm=optimised,
-                kalman_nm=filtered,
+            facts(
+                radial_order=fact(int(order), "radial order"),
+                modes=fact(int(which.sum()), "modes"),
+                turbulence_nm=fact(_total_rms(turbulence[which]), "turbulence", **_RMS),
+                noise_nm=fact(float(noise[which][0]), "noise per mode", unit="nm", format=".2f"),
+                gain=fact(float(gains[which].mean()), "mean gain", format=".3f"),
+                uniform_nm=fact(uniform, "one gain", **_RMS),
+                optimised_nm=fact(optimised, "optimised gains", **_RMS),
+                kalman_nm=fact(filtered, "Kalman", **_RMS),
             )
         )
     return rows

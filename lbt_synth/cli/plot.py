@@ -28,7 +28,7 @@ from lbt_synth.report.figures.open_loops import axes_name, open_loops
 from lbt_synth.report.figures.sigma import sigma_curves
 from lbt_synth.report.figures.step import design_steps
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import column, columns, fill_row, json_record, json_units, table_row
+from lbt_synth.storage.rows import column, columns, fact, facts, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
 
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
@@ -65,23 +65,6 @@ class StepPoint:
     time_s: float = column("time", unit="s", help="Time after the step")
     residual: float = column("residual", help="Residual, as a part of the step")
     command: float = column("command", help="Command, as a part of the step")
-
-
-@table_row
-class StepFacts:
-    """How a loop follows a step."""
-
-    design: str = column("design", help="Name of the design, with its axis where they differ")
-    overshoot_percent: float = column(
-        "overshoot", unit="%", format=".1f", help="How far the correction goes beyond the step"
-    )
-    settling_s: float = column(
-        "settling time, to 5 %",
-        unit="ms",
-        scale=1e3,
-        format=".2f",
-        help="Time after which the residual stays within 5 % of the step",
-    )
 
 
 def run(arguments: Namespace) -> Report:
@@ -200,9 +183,17 @@ def _named_steps(
 
 def _add_step_facts(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:
     """Add how the loops follow a step."""
-    steps = _named_steps(designs, sensor_gain, frames=_SETTLING_FRAMES)
-    facts = [fill_row(StepFacts, step, design=name) for name, step in steps]
-    report.add_rows("steps", "After a step of the wavefront", facts)
+    percent = {"unit": "%", "format": ".1f"}
+    ms = {"unit": "ms", "scale": 1e3, "format": ".2f"}
+    rows = [
+        facts(
+            design=fact(name, "design"),
+            overshoot_percent=fact(step.overshoot_percent, "overshoot", **percent),
+            settling_s=fact(step.settling_s, "settling time, to 5 %", **ms),
+        )
+        for name, step in _named_steps(designs, sensor_gain, frames=_SETTLING_FRAMES)
+    ]
+    report.add_rows("steps", "After a step of the wavefront", rows)
 
 
 def _step_points(designs: Mapping[str, Design], sensor_gain: float) -> list[StepPoint]:

@@ -26,7 +26,7 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.figures.simulation import simulation_figure
 from lbt_synth.report.figures.style import save_figure
-from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.validation import FloatArray, integer
 
 _FRAMES = 8000  # of a drawn disturbance
@@ -46,29 +46,6 @@ class _Series:
     imaging: Imaging
     sensor_gain: float
     ran: tuple[FloatArray, FloatArray] | None = None  # residual and commands of the record
-
-
-@table_row
-class RehearsedRow:
-    """One loop on the series."""
-
-    name: str = column("loop")
-    first_nm: float = nm_column("first axis", unit="nm rms")
-    second_nm: float | None = nm_column("second axis", unit="nm rms")
-    residual_nm: float = nm_column("residual", unit="nm rms")
-    strehl: float | None = percent_column("Strehl")
-    largest_command_nm: float = nm_column("largest command")
-    clipped_frames: int | None = column("clipped frames")
-
-
-@table_row
-class RehearsalFacts:
-    """How far the target is from the design."""
-
-    difference_rms_nm: float = column("difference of the commands", unit="nm rms")
-    difference_largest_nm: float = column("  largest", unit="nm")
-    frames: int = column("frames compared")
-    settle_frames: int = column("frames before, in which the loops settle")
 
 
 def run(arguments: Namespace) -> Report:
@@ -101,13 +78,18 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"gain": arguments.gain, "target": arguments.target})
     what = f"Rehearsal for {arguments.target} on {series.source}; {imaging.label}"
     report.add_rows("loops", what, rows)
-    facts = RehearsalFacts(
-        difference_rms_nm=float(np.sqrt(np.mean(np.sum(found.differences**2, axis=1)))),
-        difference_largest_nm=float(np.max(np.abs(found.differences))),
-        frames=len(found.differences),
-        settle_frames=found.settle_frames,
+    apart_nm = found.differences
+    rms_nm = float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1))))
+    settled = "frames before, in which the loops settle"
+    report.add_facts(
+        "The target beside the design",
+        facts(
+            difference_rms_nm=fact(rms_nm, "difference of the commands", unit="nm rms"),
+            difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
+            frames=fact(len(apart_nm), "frames compared"),
+            settle_frames=fact(found.settle_frames, settled),
+        ),
     )
-    report.add_facts("The target beside the design", facts)
     report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
     if series.noise is None:
         report.notes += [
@@ -123,7 +105,7 @@ def run(arguments: Namespace) -> Report:
             total_nm=series.total_nm[None, found.settle_frames :],
             residual_nm=found.target.residual_nm[None],
             commands=found.target.commands[None],
-            measurements=np.zeros((1, len(found.differences), series.hardware.n_measurements)),
+            measurements=np.zeros((1, len(apart_nm), series.hardware.n_measurements)),
             frame_rate_hz=series.hardware.frame_rate_hz,
             seed=0,
         )
@@ -134,16 +116,21 @@ def run(arguments: Namespace) -> Report:
 
 def _describe(
     name: str, residual: FloatArray, commands: FloatArray, imaging: Imaging, clipped: int | None
-) -> RehearsedRow:
+) -> Facts:
+    """Return the row of one loop on the series."""
     axes = np.sqrt(np.mean(residual**2, axis=0)).tolist()
-    return RehearsedRow(
-        name=name,
-        first_nm=axes[0],
-        second_nm=axes[1] if len(axes) == 2 else None,
-        residual_nm=float(np.linalg.norm(axes)),
-        strehl=series_strehl(residual, imaging) if len(axes) <= 2 else None,
-        largest_command_nm=float(np.max(np.abs(commands))),
-        clipped_frames=clipped,
+    second = axes[1] if len(axes) == 2 else None
+    ratio = series_strehl(residual, imaging) if len(axes) <= 2 else None
+    rms = {"unit": "nm rms", "format": ".1f"}
+    largest_nm = float(np.max(np.abs(commands)))
+    return facts(
+        name=fact(name, "loop"),
+        first_nm=fact(axes[0], "first axis", **rms),
+        second_nm=fact(second, "second axis", **rms),
+        residual_nm=fact(float(np.linalg.norm(axes)), "residual", **rms),
+        strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
+        largest_command_nm=fact(largest_nm, "largest command", unit="nm", format=".1f"),
+        clipped_frames=fact(clipped, "clipped frames"),
     )
 
 

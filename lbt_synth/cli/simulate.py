@@ -40,7 +40,7 @@ from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import column, columns, fill_row, json_record, json_units, table_row
+from lbt_synth.storage.rows import Column, Facts, columns, json_record, json_units
 from lbt_synth.storage.words import count_text
 from lbt_synth.studies.sensor_failures import run_failures
 from lbt_synth.validation import FloatArray
@@ -114,19 +114,15 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
     return report
 
 
-@table_row
-class ExactAnswers:
-    """What the loop leaves without chance; a truth that drifts has no exact answer."""
-
-    strehl_exact: float | None = column("Strehl ratio", unit="%", scale=100, default=None)
-    residual_exact_nm: float | None = column("residual", unit="nm rms", default=None)
-    turbulence_nm: float | None = column("  turbulence", unit="nm rms", default=None)
-    vibration_nm: float | None = column("  vibration", unit="nm rms", default=None)
-    noise_nm: float | None = column("  noise", unit="nm rms", default=None)
-    limit_nm: float | None = column(
-        "least residual in the truth, any controller", unit="nm rms", default=None
-    )
-    above_limit_percent: float | None = column("  residual above it", unit="%", default=None)
+_EXACT = (  # what the loop leaves without chance
+    Column(name="strehl_exact", heading="Strehl ratio", unit="%", scale=100),
+    Column(name="residual_exact_nm", heading="residual", unit="nm rms"),
+    Column(name="turbulence_nm", heading="  turbulence", unit="nm rms"),
+    Column(name="vibration_nm", heading="  vibration", unit="nm rms"),
+    Column(name="noise_nm", heading="  noise", unit="nm rms"),
+    Column(name="limit_nm", heading="least residual in the truth, any controller", unit="nm rms"),
+    Column(name="above_limit_percent", heading="  residual above it", unit="%"),
+)
 
 
 def run(arguments: Namespace) -> Report:
@@ -190,7 +186,7 @@ def run(arguments: Namespace) -> Report:
 def _describe_simulation(
     simulation: Simulation,
     strehls: FloatArray,
-    exact: ExactAnswers,
+    exact: Facts,
     design: Design,
     imaging: Imaging,
 ) -> Report:
@@ -228,20 +224,21 @@ def _describe_simulation(
     return report
 
 
-def _exact_answers(loop: ClosedLoop, config: Config, truth: Truth) -> ExactAnswers:
+def _exact_answers(loop: ClosedLoop, config: Config, truth: Truth) -> Facts:
+    """Return what the loop leaves without chance; a truth that drifts has no exact answer."""
     if truth.drifts:
-        return ExactAnswers()
+        return Facts(_EXACT, {})
     budget = residual_budget(loop, truth)
     alone = config.hardware.own_sensor_alone()
     limit_nm = limit_or_nan(lambda: least_residual(alone, truth))
-    return fill_row(
-        ExactAnswers,
-        budget,
-        strehl_exact=strehl(budget, config.imaging),
-        residual_exact_nm=budget.rms_nm,
-        limit_nm=limit_nm,
-        above_limit_percent=round(above_percent(budget.rms_nm, limit_nm), 6) + 0.0,
-    )
+    parts = {name: getattr(budget, name) for name in ("turbulence_nm", "vibration_nm", "noise_nm")}
+    exact = {
+        "strehl_exact": strehl(budget, config.imaging),
+        "residual_exact_nm": budget.rms_nm,
+        "limit_nm": limit_nm,
+        "above_limit_percent": round(above_percent(budget.rms_nm, limit_nm), 6) + 0.0,
+    }
+    return Facts(_EXACT, parts | exact)
 
 
 def _require_stable(loop: ClosedLoop, design: Design, reference_gain: float) -> None:

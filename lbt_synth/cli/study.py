@@ -9,18 +9,19 @@ from pathlib import Path
 
 from lbt_synth import studies
 from lbt_synth.cli.display import choose_config_unit
-from lbt_synth.cli.engine import choose_engine, keep_finished, require_counts
+from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import write_study_page
 from lbt_synth.report.page.page_files import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import fact, facts
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.study.run import FinishedStudy, StudyRun, output_paths
 from lbt_synth.studies.study.statistics import StudyStatistics
 from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
 from lbt_synth.studies.study.summary import worst_table
+from lbt_synth.validation import integer
 
 _COUNTS = ("samples", "computed", "failures", "seconds")
 _WORST = 3  # rows of each controller that are printed; the page has more
@@ -28,7 +29,7 @@ _WORST = 3  # rows of each controller that are printed; the page has more
 
 def run(arguments: Namespace) -> Report:
     """Run a study, say what it would cost, or replay one of its rows."""
-    require_counts(arguments, "jobs")
+    integer(arguments.jobs, "--jobs", at_least=1)
     folder = Path(arguments.output)
     if arguments.pdf:
         require_weasyprint()
@@ -137,21 +138,6 @@ def _sampling_notes(loaded: studies.Study) -> list[str]:
     ]
 
 
-@table_row
-class StudyFacts:
-    """What a study is, and what it would cost."""
-
-    samples: int = column("samples")
-    sampling: str = column("sampling")
-    seed: int = column("seed")
-    evaluation: str = column("evaluation")
-    workers: int = column()
-    measured_rows: int = column("samples measured in one process")
-    measured_s: float = column("  their time", unit="s", format=".3g")
-    seconds: float = column()  # said in a note, in words for long ones
-    disk_bytes: float = column("space on the disk, about", unit="MB", scale=1e-6, format=".3g")
-
-
 def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     with choose_engine(arguments) as (_, workers):
         count = workers or arguments.jobs
@@ -163,8 +149,21 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     parameters = {p.name: p.distribution.text for p in loaded.parameters}
     controllers = {c.name: c.origin for c in loaded.controllers}
     report = Report(data={"parameters": parameters, "controllers": controllers})
-    facts = fill_row(StudyFacts, cost, loaded.settings, samples=loaded.samples, workers=count)
-    report.add_facts(f"Study {loaded.source}", facts)
+    mb = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
+    report.add_facts(
+        f"Study {loaded.source}",
+        facts(
+            samples=fact(loaded.samples, "samples"),
+            sampling=fact(loaded.settings.sampling, "sampling"),
+            seed=fact(loaded.settings.seed, "seed"),
+            evaluation=fact(loaded.settings.evaluation, "evaluation"),
+            workers=fact(count),
+            measured_rows=fact(cost.measured_rows, "samples measured in one process"),
+            measured_s=fact(cost.measured_s, "  their time", unit="s", format=".3g"),
+            seconds=fact(cost.seconds),  # said in a note, in words for long ones
+            disk_bytes=fact(cost.disk_bytes, "space on the disk, about", **mb),
+        ),
+    )
     report.add_table("Parameters", ("parameter", "distribution"), parameters.items())
     report.add_table("Controllers", ("controller", "what"), controllers.items())
     report.notes += [

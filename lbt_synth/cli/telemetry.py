@@ -16,28 +16,9 @@ from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import column, fact_table, fill_row, json_record, json_units, table_row
+from lbt_synth.storage.rows import fact, fact_table, facts, json_record, json_units
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
-
-
-@table_row
-class TelemetryFacts:
-    """The loop that telemetry is from."""
-
-    name: str = column("system")
-    frame_rate_hz: float = column("frame rate", unit="Hz")
-    delay_frames: float = column("total delay", unit="frames")
-    sensor_gain: float | None = column("sensor gain")
-    controller_name: str | None = column("controller")
-    controller_digest: str | None = column("gain file, SHA-256")
-    strehl: float | None = column("Strehl ratio")
-    imaging_wavelength_um: float | None = column("imaging wavelength", unit="um")
-    psf_pixel_mas: float | None = column("pixel of the image", unit="mas")
-    diameter_m: float | None = column("telescope diameter", unit="m")
-    obstruction: float | None = column("central obstruction")
-    seed: int | None = column("seed")
-    controller_states: int | None = column("states of the controller")
 
 
 def run(arguments: Namespace) -> Report:
@@ -74,19 +55,31 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     }
     units = {name: layer.unit_in(telemetry) for name, _, layer in arrays}
     controller, mirror = telemetry.controller, telemetry.mirror
-    facts = fill_row(
-        TelemetryFacts,
-        telemetry,
-        controller_states=None if controller is None else controller.n_states,
+    what = facts(
+        name=fact(telemetry.name, "system"),
+        frame_rate_hz=fact(telemetry.frame_rate_hz, "frame rate", unit="Hz"),
+        delay_frames=fact(telemetry.delay_frames, "total delay", unit="frames"),
+        sensor_gain=fact(telemetry.sensor_gain, "sensor gain"),
+        controller_name=fact(telemetry.controller_name, "controller"),
+        controller_digest=fact(telemetry.controller_digest, "gain file, SHA-256"),
+        strehl=fact(telemetry.strehl, "Strehl ratio"),
+        imaging_wavelength_um=fact(
+            telemetry.imaging_wavelength_um, "imaging wavelength", unit="um"
+        ),
+        psf_pixel_mas=fact(telemetry.psf_pixel_mas, "pixel of the image", unit="mas"),
+        diameter_m=fact(telemetry.diameter_m, "telescope diameter", unit="m"),
+        obstruction=fact(telemetry.obstruction, "central obstruction"),
+        seed=fact(telemetry.seed, "seed"),
+        controller_states=fact(controller and controller.n_states, "states of the controller"),
     )
     mirror_record = None if mirror is None else asdict(mirror)
     report = Report(
         data={
-            **json_record(facts),
+            **json_record(what),
             "frames": telemetry.frames,
             "modes": telemetry.modes,
             "arrays": {name: list(array.shape) for name, array, _ in arrays},
-            "units": json_units(facts) | units,
+            "units": json_units(what) | units,
             "rms": rms,
             "integrator_gains": telemetry.integrator_gains,
             "metadata": dict(telemetry.metadata),
@@ -110,7 +103,7 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
             for name, array, layer in arrays
         ],
     )
-    report.tables.append(fact_table("Loop", facts))
+    report.tables.append(fact_table("Loop", what))
     more = {f"mirror, {name}": value for name, value in (mirror_record or {}).items()}
     more |= telemetry.metadata
     if more:

@@ -105,6 +105,22 @@ class Facts:
         raise AttributeError(f"there is no column {name!r}")
 
 
+def fact(value: Any, heading: str = "", **printing: Any) -> tuple[Any, Column]:
+    """Return a value, and how it is printed."""
+    return value, Column(heading=heading, **printing)
+
+
+def facts(**named: tuple[Any, Column]) -> Facts:
+    """Return a row of what is printed in one place only, each made by :func:`fact`.
+
+    >>> from lbt_synth.storage.rows import fact, facts, json_record
+    >>> json_record(facts(rate_hz=fact(800.0, "frame rate", unit="Hz")))
+    {'rate_hz': 800.0}
+    """
+    kept = tuple(dataclasses.replace(how, name=name) for name, (_, how) in named.items())
+    return Facts(kept, {name: value for name, (value, _) in named.items()})
+
+
 def columns(kind: Any) -> tuple[Column, ...]:
     """Return the columns of a row or a row type, in the order of its fields."""
     named = (
