@@ -19,7 +19,7 @@ from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import require_length
-from lbt_synth.interop import rehearse
+from lbt_synth.interop import Rehearsal, rehearse
 from lbt_synth.loop import Imaging, Simulation, series_strehl
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.models import LoopHardware
@@ -78,18 +78,7 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"gain": arguments.gain, "target": arguments.target})
     what = f"Rehearsal for {arguments.target} on {series.source}; {imaging.label}"
     report.add_rows("loops", what, rows)
-    apart_nm = found.differences
-    rms_nm = float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1))))
-    settled = "frames before, in which the loops settle"
-    report.add_facts(
-        "The target beside the design",
-        facts(
-            difference_rms_nm=fact(rms_nm, "difference of the commands", unit="nm rms"),
-            difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
-            frames=fact(len(apart_nm), "frames compared"),
-            settle_frames=fact(found.settle_frames, settled),
-        ),
-    )
+    report.add_facts("The target beside the design", _difference_facts(found))
     report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
     if series.noise is None:
         report.notes += [
@@ -105,7 +94,7 @@ def run(arguments: Namespace) -> Report:
             total_nm=series.total_nm[None, found.settle_frames :],
             residual_nm=found.target.residual_nm[None],
             commands=found.target.commands[None],
-            measurements=np.zeros((1, len(apart_nm), series.hardware.n_measurements)),
+            measurements=np.zeros((1, len(found.differences), series.hardware.n_measurements)),
             frame_rate_hz=series.hardware.frame_rate_hz,
             seed=0,
         )
@@ -131,6 +120,19 @@ def _describe(
         strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
         largest_command_nm=fact(largest_nm, "largest command", unit="nm", format=".1f"),
         clipped_frames=fact(clipped, "clipped frames"),
+    )
+
+
+def _difference_facts(found: Rehearsal) -> Facts:
+    """Return how far the target is from the design."""
+    apart_nm = found.differences
+    rms_nm = float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1))))
+    settled = "frames before, in which the loops settle"
+    return facts(
+        difference_rms_nm=fact(rms_nm, "difference of the commands", unit="nm rms"),
+        difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
+        frames=fact(len(apart_nm), "frames compared"),
+        settle_frames=fact(found.settle_frames, settled),
     )
 
 

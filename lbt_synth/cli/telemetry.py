@@ -16,7 +16,7 @@ from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import fact, fact_table, facts, json_record, json_units
+from lbt_synth.storage.rows import Facts, fact, fact_table, facts, json_record, json_units
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
@@ -54,24 +54,8 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         name: _rms(array) for name, array, layer in arrays if layer.is_series and name != "times_s"
     }
     units = {name: layer.unit_in(telemetry) for name, _, layer in arrays}
-    controller, mirror = telemetry.controller, telemetry.mirror
-    what = facts(
-        name=fact(telemetry.name, "system"),
-        frame_rate_hz=fact(telemetry.frame_rate_hz, "frame rate", unit="Hz"),
-        delay_frames=fact(telemetry.delay_frames, "total delay", unit="frames"),
-        sensor_gain=fact(telemetry.sensor_gain, "sensor gain"),
-        controller_name=fact(telemetry.controller_name, "controller"),
-        controller_digest=fact(telemetry.controller_digest, "gain file, SHA-256"),
-        strehl=fact(telemetry.strehl, "Strehl ratio"),
-        imaging_wavelength_um=fact(
-            telemetry.imaging_wavelength_um, "imaging wavelength", unit="um"
-        ),
-        psf_pixel_mas=fact(telemetry.psf_pixel_mas, "pixel of the image", unit="mas"),
-        diameter_m=fact(telemetry.diameter_m, "telescope diameter", unit="m"),
-        obstruction=fact(telemetry.obstruction, "central obstruction"),
-        seed=fact(telemetry.seed, "seed"),
-        controller_states=fact(controller and controller.n_states, "states of the controller"),
-    )
+    mirror = telemetry.mirror
+    what = _loop_facts(telemetry)
     mirror_record = None if mirror is None else asdict(mirror)
     report = Report(
         data={
@@ -109,6 +93,28 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     if more:
         report.add_table("What else the file says", ("name", "value"), more.items())
     return report
+
+
+def _loop_facts(telemetry: Telemetry) -> Facts:
+    """Return what telemetry says of the loop that it is from."""
+    controller = telemetry.controller
+    return facts(
+        name=fact(telemetry.name, "system"),
+        frame_rate_hz=fact(telemetry.frame_rate_hz, "frame rate", unit="Hz"),
+        delay_frames=fact(telemetry.delay_frames, "total delay", unit="frames"),
+        sensor_gain=fact(telemetry.sensor_gain, "sensor gain"),
+        controller_name=fact(telemetry.controller_name, "controller"),
+        controller_digest=fact(telemetry.controller_digest, "gain file, SHA-256"),
+        strehl=fact(telemetry.strehl, "Strehl ratio"),
+        imaging_wavelength_um=fact(
+            telemetry.imaging_wavelength_um, "imaging wavelength", unit="um"
+        ),
+        psf_pixel_mas=fact(telemetry.psf_pixel_mas, "pixel of the image", unit="mas"),
+        diameter_m=fact(telemetry.diameter_m, "telescope diameter", unit="m"),
+        obstruction=fact(telemetry.obstruction, "central obstruction"),
+        seed=fact(telemetry.seed, "seed"),
+        controller_states=fact(controller and controller.n_states, "states of the controller"),
+    )
 
 
 def _rms(series: FloatArray) -> float:
