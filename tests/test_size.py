@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 5143,
+    "cli": 4919,
     "config": 2222,
     "design": 8361,
     "files": 1678,
@@ -25,7 +25,7 @@ LINES = {
     "methods": 1109,
     "models": 4465,
     "report": 7083,
-    "storage": 1246,
+    "storage": 1262,
     "studies": 5259,
     "errors, validation": 640,
 }
