@@ -30,8 +30,8 @@ LINES = {
     "errors, validation": 640,
 }
 COUNTS = {
-    "files of the package": 407,
-    "public names": 277,
+    "files of the package": 399,
+    "public names": 267,
     "tuned constants": 933,
     "lines of tests": 42500,
     "words of docs": 72412,
