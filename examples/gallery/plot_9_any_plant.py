@@ -69,7 +69,7 @@ for index, (axis, name) in enumerate(zip(axes, ("acceleration", "travel"), stric
         response = design.closed_loop.frequency_response(frequency_hz)[:, index, 0] / size
         axis.loglog(frequency_hz, np.abs(response), label=f"comfort {comfort:g}")
     size = (0.5, 1 / 0.08)[index]
-    passive = designs[0.5].plant.whole.frequency_response(frequency_hz)[:, index, 0] / size
+    passive = designs[0.5].problem.whole.frequency_response(frequency_hz)[:, index, 0] / size
     axis.loglog(frequency_hz, np.abs(passive), "k:", label="no control")
     axis.set(xlabel="frequency [Hz]", title=f"{name} of the body, road of 5 cm")
 axes[0].set_ylabel("m/s$^2$")
