@@ -409,9 +409,29 @@ def test_an_edited_header_card_is_found(tmp_path, old, new):
         lbt.load_gain(path)
 
 
+def test_a_header_that_says_something_else_is_found_behind_a_right_checksum(tmp_path):
+    with fits.open(lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"])) as hdus:
+        hdus[0].header["RATE_HZ"] = 900.0
+        hdus.writeto(tmp_path / "other.fits", checksum=True)
+    with pytest.raises(lbt.errors.GainFileError, match="header.RATE_HZ must be 800.0"):
+        lbt.load_gain(tmp_path / "other.fits")
+
+
+def test_the_header_counts_the_measurements_of_all_sensors(tmp_path):
+    design = DESIGNS["sensors"]
+    header = fits.getheader(lbt.save_gain(tmp_path / "g.fits", design))
+    assert header["NFILTER"] == design.problem.n_measurements
+
+
 def test_only_designs_are_saved(tmp_path):
     with pytest.raises(lbt.errors.OutputError, match="holds a Design; got int"):
         lbt.save_gain(tmp_path / "g.fits", 3)
+    twisted = replace(DESIGNS["kalman"])
+    k = twisted.controller
+    object.__setattr__(twisted, "controller", replace(k, B=1.001 * k.B))
+    with pytest.raises(lbt.errors.OutputError, match="contradicts itself: B is not what plant"):
+        lbt.save_gain(tmp_path / "g.fits", twisted)
+    assert not (tmp_path / "g.fits").exists()
 
 
 SCRIPT = ROOT / "tests" / "support" / "specula_filters.py"
