@@ -75,10 +75,11 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
-    report.notes += design.notes()
+    tables = design.tables()
+    report.notes += [*design.notes(), *(note for table in tables for note in table.notes)]
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
     report.data["assumptions"] = design.assumptions
-    for table in design.tables():
+    for table in tables:
         report.add_rows(table.key, table.title, table.rows)
     report.add_rows("checks", "Certificate", design.certificate.checks)
     if matrices:

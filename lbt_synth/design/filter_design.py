@@ -24,7 +24,6 @@ from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.fallbacks import (
     Fallback,
     dwell_frames,
-    failed_loop,
     failure_rows,
     fallback_checks,
     make_fallbacks,
@@ -237,32 +236,22 @@ class FilterDesign(Design):
         return {frozenset(missing): k for missing, k in {(): self.controller, **others}.items()}
 
     def tables(self) -> tuple[RowTable, ...]:
-        """Return what becomes of the loop when sensors fail."""
+        """Return what becomes of the loop when sensors fail, and which failures it has to see."""
         if not reads_several(self.problem):
             return ()
         rows = failure_rows(self.problem, self.gain_predictor, self.fallbacks)
-        return (RowTable(key="failures", title="When sensors fail", rows=rows),)
-
-    def notes(self) -> list[str]:
-        """Return what the table of failures says, and which failures the loop has to see."""
-        plant = self.problem
-        if not reads_several(plant):
-            return []
-        unseen = [
-            " + ".join(fallback.missing)
-            for fallback in self.fallbacks
-            if not failed_loop(plant, self.gain_predictor, fallback.missing).is_stable
-        ]
+        unseen = [row.missing for row in rows if row.must_switch]
         warning = (
             f"note: unstable if these fail unseen: {'; '.join(unseen)}. The computer of the loop "
             "has to see such a failure, and take the fall-back filter."
         )
-        return [
+        notes = [
             "unseen: the readings are zero, or frozen, and the filter believes them: a reading "
             "that stays leaves an offset, which counts to the residual. Not read: the fall-back "
             "filter of this file for the remaining sensors, with the same state.",
             *[warning] * bool(unseen),
         ]
+        return (RowTable(key="failures", title="When sensors fail", rows=rows, notes=notes),)
 
     @property
     def estimator(self) -> Controller:

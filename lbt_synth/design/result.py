@@ -80,11 +80,14 @@ class RowTable:
         Line above the table.
     rows : sequence
         Rows made with :func:`lbt_synth.storage.rows.table_row`, all of one type.
+    notes : sequence of str
+        What the rows mean, and what they warn of.
     """
 
     key: str
     title: str
     rows: Sequence[Any]
+    notes: Sequence[str] = ()
 
 
 UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))
@@ -226,7 +229,7 @@ class Design(Summarised, ABC):
         return ()
 
     def notes(self) -> list[str]:
-        """Return warnings below the tables."""
+        """Return warnings that belong to no table."""
         return []
 
     def facts(self) -> Facts:
