@@ -25,6 +25,7 @@ ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Entry = TypeVar("Entry", bound=np.generic)
+T = TypeVar("T")
 # Types of fields that `check_fields` checks: the metadata are keywords of `number` or `integer`.
 Finite: TypeAlias = Annotated[float, ("at_least", -math.inf)]
 Positive: TypeAlias = Annotated[float, ("above", 0)]
@@ -295,8 +296,8 @@ def set_fields(target: object, **values: Any) -> None:
         object.__setattr__(target, name, value)
 
 
-def require_instance(value: object, kind: type[Any], name: str = "") -> None:
-    """Refuse anything that is not an instance of a class; the message names the argument."""
+def require_instance(value: object, kind: type[T], name: str = "") -> T:
+    """Return an instance of a class, refuse anything else; the message names the argument."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         start = f"{name} must be" if name else "expected"
@@ -304,6 +305,7 @@ def require_instance(value: object, kind: type[Any], name: str = "") -> None:
             f"{start} {article} {kind.__name__}; got {type(value).__name__}."
             f"{suggest_part(value, kind)}"
         )
+    return value
 
 
 def suggest_part(value: object, kind: type[Any]) -> str:

@@ -82,7 +82,8 @@ def make_fallbacks(problem: EstimationProblem) -> tuple[Fallback, ...]:
 
 def reads_several(problem: EstimationProblem) -> TypeGuard[TipTiltPlant]:
     """Return whether a problem is the plant of a loop with other sensors beside its own."""
-    return isinstance(problem, TipTiltPlant) and bool(problem.hardware.suite.sensors)
+    hardware = getattr(problem, "hardware", None)
+    return hardware is not None and bool(hardware.suite.sensors)
 
 
 def _remaining(plant: TipTiltPlant, missing: tuple[str, ...]) -> BoolArray:

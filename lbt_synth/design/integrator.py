@@ -52,6 +52,11 @@ class IntegratorDesign(Design):
         changes = {name: value for name, value in self.claims.items() if name != "gain"}
         return IntegratorLaw(**changes)
 
+    @property
+    def integrator_gain(self) -> float | None:
+        """The gain, if there is neither leak nor zero nor a second integrator."""
+        return self.gain if self.law.is_pure else None
+
     def make_controller(self) -> Controller:
         """Return the controller of the law and its gain."""
         return self.law.controller(self.problem, self.gain)

@@ -44,7 +44,13 @@ from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.rows import Column
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    frozen_copy,
+    number,
+    require_instance,
+)
 
 _ON_CIRCLE = 1e-6  # a zero this close to the unit circle leaves no stable regulator
 _SQUARINGS = 60
@@ -191,12 +197,8 @@ class LqgDesign(Design):
         own = self.estimation
         real = own
         if problem is not None:
-            if not isinstance(problem, TipTiltPlant):
-                raise ProblemError(
-                    "the other disturbances of an LQG design must come in a TipTiltPlant; got "
-                    f"{type(problem).__name__}."
-                )
-            real = estimation_plant(replace(problem, hardware=self.problem.hardware))
+            plant = require_instance(problem, TipTiltPlant, "problem")
+            real = estimation_plant(replace(plant, hardware=self.problem.hardware))
             if real.A.shape != own.A.shape:
                 raise ProblemError(
                     f"the other plant must have {own.n_states} states to be estimated; got "
@@ -338,11 +340,7 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-6)
     True
     """
-    if not isinstance(plant, TipTiltPlant):
-        raise ProblemError(
-            "lqg needs a TipTiltPlant, which knows its loop; got "
-            f"{type(plant).__name__}. Try tip_tilt_plant."
-        )
+    require_instance(plant, TipTiltPlant, "plant")
     rho = number(command_weight, "command_weight", at_least=0)
     plant.require_own_sensor("lqg")
     hardware = plant.hardware

@@ -20,7 +20,7 @@ from lbt_synth.models import (
     TipTiltPlant,
     Vibration,
 )
-from lbt_synth.models.plant.parts import PlantParts, held_frames
+from lbt_synth.models.plant.parts import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.models.sensor_suite import (
     Accelerometer,
@@ -42,7 +42,6 @@ from lbt_synth.validation import (
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
-_SAME = 1e-9
 _SENSORS: dict[str, type[Sensor]] = {"wavefront": WavefrontSensor, "accelerometer": Accelerometer}
 _SENSOR_ARRAYS = ("noise_nm", "sensor_matrix", "noise_m_s2")
 _CHECK = ("name", "value", "limit", "computed_by")
@@ -107,18 +106,12 @@ class DesignRecord:
         kind = _PROBLEMS[self.meta["problem"]]
         if kind is LoopHardware:
             return self.hardware()
-        if kind is TipTiltPlant:
-            return self._assembled_plant()
+        if kind is not EstimationProblem:
+            return self._assembled_plant(full=kind is FullStatePlant)
         fields: dict[str, Any] = {name: self.arrays[f"PLANT_{name}"] for name in "ABCDL"}
-        fields["dt_s"] = self.meta["dt_s"]
-        if kind is FullStatePlant:
-            fields |= {"B_known": self.arrays["KNOWN_B"], "D_known": self.arrays["KNOWN_D"]}
-            plant = FullStatePlant(**fields, hardware=self.hardware())
-            _require_own_loop(plant)
-            return plant
-        return kind(**fields)
+        return EstimationProblem(**fields, dt_s=self.meta["dt_s"])
 
-    def _assembled_plant(self) -> EstimationProblem:
+    def _assembled_plant(self, *, full: bool) -> EstimationProblem:
         """Return the plant of loop, turbulence, vibrations and noise, with a filter's memory."""
         hardware, meta = self.hardware(), self.meta
         parts = PlantParts(
@@ -137,7 +130,7 @@ class DesignRecord:
                 for moved in meta["motions"]
             ),
         )
-        plant = assemble(parts)
+        plant = assemble(parts).full() if full else assemble(parts)
         memory = self.arrays["PLANT_L"][:, plant.n_states :]
         return plant.with_memory(memory) if memory.size else plant
 
@@ -293,24 +286,23 @@ def record_hardware(hardware: LoopHardware) -> DesignRecord:
 
 def record_problem(problem: EstimationProblem | LoopHardware) -> DesignRecord:
     """Record an estimation problem, with the models that a plant is made of; or a loop alone."""
-    if isinstance(problem, LoopHardware):
-        return DesignRecord(meta={"problem": "loop"})
-    arrays: Arrays = {f"PLANT_{name}": getattr(problem, name) for name in "ABCDL"}
     meta: Meta = {"problem": next(k for k, kind in _PROBLEMS.items() if type(problem) is kind)}
-    if isinstance(problem, FullStatePlant):
-        arrays |= {"KNOWN_B": problem.B_known, "KNOWN_D": problem.D_known}
-    if isinstance(problem, TipTiltPlant):
+    if problem is getattr(problem, "hardware", None):
+        return DesignRecord(meta=meta)
+    arrays: Arrays = {f"PLANT_{name}": getattr(problem, name) for name in "ABCDL"}
+    plant: TipTiltPlant | None = getattr(problem, "reduced", None)
+    if plant is not None:
         meta["turbulence"] = [
             {"coefficients": ar.coefficients.tolist(), "driving_rms_nm": ar.driving_rms_nm}
-            for ar in problem.turbulence
+            for ar in plant.turbulence
         ]
         meta["vibrations"] = [
-            {**asdict(line), "direction": list(line.direction)} for line in problem.vibrations
+            {**asdict(line), "direction": list(line.direction)} for line in plant.vibrations
         ]
         meta["motions"] = [
-            {name: asdict(motion) for name, motion in moved.items()} for moved in problem.motions
+            {name: asdict(motion) for name, motion in moved.items()} for moved in plant.motions
         ]
-        arrays["NOISE"] = problem.own_noise_factor
+        arrays["NOISE"] = plant.own_noise_factor
     return DesignRecord(arrays, meta)
 
 
@@ -336,32 +328,3 @@ def _unpack_sensor(packed: Meta) -> Sensor:
 def certificate_record(certificate: Certificate) -> list[Meta]:
     """Return the checks of a certificate as plain metadata."""
     return [{name: getattr(check, name) for name in _CHECK} for check in certificate.checks]
-
-
-def _require_own_loop(plant: FullStatePlant) -> None:
-    """Refuse a plant whose commands or sensor are not those of its loop.
-
-    The response of y to a command is that of the hardware; and as y sees the phase ``h + 1``
-    frames after ``L x`` reaches it, ``S L A^i B = (1-f) C A^(i+h) B + f C A^(i+h-1) B``, with f the
-    weight of the frame before.
-    """
-    hardware, n = plant.hardware, plant.n_states
-    mirror, response = hardware.mirror_system.whole, -hardware.sensor @ hardware.influence
-    held = held_frames(hardware)
-    late = held + 1 - hardware.delay_frames
-    known, entry, state = plant.B_known, plant.B, mirror.B
-    seen, estimated = [], []
-    pairs = [(plant.D_known, mirror.D * response)]
-    for _ in range(n + held):
-        pairs.append((plant.C @ known, mirror.C @ state * response))
-        seen.append(plant.C @ entry)
-        estimated.append(hardware.sensor @ plant.L @ entry)
-        known, entry, state = plant.A @ known, plant.A @ entry, mirror.A @ state
-    before = [np.zeros_like(seen[0]), *seen]
-    pairs += [(seen[i], before[0]) for i in range(held)]
-    pairs += [
-        ((1 - late) * seen[i + held] + late * before[i + held], estimated[i]) for i in range(n)
-    ]
-    found, expected = (np.concatenate([np.ravel(pair[i]) for pair in pairs]) for i in (0, 1))
-    if not np.allclose(found, expected, rtol=_SAME, atol=_SAME * np.max(np.abs(expected))):
-        raise ValueError("the plant does not respond to its loop's commands and phase")

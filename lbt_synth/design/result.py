@@ -21,7 +21,7 @@ from lbt_synth.loop.least_residuals.residual_limit import (
     least_model_residual,
     limit_or_nan,
 )
-from lbt_synth.models import FullStatePlant, LoopHardware, TipTiltPlant
+from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.rows import Column, Facts, fact_table
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.tables import Table
@@ -150,9 +150,12 @@ class Design(Summarised, ABC):
     @property
     def hardware(self) -> LoopHardware | None:
         """Loop that the design is for; None for a bare estimation problem."""
-        if isinstance(self.problem, LoopHardware):
-            return self.problem
         return getattr(self.problem, "hardware", None)
+
+    @property
+    def plant(self) -> TipTiltPlant | None:
+        """Plant that the design is for, with its models; None for one that is made of less."""
+        return getattr(self.problem, "reduced", None)
 
     @property
     def gamma(self) -> float:
@@ -198,6 +201,11 @@ class Design(Summarised, ABC):
     def expected_residual_nm(self) -> float | None:
         """Residual that the design expects, rms of all modes; None if it was made for none."""
         return None if self.hardware is None or np.isnan(self.rms) else self.rms
+
+    @property
+    def integrator_gain(self) -> float | None:
+        """Gain of a pure integrator; None for any other design."""
+        return None
 
     @property
     def vibration_bands(self) -> tuple[VibrationBand, ...]:
@@ -351,16 +359,14 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
     They are None without a loop, and what cannot be computed is nan. The residual is the estimation
     error where the mirror reaches every command at once, or the design commands for its dynamics.
     """
-    plant = design.problem
-    if not isinstance(plant, TipTiltPlant | FullStatePlant):
+    plant = design.plant
+    if plant is None:
         return {}
     hardware, residual_nm = plant.hardware, design.rms
     settled = hardware.delay_frames % 1 == 0 and hardware.mirror is None
     if not (settled or design.knows_mirror):
-        residual_nm = np.nan
-        if isinstance(plant, TipTiltPlant):
-            loop = close_loop(hardware, design.controller)
-            residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
+        loop = close_loop(hardware, design.controller)
+        residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}

@@ -146,6 +146,11 @@ class LoopHardware(Summarised):
         return int(self.sensor.shape[0])
 
     @property
+    def hardware(self) -> LoopHardware:
+        """The loop itself: a plant has its loop by this name."""
+        return self
+
+    @property
     def n_readings(self) -> int:
         """Number of measurements of all sensors."""
         return max(int(rows.stop) for rows in self.suite.rows(self).values())

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.design import Design, kalman, lqg, optimal_integrator
-from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, close_loop, residual_budget, settling_error, strehl
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
@@ -87,8 +86,7 @@ def mirror(
     >>> [(row.design, row.stable) for row in rows][1::2]
     [('kalman, settled mirror', False), ('lqg', True)]
     """
-    if not isinstance(plant, TipTiltPlant):
-        raise ProblemError(f"a mirror study needs a TipTiltPlant; got {type(plant).__name__}.")
+    require_instance(plant, TipTiltPlant, "plant")
     require_instance(truth, Truth)
     require_instance(imaging, Imaging)
     hardware = plant.hardware

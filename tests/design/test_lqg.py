@@ -226,14 +226,14 @@ def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
 
 def test_wrong_arguments_are_refused():
     plant = slow_plant(2.0, shell())
-    with pytest.raises(lbt.errors.ProblemError, match="lqg needs a TipTiltPlant"):
+    with pytest.raises(lbt.errors.ProblemError, match="plant must be a TipTiltPlant"):
         lbt.lqg(plant.full())
     with pytest.raises(lbt.errors.ProblemError, match="command_weight must be at least 0"):
         lbt.lqg(plant, command_weight=-1.0)
     flat = slow_plant(2.0, shell(), modes=2, influence_matrix=[[1.0], [0.5]])
     with pytest.raises(lbt.errors.DimensionError, match="must have rank 2"):
         lbt.lqg(flat)
-    with pytest.raises(lbt.errors.ProblemError, match="needs a TipTiltPlant"):
+    with pytest.raises(lbt.errors.ProblemError, match="plant must be a TipTiltPlant"):
         lbt.studies.mirror(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
     with pytest.raises(lbt.errors.ProblemError, match="settles at once"):
         mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
@@ -274,7 +274,7 @@ def test_other_disturbances_meet_the_same_loop():
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5, vibrations=moved.vibrations)
     budget = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
     assert np.sqrt(error.C @ X @ error.C.T)[0, 0] == pytest.approx(budget.rms_nm, rel=1e-8)
-    with pytest.raises(lbt.errors.ProblemError, match="must come in a TipTiltPlant"):
+    with pytest.raises(lbt.errors.ProblemError, match="problem must be a TipTiltPlant"):
         design.error_system(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
     with pytest.raises(lbt.errors.ProblemError, match="must have 4 states"):
         design.error_system(slow_plant(2.25, shell(), vibrations=None))

@@ -305,12 +305,12 @@ def modal_loop(
     >>> one.residual_rms_nm(air, noise_nm=5.0).round(2).tolist()
     [15.98]
     """
-    if not isinstance(controller, MixedController | ModalFilters):
+    if not hasattr(controller, "banks"):
         raise ProblemError(
             "controller must be a MixedController or ModalFilters; got "
             f"{type(controller).__name__}. Try MixedController(gains=gains)."
         )
-    if isinstance(controller, MixedController) and controller.reconstructor is not None:
+    if getattr(controller, "reconstructor", None) is not None:
         raise ProblemError(
             "a modal loop is that of modal coefficients; got a controller with a "
             "reconstructor. Leave it out, or use simulate with the sensor's matrix."

@@ -17,8 +17,6 @@ from scipy.linalg import block_diag
 from lbt_synth.design.modal.banks import Bank
 from lbt_synth.design.modal.per_mode import mode_indices, number_per_mode
 from lbt_synth.design.modal.reconstructor import Reconstructor
-from lbt_synth.design.modal.stack import ModalFilters
-from lbt_synth.design.result import Design
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.state_space import RunningController
@@ -101,8 +99,9 @@ class MixedController:
         self._modes, self._running, self._stacks = np.zeros(0, dtype=np.intp), None, ()
         if self.filter is not None:
             self._modes = mode_indices(self.filtered, "filtered", n)
-            if isinstance(self.filter, ModalFilters):
-                self._stacks = self._stacked_filters(self.filter)
+            stack = getattr(self.filter, "banks", None)
+            if stack is not None:
+                self._stacks = self._stacked_filters(stack())
             else:
                 self._running = _start_filter(self.filter, self._modes.size)
             self._gain[self._modes] = self._leak[self._modes] = 0.0
@@ -117,16 +116,14 @@ class MixedController:
     @property
     def dt_s(self) -> float | None:
         """Sampling period of the filter [s]; None where nothing says it."""
-        if isinstance(self.filter, ModalFilters):
-            return self.filter.dt_s
         if isinstance(self._running, RunningController):
             return self._running.controller.dt_s
-        return None
+        return getattr(self.filter, "dt_s", None)
 
     @property
     def hardware(self) -> LoopHardware | None:
         """Loop that the filter is designed for, of any number of modes; None if it says none."""
-        return self.filter.hardware if isinstance(self.filter, Design | ModalFilters) else None
+        return getattr(self.filter, "hardware", None)
 
     @property
     def n_measurements(self) -> int:
@@ -266,21 +263,21 @@ class MixedController:
         C = np.hstack([chosen.T @ C for chosen, _, _, C, _ in each])
         return Controller(A=A, B=B, C=C, D=D, dt_s=1.0 if period is None else period)
 
-    def _stacked_filters(self, filters: ModalFilters) -> tuple[Bank, ...]:
+    def _stacked_filters(self, banks: Sequence[Bank]) -> tuple[Bank, ...]:
         """Return the filters of a stack for the modes that they control."""
-        if filters.n_modes != self._modes.size:
+        modes = sum(bank.modes.size for bank in banks)
+        if modes != self._modes.size:
             raise DimensionError(
-                f"the filters must be for the {self._modes.size} filtered modes; got "
-                f"{filters.n_modes}."
+                f"the filters must be for the {self._modes.size} filtered modes; got {modes}."
             )
-        return tuple(bank.for_modes(self._modes) for bank in filters.banks())
+        return tuple(bank.for_modes(self._modes) for bank in banks)
 
 
 def _start_filter(given: Any, modes: int) -> SteppedController:
     """Return the filter as an object to step, of as many inputs and outputs as modes."""
-    if isinstance(given, Design):
-        given = given.controller
-    running = given.start() if isinstance(given, Controller) else given
+    running = given if isinstance(given, SteppedController) else getattr(given, "controller", given)
+    if isinstance(running, Controller):
+        running = running.start()
     if not isinstance(running, SteppedController):
         raise ProblemError(
             "filter must be a design, a Controller, an object with step(y) and reset(), or None; "

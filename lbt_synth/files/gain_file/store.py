@@ -34,7 +34,7 @@ from lbt_synth.storage.array_file import (
 )
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import agree, frozen_copy, number, real_array, text
+from lbt_synth.validation import agree, frozen_copy, number, real_array, require_instance, text
 
 SCHEMA = "lbt_synth gain file"
 SCHEMA_VERSION = 3
@@ -122,8 +122,7 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
     'integrator'
     """
     target = require_gain_name(path)
-    if not isinstance(design, Design):
-        raise OutputError(f"a gain file holds a Design; got {type(design).__name__}.", path=target)
+    require_instance(design, Design, "design")
     record = _record_design(design, lbt_synth.__version__)
     try:  # what could not be read back is not written
         require_agreement(record, _record_design(_rebuild(record), lbt_synth.__version__))

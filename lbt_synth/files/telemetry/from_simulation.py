@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.design.integrator import IntegratorDesign
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.telemetry.fields import Scalar
 from lbt_synth.files.telemetry.telemetry import Telemetry
@@ -87,11 +86,11 @@ def telemetry_from_simulation(
             f"hardware must be that of the simulation, at {simulation.frame_rate_hz:g} Hz; got "
             f"one at {hardware.frame_rate_hz:g} Hz."
         )
+    gains = None
     if design is not None:
         require_instance(design, Design)
-    gains = None
-    if isinstance(design, IntegratorDesign) and design.law.is_pure:
-        gains = np.full(hardware.n_commands, design.gain)
+        if (gain := design.integrator_gain) is not None:
+            gains = np.full(hardware.n_commands, gain)
     residual, strehl = simulation.residual_nm[case], None
     if imaging is not None and residual.shape[1] <= 2:  # the jitter of an image has two axes
         strehl = float(np.clip(series_strehl(residual, imaging), 0, 1))  # a mean of cosines

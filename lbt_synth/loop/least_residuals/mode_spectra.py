@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import CoupledModesError, ProblemError
-from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.least_residuals.prediction import InnerFactor
-from lbt_synth.models import ARModel, FullStatePlant, LoopHardware, Spectrum, Vibration
+from lbt_synth.models import ARModel, LoopHardware, Spectrum, Vibration
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
-from lbt_synth.validation import FloatArray, real_array
+from lbt_synth.validation import FloatArray
 
 _COUPLING = 1e-9  # relative size above which an off-diagonal entry counts as coupling
-_SAMPLES = 24  # frequencies at which the modes of a plant have to decouple
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,30 +90,6 @@ class _VanishingError(Exception):
     """A spectrum without noise is zero over an interval: the process can be predicted exactly."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ResponseSpectrum:
-    """One-sided spectrum of one direction of a system driven by white noise."""
-
-    system: StateSpace  # from unit white noise to the modes
-    axis: FloatArray  # (n,)
-
-    @property
-    def breakpoints_hz(self) -> FloatArray:
-        """Frequencies around the poles [Hz]."""
-        poles = self.system.poles
-        centre = np.abs(np.angle(poles)) / np.pi
-        width = np.maximum(1 - np.abs(poles), 1e-9) / np.pi
-        spread = centre[:, None] + width[:, None] * np.array([-16, -4, -1, 0, 1, 4, 16])
-        return np.asarray(spread.ravel() / (2 * self.system.dt_s))
-
-    def psd(self, frequency_hz: Any) -> FloatArray:
-        """Return the spectrum [nm^2/Hz]."""
-        frequency = real_array(frequency_hz, "frequency_hz")
-        response = (self.axis[None] @ self.system.frequency_response(frequency.ravel()))[:, 0]
-        power = np.sum(np.abs(response) ** 2, axis=-1)
-        return np.asarray(2 * self.system.dt_s * power.reshape(frequency.shape))
-
-
 def decoupled_modes(
     hardware: LoopHardware,
     noise_nm2: FloatArray,
@@ -150,22 +123,13 @@ def decoupled_modes(
         matrices.append((f"the vibration at {line.frequency_hz:.6g} Hz", np.outer(along, along)))
     matrices += [("the given direction", np.outer(along, along)) for along in directions]
     axes = _common_axes(matrices)
-    parts = []
+    inner, modes = InnerFactor.of(hardware), []
     for axis in axes:
-        own = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
+        key = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
         lines = [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
-        parts.append(tuple(part for part in (kinds[own], *lines) if part is not None))
-    return axes, _spectra_along(axes, parts, noise, hardware)
-
-
-def _spectra_along(
-    axes: FloatArray, parts: list[tuple[Spectrum, ...]], noise: FloatArray, hardware: LoopHardware
-) -> list[ModeSpectrum]:
-    inner, rate = InnerFactor.of(hardware), hardware.frame_rate_hz
-    return [
-        ModeSpectrum(inner, rate, own, max(float(axis @ noise @ axis), 0.0))
-        for axis, own in zip(axes, parts, strict=True)
-    ]
+        parts = tuple(part for part in (kinds[key], *lines) if part is not None)
+        modes.append(ModeSpectrum(inner, rate, parts, max(float(axis @ noise @ axis), 0.0)))
+    return axes, modes
 
 
 def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
@@ -221,35 +185,3 @@ def _common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
             "each mode by itself."
         )
     return np.asarray(axes)
-
-
-def plant_modes(plant: FullStatePlant) -> tuple[FloatArray, list[ModeSpectrum]]:
-    """Decouple the modes of a plant that is given by its matrices, as :func:`decoupled_modes`."""
-    hardware = plant.hardware
-    noise = _noise_on_modes(hardware, plant.R)
-    if np.any(plant.S):
-        raise ProblemError(
-            "a limit needs measurement noise that is independent of the disturbance; got a plant "
-            "with B D' different from zero."
-        )
-    # the commands are left out: this is the response to the disturbance alone
-    C = np.linalg.pinv(hardware.sensor) @ plant.C
-    D = np.zeros((len(C), plant.B.shape[1]))
-    system = StateSpace(A=plant.A, B=plant.B, C=C, D=D, dt_s=plant.dt_s)
-    nyquist = hardware.frame_rate_hz / 2
-    poles = ResponseSpectrum(system, np.ones(hardware.modes)).breakpoints_hz
-    at = np.concatenate([np.geomspace(1e-5, 0.999, _SAMPLES) * nyquist, poles])
-    response = system.frequency_response(at[(at > 0) & (at < nyquist)])
-    spectra = response @ response.conj().transpose(0, 2, 1)
-    matrices = [("the noise of the sensor", noise)]
-    matrices += [("the disturbance", np.real(one)) for one in spectra]
-    axes = _common_axes(matrices)
-    turned = axes @ spectra @ axes.T
-    crossed = np.abs(turned * (1 - np.eye(hardware.modes)))
-    if np.any(crossed.max(axis=(1, 2)) > 1e-6 * np.abs(turned).max(axis=(1, 2))):
-        raise ProblemError(
-            "a limit needs modes that decouple; got disturbances of two modes that follow each "
-            "other with a delay. Treat each mode by itself."
-        )
-    parts: list[tuple[Spectrum, ...]] = [(ResponseSpectrum(system, axis),) for axis in axes]
-    return axes, _spectra_along(axes, parts, noise, hardware)

@@ -11,10 +11,9 @@ from scipy.linalg import block_diag
 
 from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_modes, plant_modes
+from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_modes
 from lbt_synth.loop.least_residuals.prediction import Prediction
 from lbt_synth.models import (
-    FullStatePlant,
     LoopHardware,
     SinusoidalVibration,
     TipTiltPlant,
@@ -126,14 +125,12 @@ def _limit_of_sensors(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     return _residual_limit(*truth_modes(every, truth, noise_nm2=block_diag(*blocks)))
 
 
-def least_model_residual(plant: TipTiltPlant | FullStatePlant) -> ResidualLimit:
+def least_model_residual(plant: TipTiltPlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth.
 
     Coupled modes have a limit where nothing but whole frames of delay is between command and
     mirror: the error of the best estimate, from a Riccati equation.
     """
-    if isinstance(plant, FullStatePlant):
-        return _residual_limit(*plant_modes(plant))
     hardware = plant.hardware
     lines = [(checked_direction(line, hardware), line) for line in plant.vibrations]
     try:

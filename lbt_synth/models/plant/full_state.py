@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.validation import FloatArray
+
+if TYPE_CHECKING:
+    from lbt_synth.models.plant.tip_tilt import TipTiltPlant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,13 +30,18 @@ class FullStatePlant(EstimationProblem):
         Known input to state.
     D_known : (q, m) array_like
         Known input to measurement.
-    hardware : LoopHardware
-        The loop.
+    reduced : TipTiltPlant
+        The same plant without its past commands.
     """
 
     B_known: FloatArray
     D_known: FloatArray
-    hardware: LoopHardware
+    reduced: TipTiltPlant
+
+    @property
+    def hardware(self) -> LoopHardware:
+        """The loop."""
+        return self.reduced.hardware
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Return the controller from y(k) to u(k), the known input included, in new-state form.
@@ -78,6 +87,7 @@ class FullStatePlant(EstimationProblem):
         return replace(
             self,
             **{name: getattr(longer, name) for name in "ABCL"},
+            reduced=self.reduced.with_memory(taps),
             B_known=np.vstack([self.B_known, np.zeros((more, self.B_known.shape[1]))]),
         )
 

@@ -118,9 +118,14 @@ class TipTiltPlant(EstimationProblem):
             read=self.read,
             B_known=frozen_copy(entry[0] if single else entry),  # u(k-1) is the input
             D_known=frozen_copy(D_known[0] if single else D_known),
-            hardware=self.hardware,
+            reduced=self,
             dt_s=self.dt_s,
         )
+
+    @property
+    def reduced(self) -> TipTiltPlant:
+        """The plant itself: a full form has its reduced form by this name."""
+        return self
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Return the controller from y(k) to u(k), the known input included, in new-state form.

@@ -424,7 +424,7 @@ def test_the_header_counts_the_measurements_of_all_sensors(tmp_path):
 
 
 def test_only_designs_are_saved(tmp_path):
-    with pytest.raises(lbt.errors.OutputError, match="holds a Design; got int"):
+    with pytest.raises(lbt.errors.ProblemError, match="design must be a Design; got int"):
         lbt.save_gain(tmp_path / "g.fits", 3)
     twisted = replace(DESIGNS["kalman"])
     k = twisted.controller
