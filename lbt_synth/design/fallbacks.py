@@ -23,8 +23,7 @@ from lbt_synth.design.certificate import (
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import EstimationProblem, StateSpace, kalman_riccati
 from lbt_synth.loop import ClosedLoop, close_loop
-from lbt_synth.loop.budget import plant_budget
-from lbt_synth.loop.sensor_budget import model_readings
+from lbt_synth.loop.budget import model_readings, plant_budget
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy

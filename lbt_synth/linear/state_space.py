@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.lyapunov import join_roots, stationary_covariance, stationary_root
 from lbt_synth.linear.matrix_functions import as_stack, complex_schur, solve_stack, transpose
 from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.storage.rows import column, fact_table, table_row
@@ -299,9 +299,17 @@ class StateSpace(LinearSystem):
         return out
 
     def output_covariances(self) -> FloatArray:
-        """Return the stationary covariance of y at each phase, for white u, (N, p, p)."""
-        _, _, C, D = self.stacks()
-        return np.asarray(C @ self.covariances() @ transpose(C) + D @ transpose(D))
+        """Return the stationary covariance of y at each phase, for white u, (N, p, p).
+
+        By roots: a small output of large states keeps its digits.
+        """
+        s = self.balanced() if self.period == 1 else self
+        root, out = stationary_root(s.monodromy, s.lifted().B), []
+        for A, B, C, D in zip(*s.stacks(), strict=True):
+            rows = np.hstack([C @ root, D])
+            out.append(rows @ rows.T)
+            root = join_roots(A @ root, B)
+        return np.array(out)
 
     def phase_response(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Complex amplitude of y at each phase for the input ``exp(2 pi i f k dt)``, (f, N, p, m).
@@ -309,6 +317,8 @@ class StateSpace(LinearSystem):
         The output is this amplitude times the input's own ``exp``: for one phase it is the
         transfer matrix. Its mean square over the phases is the mean power of the output.
         """
+        if self.period == 1:
+            return self.frequency_response(frequency_hz)[:, None]
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         (p, m), N, whole = self.D.shape[-2:], self.period, self.lifted()

@@ -1,32 +1,50 @@
 """The exact residual of one closed loop, by origin: turbulence, vibrations, noise.
 
-White noise and auto-regressive disturbances are solved by a Lyapunov equation, spectra by
-adaptive quadrature on panels that crowd at the loop's resonances, sinusoids by the frequency
-response. The same budget serves the error of assuming that the mirror settles at once.
+The camera sees the phase less the mirror's position at every moment. A command holds for one frame
+from its arrival on, so that the mean square over a frame is that of the mean over the hold, less
+the mirror, and of what moves within the hold. With a settled mirror the second is the phase's own:
+no command follows it (C. Kulcsar, H.-F. Raynaud, C. Petit, J.-M. Conan, P. Viaris de Lesegno, Opt.
+Express 14, 7464 (2006), doi:10.1364/OE.14.007464).
+
+White noise and sampled processes are solved by Lyapunov equations where a hold is a frame, spectra
+by adaptive quadrature on panels that crowd at the loop's resonances, sinusoids by the frequency
+response. A sampled process is one of means over frames, whose density in the continuous phase is
+larger by ``1 / sinc^2(f / f_s)``; spectra, and the rms of vibrations, are of the continuous phase.
+Nothing lies above half the frame rate.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.linear.quadrature import adaptive_integral, panel_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.loop.residual import ResidualBudget, require_true_gain
-from lbt_synth.loop.sensor_budget import budget_of_sensors
-from lbt_synth.models import ARModel, Spectrum, TipTiltPlant, Truth, Vibration
+from lbt_synth.models import (
+    ARModel,
+    SinusoidalVibration,
+    Spectrum,
+    TipTiltPlant,
+    Truth,
+    Vibration,
+)
+from lbt_synth.models.mirror.frame_rate_system import Hold
+from lbt_synth.models.plant.seen_vibration import seen_vibration
+from lbt_synth.models.sensor_suite import Motion, checked_motions
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
-def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
-    """Exact stationary residual of a loop under a truth.
+def residual_budget(loop: ClosedLoop, truth: Truth, *, frame_means: bool = False) -> ResidualBudget:
+    """Exact stationary residual of a loop under a truth, as the camera sees it.
 
     Parameters
     ----------
@@ -34,11 +52,14 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
         The loop; its sensor gain must be the truth's.
     truth : Truth
         Disturbances.
+    frame_means : bool, optional
+        Whether the phase of a frame is one number, as in a simulator that steps by frames. What
+        moves within a frame is then left out, and rms and spectra are those of these numbers.
 
     Returns
     -------
     ResidualBudget
-        Covariances by origin.
+        Covariances by origin; means over the period of several sensors.
 
     Raises
     ------
@@ -55,42 +76,47 @@ def residual_budget(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
     >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
-    >>> budget = lbt.residual_budget(
-    ...     lbt.close_loop(path, lazy), lbt.Truth(turbulence=None, noise_nm=3.0)
-    ... )
+    >>> loop = lbt.close_loop(path, lazy)
+    >>> budget = lbt.residual_budget(loop, lbt.Truth(turbulence=None, noise_nm=3.0))
     >>> round(budget.noise_nm**2, 9)
     3.0
+
+    Of a sinusoid of 20 Hz, ``1 - sinc^2(20/800)`` of the power moves within the frames:
+
+    >>> line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797, direction=(1,))
+    >>> shake = lbt.Truth(turbulence=None, vibrations=(line,))
+    >>> round(lbt.residual_budget(loop, shake).within_nm, 1)
+    36.1
     """
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     require_true_gain(loop.sensor_gain, truth)
     n, noise_nm = loop.hardware.modes, truth.noise_per_measurement(loop.hardware.n_measurements)
-    if loop.reads_others:
-        return budget_of_sensors(loop, truth, np.diag(noise_nm))
-    turbulence = np.zeros((n, n))
+    view = _view(loop, frame_means=frame_means)
+    turbulence, vibration = np.zeros((2, 2, n, n))
     for spectrum, modes in truth.turbulence_groups(n):
-        if isinstance(spectrum, ARModel):
-            turbulence += ar_covariance(loop, spectrum, np.eye(n)[list(modes)])
+        for mode in modes:
+            turbulence += view.of_spectrum(spectrum, _entry(loop, mode))
+    lines = stationary_vibrations(truth.vibrations)
+    amplitudes: list[ComplexArray] = []
+    moving = checked_motions(truth.motions, loop.hardware.suite, len(lines))
+    for line, motion in zip(lines, moving, strict=True):
+        if isinstance(line, Vibration):
+            vibration += view.of_line(line, motion, of_means=frame_means)
         else:
-            turbulence += _spectrum_covariance(loop, spectrum, modes)
-
-    random_vibration = np.zeros((n, n))
-    lines = []
-    for vibration in stationary_vibrations(truth.vibrations):
-        direction = checked_direction(vibration, loop.hardware)
-        if isinstance(vibration, Vibration):
-            model = vibration.ar_model(loop.hardware.frame_rate_hz)
-            random_vibration += ar_covariance(loop, model, direction[None])
-        else:
-            response = loop.sensitivity([vibration.frequency_hz])[0]
-            lines.append(vibration.amplitude_nm * response @ direction)
-    return _make_budget(loop, turbulence, np.diag(noise_nm), random_vibration, lines)
+            harmonics, within = view.of_sinusoid(line, motion)
+            vibration[1] += within
+            amplitudes += list(harmonics)
+    return _make_budget(turbulence, vibration, view.of_noise(np.diag(noise_nm)), amplitudes)
 
 
-def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
+def model_budget(
+    loop: ClosedLoop, plant: TipTiltPlant, *, frame_means: bool = False
+) -> ResidualBudget:
     """Exact stationary residual of a loop where a plant's model is the truth.
 
-    Each mode has its own turbulence and each measurement its own noise, as in the plant.
+    Each mode has its own turbulence and each measurement its own noise, as in the plant. The
+    processes of a plant are of means over frames.
 
     Parameters
     ----------
@@ -98,6 +124,8 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
         A loop of the plant's hardware, around any controller.
     plant : TipTiltPlant
         Turbulence, vibrations and noise.
+    frame_means : bool, optional
+        As in :func:`residual_budget`.
 
     Returns
     -------
@@ -118,7 +146,8 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
     >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
     >>> design = lbt.kalman(plant)
     >>> loop = lbt.close_loop(plant.hardware, design.controller)
-    >>> bool(abs(lbt.loop.model_budget(loop, plant).rms_nm / design.rms - 1) < 1e-9)
+    >>> budget = lbt.loop.model_budget(loop, plant, frame_means=True)
+    >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-9)
     True
     """
     require_instance(plant, TipTiltPlant)
@@ -135,93 +164,318 @@ def model_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
             "the loop must have the plant's sensor, mirror and delay; got another. Close it with "
             "close_loop(plant.hardware, controller)."
         )
-    return plant_budget(loop, plant)
+    return plant_budget(loop, plant, frame_means=frame_means)
 
 
-def plant_budget(loop: ClosedLoop, plant: TipTiltPlant) -> ResidualBudget:
+def plant_budget(
+    loop: ClosedLoop, plant: TipTiltPlant, *, frame_means: bool = False
+) -> ResidualBudget:
     """Return what a plant's disturbances and noise leave in any loop, at its own sensor gain."""
     loop.require_stable()
-    one, n, noise_factor = loop.hardware, loop.hardware.modes, plant.own_noise_factor
-    if loop.reads_others:
-        model = Truth(
-            turbulence=plant.turbulence, vibrations=plant.vibrations, motions=plant.motions
-        )
-        return budget_of_sensors(loop, model, noise_factor)
-    turbulence, vibration = np.zeros((2, n, n))
-    for process, direction in zip(plant.turbulence, np.eye(n), strict=True):
-        turbulence += ar_covariance(loop, process, direction[None])
-    for line in plant.vibrations:
-        direction = checked_direction(line, one)
-        vibration += ar_covariance(loop, line.ar_model(one.frame_rate_hz), direction[None])
-    return _make_budget(loop, turbulence, noise_factor, vibration, [])
+    view = _view(loop, frame_means=frame_means)
+    turbulence, vibration = np.zeros((2, 2, loop.hardware.modes, loop.hardware.modes))
+    for mode, model in enumerate(plant.turbulence):
+        turbulence += view.of_spectrum(model, _entry(loop, mode))
+    moving = checked_motions(plant.motions, loop.hardware.suite, len(plant.vibrations))
+    for line, motion in zip(plant.vibrations, moving, strict=True):
+        vibration += view.of_line(line, motion, of_means=True)
+    return _make_budget(turbulence, vibration, view.of_noise(plant.own_noise_factor), [])
 
 
-def _make_budget(
-    loop: ClosedLoop,
-    turbulence: FloatArray,
-    noise_factor: FloatArray,
-    random_vibration: FloatArray,
-    lines: list[ComplexArray],
-) -> ResidualBudget:
-    """Add what white noise of covariance ``factor factor'`` leaves."""
-    shape = len(lines), loop.hardware.modes
-    return ResidualBudget(
-        turbulence_nm2=frozen_copy(turbulence),
-        noise_nm2=frozen_copy(noise_covariance(loop, noise_factor)),
-        random_vibration_nm2=frozen_copy(random_vibration),
-        line_amplitudes_nm=np.array(lines, dtype=np.complex128).reshape(shape),
+def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
+    """Return the covariance of all readings in the first frame of a period, (q, q).
+
+    A plant's model is the truth. In that frame every sensor is read.
+    """
+    systems = [_noise_system(loop, loop.system, plant.own_noise_factor)]
+    for mode, model in enumerate(plant.turbulence):
+        systems.append(_driven_system(loop.system, ar_process(model), _entry(loop, mode)))
+    for line, motion in zip(plant.vibrations, plant.motions, strict=True):
+        process, entry = _shaken(loop, line, motion)
+        systems.append(_driven_system(loop.system, process, entry))
+    first = -plant.n_measurements
+    return np.asarray(sum(s.output_covariances()[0, first:, first:] for s in systems))
+
+
+def line_covariance(loop: ClosedLoop, line: Vibration) -> FloatArray:
+    """Return the covariance of the residual that a plant's line leaves in the image, (n, n)."""
+    return np.asarray(
+        np.sum(_view(loop, frame_means=False).of_line(line, {}, of_means=True), axis=0)
     )
 
 
 def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
     """Covariance of the residual that white noise of covariance ``factor factor'`` leaves."""
-    n, s = loop.hardware.modes, loop.system.balanced()
-    B, D = s.B[:, n:] @ factor, s.D[:n, n:] @ factor
-    root = np.hstack([s.C[:n] @ stationary_root(s.A, B), D])
-    return np.asarray(root @ root.T)
+    return np.asarray(np.sum(_view(loop, frame_means=False).of_noise(factor), axis=0))
 
 
-def ar_covariance(loop: ClosedLoop, model: ARModel, directions: FloatArray) -> FloatArray:
-    """Covariance of the residual that independent AR processes leave, one per direction."""
-    require_loop_rate(model.frame_rate_hz, loop.hardware)
-    total = np.zeros((loop.hardware.modes, loop.hardware.modes))
-    for direction in directions:
-        total += _directed_covariance(loop, model, direction)
-    return total
+def _make_budget(
+    turbulence: FloatArray,
+    vibration: FloatArray,
+    noise: FloatArray,
+    amplitudes: list[ComplexArray],
+) -> ResidualBudget:
+    """Return the budget of pairs of covariances: of the means, and of what moves within."""
+    shape = len(amplitudes), turbulence.shape[-1]
+    return ResidualBudget(
+        turbulence_nm2=frozen_copy(turbulence[0]),
+        noise_nm2=frozen_copy(noise[0]),
+        random_vibration_nm2=frozen_copy(vibration[0]),
+        within_nm2=frozen_copy(turbulence[1] + vibration[1] + noise[1]),
+        line_amplitudes_nm=np.array(amplitudes, dtype=np.complex128).reshape(shape),
+    )
 
 
-def _directed_covariance(loop: ClosedLoop, model: ARModel, direction: FloatArray) -> FloatArray:
-    n, s, order = loop.hardware.modes, loop.system.balanced(), model.order
-    # the newest sample of the process, x(k), acts on frame k
-    entry = np.zeros((s.n_states, order))
-    entry[:, 0] = s.B[:, :n] @ direction
-    A = np.block([[s.A, entry], [np.zeros((order, s.n_states)), model.companion]])
-    drive = np.zeros((len(A), 1))
-    drive[s.n_states] = model.driving_rms_nm
-    C = np.hstack([s.C[:n], np.zeros((n, order))])
-    C[:, s.n_states] = s.D[:n, :n] @ direction
-    root = C @ stationary_root(A, drive)  # what is left of a line is a small part of it
-    return np.asarray(root @ root.T)
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """What of a loop counts as its residual.
+
+    Without pieces it is the mean over a frame, and the rows of the system are the residual. With
+    pieces they are the mirror's mean positions in the pieces of a hold. What it returns are pairs
+    (2, n, n): the covariance of the mean, and of what moves within a frame.
+    """
+
+    loop: ClosedLoop
+    system: StateSpace  # from [phi_tot, noise] to the residual (n), or to the positions (g n)
+    pieces: Hold | None
+    in_image: bool  # whether what moves within a frame counts
+
+    def of_spectrum(self, spectrum: Spectrum, entry: FloatArray) -> FloatArray:
+        """Return what a spectrum leaves, or a sampled process, that enters as given."""
+        if isinstance(spectrum, ARModel):
+            require_loop_rate(spectrum.frame_rate_hz, self.loop.hardware)
+            return self.of_process(ar_process(spectrum), entry)
+
+        def density(frequency: FloatArray) -> FloatArray:
+            pieces, rest = self._residuals(frequency, entry)
+            power = self._powers(pieces[..., None], rest, entry)
+            return np.asarray(spectrum_density(spectrum, frequency)[:, None, None, None] * power)
+
+        kinks = breakpoints_below(spectrum, self.loop.hardware.frame_rate_hz / 2)
+        return self._integral(density, kinks)
+
+    def of_line(
+        self, line: Vibration, motion: Mapping[str, Motion], *, of_means: bool
+    ) -> FloatArray:
+        """Return what a resonance leaves, whose rms is of means over frames, or of all moments."""
+        if not (of_means or _moved_rows(self.loop, motion)):
+            share = float(np.sinc(line.frequency_hz / self.loop.hardware.frame_rate_hz))
+            line = replace(line, rms_nm=share * line.rms_nm)
+        return self.of_process(*_shaken(self.loop, line, motion))
+
+    def of_process(self, process: StateSpace, entry: FloatArray) -> FloatArray:
+        """Return what a process of means over frames leaves, the first of what enters."""
+        driven = _driven_system(self.system, process, entry)
+        n = self.loop.hardware.modes
+        out = np.zeros((2, n, n))
+        if self.pieces is None:
+            out[0] = np.mean(driven.output_covariances(), axis=0)
+        if not self.in_image:
+            return out
+        rate = self.loop.hardware.frame_rate_hz
+
+        def density(frequency: FloatArray) -> FloatArray:
+            mean = process.phase_response(frequency)[:, :1, 0]  # (f, 1, drives), of each phase
+            moving = mean / np.sinc(frequency / rate)[:, None, None]
+            means, rest = self._phase_means(frequency)
+            if self.pieces is None:
+                pieces = np.zeros((*moving.shape[:2], 1, n, moving.shape[2]))
+            else:
+                response = driven.phase_response(frequency)
+                positions = response.reshape(*response.shape[:2], -1, n, response.shape[-1])
+                phase = means[:, None, :, None, None] * moving[:, :, None, None]
+                pieces = phase * entry[:n, :1] - positions
+            power = np.sum(np.abs(moving) ** 2, axis=2)[:, 0] * rest
+            return 2 / rate * self._powers(pieces, power, entry)
+
+        edges = panel_edges(_roots(process.poles, process.period), rate)
+        return out + self._integral(density, edges[(edges > 0) & (edges < rate / 2)])
+
+    def of_sinusoid(
+        self, line: SinusoidalVibration, motion: Mapping[str, Motion]
+    ) -> tuple[ComplexArray, FloatArray]:
+        """Return the amplitudes of the means, (N, n), and the covariance of what moves within.
+
+        What repeats with the period turns one sinusoid into several.
+        """
+        entry = _sinusoid_entry(self.loop, line, motion)
+        pieces, rest = self._residuals(np.array([line.frequency_hz]), entry)
+        within = line.rms_nm**2 * self._powers(pieces[..., None], rest, entry)[0, 1]
+        mean = np.einsum("g,tgi->ti", self._weights, pieces[0])
+        return line.amplitude_nm * np.fft.fft(mean, axis=0) / len(mean), within
+
+    def of_noise(self, factor: FloatArray) -> FloatArray:
+        """Return what white noise of covariance ``factor factor'`` leaves; others have theirs."""
+        n = self.loop.hardware.modes
+        covariance = _noise_system(self.loop, self.system, factor).output_covariances().mean(axis=0)
+        blocks = covariance.reshape(-1, n, covariance.shape[0] // n, n)
+        w = self._weights
+        mean = np.einsum("g,gihj,h->ij", w, blocks, w)
+        return np.array([mean, np.einsum("g,gigj->ij", w, blocks) - mean])
+
+    @property
+    def _weights(self) -> FloatArray:
+        """Lengths of the pieces [frames], (g,)."""
+        return np.ones(1) if self.pieces is None else self.pieces.weights
+
+    def _phase_means(self, frequency_hz: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Means of a unit phase over the pieces, (f, g), and the power that moves within, (f,)."""
+        f = frequency_hz / self.loop.hardware.frame_rate_hz
+        if self.pieces is None:
+            means = np.sinc(f)[:, None].astype(np.complex128)
+        else:  # as seen from the middle of the frame, where the mean has its phase
+            means = self.pieces.phase_means(f) * np.exp(-1j * np.pi * f)[:, None]
+        return means, 1 - np.abs(means) ** 2 @ self._weights
+
+    def _residuals(
+        self, frequency_hz: FloatArray, entry: FloatArray | ComplexArray
+    ) -> tuple[ComplexArray, FloatArray]:
+        """Residual in each piece of a unit phase, (f, N, g, n), and the power within, (f,)."""
+        n = self.loop.hardware.modes
+        used = np.flatnonzero(entry[:, 0])
+        s = replace(self.system, B=self.system.B[..., used], D=self.system.D[..., used])
+        share = np.ones(len(frequency_hz))  # of a unit phase that the mean over a frame is
+        means, rest = self._phase_means(frequency_hz)
+        if self.in_image:
+            share = np.sinc(frequency_hz / self.loop.hardware.frame_rate_hz)
+        enters = np.where(used < n, share[:, None], 1.0) * entry[used, 0]
+        response = np.einsum("ftiu,fu->fti", s.phase_response(frequency_hz), enters)
+        pieces = response.reshape(*response.shape[:2], -1, n)
+        if self.pieces is not None:
+            pieces = means[:, None, :, None] * entry[:n, 0] - pieces
+        return pieces, rest * self.in_image
+
+    def _powers(self, pieces: ComplexArray, rest: FloatArray, entry: Any) -> FloatArray:
+        """Powers (f, 2, n, n) of the mean and within, from pieces (f, N, g, n, w) and the rest."""
+        n, w = self.loop.hardware.modes, self._weights
+        mean = np.einsum("g,ftgiw->ftiw", w, pieces)
+        apart = pieces - mean[:, :, None]
+        scale = 1 / pieces.shape[1]
+        out = np.empty((len(pieces), 2, n, n))
+        out[:, 0] = scale * np.real(np.einsum("ftiw,ftjw->fij", mean, mean.conj()))
+        out[:, 1] = scale * np.real(np.einsum("g,ftgiw,ftgjw->fij", w, apart, apart.conj()))
+        along = np.real(entry[:n, 0])
+        out[:, 1] += rest[:, None, None] * np.outer(along, along)
+        return out
+
+    def _integral(
+        self, density: Callable[[FloatArray], FloatArray], edges_hz: FloatArray
+    ) -> FloatArray:
+        """Integrate over (0, Nyquist), on panels around the loop's poles and further edges."""
+        edges = [resonance_edges(self.loop), edges_hz]
+        return adaptive_integral(density, np.unique(np.concatenate(edges)))
 
 
-def _spectrum_covariance(
-    loop: ClosedLoop, spectrum: Spectrum, modes: tuple[int, ...]
-) -> FloatArray:
-    """Integrate the residual's spectrum over (0, Nyquist), adaptively."""
+def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
+    """Return the residual of a loop in the image, or in means over frames."""
+    hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
+    if frame_means or (hardware.mirror is None and hardware.delay_frames % 1 == 0):
+        rows = replace(s, C=s.C[..., :n, :], D=s.D[..., :n, :])
+        return _View(loop, rows, None, not frame_means)
+    mirror, m = hardware.mirror_system, hardware.n_commands
+    command = slice(n, n + m)
+    first = loop.controller.n_states  # the states of the mirror follow those of the controller
+    core = slice(first, first + mirror.core.n_states * m)
+    pieces, N = mirror.hold, hardware.influence
+    C = np.einsum("g,im,...ms->...gis", pieces.D, N, s.C[..., command, :])
+    C[..., core] += np.einsum("gs,im->gism", pieces.C, N).reshape(len(pieces.D), n, -1)
+    D = np.einsum("g,im,...mw->...giw", pieces.D, N, s.D[..., command, :])
+    shape = len(pieces.D) * n
+    C, D = C.reshape(*s.C.shape[:-2], shape, -1), D.reshape(*s.D.shape[:-2], shape, s.D.shape[-1])
+    return _View(loop, replace(s, C=C, D=D), pieces, True)
 
-    def density(frequency: FloatArray) -> FloatArray:
-        response = loop.sensitivity(frequency)[:, :, list(modes)]
-        power = np.real(np.einsum("fij,fkj->fik", response, response.conj()))
-        return np.asarray(spectrum_density(spectrum, frequency)[:, None, None] * power)
 
-    nyquist = loop.hardware.frame_rate_hz / 2
-    edges = np.concatenate([resonance_edges(loop), breakpoints_below(spectrum, nyquist)])
-    return adaptive_integral(density, np.unique(edges))
+def _entry(loop: ClosedLoop, mode: int) -> FloatArray:
+    """Return how the phase of a mode enters a loop, (n + q, 1)."""
+    return np.eye(loop.system.B.shape[-1], 1, -mode)
+
+
+def _moved_rows(loop: ClosedLoop, motion: Mapping[str, Motion]) -> list[tuple[int, str]]:
+    """Return the inputs of a loop at which channels read a line, and the channels, in order."""
+    if not loop.reads_others:
+        return []
+    rows, n = loop.hardware.suite.rows(loop.hardware), loop.hardware.modes
+    return [(n + rows[name].start, name) for name in loop.hardware.suite.channels if name in motion]
+
+
+def _shaken(
+    loop: ClosedLoop, line: Vibration, motion: Mapping[str, Motion]
+) -> tuple[StateSpace, FloatArray]:
+    """Return a line as a process, and how it enters a loop."""
+    hardware, moved = loop.hardware, _moved_rows(loop, motion)
+    entry = np.zeros((loop.system.B.shape[-1], 1 + len(moved)))
+    entry[: hardware.modes, 0] = checked_direction(line, hardware)
+    for column, (row, name) in enumerate(moved, start=1):
+        entry[row, column] = name not in loop.blind
+    if not moved:
+        return ar_process(line.ar_model(hardware.frame_rate_hz)), entry
+    return seen_vibration(line, motion, hardware.suite.accelerometers, hardware), entry
+
+
+def _sinusoid_entry(
+    loop: ClosedLoop, line: SinusoidalVibration, motion: Mapping[str, Motion]
+) -> ComplexArray:
+    """Return how a sinusoid of unit amplitude enters a loop, (n + q, 1)."""
+    hardware, entry = loop.hardware, np.zeros((loop.system.B.shape[-1], 1), dtype=np.complex128)
+    entry[: hardware.modes, 0] = checked_direction(line, hardware)
+    of_channel = {
+        name: sensor for sensor in hardware.suite.accelerometers for name in sensor.channels
+    }
+    for row, name in _moved_rows(loop, motion):
+        if name not in loop.blind:
+            entry[row] = of_channel[name].swing(motion[name], line.frequency_hz, hardware)
+    return entry
+
+
+def ar_process(model: ARModel) -> StateSpace:
+    """Return the system from white noise to a process."""
+    drive, output = np.zeros((2, model.order, 1))
+    drive[0], output[0] = model.driving_rms_nm, 1.0
+    D = np.zeros((1, 1))
+    return StateSpace(A=model.companion, B=drive, C=output.T, D=D, dt_s=1 / model.frame_rate_hz)
+
+
+def _driven_system(s: StateSpace, process: StateSpace, entry: FloatArray) -> StateSpace:
+    """Return the system from the drive of a process to the outputs of one that it enters.
+
+    The process x(k + 1) = A x(k) + B w(k) has acted by the time of its newest sample.
+    """
+    phases = np.arange(s.period) % process.period
+    process_A, process_B, process_C = (stack[phases] for stack in process.stacks()[:3])
+    samples = entry @ process_C
+    loop_A, loop_B, loop_C, loop_D = s.stacks()
+    size, n = s.n_states + process.n_states, s.n_states
+    A, B = np.zeros((s.period, size, size)), np.zeros((s.period, size, process.B.shape[-1]))
+    A[:, :n, :n], A[:, :n, n:], A[:, n:, n:] = loop_A, loop_B @ samples, process_A
+    B[:, n:] = process_B
+    C = np.concatenate([loop_C, loop_D @ samples], axis=2)
+    D = np.zeros((C.shape[1], B.shape[2]))
+    if s.period == 1:
+        return StateSpace(A=A[0], B=B[0], C=C[0], D=D, dt_s=s.dt_s)
+    return StateSpace(A=A, B=B, C=C, D=D, dt_s=s.dt_s)
+
+
+def _noise_system(loop: ClosedLoop, s: StateSpace, own: FloatArray) -> StateSpace:
+    """Return the system from white noise to the outputs of a system of the loop's inputs."""
+    n, hardware = loop.hardware.modes, loop.hardware
+    noise = own
+    if loop.reads_others:
+        noise = hardware.suite.noise_factor(own, n)
+        noise[hardware.suite.marked(loop.blind, hardware)] = 0.0
+    return StateSpace(A=s.A, B=s.B[..., n:] @ noise, C=s.C, D=s.D[..., n:] @ noise, dt_s=s.dt_s)
+
+
+def _roots(poles: ComplexArray, period: int) -> ComplexArray:
+    """Return where the poles of a period show in a response: at each of their roots."""
+    turns = np.exp(2j * np.pi * np.arange(period) / period)
+    roots = np.abs(poles) ** (1 / period) * np.exp(1j * np.angle(poles) / period)
+    return np.asarray((roots[:, None] * turns).ravel())
 
 
 def resonance_edges(loop: ClosedLoop) -> FloatArray:
     """Panels of (0, Nyquist) [Hz] for a loop."""
-    return panel_edges(loop.system.poles, loop.hardware.frame_rate_hz)
+    roots = _roots(loop.system.poles, loop.system.period)
+    return panel_edges(roots, loop.hardware.frame_rate_hz)
 
 
 def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
@@ -269,7 +523,7 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     >>> 0 < missed.rms_nm < lbt.residual_budget(loop, shake).rms_nm
     True
     """
-    return residual_budget(replace(loop, system=_difference_loop(loop)), truth)
+    return residual_budget(replace(loop, system=_difference_loop(loop)), truth, frame_means=True)
 
 
 def _difference_loop(loop: ClosedLoop) -> StateSpace:

@@ -22,6 +22,7 @@ class BudgetFacts:
     turbulence_nm: float = nm_column("  turbulence", unit="nm rms")
     vibration_nm: float = nm_column("  vibrations", unit="nm rms")
     noise_nm: float = nm_column("  noise", unit="nm rms")
+    within_nm: float = nm_column("  within frames", unit="nm rms")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,14 +32,17 @@ class ResidualBudget(Summarised):
     Attributes
     ----------
     turbulence_nm2, noise_nm2, random_vibration_nm2 : (n, n) ndarray
-        Covariances over the modes [nm^2].
+        Covariances over the modes [nm^2], of means over the hold of a command.
+    within_nm2 : (n, n) ndarray
+        Covariance of what moves within the hold of a command [nm^2]; zero in means over frames.
     line_amplitudes_nm : (s, n) complex ndarray
-        Complex amplitude that each sinusoid leaves on each mode [nm].
+        Complex amplitude that each sinusoid leaves on each mode [nm], of such means.
     """
 
     turbulence_nm2: FloatArray
     noise_nm2: FloatArray
     random_vibration_nm2: FloatArray
+    within_nm2: FloatArray
     line_amplitudes_nm: ComplexArray
 
     def _brief(self) -> str:
@@ -50,7 +54,8 @@ class ResidualBudget(Summarised):
     @property
     def gaussian_nm2(self) -> FloatArray:
         """Covariance of all that is Gaussian [nm^2]."""
-        return frozen_copy(self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2)
+        steady = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
+        return frozen_copy(steady + self.within_nm2)
 
     @property
     def vibration_nm2(self) -> FloatArray:
@@ -61,7 +66,8 @@ class ResidualBudget(Summarised):
     @property
     def total_nm2(self) -> FloatArray:
         """Covariance of the residual [nm^2]."""
-        return frozen_copy(self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2)
+        steady = self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2
+        return frozen_copy(steady + self.within_nm2)
 
     @property
     def rms_nm(self) -> float:
@@ -82,6 +88,11 @@ class ResidualBudget(Summarised):
     def noise_nm(self) -> float:
         """Propagated noise over all modes [nm rms]."""
         return _rms(self.noise_nm2)
+
+    @property
+    def within_nm(self) -> float:
+        """What moves within frames over all modes, which no command follows [nm rms]."""
+        return _rms(self.within_nm2)
 
 
 def _rms(covariance: FloatArray) -> float:

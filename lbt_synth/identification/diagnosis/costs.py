@@ -9,9 +9,8 @@ import numpy as np
 from lbt_synth.identification.diagnosis.line_origins import LineOrigin
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, jitter_strehl, model_budget
-from lbt_synth.loop.budget import ar_covariance
+from lbt_synth.loop.budget import line_covariance
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.models.vibration import checked_direction
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray
 
@@ -68,14 +67,7 @@ def _covariances(
     budget = model_budget(loop, plant)
     out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
     for line in lines:
-        parts = [
-            ar_covariance(
-                loop,
-                each.ar_model(plant.hardware.frame_rate_hz),
-                checked_direction(each, plant.hardware)[None],
-            )
-            for each in line.vibrations
-        ]
+        parts = [line_covariance(loop, vibration) for vibration in line.vibrations]
         name = line.name if line.name not in out else f"{line.name}, another"
         out[name] = np.sum(parts, axis=0)
     rest = budget.total_nm2 - np.sum(list(out.values()), axis=0)

@@ -26,6 +26,8 @@ _NOTHING = 1e-14  # a leading tap of at most this counts as zero
 _TAIL = 1e-15  # the taps end where at most this is left of the step response
 _MOST_TAPS = 4000
 _MOST_SAMPLES = 100_000  # of the local loop per frame; they are run one by one
+_PIECES = 32  # of a frame, in which the mean position counts: what is left is its part of 1e-3
+_FRAME = frozen_copy([0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,12 +79,40 @@ class Response:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Hold:
+    """Where the mirror is while a command holds: for one frame, from its arrival on.
+
+    The frame is cut into g pieces, in each of which the position counts by its mean.
+    """
+
+    start: float  # of the hold of u(k) after the begin of exposure k [frames]
+    edges: FloatArray  # (g + 1,): ends of the pieces after the start, from 0 to 1 [frames]
+    C: FloatArray  # (g, n): mean position in each piece, over the states of the core
+    D: FloatArray  # (g,): over u(k)
+
+    @property
+    def weights(self) -> FloatArray:
+        """Lengths of the pieces [frames], (g,)."""
+        return np.diff(self.edges)
+
+    def phase_means(self, frequency: FloatArray) -> ComplexArray:
+        """Return the mean of ``exp(2 pi i f t)`` over each piece, for t from exposure k, (f, g).
+
+        The frequencies are in cycles per frame.
+        """
+        middle = self.start + (self.edges[1:] + self.edges[:-1]) / 2
+        f = frequency[:, None]
+        return np.asarray(np.exp(2j * np.pi * f * middle) * np.sinc(f * self.weights))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MirrorSystem:
     """The response of an exposure to the commands."""
 
     whole: Response  # from u(k) to the position averaged over exposure k
     # the same, ``lead`` frames earlier; has a feedthrough, and the first states of ``whole``
     core: Response
+    hold: Hold  # where the mirror is within a frame
     lead: int  # frames in which a command does nothing
     taps: FloatArray  # (t,): impulse response of ``whole``, to rounding, with the sum 1
 
@@ -104,9 +134,13 @@ def instant_mirror(delay_frames: float) -> MirrorSystem:
     taps = np.zeros(lead + 1 + (fraction > 0))
     taps[lead] = 1 - fraction
     taps[lead + 1 :] = fraction
+    core = tapped_mirror(taps[lead:])
+    still = frozen_copy(np.zeros((1, core.n_states)))
+    hold = Hold(start=delay_frames - 1, edges=_FRAME, C=still, D=frozen_copy(np.ones(1)))
     return MirrorSystem(
         whole=tapped_mirror(taps),
-        core=tapped_mirror(taps[lead:]),
+        core=core,
+        hold=hold,
         lead=lead,
         taps=frozen_copy(taps),
     )
@@ -122,14 +156,22 @@ def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float)
     samples = samples_per_frame(loop, frame_rate_hz)
     lead = int(np.floor(delay_frames - 1))
     fraction = delay_frames - 1 - lead
-    core = _one_frame(loop, samples, (1 - fraction) * samples)
+    core, positions, edges = _one_frame(loop, samples, (1 - fraction) * samples)
     while abs(core.D) <= _NOTHING:  # the mirror has not moved yet: one more frame of delay
         core = replace(core, C=core.C @ core.A, D=float(core.C @ core.B))
         lead += 1
-    core = _balance(core)
+    units = _balancing_units(core)
+    core = Response(A=core.A * units / units[:, None], B=core.B / units, C=core.C * units, D=core.D)
+    hold = Hold(
+        start=delay_frames - 1,
+        edges=frozen_copy(edges),
+        C=frozen_copy(positions[:, :-1] * units),
+        D=frozen_copy(positions[:, -1]),
+    )
     return MirrorSystem(
         whole=_delay(core, lead),
         core=core,
+        hold=hold,
         lead=lead,
         taps=frozen_copy(np.concatenate([np.zeros(lead), _taps(core)])),
     )
@@ -163,41 +205,65 @@ def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
     return samples
 
 
-def _one_frame(loop: PositionLoop, samples: int, split: float) -> Response:
+def _one_frame(
+    loop: PositionLoop, samples: int, split: float
+) -> tuple[Response, FloatArray, FloatArray]:
     """System of one frame after the arrival of a command, as two exposures see it.
 
-    The first ``split`` samples belong to the exposure under way, the others to the next one.
+    The first ``split`` samples belong to the exposure under way, the others to the next one. Return
+    also the mean positions in pieces of the frame, over states and command (g, n + 1), and the ends
+    of the pieces [frames], (g + 1,).
     """
     local = loop.closed_loop()
     n, ramped, late = local.n_states, loop.ramp_samples > 1, split < samples
     width = n + 2  # the local loop's states at the arrival, the command, the one before it
-    state, first, last = np.eye(n, width), np.zeros(width), np.zeros(width)
-    whole, edge = loop.position_integral(1.0), int(split)
-    part = loop.position_integral(split - edge)
+    state, ways = np.eye(n, width), np.zeros((samples, n + 1, width))
     for i in range(samples):
-        r = np.zeros(width)
-        r[n] = min(1.0, (i + 1) / loop.ramp_samples)
-        r[n + 1] = 1 - r[n]
-        given = np.vstack([state, r])
-        if i < edge:
-            first += whole @ given
-        elif i == edge:
-            first += part @ given
-            last += (whole - part) @ given
-        else:
-            last += whole @ given
-        state = local.A @ state + local.B @ r[None]
+        ways[i, :n] = state
+        ways[i, n, n] = min(1.0, (i + 1) / loop.ramp_samples)
+        ways[i, n, n + 1] = 1 - ways[i, n, n]
+        state = local.A @ state + local.B @ ways[i, n:]
     scale = 1 / (samples * loop.static_gain)
+    first, total = scale * _integrals(loop, ways, np.array([split, samples]))
     size = n + int(late) + int(ramped)
-    A, B, C = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    A[:n, :n], B[:n], C[:n] = state[:, :n], state[:, n], first[:n] * scale
+
+    def over_states(rows: FloatArray) -> FloatArray:
+        """Sort columns into the states of the frame, which are not the next part's, and command."""
+        out = np.zeros((len(rows), size + 1))
+        out[:, :n], out[:, -1] = rows[:, :n], rows[:, n]
+        if ramped:
+            out[:, size - 1] = rows[:, n + 1]
+        return out
+
+    A, B = np.zeros((size, size)), np.zeros(size)
+    A[:n], B[:n] = (part := over_states(state))[:, :-1], part[:, -1]
+    C, D = (part := over_states(first[None]))[0, :-1], part[0, -1]
     if late:  # the part of the last frame that this exposure sees is a state
-        A[n, :n], B[n], C[n] = last[:n] * scale, last[n] * scale, 1.0
+        part = over_states((total - first)[None])
+        A[n], B[n], C[n] = part[0, :-1], part[0, -1], 1.0
     if ramped:
-        A[:n, -1], C[-1], B[-1] = state[:, n + 1], first[n + 1] * scale, 1.0
-        if late:
-            A[n, -1] = last[n + 1] * scale
-    return Response(A=A, B=B, C=C, D=float(first[n] * scale))
+        B[-1] = 1.0
+    edges = np.linspace(
+        0, samples, max(min(samples, _PIECES), -(-_PIECES // samples) * samples) + 1
+    )
+    means = np.diff(_integrals(loop, ways, edges), axis=0) / np.diff(edges)[:, None]
+    return (
+        Response(A=A, B=B, C=C, D=float(D)),
+        over_states(means / loop.static_gain),
+        edges / samples,
+    )
+
+
+def _integrals(loop: PositionLoop, ways: FloatArray, ends: FloatArray) -> FloatArray:
+    """Integral of the position from the arrival of a command to some times [samples], (t, width).
+
+    ``ways`` (samples, n + 1, width) are states and command at the begin of each sample.
+    """
+    per_sample = loop.position_integral(1.0) @ ways
+    before = np.vstack([np.zeros(ways.shape[2]), np.cumsum(per_sample, axis=0)])
+    whole = np.minimum(ends.astype(np.int64), len(ways) - 1)
+    parts = [loop.position_integral(end - i) @ ways[i] for i, end in zip(whole, ends, strict=True)]
+    return np.asarray(before[whole] + np.array(parts))
 
 
 def _taps(core: Response) -> FloatArray:
@@ -234,9 +300,8 @@ def tapped_mirror(taps: FloatArray) -> Response:
     return Response(A=np.eye(n, k=-1), B=np.eye(n, 1)[:, 0], C=taps[1:], D=float(taps[0]))
 
 
-def _balance(core: Response) -> Response:
-    """Scale the states by powers of two so that the system is balanced."""
+def _balancing_units(core: Response) -> FloatArray:
+    """Powers of two by which the states are scaled so that the system is balanced, (n,)."""
     n = core.n_states
     scaling = balancing_scales(core.A, np.abs(core.B), np.abs(core.C))
-    units = scaling[:n] / scaling[n]
-    return Response(A=core.A * units / units[:, None], B=core.B / units, C=core.C * units, D=core.D)
+    return np.asarray(scaling[:n] / scaling[n])
