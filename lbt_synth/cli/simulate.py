@@ -102,7 +102,7 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
     caption = f"{design.method} in the loop: {runs}; {config.imaging.label}"
     report.add_rows("segments", caption, found.rows(config.imaging))
     if not truth.drifts:
-        ratio = strehl(residual_budget(loop, truth), config.imaging)
+        ratio = strehl(residual_budget(loop, truth, frame_means=True), config.imaging)
         report.data["strehl_exact"] = ratio
         report.notes.append(f"Strehl ratio with all sensors, exact: {100 * ratio:.2f} %")
     report.notes += loop_difference_notes(config, design)
@@ -228,7 +228,7 @@ def _exact_answers(loop: ClosedLoop, config: Config, truth: Truth) -> Facts:
     """Return what the loop leaves without chance; a truth that drifts has no exact answer."""
     if truth.drifts:
         return Facts(_EXACT, {})
-    budget = residual_budget(loop, truth)
+    budget = residual_budget(loop, truth, frame_means=True)
     alone = config.hardware.own_sensor_alone()
     limit_nm = limit_or_nan(lambda: least_residual(alone, truth))
     parts = {name: getattr(budget, name) for name in ("turbulence_nm", "vibration_nm", "noise_nm")}

@@ -366,7 +366,8 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
     settled = hardware.delay_frames % 1 == 0 and hardware.mirror is None
     if not (settled or design.knows_mirror):
         loop = close_loop(hardware, design.controller)
-        residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
+        budget = model_budget(loop, plant, frame_means=True) if loop.is_stable else None
+        residual_nm = np.nan if budget is None else budget.rms_nm
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}

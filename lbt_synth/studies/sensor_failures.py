@@ -106,7 +106,7 @@ def run_failures(
         exact_nm=tuple(
             np.nan
             if truth.drifts or "frozen" in segment.wrong.values() or not loop.is_stable
-            else residual_budget(loop, truth).rms_nm
+            else residual_budget(loop, truth, frame_means=True).rms_nm
             for segment, loop in zip(segments, loops, strict=True)
         ),
         stable=tuple(loop.is_stable for loop in loops),

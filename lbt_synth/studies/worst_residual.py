@@ -202,7 +202,7 @@ def _judge_box(
     share = 0.0
     if np.any(relative > 0):
         share = hinf_norm(reach).upper * float(np.linalg.norm(loop.hardware.sensor[own], 2))
-    budget = residual_budget(loop, rest)
+    budget = residual_budget(loop, rest, frame_means=True)
     value = float(np.trace((budget.turbulence_nm2 + budget.noise_nm2)[np.ix_(rows, rows)]))
     # a line across leaves rounding alone, on which no quadrature settles
     felt = (line for line in lines if np.any(line.direction[rows]))

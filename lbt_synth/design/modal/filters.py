@@ -144,7 +144,7 @@ def _loop_residual(design: FilterDesign, plant: TipTiltPlant) -> float:
     hardware = plant.hardware
     if hardware.mirror is None and hardware.delay_frames % 1 == 0:
         return design.rms
-    return model_budget(design.close(hardware), plant).rms_nm
+    return model_budget(design.close(hardware), plant, frame_means=True).rms_nm
 
 
 def joining_check(stacked: FloatArray, alone: FloatArray) -> Check:

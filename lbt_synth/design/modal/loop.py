@@ -255,7 +255,7 @@ def _residuals(
     if w > 1:
         sensor = np.diag(gain[0])
         hardware = replace(hardware, modes=w, sensor_matrix=sensor, influence_matrix=None)
-    left = residuals_from_matrices(bank.textbook(), hardware, conditions)
+    left = residuals_from_matrices(bank.textbook(), hardware, conditions, in_image=False)
     power = left.turbulence_nm2 + left.noise_nm2 + left.random_vibration_nm2
     return np.sqrt(np.diagonal(power, axis1=1, axis2=2))
 

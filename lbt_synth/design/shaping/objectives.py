@@ -118,7 +118,7 @@ def _measured_left(
 ) -> float:
     """Return the variance that the real loop leaves of a spectrum and noise, exactly [nm^2]."""
     truth = Truth(turbulence=spectrum, noise_nm=noise_nm, sensor_gain=sensor_gain)
-    return float(np.trace(residual_budget(loop.at(sensor_gain), truth).total_nm2))
+    return float(np.trace(residual_budget(loop.at(sensor_gain), truth, frame_means=True).total_nm2))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -276,14 +276,14 @@ def prediction_against_data(
     if measurements is not None:
         promised = None
         if running is not None:
-            promised = model_budget(_close_stable_loop(plant, RAN, running), plant).total_nm2
+            promised = _model_means(_close_stable_loop(plant, RAN, running), plant)
         ran = _measured_replay(data, hardware, measurements, tested)
         rows.append(_build_row(RAN, data.estimate(ran, frames), promised, imaging))
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
     for name, loop in loops.items():
         replayed = data.estimate(replays[name], frames)
-        rows.append(_build_row(name, replayed, model_budget(loop, plant).total_nm2, imaging))
+        rows.append(_build_row(name, replayed, _model_means(loop, plant), imaging))
     notes = [*_note_starts(rows, loops), *_note_refuted(rows)]
     try:
         limit = least_model_residual(plant)
@@ -352,6 +352,11 @@ def _measured_replay(
             f"measurements must have the {len(data.open_loop)} frames of open_loop; got {len(y)}."
         )
     return measured_replay(y @ inverse_sensor(hardware).T)
+
+
+def _model_means(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
+    """Covariance of what the plant's model leaves, in means over frames as a record has them."""
+    return model_budget(loop, plant, frame_means=True).total_nm2
 
 
 def _build_row(

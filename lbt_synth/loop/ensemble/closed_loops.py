@@ -15,10 +15,16 @@ from scipy.sparse.csgraph import connected_components
 from lbt_synth.linear.state_space import stacked_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.mirror.frame_rate_system import Response, mirror_system, tapped_mirror
+from lbt_synth.models.mirror.frame_rate_system import (
+    Hold,
+    Response,
+    mirror_system,
+    tapped_mirror,
+)
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
+_STILL = Hold(start=0.0, edges=np.array([0.0, 1.0]), C=np.zeros((1, 0)), D=np.ones(1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +56,8 @@ class LoopStack:
 
     part: LoopPart
     mirrors: tuple[Response, Response]  # first and second, with the same states
+    hold: Hold | None  # where a mirror with dynamics is within a frame; a settled one stays
+    start: FloatArray  # of the hold of u(k) after the begin of exposure k [frames], (k,)
     rows: IntArray  # which loops, (k,)
     fraction: FloatArray  # (k,)
     sensor_gains: FloatArray  # (k,)
@@ -57,18 +65,68 @@ class LoopStack:
     B: FloatArray
     C: FloatArray
     D: FloatArray
+    command_C: FloatArray  # (k, m, s): from the states to the commands
+    command_D: FloatArray
     poles: ComplexArray  # (k, s)
 
     def take(self, which: IntArray) -> LoopStack:
         """Return some of the loops."""
-        names = ("rows", "fraction", "sensor_gains", "A", "B", "C", "D", "poles")
+        names = ["rows", "start", "fraction", "sensor_gains", *"ABCD", "poles"]
+        names += ["command_C", "command_D"]
         return replace(self, **{name: getattr(self, name)[which] for name in names})
+
+    @property
+    def holds_are_frames(self) -> bool:
+        """Whether each command holds for one whole exposure in all of these loops."""
+        return self.hold is None and not np.any(self.fraction)
 
     def responses(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
         """Rejection (n, n, f, k) at f points and negative response to noise (n, q, f, k).
 
         Both lack a common denominator; the inverse of its square (f, k) is returned, too.
         """
+        unit, path, rejection, denominator = self._parts(z)
+        if len(unit) > 1:
+            path = np.asarray(sum(rejection[:, j, None] * path[j] for j in range(len(unit))))
+        scale = 1 / (denominator.real**2 + denominator.imag**2)
+        return rejection, path, scale
+
+    def piece_responses(
+        self, z: ComplexArray
+    ) -> tuple[Iterator[tuple[float, ComplexArray, ComplexArray]], FloatArray]:
+        """Residual in each piece of a hold, at f points of the upper half of the unit circle.
+
+        Yield the length of each piece [frames], and the responses to a phase of all moments (n, n,
+        f, k) and to noise (n, q, f, k). Return also the part of the phase's power that moves within
+        the pieces, (f, k).
+        """
+        unit, _, rejection, denominator = self._parts(z)
+        n, f = len(unit), np.angle(z) / (2 * np.pi)
+        commands = sum(rejection[:, j, None] * unit[j] for j in range(n)) / denominator
+        turn = np.sinc(f)[:, None] * self.sensor_gains / z[:, None]
+        of_phase = np.einsum("nq...,qm->nm...", commands, self.part.sensor) * turn
+        hold = self.hold or _STILL
+        core = hold.C.shape[1]  # the first states of the mirror
+        A, B = self.mirrors[0].A[:core, :core], self.mirrors[0].B[:core, None]
+        parts = (A, B, hold.C, hold.D[:, None])
+        positions = stacked_response(tuple(part[None] for part in parts), z)[:, 0, :, 0]
+        means = hold.phase_means(f)
+        rest = 1 - np.abs(means) ** 2 @ hold.weights
+        late = np.exp(2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
+
+        def pieces() -> Iterator[tuple[float, ComplexArray, ComplexArray]]:
+            for g, weight in enumerate(hold.weights):
+                position = positions[:, g, None]
+                # as seen from the middle of the frame, where the mean has its phase
+                phase = (means[:, g, None] * late) * np.eye(n)[:, :, None, None]
+                yield float(weight), phase - position * of_phase, -position * commands
+
+        return pieces(), np.broadcast_to(rest[:, None], late.shape)
+
+    def _parts(
+        self, z: ComplexArray
+    ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
+        """Return ``N K``, ``N K`` through the mirror, and the rejection over its denominator."""
         part = self.part
         controller = np.moveaxis(stacked_response(part.controllers(self.rows), z), (2, 3), (0, 1))
         unit = np.einsum("nm,mq...->nq...", part.influence, controller)
@@ -78,11 +136,7 @@ class LoopStack:
         loop = np.eye(len(modes), dtype=np.complex128)[:, :, None, None]
         for j in range(path.shape[1]):
             loop = loop + path[:, j, None] * (sensor[j] * turn)
-        rejection, denominator = _inverses(loop)
-        if len(modes) > 1:
-            path = np.asarray(sum(rejection[:, j, None] * path[j] for j in modes))
-        scale = 1 / (denominator.real**2 + denominator.imag**2)
-        return rejection, path, scale
+        return (unit, path, *_inverses(loop))
 
     def rejections(self, turn: FloatArray) -> ComplexArray:
         """Rejection (k, n, n) of each loop at its own frequency [radians per frame]."""
@@ -90,6 +144,25 @@ class LoopStack:
         pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
         states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
         return np.asarray(self.C @ states + self.D[..., :n])
+
+    def pieces_at(self, turn: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
+        """Residual (k, g, n, n) in pieces of a hold, for each loop at its own frequency.
+
+        Return also their lengths [frames], (g,), and the power that moves within them, (k,).
+        """
+        n, N, hold = self.C.shape[1], self.part.influence, self.hold or _STILL
+        f, first = turn / (2 * np.pi), self.part.matrices[0].shape[-1]
+        core = slice(first, first + hold.C.shape[1] * N.shape[1])
+        C = np.einsum("g,im,kms->kgis", hold.D, N, self.command_C)
+        C[..., core] += np.einsum("gs,im->gism", hold.C, N).reshape(len(hold.D), n, -1)
+        D = np.einsum("g,im,kmj->kgij", hold.D, N, self.command_D[..., :n])
+        pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
+        states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
+        positions = (C @ states[:, None] + D) * np.sinc(f)[:, None, None, None]
+        late = np.exp(2j * np.pi * f * (self.start - hold.start - 0.5))
+        means = hold.phase_means(f) * late[:, None]
+        phase = means[..., None, None] * np.eye(n)
+        return phase - positions, hold.weights, 1 - np.abs(means) ** 2 @ hold.weights
 
 
 def close_loops(
@@ -107,9 +180,9 @@ def close_loops(
     for A in rest:
         stable &= _are_stable(np.linalg.eigvals(A).astype(np.complex128))
     groups = []
-    for rows, fraction, mirrors in _mirrors_by_delay(hardware, delay_frames):
-        gains = sensor_gains[rows]
-        stacks = [_close_part(part, rows, fraction, gains, mirrors) for part in parts]
+    for rows, fraction, mirrors, hold in _mirrors_by_delay(hardware, delay_frames):
+        gains, start = sensor_gains[rows], delay_frames[rows] - 1
+        stacks = [_close_part(part, rows, fraction, gains, mirrors, hold, start) for part in parts]
         for stack in stacks:
             stable[rows] &= _are_stable(stack.poles)
         groups.append(stacks)
@@ -160,36 +233,43 @@ def _close_part(
     fraction: FloatArray,
     gains: FloatArray,
     mirrors: tuple[Response, Response],
+    hold: Hold | None,
+    start: FloatArray,
 ) -> LoopStack:
     """Close the loops of a part at one whole delay."""
     path = {"sensor": part.sensor, "influence": part.influence}
     ends = [loop_matrices(*part.controllers(rows), mirror=mirror, **path) for mirror in mirrors]
     share, gain, n = fraction[:, None, None], gains[:, None, None], len(part.influence)
     A0, A1, B, C0, C1, D = (one + share * (two - one) for one, two in zip(*ends, strict=True))
-    A = A0 + gain * A1
+    A, C = A0 + gain * A1, C0 + gain * C1
+    command = slice(n, n + part.influence.shape[1])
     return LoopStack(
         part=part,
         mirrors=mirrors,
+        hold=hold,
+        start=start,
         rows=rows,
         fraction=fraction,
         sensor_gains=gains,
         A=A,
         B=B,
-        C=(C0 + gain * C1)[:, :n],
+        C=C[:, :n],
         D=D[:, :n],
+        command_C=C[:, command],
+        command_D=D[:, command],
         poles=np.linalg.eigvals(A).astype(np.complex128),
     )
 
 
 def _mirrors_by_delay(
     hardware: LoopHardware, delay_frames: FloatArray
-) -> Iterator[tuple[IntArray, FloatArray, tuple[Response, Response]]]:
+) -> Iterator[tuple[IntArray, FloatArray, tuple[Response, Response], Hold | None]]:
     """Yield rows, fractions and mirrors by whole delay, or by delay if the mirror has dynamics."""
     if hardware.mirror is not None:
         for delay in np.unique(delay_frames):
-            mirror = mirror_system(hardware.mirror, hardware.frame_rate_hz, float(delay)).whole
+            mirror = mirror_system(hardware.mirror, hardware.frame_rate_hz, float(delay))
             rows = np.flatnonzero(delay_frames == delay)
-            yield rows, np.zeros(rows.size), (mirror, mirror)
+            yield rows, np.zeros(rows.size), (mirror.whole, mirror.whole), mirror.hold
         return
     lead = np.floor(delay_frames - 1).astype(np.int64)
     fraction = delay_frames - 1 - lead
@@ -197,7 +277,7 @@ def _mirrors_by_delay(
         rows = np.flatnonzero(lead == whole)
         taps = np.zeros((2, whole + (2 if np.any(fraction[rows] > 0) else 1)))
         taps[0, whole] = taps[1, -1] = 1.0
-        yield rows, fraction[rows], (tapped_mirror(taps[0]), tapped_mirror(taps[1]))
+        yield rows, fraction[rows], (tapped_mirror(taps[0]), tapped_mirror(taps[1])), None
 
 
 def _are_stable(poles: ComplexArray) -> BoolArray:

@@ -25,7 +25,11 @@ from lbt_synth.loop.ensemble.loop_ensemble import (
     Turbulence,
     turbulence_rows,
 )
-from lbt_synth.loop.ensemble.spectral_covariances import spectral_covariances
+from lbt_synth.loop.ensemble.spectral_covariances import (
+    power_within_frames,
+    process_covariances,
+    spectral_covariances,
+)
 from lbt_synth.loop.strehl import Imaging, jitter_spread_nm, jitter_strehls, widest_jitter_nm
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence
 from lbt_synth.models.vibration import sampled_lines
@@ -55,6 +59,7 @@ class EnsembleResiduals:
     turbulence_nm2: FloatArray
     noise_nm2: FloatArray
     random_vibration_nm2: FloatArray
+    within_nm2: FloatArray  # of what moves within frames
     # (p, s, n): complex amplitude that each sinusoid leaves on each mode [nm]
     line_amplitudes_nm: ComplexArray
 
@@ -74,13 +79,21 @@ class EnsembleResiduals:
         return np.sqrt(self._vibration_nm2())
 
     @property
+    def within_nm(self) -> FloatArray:
+        """What moves within frames over all modes [nm rms], (p,)."""
+        return np.sqrt(_power(self.within_nm2))
+
+    @property
     def rms_nm(self) -> FloatArray:
         """Residual over all modes [nm rms], (p,)."""
-        return np.sqrt(_power(self.turbulence_nm2) + _power(self.noise_nm2) + self._vibration_nm2())
+        steady = self.turbulence_nm2 + self.noise_nm2 + self.within_nm2
+        return np.sqrt(_power(steady) + self._vibration_nm2())
 
     def strehl(self, imaging: Imaging) -> FloatArray:
         """Strehl ratio of each loop."""
-        gaussian = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
+        gaussian = (
+            self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2 + self.within_nm2
+        )
         lines, out = self.line_amplitudes_nm, np.where(self.stable, 0.0, np.nan)
         spread = jitter_spread_nm(gaussian[self.stable], lines[self.stable])
         near = np.flatnonzero(self.stable)[spread <= widest_jitter_nm(imaging)]
@@ -97,7 +110,11 @@ def _power(covariances: FloatArray) -> FloatArray:
 
 
 def ensemble_residuals(
-    controller: Any, hardware: LoopHardware, ensemble: LoopEnsemble
+    controller: Any,
+    hardware: LoopHardware,
+    ensemble: LoopEnsemble,
+    *,
+    frame_means: bool = False,
 ) -> EnsembleResiduals:
     """Evaluate a controller exactly in many loops, or many controllers in one loop each.
 
@@ -113,6 +130,8 @@ def ensemble_residuals(
         Sensor and mirror of all loops; the ensemble may have other delays.
     ensemble : LoopEnsemble
         What the loops meet, p of them.
+    frame_means : bool, optional
+        As in :func:`residual_budget`.
 
     Returns
     -------
@@ -156,11 +175,16 @@ def ensemble_residuals(
             f"give one controller, or one per loop ({count}) with as many states each; got "
             f"{len(each)} with {sizes} states."
         )
-    return residuals_from_matrices(textbook_matrices(each), hardware, ensemble)
+    matrices = textbook_matrices(each)
+    return residuals_from_matrices(matrices, hardware, ensemble, in_image=not frame_means)
 
 
 def residuals_from_matrices(
-    matrices: tuple[FloatArray, ...], hardware: LoopHardware, ensemble: LoopEnsemble
+    matrices: tuple[FloatArray, ...],
+    hardware: LoopHardware,
+    ensemble: LoopEnsemble,
+    *,
+    in_image: bool,
 ) -> EnsembleResiduals:
     """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
     turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
@@ -173,30 +197,36 @@ def residuals_from_matrices(
     stable, groups = close_loops(matrices, hardware, gains, delays)
     distinct = [(turbulence_rows(spectrum, points), modes) for spectrum, modes in turbulence]
     noise_nm, n = ensemble.noise(hardware)[points], hardware.modes
-    left = np.where(stable[:, None, None, None], 0.0, np.full((2, n, n), np.nan))
+    left = np.where(stable[:, None, None, None], 0.0, np.full((3, n, n), np.nan))
     resonances = [line for line in lines if line.damping is not None]
     sinusoids = [line for line in lines if line.damping is None]
     here = stable[which]
-    random_nm2 = np.where(here[:, None, None], 0.0, np.full((n, n), np.nan))
+    shaken = np.where(here[:, None, None, None], 0.0, np.full((2, n, n), np.nan))
     amplitudes = np.where(here[:, None, None], 0j, np.full((len(sinusoids), n), np.nan))
     for stacks in groups:
         place = np.full(stable.size, -1)
         place[stacks[0].rows] = np.arange(stacks[0].rows.size)
         for rows in _batches(np.flatnonzero(stable & (place >= 0)), stacks, place):
             chosen = [stack.take(place[rows]) for stack in stacks]
-            left[rows] += _turbulence_and_noise_nm2(chosen, distinct, noise_nm, hardware)
+            left[rows] += _turbulence_and_noise_nm2(
+                chosen, distinct, noise_nm, hardware, in_image=in_image
+            )
         met = np.flatnonzero(here & (place[which] >= 0))
         for rows in _split(met, _AT_ONCE):
             chosen = [stack.take(place[which[rows]]) for stack in stacks]
             for line in resonances:
-                random_nm2[rows] += _resonance_nm2(chosen, line, rows, hardware)
+                shaken[rows] += _resonance_nm2(chosen, line, rows, hardware, in_image=in_image)
             for i, line in enumerate(sinusoids):
-                amplitudes[rows, i] = _sinusoid_nm(chosen, line, rows, hardware)
+                amplitudes[rows, i], within = _sinusoid_nm(
+                    chosen, line, rows, hardware, in_image=in_image
+                )
+                shaken[rows, 1] += within
     return EnsembleResiduals(
         stable=read_only(here),
         turbulence_nm2=left[which, 0],
         noise_nm2=left[which, 1],
-        random_vibration_nm2=random_nm2,
+        random_vibration_nm2=shaken[:, 0],
+        within_nm2=left[which, 2] + shaken[:, 1],
         line_amplitudes_nm=amplitudes,
     )
 
@@ -228,45 +258,74 @@ def _turbulence_and_noise_nm2(
     turbulence: list[tuple[Turbulence, tuple[int, ...]]],
     noise_nm: FloatArray,
     hardware: LoopHardware,
+    *,
+    in_image: bool,
 ) -> FloatArray:
-    """Covariances (k, 2, n, n) of the residual from turbulence, and from noise (p, q).
+    """Covariances (k, 3, n, n) from turbulence, from noise (p, q), and of what moves within.
 
     ``turbulence`` pairs each spectrum of the p loops with its modes.
     """
     n, rows = hardware.modes, stacks[0].rows
-    total = np.zeros((rows.size, 2, n, n))
+    total = np.zeros((rows.size, 3, n, n))
     met = [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in turbulence]
     spectra = [pair for pair in met if not isinstance(pair[0], Process)]
     for stack in stacks:
-        total += spectral_covariances(stack, spectra, noise_nm[rows], hardware)
+        total += spectral_covariances(stack, spectra, noise_nm[rows], hardware, in_image=in_image)
     for spectrum, modes in met:
         if isinstance(spectrum, Process):
             for mode in modes:
-                total[:, 0] += _process_nm2(stacks, spectrum, np.eye(n)[[mode]])
+                along = np.eye(n)[[mode]]
+                left = _process_nm2(stacks, spectrum, along, hardware, in_image=in_image)
+                total[:, [0, 2]] += left
     return total
 
 
 def _resonance_nm2(
-    stacks: list[LoopStack], line: EnsembleVibration, rows: IntArray, hardware: LoopHardware
+    stacks: list[LoopStack],
+    line: EnsembleVibration,
+    rows: IntArray,
+    hardware: LoopHardware,
+    *,
+    in_image: bool,
 ) -> FloatArray:
-    """Covariances (k, n, n) of the residual from a damped vibration."""
-    rate = hardware.frame_rate_hz
-    numbers = line.frequency_hz[rows], line.damping[rows], line.rms_nm[rows]
-    a, drive = sampled_lines(*numbers, rate)
+    """Covariances (k, 2, n, n) of the residual from a damped vibration, of means and within."""
+    rate, frequency_hz, rms_nm = hardware.frame_rate_hz, line.frequency_hz[rows], line.rms_nm[rows]
+    if in_image:
+        rms_nm = rms_nm * np.sinc(frequency_hz / rate)
+    a, drive = sampled_lines(frequency_hz, line.damping[rows], rms_nm, rate)
     process = ModalTurbulence(coefficients=a, driving_rms_nm=drive, frame_rate_hz=rate)
-    return _process_nm2(stacks, process, line.direction[rows])
+    return _process_nm2(stacks, process, line.direction[rows], hardware, in_image=in_image)
 
 
 def _sinusoid_nm(
-    stacks: list[LoopStack], line: EnsembleVibration, rows: IntArray, hardware: LoopHardware
-) -> ComplexArray:
-    """Complex amplitudes (k, n) that a sinusoid leaves."""
+    stacks: list[LoopStack],
+    line: EnsembleVibration,
+    rows: IntArray,
+    hardware: LoopHardware,
+    *,
+    in_image: bool,
+) -> tuple[ComplexArray, FloatArray]:
+    """Complex amplitudes (k, n) that a sinusoid leaves, and covariances (k, n, n) within."""
     peak = line.direction[rows] * np.sqrt(2) * line.rms_nm[rows][:, None]
-    turn = 2 * np.pi * line.frequency_hz[rows] / hardware.frame_rate_hz
-    out = np.zeros(peak.shape, dtype=np.complex128)
+    f = line.frequency_hz[rows] / hardware.frame_rate_hz
+    share = np.sinc(f)[:, None] if in_image else 1.0
+    out, n = np.zeros(peak.shape, dtype=np.complex128), hardware.modes
+    within = np.zeros((len(peak), n, n))
+    if stacks[0].holds_are_frames or not in_image:
+        for stack, modes in _reached(stacks, peak):
+            rejected = stack.rejections(2 * np.pi * f) @ (share * peak)[:, modes, None]
+            out[:, modes] = rejected[..., 0]
+        rest = np.asarray(1 - share**2)[..., None] / 2
+        return out, np.broadcast_to(rest * peak[:, :, None] * peak[:, None], within.shape)
     for stack, modes in _reached(stacks, peak):
-        out[:, modes] = (stack.rejections(turn) @ peak[:, modes, None])[..., 0]
-    return out
+        pieces, weights, rest = stack.pieces_at(2 * np.pi * f)
+        left = (pieces @ peak[:, None, modes, None])[..., 0]
+        out[:, modes] = mean = np.einsum("g,kgi->ki", weights, left)
+        apart = left - mean[:, None]
+        moved = np.real(np.einsum("g,kgi,kgj->kij", weights, apart, apart.conj())) / 2
+        within[:, modes[:, None], modes] += moved
+    within += rest[:, None, None] * peak[:, :, None] * peak[:, None] / 2
+    return out, within
 
 
 def _reached(stacks: list[LoopStack], along: FloatArray) -> list[tuple[LoopStack, IntArray]]:
@@ -275,23 +334,48 @@ def _reached(stacks: list[LoopStack], along: FloatArray) -> list[tuple[LoopStack
     return [(stack, modes) for stack, modes in pairs if np.any(along[:, modes])]
 
 
-def _process_nm2(stacks: list[LoopStack], process: Process, along: FloatArray) -> FloatArray:
-    """Covariances (k, n, n) of the residual that a process, or one per loop, leaves.
+def _process_nm2(
+    stacks: list[LoopStack],
+    process: Process,
+    along: FloatArray,
+    hardware: LoopHardware,
+    *,
+    in_image: bool,
+) -> FloatArray:
+    """Covariances (k, 2, n, n) that a process leaves, or one per loop, of means and within.
 
     Its direction ``along`` is (1, n), or (k, n) with one per loop.
     """
     reached, coefficients = _reached(stacks, along), np.atleast_2d(process.coefficients)
+    driving = np.atleast_1d(process.driving_rms_nm)
+    if in_image and not stacks[0].holds_are_frames:
+        return process_covariances(reached, coefficients, driving, along, hardware)
+    left = np.zeros((len(stacks[0].A), 2, *2 * [hardware.modes]))
+    left[:, 0] = _rejected_process_nm2(reached, coefficients, driving, along)
+    if in_image:
+        power = power_within_frames(coefficients, driving, process.frame_rate_hz)
+        left[:, 1] = power[:, None, None] * along[:, :, None] * along[:, None]
+    return left
+
+
+def _rejected_process_nm2(
+    reached: list[tuple[LoopStack, IntArray]],
+    coefficients: FloatArray,
+    driving_rms_nm: FloatArray,
+    along: FloatArray,
+) -> FloatArray:
+    """Covariances (k, n, n) of the means over frames that processes leave."""
     places = np.concatenate([modes for _, modes in reached])
     s, order, k = (
         sum(stack.A.shape[1] for stack, _ in reached),
         coefficients.shape[1],
-        len(stacks[0].A),
+        len(reached[0][0].A),
     )
     A, Q = np.zeros((2, k, s + order, s + order))
     C = np.zeros((k, places.size, s + order))
     A[:, s, s:] = coefficients
     A[:, s + 1 :, s:-1] = np.eye(order - 1)
-    Q[:, s, s] = np.square(process.driving_rms_nm)
+    Q[:, s, s] = np.square(driving_rms_nm)
     x = r = 0
     for stack, modes in reached:
         n, size, direction = modes.size, stack.A.shape[1], along[:, modes, None]

@@ -340,7 +340,7 @@ def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndS
     )
     try:
         loop = close_loop(system.hardware, row.controller, sensor_gain=gain)
-        return 100 * strehl(residual_budget(loop, truth), imaging)
+        return 100 * strehl(residual_budget(loop, truth, frame_means=True), imaging)
     except UnstableLoopError:
         return 0.0
 

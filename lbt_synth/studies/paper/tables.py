@@ -108,4 +108,4 @@ def compare_with_paper(rows: list[RobustnessRow]) -> list[TableEntry]:
 def _strehl_percent(design: Design, truth: Truth) -> float:
     hardware = require_hardware(design, "a table")
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    return 100 * strehl(residual_budget(loop, truth), given.imaging())
+    return 100 * strehl(residual_budget(loop, truth, frame_means=True), given.imaging())

@@ -127,7 +127,7 @@ def _evaluate_groups(
             with np.errstate(over="raise", divide="raise", invalid="raise"):
                 own = _design_for_samples(samples) if matrices is None else matrices
                 found = residuals_from_matrices(
-                    own, sample.hardware, ensemble.build_ensemble(samples)
+                    own, sample.hardware, ensemble.build_ensemble(samples), in_image=True
                 )
             strehl = found.strehl(sample.config.imaging)
         except ensemble.EXPECTED_ERRORS:
