@@ -57,24 +57,29 @@ def least_worst_residual(
     band_hz: tuple[float, float],
     rms_nm: float,
     direction: Sequence[float] = (1.0, 0.0),
+    frame_means: bool = False,
 ) -> BandLimit:
     """Least worst residual of any linear controller with a sinusoid anywhere in a band.
 
     The controller knows the truth, the band, and the size and direction of the sinusoid, but
-    not its frequency; what counts is the frequency that is worst for it.
+    not its frequency; what counts is the frequency that is worst for it. In the image the sinusoid
+    counts with its least mean over a frame, and its least motion within one, over the band.
 
     Parameters
     ----------
     hardware : LoopHardware
         The loop, with any delay. The sensor must see and the mirror reach every mode.
     truth : Truth
-        All else; its own sinusoids are left out, as in :func:`least_residual`.
+        All else; of its own sinusoids what moves within a frame counts, as in
+        :func:`least_residual`.
     band_hz : tuple of float
         Lowest and highest frequency of the sinusoid [Hz], between 0 and Nyquist.
     rms_nm : float
         Its standard deviation, amplitude / sqrt(2) [nm].
     direction : sequence of float, optional
         Its direction over the modes, made a unit vector.
+    frame_means : bool, optional
+        As in :func:`residual_budget`.
 
     Returns
     -------
@@ -96,7 +101,7 @@ def least_worst_residual(
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     >>> calm = lbt.Truth(turbulence=None, noise_nm=3.0)
     >>> limit = lbt.loop.least_worst_residual(
-    ...     path, calm, band_hz=(1e-9, 399.999999), rms_nm=4.0, direction=(1,)
+    ...     path, calm, band_hz=(1e-9, 399.999999), rms_nm=4.0, direction=(1,), frame_means=True
     ... )
     >>> round(limit.rms_nm, 4), round(limit.achieved_nm, 4)
     (4.0, 4.0)
@@ -106,11 +111,17 @@ def least_worst_residual(
     axis = tuple(np.ravel(direction))
     line = SinusoidalVibration(frequency_hz=high, rms_nm=rms_nm, direction=axis)
     along = checked_direction(line, hardware)
-    directions, modes = truth_modes(hardware, truth, (along,))
+    directions, modes = truth_modes(hardware, truth, (along,), in_image=not frame_means)
     own = int(np.argmax(np.abs(directions @ along)))
     ends = low / nyquist, high / nyquist
-    lower, gap, x, weight = _find_saddle(modes[own], ends, line.rms_nm**2)
+    least_mean, least_within = 1.0, 0.0  # parts of its power
+    if not frame_means:
+        least_mean, least_within = np.sinc(ends[1] / 2) ** 2, 1 - np.sinc(ends[0] / 2) ** 2
+    power = line.rms_nm**2
+    lower, gap, x, weight = _find_saddle(modes[own], ends, least_mean * power)
     variance = np.array([lower if m is modes[own] else mode_limit(m)[0] for m in modes])
+    variance = variance + [mode.within_frames_nm2() for mode in modes]
+    variance[own] += least_within * power
     return BandLimit(
         rms_nm=float(np.sqrt(variance.sum())),
         achieved_nm=float(np.sqrt(variance.sum() + gap)),

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lbt_synth.errors import CoupledModesError, ProblemError
 from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.least_residuals.prediction import InnerFactor
-from lbt_synth.models import ARModel, LoopHardware, Spectrum, Vibration
+from lbt_synth.loop.least_residuals.prediction import InnerFactor, Interpolation
+from lbt_synth.models import ARModel, LoopHardware, SinusoidalVibration, Spectrum, Vibration
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
 from lbt_synth.validation import FloatArray
 
@@ -26,14 +26,44 @@ class ModeSpectrum:
     rate_hz: float
     parts: tuple[Spectrum, ...]  # independent parts of the disturbance
     noise_nm2: float  # variance of the noise per frame, as a phase [nm^2]
+    in_image: bool  # whether spectra are of all moments, of which frames have the means
+    sinusoids: tuple[tuple[float, float], ...] = ()  # frequency [Hz] and rms [nm] of each
 
     def power(self, x: FloatArray) -> FloatArray:
         """Two-sided disturbance spectrum per sample [nm^2] at x, in units of Nyquist."""
         nyquist = self.rate_hz / 2
         total = np.zeros(x.shape)
         for part in self.parts:
-            total = total + spectrum_density(part, x * nyquist) * nyquist
+            density = spectrum_density(part, x * nyquist) * nyquist
+            if self.in_image and not isinstance(part, ARModel):
+                density = density * np.sinc(x / 2) ** 2
+            total = total + density
         return total
+
+    def interpolated(self, delay_frames: float) -> ModeSpectrum:
+        """Return the mode of which the mean over a hold between two frames is to be predicted."""
+        lags = Interpolation.lags(delay_frames)
+
+        def covariances(x: FloatArray) -> FloatArray:
+            return np.asarray(self.power(x)[:, None] * np.cos(np.pi * x[:, None] * lags))
+
+        moments = np.zeros(lags.size)
+        if self.parts:
+            moments = refine_panels(covariances, self.edges()).integrals.sum(axis=0)
+        target = Interpolation.of(delay_frames, moments)
+        return replace(self, inner=replace(self.inner, target=target))
+
+    def within_frames_nm2(self) -> float:
+        """Power that moves within frames, which no command follows [nm^2]."""
+        if not self.in_image:
+            return 0.0
+
+        def moving(x: FloatArray) -> FloatArray:
+            return np.asarray(self.power(x)[:, None] * (1 / np.sinc(x / 2) ** 2 - 1)[:, None])
+
+        shares = [rms**2 * (1 - np.sinc(f / self.rate_hz) ** 2) for f, rms in self.sinusoids]
+        still = float(refine_panels(moving, self.edges()).integrals.sum()) if self.parts else 0.0
+        return still + float(sum(shares))
 
     def edges(self, extra: Sequence[float] = ()) -> FloatArray:
         """First panels of (0, 1): geometric, and more of them at lines and kinks."""
@@ -96,6 +126,9 @@ def decoupled_modes(
     turbulence: Sequence[Spectrum | None],
     vibrations: Sequence[tuple[FloatArray, Vibration]],
     directions: Sequence[FloatArray] = (),
+    *,
+    in_image: bool,
+    sinusoids: Sequence[tuple[FloatArray, SinusoidalVibration]] = (),
 ) -> tuple[FloatArray, list[ModeSpectrum]]:
     """Rotate the modes until disturbance and noise (q, q) are diagonal.
 
@@ -123,12 +156,16 @@ def decoupled_modes(
         matrices.append((f"the vibration at {line.frequency_hz:.6g} Hz", np.outer(along, along)))
     matrices += [("the given direction", np.outer(along, along)) for along in directions]
     axes = _common_axes(matrices)
-    inner, modes = InnerFactor.of(hardware), []
+    inner, modes = InnerFactor.of(hardware, in_image=in_image), []
     for axis in axes:
         key = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
         lines = [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
         parts = tuple(part for part in (kinds[key], *lines) if part is not None)
-        modes.append(ModeSpectrum(inner, rate, parts, max(float(axis @ noise @ axis), 0.0)))
+        seen = tuple((s.frequency_hz, s.rms_nm * float(along @ axis)) for along, s in sinusoids)
+        variance = max(float(axis @ noise @ axis), 0.0)
+        mode = ModeSpectrum(inner, rate, parts, variance, in_image, seen)
+        late = in_image and hardware.delay_frames % 1 > 0
+        modes.append(mode.interpolated(hardware.delay_frames) if late else mode)
     return axes, modes
 
 

@@ -15,12 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
+from scipy.linalg import toeplitz
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _FEW_DIGITS = 1e-2  # a division by less than this would lose more than two digits
+POINTS = 16  # samples on each side of one between two samples
+_INDEPENDENT = 1e-13  # part of the largest eigenvalue of a covariance that is more than rounding
 _REAL = 1e-7  # relative imaginary part of what counts as a real zero
 _ALIKE = 1e9  # condition of the zeros' Gram matrix beyond which they count as equal
 
@@ -32,10 +35,25 @@ class InnerFactor:
     whole: int  # frames of pure delay from the measured sample to the corrected one
     zeros: tuple[float, ...]  # of the all-pass factor in the backward shift, in (-1, 1)
     terms: int  # number of cosine integrals that are needed, the mean included
+    target: Interpolation | None = None  # what is corrected, where it is not one sample
 
     @staticmethod
-    def of(hardware: LoopHardware) -> InnerFactor:
-        """Return the inner factor of a loop's path."""
+    def of(hardware: LoopHardware, *, in_image: bool) -> InnerFactor:
+        """Return the inner factor of a loop's path to the image, or to means over frames.
+
+        In the image a command of a settled mirror corrects the mean over its own hold, whatever
+        part of a frame it comes late by.
+        """
+        if in_image:
+            if hardware.mirror is not None:
+                raise ProblemError(
+                    "the limit in the image is known for a mirror that settles at once; got one "
+                    "with dynamics."
+                )
+            whole = int(hardware.delay_frames)
+            if hardware.delay_frames == whole:
+                return InnerFactor(whole=whole, zeros=(), terms=whole)
+            return InnerFactor(whole=whole, zeros=(), terms=2 * POINTS)
         mirror = hardware.mirror_system
         found = mirror.core.zeros
         late = found[np.abs(found) > 1]  # on the circle: a stable inverse, in the limit
@@ -78,6 +96,55 @@ def _gram(zeros: tuple[float, ...]) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Interpolation:
+    """A sample between two others, as the best sum over those around it: ``sum p[i] m(k + i)``.
+
+    What the sum misses is orthogonal to the samples, so that nobody predicts it.
+    """
+
+    first: int  # first sample of the sum
+    weights: FloatArray  # (2 POINTS,)
+    missed: float  # variance of what the sum misses
+
+    @staticmethod
+    def lags(samples: float) -> FloatArray:
+        """Return the lags of which :meth:`of` takes the covariances: of the samples, then to it."""
+        first = int(samples) - POINTS + 1
+        return np.concatenate([np.arange(2 * POINTS), samples - first - np.arange(2 * POINTS)])
+
+    @staticmethod
+    def of(samples: float, covariances: FloatArray) -> Interpolation:
+        """Return the sample that comes a fraction of samples after the newest one."""
+        among, to_it = np.split(covariances, 2)
+        gram = toeplitz(among)
+        values, vectors = np.linalg.eigh(gram)
+        inverse = np.where(values > _INDEPENDENT * values[-1], 1 / np.maximum(values, 1e-300), 0.0)
+        weights = vectors @ (inverse * (vectors.T @ to_it))
+        missed = among[0] - 2 * weights @ to_it + weights @ gram @ weights
+        return Interpolation(int(samples) - POINTS + 1, weights, max(float(missed), 0.0))
+
+    def variance(self, coefficients: FloatArray, sigma2: float, noise: float) -> float:
+        """Least variance of its error, for ``F = sigma (1 + f_1 z^-1 + ...)`` of ``|F|^2 = Phi``.
+
+        With the white noise R on the samples that are seen, the sum P, and ``F*`` the conjugate,
+        the error of Wiener's filter is ``|[P F - R P / F*]_+|^2`` over powers above 0, and
+        ``|P|^2 (R - R^2 / Phi)``. All but the finite sums over powers up to 0 cancels.
+        """
+        p, first = self.weights, self.first
+        inverse = np.zeros(coefficients.size)  # of 1 / (1 + f_1 x + ...)
+        inverse[0] = 1.0
+        for n in range(1, inverse.size):
+            inverse[n] = -coefficients[1 : n + 1] @ inverse[n - 1 :: -1][:n]
+        powers = first + np.arange(p.size)
+        forward = np.array([p[i:] @ coefficients[: p.size - i] for i in range(p.size)])
+        backward = np.array([p[: i + 1] @ inverse[i::-1] for i in range(p.size)])
+        past = powers <= 0
+        error = sigma2 * np.sum(forward[~past] ** 2) - noise * np.sum(p**2)
+        error += 2 * noise * np.sum(forward[past] * backward[past])
+        return float(error - noise**2 / sigma2 * np.sum(backward[past] ** 2)) + self.missed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     """Best prediction of a process whose spectrum has given integrals of its logarithm."""
 
@@ -90,6 +157,8 @@ class Prediction:
     def of(inner: InnerFactor, moments: FloatArray) -> Prediction:
         """Predict from the integrals of the logarithm times the weights of an inner factor."""
         f = _exponential(moments[: inner.terms])
+        if inner.target is not None:
+            return Prediction(inner, float(moments[0]), f, np.zeros(0))
         whole, tails = inner.whole, np.zeros(len(inner.zeros))
         for i, a in enumerate(inner.zeros):
             if a in inner.by_weight:
@@ -115,12 +184,18 @@ class Prediction:
     def variance(self, reference: float, noise: float) -> float:
         """Least variance of the residual; the reference is the noise unless that is zero."""
         sigma2 = np.exp(self.mean_log)
+        if self.inner.target is not None:
+            return self.inner.target.variance(self.coefficients, reference * sigma2, noise)
         if noise > 0:  # sums of positive numbers: no digits are lost however large the noise
             return float(reference * (np.expm1(self.mean_log) + sigma2 * self.later_power))
         return float(reference * sigma2 * (1 + self.later_power))
 
     def error_power(self, x: FloatArray) -> FloatArray:
         """``|P|^2 / sigma^2`` at frequencies x: the rejection is ``|P / F|^2``."""
+        if self.inner.target is not None:
+            raise ProblemError(
+                "the limit over a band is known for whole frames of delay; got a fraction."
+            )
         shift = np.exp(-1j * np.pi * x)
         part: ComplexArray = polyval(shift, self.coefficients)
         for a, weight in zip(self.inner.zeros, self._kernels, strict=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar, assert_never
+from typing import Protocol, TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -15,7 +15,6 @@ from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_
 from lbt_synth.loop.least_residuals.prediction import Prediction
 from lbt_synth.models import (
     LoopHardware,
-    SinusoidalVibration,
     TipTiltPlant,
     Truth,
     Vibration,
@@ -40,6 +39,7 @@ class ResidualLimit:
     """The least residual of any linear controller."""
 
     variance_nm2: FloatArray  # (n,): least variance along each direction [nm^2]
+    within_nm2: FloatArray  # (n,): the part of it that moves within frames [nm^2]
     # (n, n): directions over the modes, one per row, along which the loop decouples
     directions: FloatArray
     # what the last refinement of the integrals changed, relative to the variance; the largest over
@@ -52,14 +52,16 @@ class ResidualLimit:
         return float(np.sqrt(np.sum(self.variance_nm2)))
 
 
-def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
-    """Least stationary residual that any linear controller leaves under a truth.
+def least_residual(
+    hardware: LoopHardware, truth: Truth, *, frame_means: bool = False
+) -> ResidualLimit:
+    """Least stationary residual that any linear controller leaves under a truth, in the image.
 
     By spectral factorisation, without any design: a controller that knew the spectra, the
     noise and the sensor gain could come as close to it as it likes, none could pass it.
-    Sinusoids of the truth cost nothing (one frequency can be rejected entirely at a price as
-    small as one likes) and are left out; see :func:`least_worst_residual` for one whose
-    frequency is not known. Random vibrations count with their spectra.
+    Of sinusoids there remains what moves within a frame, since no command follows it: one frequency
+    can be rejected entirely at a price as small as one likes; see :func:`least_worst_residual` for
+    one whose frequency is not known. Random vibrations count with their spectra.
 
     With other sensors beside the loop's own it is the least residual of a loop that knows more:
     each wavefront sensor reads each frame of its exposures at once, with as much noise as gives the
@@ -72,6 +74,8 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
         The loop, with any delay. The sensor must see and the mirror reach every mode.
     truth : Truth
         Disturbances, noise and sensor gain.
+    frame_means : bool, optional
+        As in :func:`residual_budget`.
 
     Returns
     -------
@@ -82,7 +86,8 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     ------
     ProblemError
         If a mode is not seen or not reached, the modes do not decouple, or a disturbance does
-        not fit the loop; also where an exposure of another sensor ends within a frame.
+        not fit the loop; also where an exposure of another sensor ends within a frame, or in
+        the image of a mirror with dynamics.
     NumericalError
         If an integral over a spectrum does not settle.
 
@@ -93,17 +98,17 @@ def least_residual(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
     >>> slow = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=2.0, frame_rate_hz=800)
-    >>> limit = lbt.loop.least_residual(path, lbt.Truth(turbulence=slow))
+    >>> limit = lbt.loop.least_residual(path, lbt.Truth(turbulence=slow), frame_means=True)
     >>> round(float(limit.variance_nm2[0]), 8)  # 2^2 (1 + 0.5^2)
     5.0
     """
     require_instance(hardware, LoopHardware)
     if hardware.suite.sensors:
-        return _limit_of_sensors(hardware, truth)
-    return _residual_limit(*truth_modes(hardware, truth))
+        return _limit_of_sensors(hardware, truth, in_image=not frame_means)
+    return _residual_limit(*truth_modes(hardware, truth, in_image=not frame_means))
 
 
-def _limit_of_sensors(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
+def _limit_of_sensors(hardware: LoopHardware, truth: Truth, *, in_image: bool) -> ResidualLimit:
     """Return the limit of the loop that knows more than that of several sensors."""
     suite = hardware.suite
     if suite.accelerometers:
@@ -122,26 +127,31 @@ def _limit_of_sensors(hardware: LoopHardware, truth: Truth) -> ResidualLimit:
     if not noise.any():  # nothing adds to a sensor without noise
         sensor, blocks = sensor[:1], blocks[:1]
     every = replace(hardware.own_sensor_alone(), sensor_matrix=np.vstack(sensor))
-    return _residual_limit(*truth_modes(every, truth, noise_nm2=block_diag(*blocks)))
+    modes = truth_modes(every, truth, noise_nm2=block_diag(*blocks), in_image=in_image)
+    return _residual_limit(*modes)
 
 
 def least_model_residual(plant: TipTiltPlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth.
 
-    Coupled modes have a limit where nothing but whole frames of delay is between command and
-    mirror: the error of the best estimate, from a Riccati equation.
+    It is that of means over frames, as the plant has them. Coupled modes have a limit where nothing
+    but whole frames of delay is between command and mirror: the error of the best estimate, from a
+    Riccati equation.
     """
     hardware = plant.hardware
     lines = [(checked_direction(line, hardware), line) for line in plant.vibrations]
     try:
-        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines)
+        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines, in_image=False)
     except CoupledModesError:
         if hardware.mirror is not None or hardware.delay_frames % 1:
             raise
         error = plant.L @ kalman_riccati(plant).P @ plant.L.T
         variance, axes = np.linalg.eigh(error)
         return ResidualLimit(
-            variance_nm2=frozen_copy(variance), directions=frozen_copy(axes.T), change=0.0
+            variance_nm2=frozen_copy(variance),
+            within_nm2=frozen_copy(0 * variance),
+            directions=frozen_copy(axes.T),
+            change=0.0,
         )
     return _residual_limit(*modes)
 
@@ -151,46 +161,59 @@ def truth_modes(
     truth: Truth,
     directions: tuple[FloatArray, ...] = (),
     *,
+    in_image: bool,
     noise_nm2: FloatArray | None = None,
 ) -> tuple[FloatArray, list[ModeSpectrum]]:
-    """Decouple the modes of a truth without its sinusoids, as :func:`decoupled_modes`.
+    """Decouple the modes of a truth, as :func:`decoupled_modes`.
 
     ``noise_nm2`` (q, q) is that of the loop's own sensor by default.
     """
     require_instance(hardware, LoopHardware)
     require_instance(truth, Truth)
-    lines = []
+    lines, sinusoids = [], []
     for vibration in stationary_vibrations(truth.vibrations):
         along = checked_direction(vibration, hardware)
         if isinstance(vibration, Vibration):
+            if in_image:  # frames have its mean
+                share = float(np.sinc(vibration.frequency_hz / hardware.frame_rate_hz))
+                vibration = replace(vibration, rms_nm=share * vibration.rms_nm)
             lines.append((along, vibration))
-        elif not isinstance(vibration, SinusoidalVibration):
-            assert_never(vibration)  # a random vibration of a new kind counts, too
+        else:
+            sinusoids.append((along, vibration))
     if noise_nm2 is None:
         noise = truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain
         noise_nm2 = np.diag(noise**2)
     turbulence = truth.turbulence_per_mode(hardware.modes)
-    return decoupled_modes(hardware, noise_nm2, turbulence, lines, directions)
+    return decoupled_modes(
+        hardware,
+        noise_nm2,
+        turbulence,
+        lines,
+        directions,
+        in_image=in_image,
+        sinusoids=sinusoids,
+    )
 
 
 def _residual_limit(directions: FloatArray, modes: list[ModeSpectrum]) -> ResidualLimit:
-    known: dict[tuple[object, ...], tuple[float, float]] = {}
-    found = []
+    known: dict[tuple[object, ...], tuple[float, float, float]] = {}
+    limits = []
     for mode in modes:
-        key = (tuple(id(part) for part in mode.parts), mode.noise_nm2)
+        key = (tuple(id(part) for part in mode.parts), mode.noise_nm2, mode.sinusoids)
         if key not in known:
-            known[key] = mode_limit(mode)
-        found.append(known[key])
-    variance, change = np.array(found).T
+            known[key] = (*mode_limit(mode), mode.within_frames_nm2())
+        limits.append(known[key])
+    variance, change, within = np.array(limits).T
     return ResidualLimit(
-        variance_nm2=frozen_copy(variance),
+        variance_nm2=frozen_copy(variance + within),
+        within_nm2=frozen_copy(within),
         directions=frozen_copy(directions),
         change=float(np.max(change)),
     )
 
 
 def mode_limit(mode: ModeSpectrum) -> tuple[float, float]:
-    """Least variance of one mode, and its relative change at the last refinement."""
+    """Least variance of the means of one mode, and its relative change at the last refinement."""
     reference = mode.reference()
     panels = mode.log_moments(reference) if mode.parts and reference > 0 else None
     if panels is None:  # nothing to correct, or all of it can be predicted
