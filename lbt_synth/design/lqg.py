@@ -6,10 +6,14 @@ is the same for all commands, so that the regulator is one scalar Riccati proble
 mirror's few states and one linear equation for the disturbance (C. Correia, H.-F. Raynaud,
 C. Kulcsar, J.-M. Conan, J. Opt. Soc. Am. A 27, 333 (2010), doi:10.1364/JOSAA.27.000333).
 
-With the mirror's core ``m(k+1) = F m(k) + G v(k)``, ``c(k) = h m(k) + d v(k)``, one frame of
-one mode, ``v = (N u)_i`` and the target ``z(k) = l x(k+1)``, which is phi_tot(k + lead)::
+The camera sees the mirror at every moment. A command holds for one frame, which is cut into pieces
+of length w_g. With the mirror's core ``m(k+1) = F m(k) + G v(k)``, its mean position ``c_g(k) = h_g
+m(k) + d_g v(k)`` in a piece, one frame of one mode, ``v = (N u)_i`` and the phase ``z_g(k) = l_g
+x(k+1)`` there, interpolated between means over frames::
 
-    minimise  E (z(k) - c(k))^2 + rho v(k)^2
+    minimise  E sum_g w_g (z_g(k) - c_g(k))^2 + rho v(k)^2
+
+A settled mirror has one piece, and the law is that of the Kalman filter whatever the delay.
 """
 
 from __future__ import annotations
@@ -35,13 +39,14 @@ from lbt_synth.design.result import (
     model_limits,
     with_certificate,
 )
-from lbt_synth.errors import DimensionError, InfeasibleError, ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, solve_dare
 from lbt_synth.linear.lyapunov import output_variances, stationary_covariance, stationary_root
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.models.mirror.frame_rate_system import Response
+from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
+from lbt_synth.models.plant.parts import held_frames
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.rows import Column
 from lbt_synth.validation import (
@@ -52,7 +57,6 @@ from lbt_synth.validation import (
     require_instance,
 )
 
-_ON_CIRCLE = 1e-6  # a zero this close to the unit circle leaves no stable regulator
 _SQUARINGS = 60
 Vector: TypeAlias = FloatArray  # which may be empty
 
@@ -60,7 +64,7 @@ Vector: TypeAlias = FloatArray  # which may be empty
 def _check_objective(evidence: Evidence, objective_nm: float) -> Iterator[Check]:
     """Compare the cost of the real loop, by a Lyapunov equation, with the claimed one."""
     design, rms = evidence.design, evidence.certificate.rms
-    residual, commands = loop_variances(design.problem, design.estimation, design.controller)
+    residual, commands = loop_variances(design.problem, design.controller)
     cost = residual + design.command_weight * commands
     pairs = (
         ("residual of the closed loop, against the error system", residual, rms**2),
@@ -75,20 +79,20 @@ def _check_objective(evidence: Evidence, objective_nm: float) -> Iterator[Check]
 def _check_weight(evidence: Evidence, rho: float) -> Iterator[Check]:
     """Check that a step of policy iteration from the cost of this law finds no better law."""
     design = evidence.design
-    model, core = design.estimation, design.problem.hardware.mirror_system.core
+    model, core, pieces = design.estimation, mirror_core(design.problem), _pieces(design.problem)
     n, c = model.n_states, core.n_states
     whole = np.zeros((n + c, n + c))
     whole[:n, :n], whole[n:, n:] = model.A, core.A
     entry = np.concatenate([np.zeros(n), core.B])
     worst = 0.0
-    for target, gain in zip(model.L, design.gain_state, strict=True):
+    for target, gain in zip(pieces.L.swapaxes(0, 1), design.gain_state, strict=True):
         law = np.concatenate([gain, -design.gain_mirror])
-        row = np.concatenate([target, -core.C])
+        rows = np.hstack([target, -pieces.C])
         closed = whole + np.outer(entry, law)
-        left = row - core.D * law
-        X = stationary_covariance(closed.T, np.outer(left, left) + rho * np.outer(law, law))
-        weight = core.D**2 + rho + entry @ X @ entry
-        better = (core.D * row - entry @ X @ whole) / weight
+        left = rows - np.outer(pieces.D, law)
+        X = stationary_covariance(closed.T, left.T @ left + rho * np.outer(law, law))
+        weight = pieces.D @ pieces.D + rho + entry @ X @ entry
+        better = (pieces.D @ rows - entry @ X @ whole) / weight
         size = max(float(np.linalg.norm(better)), 1e-300)
         worst = max(worst, float(np.linalg.norm(law - better)) / size)
     how = "gains recomputed from a Lyapunov equation"
@@ -101,7 +105,7 @@ class LqgDesign(Design):
 
     The commands are ``N u(k) = gain_state x_hat(k+1|k) - N gain_mirror m(k)``, with x the
     states of :attr:`estimation` and m those of the mirror's core, one set a command. The
-    error, with ``rms`` and ``gamma``, is the residual of the loop.
+    error, with ``rms`` and ``gamma``, is the residual of the loop in the pieces of a hold.
 
     Attributes
     ----------
@@ -130,7 +134,7 @@ class LqgDesign(Design):
     gain_mirror: Vector
 
     def __post_init__(self) -> None:
-        model, mirror = self.estimation, self.problem.hardware.mirror_system.core
+        model, mirror = self.estimation, mirror_core(self.problem)
         sizes = {
             "gain_predictor": model.C.T.shape,
             "gain_state": model.L.shape,
@@ -163,14 +167,19 @@ class LqgDesign(Design):
         return dict(model_limits(self))
 
     @property
+    def knows_mirror(self) -> bool:
+        """Whether the mirror has dynamics: with a settled one the law is that of a filter."""
+        return self.problem.hardware.mirror is not None
+
+    @property
     def estimation(self) -> TipTiltPlant:
-        """The plant of the filter: its z is the phase that the next command first acts on."""
+        """The plant of the filter, whose state holds the phase while the next command holds."""
         return estimation_plant(self.problem)
 
     @property
     def poles(self) -> ComplexArray:
         """Poles of the closed loop: of the filter and of the regulated mirror."""
-        mirror = self.problem.hardware.mirror_system.core
+        mirror = mirror_core(self.problem)
         closed = mirror.A - np.outer(mirror.B, self.gain_mirror)
         of_filter = self.estimation.error_system(self.gain_predictor).poles
         return np.concatenate([of_filter, np.linalg.eigvals(closed).astype(np.complex128)])
@@ -204,7 +213,8 @@ class LqgDesign(Design):
                     f"the other plant must have {own.n_states} states to be estimated; got "
                     f"{real.n_states}."
                 )
-        core, K, modes = self.problem.hardware.mirror_system.core, self.gain_predictor, len(own.L)
+        core, K, modes = mirror_core(self.problem), self.gain_predictor, len(own.L)
+        pieces = _pieces(replace(real, hardware=self.problem.hardware))
         n, each = own.n_states, np.eye(modes)
         size = 2 * n + core.n_states * modes
         e, x, m = slice(0, n), slice(n, 2 * n), slice(2 * n, size)
@@ -215,11 +225,13 @@ class LqgDesign(Design):
         A[m, x] = np.kron(core.B[:, None], self.gain_state)
         A[m, m] = np.kron(core.A - np.outer(core.B, self.gain_mirror), each)
         B[e], B[x] = real.B - K @ real.D, K @ real.D
-        C = np.zeros((modes, size))
-        C[:, e], C[:, x] = real.L, real.L - core.D * self.gain_state
-        C[:, m] = -np.kron(core.C - core.D * self.gain_mirror, each)
-        D = np.zeros((modes, B.shape[1]))
-        return StateSpace(A=A, B=B, C=C, D=D, dt_s=own.dt_s)
+        C = np.zeros((len(pieces.D), modes, size))
+        C[..., e] = pieces.L
+        C[..., x] = pieces.L - pieces.D[:, None, None] * self.gain_state
+        seen = pieces.C - np.outer(pieces.D, self.gain_mirror)
+        C[..., m] = -np.stack([np.kron(row, each) for row in seen])
+        D = np.zeros((len(pieces.D) * modes, B.shape[1]))
+        return StateSpace(A=A, B=B, C=C.reshape(-1, size), D=D, dt_s=own.dt_s)
 
     def examine(self) -> Evidence:
         """Compute the norms of the residual, and check the filter's gain."""
@@ -248,32 +260,72 @@ def lqg_controller(
 
 
 def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:
-    """Plant whose z is the phase on which the next command first acts."""
+    """Plant whose state holds the phase in the frames in which the next command holds."""
     hardware = plant.hardware
-    delay = hardware.mirror_system.lead + 1
-    if hardware.mirror is None and hardware.delay_frames == delay:
+    if hardware.mirror is None:
         return plant
-    waiting = replace(hardware, delay_frames=delay, mirror=None)
+    newest = int(np.floor(hardware.delay_frames + 0.5))  # frame in which the hold ends
+    waiting = replace(hardware, delay_frames=newest + 1, mirror=None)
     return assemble(replace(plant.parts(), hardware=waiting))
 
 
-def loop_variances(
-    plant: TipTiltPlant, model: TipTiltPlant, controller: Controller
-) -> tuple[float, float]:
-    """Variances of residual and command (as a wavefront) where the model is the truth."""
+def mirror_core(plant: TipTiltPlant) -> Response:
+    """Return the states of the mirror that a command moves in its hold; a settled one has none."""
     hardware = plant.hardware
+    return tapped_mirror(np.ones(1)) if hardware.mirror is None else hardware.mirror_system.core
+
+
+class Pieces(NamedTuple):
+    """Phase and mirror in the pieces of a hold, each times the root of its length."""
+
+    L: FloatArray  # (g, modes, n): phase, over the states of the estimation
+    C: FloatArray  # (g, c): position, over the states of the mirror's core
+    D: FloatArray  # (g,): position, over the command
+
+
+def _pieces(plant: TipTiltPlant) -> Pieces:
+    """Return what counts of a plant while a command holds; its model is the estimation's."""
+    hardware, model = plant.hardware, estimation_plant(plant)
+    if hardware.mirror is None:
+        return Pieces(model.L[None], np.zeros((1, 0)), np.ones(1))
+    hold, n = hardware.mirror_system.hold, hardware.modes
+    newest = int(model.hardware.delay_frames) - 1
+    held = held_frames(model.hardware)
+    # the phase in the frames newest, newest - 1, ... after exposure k, over x(k + 1)
+    past = [np.eye(n, model.n_states, model.n_states - (held - i) * n) for i in range(held)]
+    frames = np.stack([model.L, *past])
+    middle = hold.start + (hold.edges[1:] + hold.edges[:-1]) / 2 - 0.5
+    age = np.clip(np.floor(newest - middle).astype(np.int64), 0, held - 1)
+    later = (middle - (newest - age - 1))[:, None, None]  # weight of the later frame
+    L = later * frames[age] + (1 - later) * frames[age + 1]
+    root = np.sqrt(hold.weights)
+    return Pieces(root[:, None, None] * L, root[:, None] * hold.C, root * hold.D)
+
+
+def loop_variances(plant: TipTiltPlant, controller: Controller) -> tuple[float, float]:
+    """Variances of residual in a hold, and command (as a wavefront), in the model of a plant."""
+    hardware, model, pieces = plant.hardware, estimation_plant(plant), _pieces(plant)
     loop = close_loop(hardware, controller).system
     n, m, states = hardware.modes, hardware.n_commands, model.n_states
-    total = loop.B[:, :n] @ model.L
-    A = np.block([[model.A, np.zeros((states, loop.n_states))], [total, loop.A]])
-    B = np.vstack([model.B, loop.B[:, n:] @ model.D])
+    # the loop meets the phase of frame k, the last that x(k + 1) holds
+    held = np.eye(n, states, states - n)
+    entry = loop.B[:, :n] @ held
+    A = np.block([[model.A, np.zeros((states, loop.n_states))], [entry @ model.A, loop.A]])
+    B = np.vstack([model.B, entry @ model.B + loop.B[:, n:] @ model.D])
     root = stationary_root(A, B)
-    powers = []
-    for rows, shape in ((slice(n), np.eye(n)), (slice(n, n + m), hardware.influence)):
-        C = shape @ np.hstack([loop.D[rows, :n] @ model.L, loop.C[rows]])
-        D = shape @ loop.D[rows, n:] @ model.D
-        powers.append(float(np.sum(output_variances(C, D, root))))
-    return powers[0], powers[1]
+    u = slice(n, n + m)
+    command_C = np.hstack([loop.D[u, :n] @ held @ model.A, loop.C[u]])
+    command_D = loop.D[u, :n] @ held @ model.B + loop.D[u, n:] @ model.D
+    shape, first = hardware.influence, states + controller.n_states
+    core = slice(first, first + pieces.C.shape[1] * m)
+    power = 0.0
+    for L, position, direct in zip(*pieces, strict=True):
+        C, D = -direct * shape @ command_C, -direct * shape @ command_D
+        C[:, :states] += L @ model.A
+        C[:, core] -= np.kron(position, shape)
+        power += float(np.sum(output_variances(C, D + L @ model.B, root)))
+    commands = output_variances(shape @ command_C, shape @ command_D, root)
+    return power, float(np.sum(commands))
 
 
 class Regulator(NamedTuple):
@@ -290,24 +342,22 @@ class Regulator(NamedTuple):
 
 
 def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
-    """Design the controller of least residual for a mirror that moves, or a fractional delay.
+    """Design the controller of least residual in the image, for a mirror that moves.
 
-    For a mirror that settles at once and a whole delay it is the Kalman controller.
+    For a mirror that settles at once it is the Kalman controller.
 
     Parameters
     ----------
     plant : TipTiltPlant
         Disturbance, noise and loop; the dynamics are those of ``plant.hardware.mirror``.
     command_weight : float, optional
-        Weight of the squared command, as a wavefront, beside the squared residual. A small
-        one, such as 1e-4, is needed where the mirror has a zero on the unit circle (a settled
-        one at a delay of half a frame), and keeps commands small near it.
+        Weight of the squared command, as a wavefront, beside the squared residual.
 
     Returns
     -------
     LqgDesign
-        Certified design; ``rms`` is the residual where the model is the truth. Without a
-        command weight no linear controller leaves less.
+        Certified design; ``rms`` is the residual while commands hold, where the model is the truth.
+        Without a command weight no linear controller leaves less.
 
     Raises
     ------
@@ -315,8 +365,6 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         If the plant is none of :func:`tip_tilt_plant`, or an argument is out of its range.
     DimensionError
         If the mirror does not reach every mode.
-    InfeasibleError
-        If the mirror has a zero on the unit circle and there is no command weight.
     DetectabilityError
         If no stable filter exists.
     NumericalError
@@ -336,9 +384,10 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     ... )
     >>> design = lbt.lqg(plant)
     >>> loop = lbt.close_loop(plant.hardware, design.controller)
-    >>> budget = lbt.residual_budget(loop, lbt.Truth(turbulence=slow, noise_nm=15.5))
-    >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-6)
-    True
+    >>> kalman = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
+    >>> truth = lbt.Truth(turbulence=slow, noise_nm=15.5)
+    >>> [round(lbt.residual_budget(one, truth).rms_nm) for one in (loop, kalman)]
+    [146, 165]
     """
     require_instance(plant, TipTiltPlant, "plant")
     rho = number(command_weight, "command_weight", at_least=0)
@@ -352,12 +401,14 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         )
     estimation = estimation_plant(plant)
     solution = kalman_riccati(estimation)
-    regulator = _regulator(hardware.mirror_system.core, estimation.A, estimation.L, rho)
+    pieces = _pieces(plant)
+    regulator = _regulator(mirror_core(plant), pieces, estimation.A, rho)
     innovation = estimation.R + estimation.C @ solution.P @ estimation.C.T
     drive = solution.gain_predictor @ innovation @ solution.gain_predictor.T
     gains = regulator.gain_state
-    rest = estimation.L.T @ estimation.L - regulator.weight * gains.T @ gains
-    cost = np.trace(estimation.L @ solution.P @ estimation.L.T)
+    L = pieces.L.reshape(-1, estimation.n_states)
+    rest = L.T @ L - regulator.weight * gains.T @ gains
+    cost = np.trace(L @ solution.P @ L.T)
     if np.any(np.abs(rest) > 1e-14 * np.max(np.abs(estimation.L)) ** 2):
         cost += np.trace(stationary_covariance(estimation.A.T, rest) @ drive)
     design = LqgDesign(
@@ -378,29 +429,22 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     )
 
 
-def _regulator(core: Response, A: FloatArray, L: FloatArray, rho: float) -> Regulator:
-    """Regulator of one mirror for all modes; the rows of L are their targets."""
-    F, G, h, d = core.A, core.B, core.C, core.D
-    weight = d**2 + rho
+def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Regulator:
+    """Regulator of one mirror for all modes, whose targets are those of the pieces."""
+    F, G, (L, h, d) = core.A, core.B, pieces
+    weight = float(d @ d) + rho
     if core.n_states == 0:
-        return Regulator(d / weight * L, np.zeros(0), weight, "settled", 0)
-    X, status, iterations = np.zeros_like(F), "inverted", 0
-    zeros = np.abs(core.zeros)
-    if rho == 0 and np.any(np.abs(zeros - 1) < _ON_CIRCLE):
-        raise InfeasibleError(
-            "without a command weight the mirror must have no zero on the unit circle; got one at "
-            f"a modulus of {zeros[np.argmin(np.abs(zeros - 1))]:.9g}, where the commands would "
-            "grow for ever. Try command_weight=1e-4, or another delay."
-        )
-    if rho > 0 or np.any(zeros > 1):  # otherwise the mirror's inverse is stable and costs nothing
-        solved = solve_dare(F, G[:, None], np.outer(h, h), [[weight]], d * h[:, None])
-        X, status, iterations = solved.X, solved.route, solved.iterations
+        gain_state = np.einsum("g,gan->an", d, L) / weight
+        return Regulator(gain_state, np.zeros(0), weight, "settled", 0)
+    solved = solve_dare(F, G[:, None], h.T @ h, [[weight]], (d @ h)[:, None])
+    X = solved.X
     total = float(weight + G @ X @ G)
-    gain_mirror = (G @ X @ F + d * h) / total
+    gain_mirror = (G @ X @ F + d @ h) / total
     closed = F - np.outer(G, gain_mirror)
-    crossed = _solve_stein(closed.T, A, (gain_mirror * d - h)[None, :, None] * L[:, None, :])
-    gain_state = (d * L - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
-    return Regulator(gain_state, gain_mirror, total, status, iterations)
+    left = np.outer(d, gain_mirror) - h
+    crossed = _solve_stein(closed.T, A, np.einsum("gc,gan->acn", left, L))
+    gain_state = (np.einsum("g,gan->an", d, L) - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
+    return Regulator(gain_state, gain_mirror, total, solved.route, solved.iterations)
 
 
 def _solve_stein(left: FloatArray, right: FloatArray, drive: FloatArray) -> FloatArray:

@@ -356,18 +356,13 @@ def require_hardware(design: Design, what: str) -> LoopHardware:
 def model_limits(design: Design) -> Mapping[str, float | None]:
     """Return the values of ``MODEL_LIMITS``: residual in the own model, limit, and how far above.
 
-    They are None without a loop, and what cannot be computed is nan. The residual is the estimation
-    error where the mirror reaches every command at once, or the design commands for its dynamics.
+    Both are in the image. They are None without a loop, and what cannot be computed is nan.
     """
     plant = design.plant
     if plant is None:
         return {}
-    hardware, residual_nm = plant.hardware, design.rms
-    settled = hardware.delay_frames % 1 == 0 and hardware.mirror is None
-    if not (settled or design.knows_mirror):
-        loop = close_loop(hardware, design.controller)
-        budget = model_budget(loop, plant, frame_means=True) if loop.is_stable else None
-        residual_nm = np.nan if budget is None else budget.rms_nm
+    loop = close_loop(plant.hardware, design.controller)
+    residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_modes
-from lbt_synth.loop.least_residuals.prediction import Prediction
+from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
 from lbt_synth.models import (
     LoopHardware,
     TipTiltPlant,
@@ -134,22 +134,29 @@ def _limit_of_sensors(hardware: LoopHardware, truth: Truth, *, in_image: bool) -
 def least_model_residual(plant: TipTiltPlant) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth.
 
-    It is that of means over frames, as the plant has them. Coupled modes have a limit where nothing
-    but whole frames of delay is between command and mirror: the error of the best estimate, from a
-    Riccati equation.
+    It is that in the image. The processes of a plant are of means over frames. Coupled modes have a
+    limit where nothing but whole frames of delay is between command and mirror: the error of the
+    best estimate, from a Riccati equation, and what moves within frames.
     """
-    hardware = plant.hardware
+    hardware, inner = plant.hardware, InnerFactor.of(plant.hardware, in_image=True)
+    rate = hardware.frame_rate_hz
     lines = [(checked_direction(line, hardware), line) for line in plant.vibrations]
     try:
-        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines, in_image=False)
+        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines, in_image=True)
     except CoupledModesError:
-        if hardware.mirror is not None or hardware.delay_frames % 1:
+        if hardware.delay_frames % 1:
             raise
+        parts = list(zip(np.eye(hardware.modes), plant.turbulence, strict=True))
+        parts += [(along, line.ar_model(rate)) for along, line in lines]
+        within = np.zeros((hardware.modes, hardware.modes))
+        for along, model in parts:
+            mode = ModeSpectrum(inner, rate, (model,), 0.0, in_image=True)
+            within += mode.within_frames_nm2() * np.outer(along, along)
         error = plant.L @ kalman_riccati(plant).P @ plant.L.T
-        variance, axes = np.linalg.eigh(error)
+        variance, axes = np.linalg.eigh(error + within)
         return ResidualLimit(
             variance_nm2=frozen_copy(variance),
-            within_nm2=frozen_copy(0 * variance),
+            within_nm2=frozen_copy(np.einsum("in,ij,jn->n", axes, within, axes)),
             directions=frozen_copy(axes.T),
             change=0.0,
         )
