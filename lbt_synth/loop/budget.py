@@ -198,15 +198,13 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 
 
 def line_covariance(loop: ClosedLoop, line: Vibration) -> FloatArray:
-    """Return the covariance of the residual that a plant's line leaves in the image, (n, n)."""
-    return np.asarray(
-        np.sum(_view(loop, frame_means=False).of_line(line, {}, of_means=True), axis=0)
-    )
+    """Covariance (n, n) of the residual that a line leaves, in means over frames."""
+    return np.asarray(_view(loop, frame_means=True).of_line(line, {}, of_means=True)[0])
 
 
 def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
-    """Covariance of the residual that white noise of covariance ``factor factor'`` leaves."""
-    return np.asarray(np.sum(_view(loop, frame_means=False).of_noise(factor), axis=0))
+    """Covariance of what noise of covariance ``factor factor'`` leaves, in means over frames."""
+    return np.asarray(_view(loop, frame_means=True).of_noise(factor)[0])
 
 
 def _make_budget(

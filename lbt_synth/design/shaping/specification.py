@@ -280,11 +280,12 @@ def _mode_limit(
     hardware: LoopHardware, truth: Truth, bands: list[VibrationBand]
 ) -> ResidualLimit | BandLimit:
     if not bands:
-        return least_residual(hardware, truth)
+        return least_residual(hardware, truth, frame_means=True)
     return least_worst_residual(
         hardware,
         truth,
         band_hz=(bands[0].low_hz, bands[0].high_hz),
         rms_nm=bands[0].rms_nm,
         direction=(1.0,),
+        frame_means=True,
     )

@@ -64,7 +64,7 @@ def _covariances(
     loop = close_loop(plant.hardware, controller)
     if not loop.is_stable:
         return {}
-    budget = model_budget(loop, plant)
+    budget = model_budget(loop, plant, frame_means=True)
     out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
     for line in lines:
         parts = [line_covariance(loop, vibration) for vibration in line.vibrations]

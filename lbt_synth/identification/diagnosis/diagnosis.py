@@ -249,7 +249,7 @@ def _examine_loop(
         comparison=comparison,
         best=best,
         best_design=best_design,
-        limit_nm=limit_or_nan(lambda: least_model_residual(model.plant())),
+        limit_nm=limit_or_nan(lambda: least_model_residual(model.plant(), frame_means=True)),
     )
     step(1)
     for name, design in given.items():

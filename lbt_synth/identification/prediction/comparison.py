@@ -286,7 +286,7 @@ def prediction_against_data(
         rows.append(_build_row(name, replayed, _model_means(loop, plant), imaging))
     notes = [*_note_starts(rows, loops), *_note_refuted(rows)]
     try:
-        limit = least_model_residual(plant)
+        limit = least_model_residual(plant, frame_means=True)
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
         notes = [f"no {LIMIT}: {error}", *notes]
     else:

@@ -131,26 +131,26 @@ def _limit_of_sensors(hardware: LoopHardware, truth: Truth, *, in_image: bool) -
     return _residual_limit(*modes)
 
 
-def least_model_residual(plant: TipTiltPlant) -> ResidualLimit:
+def least_model_residual(plant: TipTiltPlant, *, frame_means: bool = False) -> ResidualLimit:
     """Least residual that any linear controller leaves where a plant's model is the truth.
 
-    It is that in the image. The processes of a plant are of means over frames. Coupled modes have a
-    limit where nothing but whole frames of delay is between command and mirror: the error of the
-    best estimate, from a Riccati equation, and what moves within frames.
+    It is that in the image, or of means over frames; the processes of a plant are of such means.
+    Coupled modes have a limit where nothing but whole frames of delay is between command and
+    mirror: the error of the best estimate, from a Riccati equation, and what moves within frames.
     """
-    hardware, inner = plant.hardware, InnerFactor.of(plant.hardware, in_image=True)
-    rate = hardware.frame_rate_hz
+    hardware, rate, in_image = plant.hardware, plant.hardware.frame_rate_hz, not frame_means
+    inner = InnerFactor.of(hardware, in_image=in_image)
     lines = [(checked_direction(line, hardware), line) for line in plant.vibrations]
     try:
-        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines, in_image=True)
+        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines, in_image=in_image)
     except CoupledModesError:
-        if hardware.delay_frames % 1:
+        if hardware.mirror is not None or hardware.delay_frames % 1:
             raise
         parts = list(zip(np.eye(hardware.modes), plant.turbulence, strict=True))
         parts += [(along, line.ar_model(rate)) for along, line in lines]
         within = np.zeros((hardware.modes, hardware.modes))
         for along, model in parts:
-            mode = ModeSpectrum(inner, rate, (model,), 0.0, in_image=True)
+            mode = ModeSpectrum(inner, rate, (model,), 0.0, in_image)
             within += mode.within_frames_nm2() * np.outer(along, along)
         error = plant.L @ kalman_riccati(plant).P @ plant.L.T
         variance, axes = np.linalg.eigh(error + within)
