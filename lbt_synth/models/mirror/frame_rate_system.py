@@ -26,7 +26,7 @@ _NOTHING = 1e-14  # a leading tap of at most this counts as zero
 _TAIL = 1e-15  # the taps end where at most this is left of the step response
 _MOST_TAPS = 4000
 _MOST_SAMPLES = 100_000  # of the local loop per frame; they are run one by one
-_PIECES = 32  # of a frame, in which the mean position counts: what is left is its part of 1e-3
+_PIECES = 16  # of a frame, in which the mean position counts: 4e-3 of its motion is left out
 _FRAME = frozen_copy([0.0, 1.0])
 
 
