@@ -9,7 +9,7 @@ answer c is not a delay of d frames, the filter corrects the series by the comma
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
-from lbt_synth.interop.written_loop import ROUNDOFF, Rounding
+from lbt_synth.interop.proof import ROUNDOFF, Written
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
+from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
 
 _LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single precision
@@ -29,6 +30,7 @@ _LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single preci
 class PolFilter:
     """A controller in the units of pyRTC's commands."""
 
+    hardware: LoopHardware  # of its loop
     delay_frames: int  # after which pyRTC takes a command away
     response: FloatArray  # from commands to measurements, (m, m): its interaction matrix
     # what the last commands, u(k-1) first, are of the correction that measurement k sees, (frames,)
@@ -43,19 +45,16 @@ class PolFilter:
     @property
     def is_whole(self) -> bool:
         """Whether the series of pyRTC needs no correction."""
-        return not np.any(self._tap_error())
+        return not np.any(self.tap_error)
 
-    def _tap_error(self) -> FloatArray:
+    @property
+    def tap_error(self) -> FloatArray:
         """Return what pyRTC leaves of the last commands in its series, (frames,)."""
         out = self.taps.copy()
         out[self.delay_frames - 1] -= 1
         return out
 
-    def start(self, limit: float = np.inf) -> RunningPolFilter:
-        """Return the filter with a memory of its own; it clips commands at the limit."""
-        return RunningPolFilter(system=self.system, tap_error=self._tap_error(), limit=limit)
-
-    def as_computed(self) -> tuple[Controller, Rounding]:
+    def as_computed(self) -> Written:
         """Return the controller that pyRTC's loop computes, and what its arithmetic adds.
 
         The states are those of the filter and the commands sent; noise enters the residual and
@@ -86,42 +85,46 @@ class PolFilter:
             ]
             return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate(squares))
 
-        return whole, Rounding(
-            entry=replace(whole, B=entry, D=np.zeros((m, 2 * m))), variance=variance
-        )
+        entered = replace(whole, B=entry, D=np.zeros((m, 2 * m)))
+        return Written(controllers={frozenset(): whole}, entry=entered, variance=variance)
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
-class RunningPolFilter:
-    """A filter with its state, and the commands that it sent, (frames, m), the last first."""
+class InnerLoop:
+    """A filter as pyRTC runs it: signals and commands in single precision, the filter in double.
 
-    system: StateSpace
-    tap_error: FloatArray
-    limit: float
-    state: FloatArray = field(init=False)
-    sent: FloatArray = field(init=False)
+    It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
+    """
 
-    def __post_init__(self) -> None:
+    def __init__(self, whole: PolFilter, limit: float = np.inf) -> None:
+        self._whole, self._limit, self._tap_error = whole, limit, whole.tap_error
+        self._reconstructor = whole.reconstructor.astype(np.float32)
         self.reset()
 
     def reset(self) -> None:
         """Forget the past."""
-        self.state = np.zeros(self.system.n_states)
-        self.sent = np.zeros((len(self.tap_error), len(self.system.C)))
+        self._state = np.zeros(self._whole.system.n_states)
+        # commands that were sent, the last first
+        self._sent = np.zeros((len(self._tap_error), len(self._whole.response)))
 
-    def step(self, pol: FloatArray, *, flat: bool = False) -> FloatArray:
+    def step(self, y: ArrayLike) -> FloatArray:
+        """Take y(k), (m,), return u(k), (m,)."""
+        residual = self._reconstructor @ np.asarray(y, dtype=np.float32)
+        pol = residual + self._sent[self._whole.delay_frames - 1].astype(np.float32)
+        return self.step_pol(pol.astype(np.float64))
+
+    def step_pol(self, pol: FloatArray, *, flat: bool = False) -> FloatArray:
         """Take the series of pyRTC, (m,), return the command u that it sends, (m,).
 
         Values that are not finite leave the state as it is, and repeat the last command. ``flat``
         sends zeros.
         """
-        s, u = self.system, self.sent[0]
+        s, u = self._whole.system, self._sent[0]
         if np.isfinite(pol).all():
-            seen = pol + self.tap_error @ self.sent
-            u = np.clip(s.C @ self.state + s.D @ seen, -self.limit, self.limit)
-            self.state = s.A @ self.state + s.B @ seen
+            seen = pol + self._tap_error @ self._sent
+            u = np.clip(s.C @ self._state + s.D @ seen, -self._limit, self._limit)
+            self._state = s.A @ self._state + s.B @ seen
         sent = 0 * u if flat else u.astype(np.float32).astype(np.float64)
-        self.sent = np.vstack([sent, self.sent[:-1]])
+        self._sent = np.vstack([sent, self._sent[:-1]])
         return np.asarray(sent)
 
 
@@ -137,35 +140,22 @@ def pol_filter(design: Design) -> PolFilter:
             f"of {np.linalg.cond(response):.3g} (limit {_LARGEST_CONDITION:g}). Design for the "
             "modes."
         )
-    own = design.controller
+    return filter_of(hardware, design.controller, response)
+
+
+def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> PolFilter:
+    """Return the filter of a controller, for a response (m, m) from commands to measurements."""
+    m = len(response)
     own = replace(own, B=own.B @ response, D=own.D @ response)
     modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
     whole = close_loop(modal, own).commanding()
     delay = max(1, int(hardware.delay_frames + 0.5))
     taps = np.zeros(max(delay, len(hardware.mirror_taps)))
     taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
-    system = replace(whole, B=whole.B[:, m:], D=whole.D[:, m:])
-    return PolFilter(delay_frames=delay, response=response, taps=taps, system=system)
-
-
-class InnerLoop:
-    """A design as pyRTC runs it: signals and commands in single precision, the filter in double.
-
-    It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
-    """
-
-    def __init__(self, design: Design, limit: float = np.inf) -> None:
-        found = pol_filter(design)
-        self._filter, self._delay = found.start(limit), found.delay_frames
-        self._reconstructor = found.reconstructor.astype(np.float32)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the past."""
-        self._filter.reset()
-
-    def step(self, y: ArrayLike) -> FloatArray:
-        """Take y(k), (m,), return u(k), (m,)."""
-        residual = self._reconstructor @ np.asarray(y, dtype=np.float32)
-        pol = residual + self._filter.sent[self._delay - 1].astype(np.float32)
-        return self._filter.step(pol.astype(np.float64))
+    return PolFilter(
+        hardware=hardware,
+        delay_frames=delay,
+        response=response,
+        taps=taps,
+        system=replace(whole, B=whole.B[:, m:], D=whole.D[:, m:]),
+    )

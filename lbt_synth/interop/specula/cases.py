@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
-from lbt_synth.interop.specula.simulation import EndToEndSetup
-from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.interop.specula.optics import EndToEndSystem
+from lbt_synth.interop.specula.simulation import EndToEndRun, EndToEndSetup
 from lbt_synth.linear import Controller
 from lbt_synth.models import (
     DriftingVibration,

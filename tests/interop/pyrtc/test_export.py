@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from support.exports import lbt_designs, with_controller
 from support.gain_file_edits import odd_plant
 
 import lbt_synth as lbt
-from lbt_synth.interop.pyrtc import export as pyrtc_export
+from lbt_synth.interop.pyrtc.pol_filter import pol_filter
 
 NAMES = ["config.yaml", "config.yaml.certificate.json", "gain.fits", "interaction_matrix.npz"]
 
@@ -21,7 +22,7 @@ def read(folder):
 
 def test_the_folder_holds_all_that_it_refers_to(tmp_path):
     design = lbt_designs()["kalman"]
-    written = lbt.interop.export_pyrtc(tmp_path / "k", design, gain_digest="a" * 64)
+    written = lbt.interop.export(tmp_path / "k", design, "pyrtc", gain_digest="a" * 64)
     assert sorted(path.name for path in (tmp_path / "k").iterdir()) == NAMES
     assert sorted(path.name for path in written.files) == NAMES
     assert 0 < written.error < 1e-6
@@ -40,7 +41,7 @@ def test_the_folder_holds_all_that_it_refers_to(tmp_path):
 
 
 def test_the_certificate_has_digests_and_checks(tmp_path):
-    written = lbt.interop.export_pyrtc(tmp_path, lbt_designs()["hinf"], gain_digest="b" * 64)
+    written = lbt.interop.export(tmp_path, lbt_designs()["hinf"], "pyrtc", gain_digest="b" * 64)
     found = json.loads((tmp_path / "config.yaml.certificate.json").read_text())
     assert found["gain_sha256"] == "b" * 64
     assert [check["passed"] for check in found["checks"]] == [True] * len(written.checks)
@@ -51,14 +52,14 @@ def test_the_certificate_has_digests_and_checks(tmp_path):
 
 def test_the_same_design_gives_the_same_bytes(tmp_path):
     for name in "ab":
-        lbt.interop.export_pyrtc(tmp_path / name, lbt_designs()["integrator"])
+        lbt.interop.export(tmp_path / name, lbt_designs()["integrator"], "pyrtc")
     for name in NAMES:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 def test_a_loop_of_more_modes_and_other_matrices(tmp_path):
     plant = odd_plant()
-    lbt.interop.export_pyrtc(tmp_path, lbt.kalman(plant), modes=4)
+    lbt.interop.export(tmp_path, lbt.kalman(plant), "pyrtc", modes=4)
     assert read(tmp_path)["wfc"]["num_actuators"] == 4
     expected = np.eye(4)
     expected[:2, :2] = plant.hardware.sensor @ plant.hardware.influence
@@ -68,22 +69,19 @@ def test_a_loop_of_more_modes_and_other_matrices(tmp_path):
 def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch):
     design = lbt_designs()["integrator"]
     with pytest.raises(lbt.errors.ProblemError, match="modes must be at least 2"):
-        lbt.interop.export_pyrtc(tmp_path / "k", design, modes=1)
+        lbt.interop.export(tmp_path / "k", design, "pyrtc", modes=1)
     wild = with_controller(design, lbt.integrator(design.hardware, gain=0.95).controller)
-    with pytest.raises(lbt.errors.NumericalError, match=r"in the arithmetic of pyRTC; .+ is"):
-        lbt.interop.export_pyrtc(tmp_path / "k", mislead(design, wild, monkeypatch))
+    held = (pol_filter(wild),)  # pyRTC computes another controller than that of the design
+    own = replace(lbt.interop.target_named("pyrtc"), round=lambda *_, **__: [held])
+    own = replace(own, read=lambda *_: held)
+    monkeypatch.setattr("lbt_synth.interop.pyrtc.export.TARGET", own)
+    with pytest.raises(lbt.errors.NumericalError, match=r"in the arithmetic of pyrtc .+ is"):
+        lbt.interop.export(tmp_path / "k", design, "pyrtc")
     assert list(tmp_path.iterdir()) == []
-
-
-def mislead(design, wild, monkeypatch):
-    """Let pyRTC compute another controller than that of the design."""
-    own = pyrtc_export.pol_filter
-    monkeypatch.setattr(pyrtc_export, "pol_filter", lambda _: own(wild))
-    return design
 
 
 @pytest.mark.parametrize(("name", "text"), [("file", "cannot make"), ("no/k", "cannot make")])
 def test_a_folder_that_cannot_be_made_is_an_error(tmp_path, name, text):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(lbt.errors.OutputError, match=text):
-        lbt.interop.export_pyrtc(tmp_path / name, lbt_designs()["integrator"])
+        lbt.interop.export(tmp_path / name, lbt_designs()["integrator"], "pyrtc")

@@ -49,7 +49,7 @@ def test_what_pyrtc_computes_is_the_controller(name):
     frequencies = np.array([0.5, 10.0, 20.0, 60.0, 399.0])
     expected, written = (
         c.to_statespace().frequency_response(frequencies)
-        for c in (design.controller, found.as_computed()[0])
+        for c in (design.controller, found.as_computed().controllers[frozenset()])
     )
     # matrices that are not the identity are inverted in single precision
     tolerance = 1e-6 if name == "odd" else 1e-12
@@ -64,16 +64,17 @@ def test_a_controller_that_is_unstable_alone_becomes_a_stable_filter():
 
 def test_the_filter_of_an_integrator_in_closed_form():
     """With u+ = u + g y and pol = y + u two frames ago: u(k) = u(k-1) + g (pol(k) - u(k-2))."""
-    running, u = pol_filter(lbt.integrator(PATH, gain=0.4)).start(), [0.0, 0.0]
+    running, u = InnerLoop(pol_filter(lbt.integrator(PATH, gain=0.4))), [0.0, 0.0]
     for pol in np.random.default_rng(0).standard_normal(50):
         u.append(u[-1] + 0.4 * (pol - u[-2]))
-        assert running.step(np.array([pol]))[0] == pytest.approx(u[-1], rel=1e-6)
+        assert running.step_pol(np.array([pol]))[0] == pytest.approx(u[-1], rel=1e-6)
 
 
 def test_the_noise_of_the_arithmetic_in_closed_form():
     """Rounding enters the residual, and the command where it is sent."""
     design = lbt.integrator(PATH, gain=0.4)
-    whole, rounding = pol_filter(design).as_computed()
+    rounding = pol_filter(design).as_computed()
+    (whole,) = rounding.controllers.values()
     entry = rounding.entry.to_statespace().frequency_response([30.0])[0, 0]
     z = np.exp(2j * np.pi * 30.0 / 800)
     own = 0.4 / (1 - 1 / z)
@@ -110,7 +111,7 @@ def test_its_commands_are_those_of_the_controller(name):
     given = series(design, 1000)
     own, twin = (
         step_loop(one, 1.0, design.hardware, *given)[0, :, 2:4]
-        for one in (design.controller.start(), InnerLoop(design))
+        for one in (design.controller.start(), InnerLoop(pol_filter(design)))
     )
     assert 0 < relative(twin, own) < 1e-6
     assert np.array_equal(twin, twin.astype(np.float32))
@@ -121,7 +122,9 @@ def test_a_clipped_command_winds_nothing_up():
     total, noise = series(design, 3000)
     total[:, 500:1000] += 1e5  # far beyond the stroke
     free, held = (
-        step_loop(InnerLoop(design, limit), 1.0, design.hardware, total, noise)[0, :, :2]
+        step_loop(InnerLoop(pol_filter(design), limit), 1.0, design.hardware, total, noise)[
+            0, :, :2
+        ]
         for limit in (np.inf, 500.0)
     )
     assert np.max(np.abs(held[600:1000])) > 9e4
@@ -136,8 +139,8 @@ def test_a_loop_that_was_open_closes_as_if_it_had_not_been():
     """The mirror is flattened while the loop does not run."""
     design, frames = lbt_designs()["kalman"], 2500
     total, noise = series(design, frames)
-    whole = step_loop(InnerLoop(design), 1.0, design.hardware, total, noise)[0, :, :2]
-    loop, commands, residual = InnerLoop(design), np.zeros((2, 2)), np.zeros(2)
+    whole = step_loop(InnerLoop(pol_filter(design)), 1.0, design.hardware, total, noise)[0, :, :2]
+    loop, commands, residual = InnerLoop(pol_filter(design)), np.zeros((2, 2)), np.zeros(2)
     for k in range(frames):
         closed = not 500 <= k < 800
         commands = np.vstack(
@@ -149,7 +152,7 @@ def test_a_loop_that_was_open_closes_as_if_it_had_not_been():
 
 
 def test_reset_forgets():
-    loop = InnerLoop(lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5))
+    loop = InnerLoop(pol_filter(lbt.integrator(PATH, gain=0.5)))
     assert [loop.step([2.0])[0] for _ in range(2)] == [1.0, 2.0]
     loop.reset()
     assert loop.step([2.0])[0] == 1.0
