@@ -4,7 +4,6 @@ from .pipeline import Exported as Exported
 from .pipeline import Target as Target
 from .pipeline import export as export
 from .pipeline import target_named as target_named
-from .pyrtc.plugin import pyrtc_commands as pyrtc_commands
 from .rehearsal import Rehearsal as Rehearsal
 from .rehearsal import rehearse as rehearse
 from .specula.calibration import calibrate as calibrate

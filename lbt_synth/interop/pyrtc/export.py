@@ -1,6 +1,12 @@
 """The target pyRTC: a folder with a configuration that it starts, and all that it refers to.
 
 The gain file goes into the folder; inside pyRTC it is certified again before it runs.
+
+pyRTC measures ``residual(k) = phase - c[0] u(k-1) - c[1] u(k-2) - ..``, in units of its commands,
+and gives the predictor ``residual(k) + u(k-d)``, with the command that it *sent* d frames before.
+The filter that returns the controller's commands is the controller in its own loop: what it knows
+of the phase does not depend on its past commands, so that nothing winds up. Where the mirror's
+answer c is not a delay of d frames, the filter corrects the series by the commands that it sent.
 """
 
 from __future__ import annotations
@@ -8,20 +14,28 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target, join_labels
-from lbt_synth.interop.pyrtc.pol_filter import InnerLoop, PolFilter, filter_of, pol_filter
-from lbt_synth.linear import Controller
+from lbt_synth.interop.proof import ROUNDOFF, Written
+from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.loop import close_loop
+from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
+from lbt_synth.validation import FloatArray
 
+_LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single precision
 _FIT_SECONDS = 20.0  # of pseudo-open-loop series that fit_predictor identifies
 _CONFIG, _GAIN, _RESPONSE = "config.yaml", "gain.fits", "interaction_matrix.npz"
 _SYSTEM = """\
@@ -54,6 +68,141 @@ loop:
     fit_frames: {fit}
     other_gain: {other_gain!r}  # of the integrator of each further mode
 """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PolFilter:
+    """A controller in the units of pyRTC's commands."""
+
+    hardware: LoopHardware  # of its loop
+    delay_frames: int  # after which pyRTC takes a command away
+    response: FloatArray  # from commands to measurements, (m, m): its interaction matrix
+    # what the last commands, u(k-1) first, are of the correction that measurement k sees, (frames,)
+    taps: FloatArray
+    system: StateSpace  # from phase and noise without a correction to the command, (m,); stable
+
+    @property
+    def reconstructor(self) -> FloatArray:
+        """From measurements to residuals, (m, m), in the precision of pyRTC."""
+        return np.linalg.pinv(self.response).astype(np.float32).astype(np.float64)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the series of pyRTC needs no correction."""
+        return not np.any(self.tap_error)
+
+    @property
+    def tap_error(self) -> FloatArray:
+        """Return what pyRTC leaves of the last commands in its series, (frames,)."""
+        out = self.taps.copy()
+        out[self.delay_frames - 1] -= 1
+        return out
+
+    def as_computed(self) -> Written:
+        """Return the controller that pyRTC's loop computes, and what its arithmetic adds.
+
+        The states are those of the filter and the commands sent; noise enters the residual and
+        the command that is sent.
+        """
+        s, R, m, d = self.system, self.reconstructor, len(self.response), len(self.taps)
+        n = s.n_states
+        A = np.zeros((n + d * m, n + d * m))
+        A[: n + m, :n] = np.vstack([s.A, s.C])
+        A[n + m :, n:-m] = np.eye((d - 1) * m)
+        entry = np.zeros((len(A), 2 * m))
+        entry[: n + m, :m] = np.vstack([s.B, s.D])
+        entry[n : n + m, m:] = np.eye(m)
+        A[:, n:] += np.kron(self.taps, entry[:, :m])
+        C = np.zeros((m, len(A)))
+        C[:, n : n + m] = np.eye(m)  # the command sent, in the new state
+        whole = Controller(A=A, B=entry[:, :m] @ R, C=C, D=np.zeros((m, m)), dt_s=s.dt_s)
+
+        def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
+            """Bound the rounding of the signal, of its product, of the sum and of the command."""
+            terms = np.abs(R) * measured
+            residual = np.sum(terms, axis=1)
+            squares = [
+                2 * np.sum(terms**2, axis=1)
+                + np.sum(np.cumsum(terms, axis=1) ** 2, axis=1)
+                + (residual + commands) ** 2,
+                commands**2,
+            ]
+            return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate(squares))
+
+        entered = replace(whole, B=entry, D=np.zeros((m, 2 * m)))
+        return Written(controllers={frozenset(): whole}, entry=entered, variance=variance)
+
+
+class InnerLoop:
+    """A filter as pyRTC runs it: signals and commands in single precision, the filter in double.
+
+    It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
+    """
+
+    def __init__(self, whole: PolFilter, limit: float = np.inf) -> None:
+        self._whole, self._limit, self._tap_error = whole, limit, whole.tap_error
+        self._reconstructor = whole.reconstructor.astype(np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._state = np.zeros(self._whole.system.n_states)
+        # commands that were sent, the last first
+        self._sent = np.zeros((len(self._tap_error), len(self._whole.response)))
+
+    def step(self, y: ArrayLike) -> FloatArray:
+        """Take y(k), (m,), return u(k), (m,)."""
+        residual = self._reconstructor @ np.asarray(y, dtype=np.float32)
+        pol = residual + self._sent[self._whole.delay_frames - 1].astype(np.float32)
+        return self.step_pol(pol.astype(np.float64))
+
+    def step_pol(self, pol: FloatArray, *, flat: bool = False) -> FloatArray:
+        """Take the series of pyRTC, (m,), return the command u that it sends, (m,).
+
+        Values that are not finite leave the state as it is, and repeat the last command. ``flat``
+        sends zeros.
+        """
+        s, u = self._whole.system, self._sent[0]
+        if np.isfinite(pol).all():
+            seen = pol + self._tap_error @ self._sent
+            u = np.clip(s.C @ self._state + s.D @ seen, -self._limit, self._limit)
+            self._state = s.A @ self._state + s.B @ seen
+        sent = 0 * u if flat else u.astype(np.float32).astype(np.float64)
+        self._sent = np.vstack([sent, self._sent[:-1]])
+        return np.asarray(sent)
+
+
+def pol_filter(design: Design) -> PolFilter:
+    """Return the filter that gives a design's commands in pyRTC; refuse a loop it cannot hold."""
+    hardware = require_hardware(design, "pyRTC")
+    response = hardware.sensor @ hardware.influence
+    q, m = response.shape
+    if q != m or np.linalg.cond(response) > _LARGEST_CONDITION:
+        raise ProblemError(
+            "pyRTC's predictors get one residual per command, so that the commands must show in "
+            f"as many measurements; got {q} measurements of {m} commands, with a condition number "
+            f"of {np.linalg.cond(response):.3g} (limit {_LARGEST_CONDITION:g}). Design for the "
+            "modes."
+        )
+    return filter_of(hardware, design.controller, response)
+
+
+def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> PolFilter:
+    """Return the filter of a controller, for a response (m, m) from commands to measurements."""
+    m = len(response)
+    own = replace(own, B=own.B @ response, D=own.D @ response)
+    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
+    whole = close_loop(modal, own).commanding()
+    delay = max(1, int(hardware.delay_frames + 0.5))
+    taps = np.zeros(max(delay, len(hardware.mirror_taps)))
+    taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
+    return PolFilter(
+        hardware=hardware,
+        delay_frames=delay,
+        response=response,
+        taps=taps,
+        system=replace(whole, B=whole.B[:, m:], D=whole.D[:, m:]),
+    )
 
 
 def _write(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Design, integrator
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import GainFileError, MissingExtraError, ProblemError
+from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import design_from_record, loop_record
-from lbt_synth.interop.pyrtc.pol_filter import InnerLoop, pol_filter
+from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
 from lbt_synth.methods.registry import record_methods
-from lbt_synth.validation import FloatArray, integer, matrix, number
+from lbt_synth.validation import FloatArray, integer, number
 
 PREDICTOR = "lbt_synth"
-_DISTRIBUTION = "pyrtcao"  # the distribution pyrtc on PyPI is another program
 _ANSWER_SECONDS = 20.0  # a first frame may compile code
 _FITTED_NM = 100.0  # rms of a series that is identified
 
@@ -218,71 +216,3 @@ class GainFilePredictor:
         rest = self.num_modes - self._own
         self._sent = np.zeros((self.horizon, rest), dtype=np.float32)
         self._frames: int = 0
-
-
-def pyrtc_version() -> str | None:
-    """Return the version of pyRTC that is installed, or None."""
-    try:
-        return metadata.version(_DISTRIBUTION)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def pyrtc_commands(
-    kind: str, training: ArrayLike, series: ArrayLike, *, horizon: int = 2
-) -> FloatArray:
-    """Return the commands of a predictor of pyRTC, fitted to one series and run over another.
-
-    Its loop subtracts the applied command from the residual, as a replay does; the prediction is
-    the command.
-
-    Parameters
-    ----------
-    kind : str
-        Name of the predictor in pyRTC, such as ``ar_kalman`` or ``least_squares``.
-    training : (frames, modes) array_like
-        Contiguous pseudo-open-loop series to fit it to [nm].
-    series : (frames, modes) array_like
-        Series that it runs over [nm].
-    horizon : int, optional
-        Whole frames ahead that it predicts: the delay of the loop.
-
-    Returns
-    -------
-    (frames, modes) ndarray
-        u(k), which depends on the series up to frame k [nm].
-
-    Raises
-    ------
-    MissingExtraError
-        If pyRTC is not installed: ``pip install "lbt-synth[pyrtc]"``.
-    ProblemError
-        If pyRTC refuses the predictor or the series.
-
-    Examples
-    --------
-    >>> from lbt_synth.interop import pyrtc_commands
-    >>> pyrtc_commands("persistence", [[1.0]], [[2.0]], horizon=0)
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.ProblemError: horizon must be at least 1; got 0.
-    """
-    past, now = matrix(training, "training"), matrix(series, "series")
-    frames_ahead = integer(horizon, "horizon", at_least=1)
-    if pyrtc_version() is None:
-        raise MissingExtraError(
-            'the predictors of pyRTC need pyrtcao; try: pip install "lbt-synth[pyrtc]".',
-            extra="pyrtc",
-        )
-    try:
-        options = {"type": kind, "horizon": frames_ahead}
-        predictor = register().make_predictor(options, past.shape[1])
-        predictor.fit(past)
-        predictor.reset()
-        commands = np.zeros(now.shape)
-        for k, measured in enumerate(now):
-            predictor.update(measured)
-            commands[k] = predictor.predict()
-    except (ValueError, np.linalg.LinAlgError) as error:
-        raise ProblemError(f"pyRTC's predictor {kind} failed: {error}.") from error
-    return commands

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,14 +22,20 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_parts
 from lbt_synth.loop.simulation.failing_sensors import draw_others
 from lbt_synth.loop.simulation.run import SteppedController, step_controller
-from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models import (
+    DriftingVibration,
+    LoopHardware,
+    PositionLoop,
+    SinusoidalVibration,
+    Truth,
+    Vibration,
+)
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.vibration import TrueVibration
 from lbt_synth.validation import (
     FloatArray,
     NotNegative,
     check_fields,
-    integer,
     number,
     require_instance,
 )
@@ -140,6 +148,21 @@ class EndToEndRun:
     def tip_tilt_noise_nm(self) -> float:
         """Measured tip and tilt that the optical gain does not explain [nm rms per mode]."""
         return float(self._regress(_TIP_TILT)[2])
+
+    def summary(self) -> dict[str, Any]:
+        """Return the main numbers; None stands for NaN, which JSON does not have."""
+        rms = self.rms_nm
+        return {
+            "strehl": self.strehl,
+            "strehl_error": None if math.isnan(self.strehl_error) else self.strehl_error,
+            "other_modes_strehl": self.other_modes_strehl,
+            "tip_rms_nm": float(rms[0]),
+            "tilt_rms_nm": float(rms[1]),
+            "other_modes_rms_nm": float((rms[2:] ** 2).sum() ** 0.5),
+            "tip_tilt_gain": self.tip_tilt_gain,
+            "tip_tilt_gain_error": self.tip_tilt_gain_error,
+            "tip_tilt_noise_nm": self.tip_tilt_noise_nm,
+        }
 
     def _regress(
         self, modes: slice, axis: int | None = None
@@ -288,8 +311,13 @@ class EndToEndSetup:
             Integrator gain of tip and tilt where there is no filter.
         """
         if getattr(filter, "other_sensors", ()):
-            shaken = Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
-            filter = accompany_filter(filter, shaken, **self._length)  # noqa: A001
+            filter = accompany_filter(  # noqa: A001
+                filter,
+                self.shaken,
+                frames=self.frames,
+                settle_frames=self.settle_frames,
+                seed=self.seed,
+            )
         hardware = getattr(filter, "hardware", None)
         mine = self.system.hardware
         if hardware is not None and (hardware.frame_rate_hz, hardware.delay_frames) != (
@@ -311,6 +339,11 @@ class EndToEndSetup:
             gains[:2] = number(tip_tilt_gain, "tip_tilt_gain", at_least=0)
         return MixedController(filter=filter, gains=gains, leak=self.leaks)
 
+    @property
+    def shaken(self) -> Truth:
+        """The vibrations, and how channels of accelerometers move with them."""
+        return Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
+
     def run(
         self,
         filter: Any,  # noqa: A002
@@ -318,35 +351,77 @@ class EndToEndSetup:
         tip_tilt_gain: float | None = None,
         **options: Any,
     ) -> EndToEndRun:
-        """Close the loop with :meth:`controller`.
+        """Close the loop with :meth:`controller`, with options of :func:`run_end_to_end`."""
+        return run_end_to_end(self, self.controller(filter, tip_tilt_gain=tip_tilt_gain), **options)
 
-        The options are calibration, cache and progress, as of :func:`run_end_to_end`.
+    def case(
+        self,
+        controller: Controller | None,
+        *,
+        vibrations: Sequence[TrueVibration] = (),
+        seed: int = 0,
+    ) -> dict[str, Any]:
+        """Return all that a run depends on, in values that JSON can hold.
+
+        Vibrations and seed replace those of the set-up. Without a controller, integrators control
+        tip and tilt.
         """
-        control = self.controller(filter, tip_tilt_gain=tip_tilt_gain)
-        return run_end_to_end(
-            self.system,
-            control,
-            vibrations=self.vibrations,
-            motions=self.motions,
-            **self._length,
-            **options,
-        )
+        settings = asdict(replace(self, vibrations=tuple(vibrations), seed=seed, motions=()))
+        lines, system = list(settings.pop("vibrations")), settings.pop("system")
+        settings.pop("motions")  # a case has no channels
+        hardware = system.pop("hardware")  # its two matrices are the identity
+        kept = ("frame_rate_hz", "delay_frames", "mirror")
+        matrices = None
+        if controller is not None:
+            matrices = {name: getattr(controller, name).tolist() for name in "ABCD"}
+            matrices["dt_s"] = controller.dt_s
+        return {
+            "versions": {name: _installed_version(name) for name in ("lbt-synth", "specula")},
+            "system": system,
+            "hardware": {name: hardware[name] for name in kept},
+            "setup": settings,
+            "vibrations": lines,
+            "controller": matrices,
+        }
 
-    @property
-    def _length(self) -> dict[str, Any]:
-        """Length and seed of a run."""
-        return {name: getattr(self, name) for name in ("frames", "settle_frames", "seed")}
+
+def run_case(
+    case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
+) -> dict[str, Any]:
+    """Run what :meth:`EndToEndSetup.case` returned, and return its summary.
+
+    ``cache`` is the directory of calibrations and phase screens.
+    """
+    mirror = case["hardware"]["mirror"]
+    mirror = None if mirror is None else PositionLoop(**mirror)
+    system = EndToEndSystem(
+        hardware=LoopHardware(**{**case["hardware"], "mirror": mirror}), **case["system"]
+    )
+    lines = tuple(_build_vibration(line) for line in case["vibrations"])
+    setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
+    matrices = case["controller"]
+    return setup.run(matrices and Controller(**matrices), cache=cache).summary()
+
+
+def _installed_version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _build_vibration(line: Mapping[str, Any]) -> TrueVibration:
+    """Rebuild a vibration; its fields tell which of the three types it has."""
+    values = {**line, "direction": tuple(line["direction"])}
+    if "start_hz" in line:
+        return DriftingVibration(**values)
+    return Vibration(**values) if "damping" in line else SinusoidalVibration(**values)
 
 
 def run_end_to_end(
-    system: EndToEndSystem,
+    setup: EndToEndSetup,
     controller: SteppedController,
     *,
-    vibrations: Sequence[TrueVibration] = (),
-    motions: Motions = (),
-    frames: int = 1600,
-    settle_frames: int = 400,
-    seed: int = 0,
     calibration: Calibration | None = None,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
@@ -365,22 +440,10 @@ def run_end_to_end(
 
     Parameters
     ----------
-    system : EndToEndSystem
-        Telescope, air, pyramid, mirror and camera.
+    setup : EndToEndSetup
+        Telescope, vibrations, length and seed.
     controller : object with ``step(y)`` and ``reset()``
         From modal measurements to modal commands, (modes,), such as :class:`MixedController`.
-    vibrations : sequence of Vibration, SinusoidalVibration or DriftingVibration, optional
-        Vibrations of tip and tilt; their direction has two components. A drift begins with
-        the exposure.
-    motions : tuple of mapping, optional
-        For each vibration, how channels of accelerometers move with it. A resonance that channels
-        see is a continuous oscillator, others are AR2 processes.
-    frames : int, optional
-        Frames of the exposure.
-    settle_frames : int, optional
-        Frames run before and dropped, at least 200.
-    seed : int, optional
-        Seed of turbulence, vibrations and noise.
     calibration : Calibration, optional
         Calibration of the system; by default from the cache, or measured.
     cache : path-like, optional
@@ -398,8 +461,7 @@ def run_end_to_end(
     MissingExtraError
         If SPECULA is missing.
     ProblemError
-        If a value is out of range, or the controller does not return one finite command per
-        mode.
+        If the controller does not return one finite command per mode.
     OutputError
         If the cache cannot be written.
 
@@ -409,29 +471,26 @@ def run_end_to_end(
     >>> config = lbt.load_config("examples/lbt.yaml")
     >>> setup, design = config.end_to_end, lbt.kalman(config.plant)
     >>> control = setup.controller(design)
-    >>> run = lbt.interop.run_end_to_end(setup.system, control)        # doctest: +SKIP
+    >>> run = lbt.interop.run_end_to_end(setup, control)        # doctest: +SKIP
 
     It takes half a minute; what cannot run is refused at once:
 
-    >>> lbt.interop.run_end_to_end(setup.system, design)
+    >>> lbt.interop.run_end_to_end(setup, design)
     Traceback (most recent call last):
         ...
     lbt_synth.errors.ProblemError: controller must have step(y) and reset(), as MixedController \
 has; got FilterDesign.
     """
-    require_instance(system, EndToEndSystem)
+    require_instance(setup, EndToEndSetup)
     if not isinstance(controller, SteppedController):
         raise ProblemError(
             "controller must have step(y) and reset(), as MixedController has; "
             f"got {type(controller).__name__}."
         )
-    frames = integer(frames, "frames", at_least=2)
-    settle = integer(settle_frames, "settle_frames", at_least=RAMP_FRAMES)
-    seed = integer(seed, "seed", at_least=0, at_most=LARGEST_SEED)
-    shaken = Truth(turbulence=None, vibrations=tuple(vibrations), motions=motions)
-    total = settle + frames
+    system, settle, seed = setup.system, setup.settle_frames, setup.seed
+    total = settle + setup.frames
     tilts = draw_disturbance(
-        shaken,
+        setup.shaken,
         system.hardware,
         frames=total,
         cases=1,

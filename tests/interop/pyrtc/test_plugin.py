@@ -4,7 +4,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from support.exports import lbt_config, lbt_designs, relative
 from support.gain_file_edits import odd_plant
 from support.pyrtc_systems import (
@@ -18,11 +17,9 @@ from support.pyrtc_systems import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.errors import MissingExtraError, ProblemError
-from lbt_synth.interop import pyrtc_commands
 from lbt_synth.interop.pyrtc import plugin
+from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
 from lbt_synth.interop.pyrtc.plugin import GainFilePredictor
-from lbt_synth.interop.pyrtc.pol_filter import InnerLoop, pol_filter
 from lbt_synth.loop.simulation.run import step_loop
 
 QUIET = 5  # frames without a signal, until the loop runs
@@ -250,44 +247,3 @@ def test_fit_identifies_the_series_and_designs_for_it(gains):
     after = run(predictor, series)
     left, gone = (np.std((series[2:] - found[:-2])[2000:]) for found in (before, after))
     assert gone < 0.3 * left
-
-
-WHITE = np.random.default_rng(0).standard_normal((3000, 2))
-SLOW = lfilter([1], [1, -0.9], WHITE, axis=0)
-
-
-def test_without_it_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(plugin, "pyrtc_version", lambda: None)
-    with pytest.raises(MissingExtraError, match=r"pip install \"lbt-synth\[pyrtc\]\"") as caught:
-        pyrtc_commands("ar_kalman", SLOW, SLOW)
-    assert caught.value.extra == "pyrtc"
-
-
-def test_a_distribution_that_is_not_there_has_no_version(monkeypatch):
-    monkeypatch.setattr(plugin, "_DISTRIBUTION", "no-such-distribution-of-lbt-synth")
-    assert plugin.pyrtc_version() is None
-    monkeypatch.setattr(plugin, "_DISTRIBUTION", "numpy")
-    assert plugin.pyrtc_version() == np.__version__
-
-
-@pytest.mark.e2e
-def test_an_ar1_process_is_predicted_by_the_square_of_its_pole():
-    pytest.importorskip("pyrtc")
-    now = SLOW[2000:]
-    assert np.array_equal(pyrtc_commands("persistence", SLOW[:2000], now), now)
-    taught = pyrtc_commands("least_squares", SLOW[:2000], now, horizon=2)
-    assert np.mean((taught - 0.81 * now)[50:] ** 2) < 0.02 * np.mean(now**2)
-    ahead = np.mean((now[52:] - taught[50:-2]) ** 2) / (1 + 0.9**2)
-    assert 0.9 < ahead < 1.1
-    # the past alone
-    other = np.vstack([now[:500], 9 * now[500:]])
-    again = pyrtc_commands("least_squares", SLOW[:2000], other, horizon=2)
-    assert np.array_equal(again[:500], taught[:500])
-
-
-@pytest.mark.e2e
-@pytest.mark.parametrize("kind", ["ar_kalman", "magic"])
-def test_what_pyrtc_refuses_is_an_error_of_ours(kind):
-    pytest.importorskip("pyrtc")
-    with pytest.raises(ProblemError, match=f"pyRTC's predictor {kind} failed"):
-        pyrtc_commands(kind, SLOW[:20], SLOW)

@@ -1,18 +1,25 @@
 """A controller in closed loop with SPECULA's optics: a small telescope, seconds per test."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.drifting import drifting
 from support.end_to_end import CONFIG, make_run
 from support.sensor_loops import sinusoid_reading
 from support.small_telescope import BRIGHT, PATH, PLANT, SETUP, SHAKE, needs_specula
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.interop.specula.simulation import AccompaniedFilter, accompany_filter
+from lbt_synth.interop.specula.simulation import (
+    AccompaniedFilter,
+    _build_vibration,
+    accompany_filter,
+    run_case,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
@@ -20,7 +27,7 @@ from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 def test_a_run_needs_a_controller_with_steps(setup):
     with pytest.raises(ProblemError, match="step"):
-        lbt.interop.run_end_to_end(setup.system, object())
+        lbt.interop.run_end_to_end(setup, object())
 
 
 @needs_specula
@@ -99,8 +106,9 @@ def test_a_controller_that_returns_something_else(cache, returned, match):
         def reset(self):
             pass
 
+    short = replace(SETUP, frames=2, settle_frames=200)
     with pytest.raises(ProblemError, match=match):
-        lbt.interop.run_end_to_end(BRIGHT, Odd(), frames=2, settle_frames=200, cache=cache)
+        lbt.interop.run_end_to_end(short, Odd(), cache=cache)
 
 
 @needs_specula
@@ -118,7 +126,7 @@ def test_phase_screens_are_kept_by_their_content_and_computed_again_if_damaged(
         assert file.read_bytes() == whole
     # 1.5 and 1.5001 m have the same pixel to three decimals, which is how SPECULA names a screen
     other = replace(BRIGHT, diameter_m=1.5001)
-    lbt.interop.run_end_to_end(other, setup.controller(None), frames=2, settle_frames=200, **known)
+    replace(setup, system=other, frames=2).run(None, **known)
     assert len(list(tmp_path.glob("screens/*/*.fits"))) == 2
 
 
@@ -319,3 +327,44 @@ def test_with_accelerometers_a_dim_star_leaves_less_as_predicted(shaking, cache)
     for name, value in found.items():
         assert value == pytest.approx(expected[name], rel=0.1)
     assert found["all"] < 0.7 * found["alone"]
+
+
+def test_a_case_holds_all_that_decides_and_fits_into_json(setup):
+    design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
+    shake = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100)
+    case = setup.case(design.controller, vibrations=[shake], seed=3)
+    assert json.loads(json.dumps(case)) is not None
+    for other in (
+        setup.case(None, vibrations=[shake], seed=3),
+        setup.case(design.controller, seed=3),
+        setup.case(design.controller, vibrations=[shake], seed=4),
+        replace(setup, gain=0.4).case(design.controller, vibrations=[shake], seed=3),
+        replace(setup, system=replace(setup.system, photons=51.0)).case(
+            design.controller,
+            vibrations=[shake],
+            seed=3,
+        ),
+    ):
+        assert json.dumps(other) != json.dumps(case)
+
+
+@needs_specula
+def test_a_case_is_its_run(cache):
+    setup = replace(SETUP, frames=60, settle_frames=200, vibrations=(SHAKE,), seed=5)
+    design = lbt.kalman(PLANT)
+    direct = setup.run(design, cache=cache)
+    case = json.loads(json.dumps(setup.case(design.controller, vibrations=(SHAKE,), seed=5)))
+    result = run_case(case, cache=cache)
+    assert result["strehl"] == direct.strehl
+    assert result["tip_rms_nm"] == float(direct.rms_nm[0])
+    shake = lbt.Vibration(frequency_hz=30, damping=0.05, rms_nm=10.0)
+    case = json.loads(json.dumps(setup.case(None, vibrations=[shake], seed=5)))
+    run = replace(setup, vibrations=(shake,)).run(None, cache=cache)
+    assert run_case(case, cache=cache)["tip_rms_nm"] == float(run.rms_nm[0])
+
+
+def test_a_case_keeps_a_drifting_vibration():
+    setup = lbt.load_config(CONFIG).end_to_end
+    line = drifting(direction=(1, 0), damping=0.01)
+    case = json.loads(json.dumps(setup.case(None, vibrations=[line])))
+    assert _build_vibration(case["vibrations"][0]) == line
