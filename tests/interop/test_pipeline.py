@@ -1,5 +1,6 @@
 """The targets of an export."""
 
+import hashlib
 import json
 from dataclasses import astuple, replace
 from fractions import Fraction
@@ -116,14 +117,26 @@ def test_what_no_format_takes(tmp_path, designs, file):
 
 
 @pytest.mark.usefixtures("short_rehearsal")
-def test_exports_to_two_targets_keep_their_certificates(tmp_path, designs):
-    lbt.interop.export(tmp_path / "k.c", designs["integrator"], "c")
-    lbt.interop.export(tmp_path / "k.npy", designs["integrator"], "dao")
-    found = {path.name: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
-    assert {name: read["target"] for name, read in found.items()} == {
-        "k.c.certificate.json": "c",
-        "k.npy.certificate.json": "dao",
-    }
+@pytest.mark.parametrize("name", target_names())
+def test_the_same_design_gives_the_same_files_and_a_certificate_of_them(tmp_path, designs, name):
+    own, seen = lbt.interop.target_named(name), []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        folder.mkdir()
+        written = lbt.interop.export(
+            own.path_in(folder), designs["hinf"], name, gain_digest="ab" * 32
+        )
+        *files, certificate = written.files
+        seen.append([path.read_bytes() for path in files])
+        beside = json.loads(certificate.read_text())
+        assert (beside["target"], beside["gain_sha256"]) == (name, "ab" * 32)
+        digests = {beside["file"]: beside["file_sha256"], **beside.get("others_sha256", {})}
+        found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+        assert digests == found
+        assert [check["name"] for check in beside["checks"]] == [c.name for c in written.checks]
+        assert all(check["passed"] for check in beside["checks"])
+        assert beside["arithmetic"]["program"] == own.arithmetic.program
+        assert 0 <= written.error < 1e-3
+    assert seen[0] == seen[1]
 
 
 @pytest.mark.usefixtures("short_rehearsal")

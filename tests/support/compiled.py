@@ -63,6 +63,7 @@ class Compiled:
         self.numbers = header_numbers(source, self.name)
         size = self.numbers["STATES"] + self.numbers["COMMANDS"]
         self.masked = "SENSORS" in self.numbers
+        self.estimator = "*applied" in source.with_suffix(".h").read_text()
         if self.masked:  # a flag and a phase
             size += 8 // self.real().nbytes
         self.state = np.full(size, 7.0, dtype=self.real)  # what was in the memory before
@@ -82,7 +83,11 @@ class Compiled:
         getattr(self.library, f"{self.name}_phase")(at, ctypes.c_ulong(frames))
 
     def step(self, y, *given):
-        """Take measurements, what is new of them and applied commands; return the commands."""
+        """Take measurements, what is new of them and applied commands; return the commands.
+
+        By default its own commands were applied.
+        """
+        given = given or ([self.u] if self.estimator else [])
         arrays = [np.array(y, dtype=self.real)]
         assert arrays[0].shape == (self.numbers["MEASUREMENTS"],)
         kinds = [np.uint8] * self.masked + [self.real]

@@ -86,14 +86,59 @@ def test_the_rehearsal_is_the_arithmetic_of_the_source(exported, designs, name, 
         assert np.array_equal(ours.step(y), theirs.step(y))
 
 
-@pytest.mark.parametrize("precision", LIMITS)
-def test_the_compiled_integrator_on_given_measurements(exported, designs, precision):
-    written = exported("integrator", precision)
-    theirs = Compiled(written.files[0], single=precision == "single")
-    ours = designs["integrator"].controller.start()
-    series = np.random.default_rng(1).standard_normal((FRAMES, 2))
-    found = [theirs.step(y) for y in series]
-    assert relative(found, np.array([ours.step(y) for y in series])) < LIMITS[precision]
+FORMS = [{"form": form, "precision": p} for form in ("plain", "estimator") for p in LIMITS]
+
+
+@pytest.mark.parametrize("options", FORMS, ids=lambda options: "-".join(options.values()))
+@pytest.mark.parametrize("name", ["kalman", "turned"])
+def test_what_is_not_finite_holds_command_and_state(tmp_path, designs, name, options):
+    """In arrays of their own, and where commands share one with the measurements."""
+    source = lbt.interop.export(tmp_path / "ctl.c", designs[name], "c", **options).files[0]
+    theirs, clean = (Compiled(source, single=options["precision"] == "single") for _ in range(2))
+    before, more = np.zeros(2), options["form"] == "estimator"
+    for y in np.random.default_rng(4).standard_normal((20, 2)):
+        for bad in (np.nan, np.inf, -np.inf):
+            state = theirs.state.copy()
+            for place in range(2 + 2 * more):
+                inputs = np.ones(2 + 2 * more)
+                inputs[place] = bad
+                theirs.u[:] = 99.0
+                assert np.array_equal(theirs.step(*inputs.reshape(-1, 2)), before)
+                assert theirs.status == 1
+                assert np.array_equal(theirs.state, state)
+        given = [y, before][: 1 + more]
+        both = np.array([np.nan, 1.0], dtype=theirs.real)
+        theirs._call("step", theirs.state, *[both] * (2 + more))
+        assert np.array_equal(both, before)
+        before = clean.step(*given)
+        assert np.array_equal(theirs.step(*given), before)
+        assert theirs.status == clean.status == 0
+
+
+@pytest.mark.parametrize("name", ["kalman", "turned", "sensors"])
+def test_reset_forgets(exported, sensor_files, name):
+    files = sensor_files["double"].files if name == "sensors" else exported(name).files
+    theirs, sensors = Compiled(files[0]), name == "sensors"
+    series = np.random.default_rng(4).standard_normal((20, 6 if sensors else 2))
+    runs = []
+    for _ in range(2):
+        theirs.reset()
+        more = [[fresh_in(k, ()), y[:2]] if sensors else [] for k, y in enumerate(series)]
+        runs.append([theirs.step(y, *given) for y, given in zip(series, more, strict=True)])
+        theirs.step(series[0], *([[0, 0, 0, 0], [5.0, 5.0]] if sensors else []))
+    assert np.array_equal(*runs)
+    theirs.reset()
+    if not sensors:
+        assert np.array_equal(theirs.step([np.nan, 1.0]), [0.0, 0.0])
+
+
+def test_measurements_and_commands_in_one_array(exported, designs):
+    for name in ("kalman", "turned"):
+        theirs, ours = Compiled(exported(name).files[0]), designs[name].controller.start()
+        for y in np.random.default_rng(5).standard_normal((5, 2)):
+            both = y.copy()
+            theirs._call("step", theirs.state, both, both)
+            assert np.allclose(both, ours.step(y), rtol=1e-12, atol=1e-12)
 
 
 @st.composite
@@ -145,52 +190,6 @@ def test_two_loops_at_once_do_not_meet(exported, designs, name):
             assert np.allclose(instance.step(y), own.step(y), rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("precision", ["double", "single"])
-@pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_a_measurement_that_is_not_finite_holds_command_and_state(exported, name, precision):
-    source = exported(name, precision).files[0]
-    theirs, undisturbed = (Compiled(source, single=precision == "single") for _ in range(2))
-    before = np.zeros(2)
-    for k, y in enumerate(np.random.default_rng(4).standard_normal((20, 2))):
-        for bad in (np.nan, np.inf, -np.inf):
-            state = theirs.state.copy()
-            theirs.u[:] = 99.0
-            assert np.array_equal(theirs.step([bad, 1.0] if k % 2 else [1.0, bad]), before)
-            assert theirs.status == 1
-            assert np.array_equal(theirs.state, state)
-        before = undisturbed.step(y)
-        assert np.array_equal(theirs.step(y), before)
-        assert theirs.status == undisturbed.status == 0
-
-
-def test_a_command_is_held_where_it_shares_its_array_with_the_measurements(exported):
-    theirs = Compiled(exported("kalman").files[0])
-    last = theirs.step([1.0, -2.0])
-    both = np.array([3.0, np.nan])
-    assert theirs._call("step", theirs.state, both, both) == 1
-    assert np.array_equal(both, last)
-
-
-@pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_reset_forgets(exported, name):
-    theirs = Compiled(exported(name).files[0])
-    series = np.random.default_rng(4).standard_normal((20, 2))
-    first = [theirs.step(y) for y in series]
-    theirs.reset()
-    assert np.array_equal(theirs.step([np.nan, 1.0]), [0.0, 0.0])
-    assert np.array_equal([theirs.step(y) for y in series], first)
-
-
-def test_measurements_and_commands_in_one_array(exported, designs):
-    for name in ("kalman", "turned"):
-        theirs = Compiled(exported(name).files[0])
-        ours = designs[name].controller.start()
-        for y in np.random.default_rng(5).standard_normal((5, 2)):
-            both = y.copy()
-            theirs._call("step", theirs.state, both, both)
-            assert np.allclose(both, ours.step(y), rtol=1e-12, atol=1e-12)
-
-
 def test_coefficients_are_exact_and_explained(exported, designs):
     controller = designs["kalman"].controller
     text = exported("kalman").files[0].read_text()
@@ -232,16 +231,6 @@ def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
     assert code.isascii()
     assert code.count("*/") == code.count("/*")
     assert "main" not in code.split("*/", 1)[1]
-
-
-@pytest.mark.parametrize("precision", LIMITS)
-def test_the_same_design_is_the_same_source(tmp_path, exported, designs, precision):
-    again = lbt.interop.export(tmp_path / "ctl.c", designs["hinf"], "c", precision=precision)
-    texts = [
-        [file.read_bytes() for file in files]
-        for files in (exported("hinf", precision).files, again.files)
-    ]
-    assert texts[0] == texts[1]
 
 
 def test_a_name_of_its_own(tmp_path, designs):
@@ -294,11 +283,6 @@ def test_a_loop_that_rounding_would_break_is_refused(tmp_path, loaded):
     ):
         lbt.interop.export(tmp_path / "single.c", brink, "c", precision="single")
     assert not list(tmp_path.glob("single*"))
-
-
-def test_precision_is_one_of_two(tmp_path, designs):
-    with pytest.raises(lbt.errors.ProblemError, match="precision must be one of double, single"):
-        lbt.interop.export(tmp_path / "k.c", designs["integrator"], "c", precision="half")
 
 
 @pytest.mark.usefixtures("short_rehearsal")
@@ -485,16 +469,6 @@ def test_commands_that_are_not_finite_are_taken_for_the_last_ones(theirs, sensor
     assert np.any(theirs.u)
 
 
-def test_reset_forgets_states_and_sensors(theirs):
-    series = np.random.default_rng(4).standard_normal((9, 6))
-    runs = []
-    for _ in range(2):
-        theirs.reset()
-        runs.append([theirs.step(y, fresh_in(k, ()), y[:2]) for k, y in enumerate(series)])
-        theirs.step(series[0], [0, 0, 0, 0], [5.0, 5.0])
-    assert np.array_equal(*runs)
-
-
 def renamed(sensors_design, names):
     """The design with other names of its sensor and channels."""
     sensors = sensors_design.problem.hardware.suite.sensors
@@ -532,6 +506,7 @@ def test_what_has_no_source_is_refused(tmp_path, sensors_design):
         (sensors_design, {"form": "plain"}, ProblemError, "in estimator form alone"),
         (sensors_design, {"name": "kal-man"}, ProblemError, "prefix of the C names must"),
         (wrong, {}, CertificateError, "of a test"),
+        (sensors_design, {"precision": "half"}, ProblemError, "must be one of double, single"),
     ):
         with pytest.raises(error, match=words):
             lbt.interop.export(tmp_path / "k.c", design, "c", **options)
