@@ -8,7 +8,7 @@ import numpy as np
 from speed_export import frame
 
 import lbt_synth as lbt
-from lbt_synth.interop.c import export as c_export
+from lbt_synth.interop.c.terms import SourceTerms
 
 sys.path.insert(0, "tests")
 from support.exports import bare_design
@@ -26,7 +26,7 @@ def source(folder: Path) -> None:
         ("15 lines an axis", lbt.kalman(prior)),
     ):
         cost = lbt.interop.frame_cost(design)
-        written = lbt.interop.export_c(folder / "c.c", design, precision="single")
+        written = lbt.interop.export(folder / "c.c", design, "c", precision="single")
         print(
             f"{name}: {cost.states} states, {cost.multiplications} multiplications "
             f"({cost.dense_multiplications} dense), single precision {written.error:.1e}"
@@ -53,13 +53,13 @@ def forms() -> None:
         )
         # the loop of the design is not what is timed
         designs[f"no zeros, {n} states"] = bare_design(full)
-    chosen = c_export.has_straight_line_form
+    chosen = SourceTerms.dense
     for name, design in designs.items():
         times = []
         for written in (True, False):
-            c_export.has_straight_line_form = lambda _, w=written: w
+            SourceTerms.dense = not written
             times.append(1e9 * frame(design, single=False)["ours_s"])
-        c_export.has_straight_line_form = chosen
+        SourceTerms.dense = chosen
         print(f"{name}: written out {times[0]:.0f} ns, loops {times[1]:.0f} ns")
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth as lbt
-from lbt_synth.interop.dao.direct_form import InnerLoop, direct_form_rows
+from lbt_synth.interop.dao.export import InnerLoop, direct_form_rows
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 
 LOOPS, FRAMES, SETTLE = 20, 50_000, 5000

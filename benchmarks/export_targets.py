@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth as lbt
-from lbt_synth.interop.dao.direct_form import InnerLoop
-from lbt_synth.interop.export_checks import Exported
-from lbt_synth.interop.target import target_named, target_names
+from lbt_synth.interop import Exported
+from lbt_synth.interop.dao.export import InnerLoop
+from lbt_synth.interop.pipeline import target_named, target_names
 from lbt_synth.linear.block_filtering import filter_series
 
 Array = npt.NDArray[Any]
@@ -70,7 +70,7 @@ def designs() -> dict[str, lbt.Design]:
 
 def export(design: lbt.Design, target: str, options: dict[str, str], folder: Path) -> Exported:
     """Export a design."""
-    return target_named(target).write(target_named(target).path_in(folder), design, **options)
+    return lbt.interop.export(target_named(target).path_in(folder), design, target, **options)
 
 
 def worst_loss(design: lbt.Design, target: str, options: dict[str, str], folder: Path) -> str:

@@ -35,7 +35,8 @@ import numpy as np
 from support.pyrtc_systems import drawn, pol_series, residual_rms, running
 
 import lbt_synth as lbt
-from lbt_synth.interop.pyrtc.pol_filter import InnerLoop
+from lbt_synth.interop.pyrtc import plugin
+from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
 from lbt_synth.loop.simulation.run import step_loop
 
 FRAMES, SETTLE, QUIET = 16_000, 2000, 5
@@ -50,6 +51,19 @@ def main() -> None:
         compare_draws({Path(file).stem: lbt.load_gain(file) for file in sys.argv[2:]})
     else:
         compare_predictors()
+
+
+def predicted(kind: str, training: np.ndarray, series: np.ndarray) -> np.ndarray:
+    """Commands of a predictor of pyRTC, fitted to one pseudo-open-loop series, over another."""
+    options = {"type": kind, "horizon": 2}
+    predictor = plugin.register().make_predictor(options, training.shape[1])
+    predictor.fit(training)
+    predictor.reset()
+    commands = np.zeros(series.shape)
+    for k, measured in enumerate(series):
+        predictor.update(measured)
+        commands[k] = predictor.predict()
+    return commands
 
 
 def compare_draws(designs: dict[str, lbt.Design]) -> None:
@@ -67,7 +81,7 @@ def compare_draws(designs: dict[str, lbt.Design]) -> None:
         training = pol_series(truth, path, frames=FRAMES, seed=100 + seed)
         series = np.zeros_like(total[0])
         series[1:] = total[0, :-1] + noise[0, 1:]  # the phase of a frame is measured in the next
-        commands = lbt.interop.pyrtc_commands("least_squares", training, series)
+        commands = predicted("least_squares", training, series)
         runs.append(total - np.vstack([np.zeros((1, 2)), commands[:-1]]))
         rows.append([residual_rms(run[:, SETTLE:]) for run in runs])
         print("  ".join(f"{value:<13.2f}" for value in rows[-1]), flush=True)
@@ -82,7 +96,7 @@ def compare_arithmetic(file: str) -> None:
     for gain in (1.0, 0.7, 0.5, 0.358):
         single, double = (
             step_loop(one, gain, design.hardware, total, noise)[:, SETTLE:, :2]
-            for one in (InnerLoop(design), design.controller.start())
+            for one in (InnerLoop(pol_filter(design)), design.controller.start())
         )
         sizes = [residual_rms(series) for series in (single, double, single - double)]
         print(f"{gain:<6g}  " + "  ".join(f"{size:<10.6g}" for size in sizes), flush=True)
@@ -104,7 +118,7 @@ def compare_predictors() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, (design, kind) in names.items():
             at = Path(folder) / name.replace(" ", "_")
-            lbt.interop.export_pyrtc(at, design)
+            lbt.interop.export(at, design, "pyrtc")
             own = kind in (None, "fit")
             predictor = None if own else {"type": kind, "delay_frames": 2}
             train = None if kind is None else training
@@ -115,7 +129,7 @@ def compare_predictors() -> None:
             words = "-           -        "
             if kind is None:
                 largest = np.max(np.abs(found[..., 2:4]))
-                other = (design.controller.start(), InnerLoop(design))
+                other = (design.controller.start(), InnerLoop(pol_filter(design)))
                 runs = (step_loop(one, 1.0, path, total, noise) for one in other)
                 apart = (np.max(np.abs(run - found)[..., 2:4]) / largest for run in runs)
                 words = "   ".join(f"{value:<9.2g}" for value in apart)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.interop.c.masked_terms import masked_terms
+from lbt_synth.interop.c.terms import source_terms
 
 sys.path.insert(0, "tests")
 from support.exports import bare_design
@@ -54,7 +54,7 @@ def built(design: lbt.Design, step: str, precision: str, **options: str) -> ctyp
     """The exported source, compiled by itself and called by a driver in another file."""
     with tempfile.TemporaryDirectory() as folder:
         at = Path(folder)
-        lbt.interop.export_c(at / "ctl.c", design, precision=precision, **options)
+        lbt.interop.export(at / "ctl.c", design, "c", precision=precision, **options)
         (at / "driver.c").write_text(DRIVER)
         flags = ["-std=c99", "-O2", "-shared", "-fPIC", f"-DSTEP={step}"]
         command = ["gcc", *flags, "ctl.c", "driver.c", "-o", "ctl.so"]
@@ -66,13 +66,13 @@ def built(design: lbt.Design, step: str, precision: str, **options: str) -> ctyp
 
 def one_phase(design: lbt.design.FilterDesign) -> lbt.Design:
     """The filter of a phase in which only the fast sensors are due, as one of a single rate."""
-    terms = masked_terms(design)
+    terms = source_terms(design)
     own = terms.controller()
     whole = terms.transition[1] + own.B[1] @ terms.innovation[1]
     A, applied = np.split(whole, [len(whole)], axis=1)
     B = np.hstack([own.B[1], applied])
-    D = np.zeros((len(terms.command), B.shape[1]))
-    return bare_design(lbt.Controller(A=A, B=B, C=terms.command, D=D))
+    D = np.zeros((len(own.C[1]), B.shape[1]))
+    return bare_design(lbt.Controller(A=A, B=B, C=own.C[1], D=D))
 
 
 def main() -> None:

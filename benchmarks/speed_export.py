@@ -93,7 +93,7 @@ def frame(design: lbt.Design, *, single: bool, form: str = "plain") -> Row:
     with tempfile.TemporaryDirectory() as folder:
         at = Path(folder)
         precision = "single" if single else "double"
-        lbt.interop.export_c(at / "ctl.c", design, precision=precision, form=form)
+        lbt.interop.export(at / "ctl.c", design, "c", precision=precision, form=form)
         defined = "#define ESTIMATOR\n" if form == "estimator" else ""
         (at / "driver.c").write_text(f"#define REAL {real}\n{defined}{DRIVER}")
         subprocess.run(

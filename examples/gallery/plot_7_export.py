@@ -22,7 +22,7 @@ plant = lbt.tip_tilt_plant(
 design = lbt.kalman(plant)
 
 folder = Path(tempfile.mkdtemp())
-exported = lbt.interop.export_c(folder / "tip.c", design, precision="single")
+exported = lbt.interop.export(folder / "tip.c", design, "c", precision="single")
 print(f"the commands differ by at most {exported.error:.1e} of the largest one")
 
 # %%

@@ -173,7 +173,7 @@ def rehearse(parser: ArgumentParser) -> None:
 
 
 def _add_target(parser: ArgumentParser) -> None:
-    from lbt_synth.interop.target import target_names
+    from lbt_synth.interop.pipeline import target_names
 
     text = "the program that loads the file; without NAME, list what each computes, and end"
     add_option(

@@ -18,10 +18,9 @@ from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
-from lbt_synth.interop.specula.accompanied_filter import unread_sensors
 from lbt_synth.interop.specula.calibration import Calibration
-from lbt_synth.interop.specula.cases import summarise_run
 from lbt_synth.interop.specula.optics import specula_version
+from lbt_synth.interop.specula.simulation import unread_sensors
 from lbt_synth.report.figures.end_to_end import end_to_end_figure, end_to_end_table_figure
 from lbt_synth.report.figures.style import save_figure
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
@@ -100,7 +99,7 @@ def run(arguments: Namespace) -> Report:
         method=design.method,
         specula=version,
         milliseconds_a_frame=1e3 * loop_run.seconds / total,
-        **summarise_run(loop_run),
+        **loop_run.summary(),
     )
     report = Report()
     report.add_facts(

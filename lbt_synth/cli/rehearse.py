@@ -20,7 +20,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import require_length
 from lbt_synth.interop import Rehearsal, rehearse
-from lbt_synth.loop import Imaging, Simulation, series_strehl
+from lbt_synth.loop import Imaging, series_strehl
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
@@ -69,7 +69,7 @@ def run(arguments: Namespace) -> Report:
     imaging = series.imaging
     loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
     rows = [
-        _describe(name, one.residual_nm, one.commands, imaging, one.clipped_frames)
+        _describe(name, one.residual_nm[0], one.commands[0], imaging, found.clipped_frames(one))
         for name, one in loops.items()
     ]
     if series.ran is not None:
@@ -90,15 +90,7 @@ def run(arguments: Namespace) -> Report:
             f"note: {text}" for text in loop_differences(design.hardware, series.hardware)
         ]
     if arguments.output is not None:
-        drawn = Simulation(
-            total_nm=series.total_nm[None, found.settle_frames :],
-            residual_nm=found.target.residual_nm[None],
-            commands=found.target.commands[None],
-            measurements=np.zeros((1, len(found.differences), series.hardware.n_measurements)),
-            frame_rate_hz=series.hardware.frame_rate_hz,
-            seed=0,
-        )
-        figure = simulation_figure(drawn, title=f"{design.method} in {arguments.target}")
+        figure = simulation_figure(found.target, title=f"{design.method} in {arguments.target}")
         report.note_written(save_figure(figure, arguments.output))
     return report
 

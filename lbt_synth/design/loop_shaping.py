@@ -280,6 +280,11 @@ class ShapedDesign(Design):
         return max(loop.controller.n_states for loop in self._loops)
 
     @property
+    def mode_specifications(self) -> tuple[Specification, ...]:
+        """Specification of each mode."""
+        return self.specifications
+
+    @property
     def first_equal_modes(self) -> list[int]:
         """First mode of the same specification, parameter and objective, for each mode."""
         keys = [

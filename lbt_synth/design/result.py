@@ -29,7 +29,7 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
-    from lbt_synth.design.shaping import VibrationBand
+    from lbt_synth.design.shaping import Specification, VibrationBand
 
 LIMIT_HEADING = "least residual of any linear controller in it"  # below the residual
 _WHAT = (
@@ -211,6 +211,22 @@ class Design(Summarised, ABC):
     def vibration_bands(self) -> tuple[VibrationBand, ...]:
         """Bands in which the design expects a vibration anywhere."""
         return ()
+
+    @property
+    def mode_specifications(self) -> tuple[Specification, ...]:
+        """What each mode was shaped for; empty for a design that was not shaped."""
+        return ()
+
+    @property
+    def first_equal_modes(self) -> list[int]:
+        """For each mode that was shaped, the first one that is equal to it."""
+        return []
+
+    @property
+    def model(self) -> TipTiltPlant | None:
+        """Plant whose disturbances the design estimates; None where it estimates none."""
+        named = isinstance(self.problem, TipTiltPlant)
+        return self.problem if self.is_estimator and named else None
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...] | None:
         """Return the demands on the design that a controller violates; None if it has none."""

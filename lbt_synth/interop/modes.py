@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from lbt_synth.design import Check, Design, IntegratorLaw, integrator
+from lbt_synth.design import Design, IntegratorLaw, integrator
 from lbt_synth.design.modal import MixedController, ModalFilters
-from lbt_synth.design.modal.per_mode import name_modes
-from lbt_synth.errors import ProblemError
-from lbt_synth.interop.export_checks import require_exportable, require_modal
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import integer, number
+from lbt_synth.validation import integer, number, require_instance
 
 ModalDesign: TypeAlias = Design | MixedController | ModalFilters
 
@@ -32,97 +29,123 @@ class ModeDesign(NamedTuple):
         return [(mode,) for mode in self.modes] if single else [self.modes]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AllModes:
-    """The designs of a file, its modes, and how many of them come first and have a design."""
+def require_exportable(design: Design, *, reads_others: bool = False) -> None:
+    """Refuse a design that is not certified, or that reads sensors which a target does not know."""
+    require_instance(design, Design)
+    if not design.certificate.passed:
+        failed = tuple(check.name for check in design.certificate.checks if not check.passed)
+        raise CertificateError(
+            f"only a certified design is exported; this one failed: {'; '.join(failed)}.",
+            failed=failed,
+        )
+    if design.other_sensors and not reads_others:
+        raise ProblemError(
+            f"this design reads {', '.join(design.other_sensors)} beside the loop's own sensor, "
+            "each when it is due; what this target loads has one matrix, for a loop of one sensor. "
+            "Export it to C."
+        )
 
-    parts: list[ModeDesign]
-    own: int
-    count: int
 
-    def name_checks(self, part: ModeDesign, checks: Iterable[Check]) -> list[Check]:
-        """Return checks of a part, named after its modes where there are others."""
-        if len(part.modes) == self.own:
-            return list(checks)
-        modes = name_modes(np.array(part.modes))
-        return [replace(check, name=f"{check.name} ({modes})") for check in checks]
+def require_modal(design: Design) -> int:
+    """Return the number of modes of a design whose measurements and commands are its modes."""
+    hardware = require_hardware(design, "an export of modes")
+    identity = np.eye(hardware.modes)
+    for name in ("sensor", "influence"):
+        if not np.array_equal(getattr(hardware, name), identity):
+            raise ProblemError(
+                f"{name}_matrix must be the identity: the RTC reconstructs modes and projects them "
+                "on actuators itself. Design for the modes."
+            )
+    return hardware.modes
 
 
-def all_modes(
+def mode_designs(
     design: ModalDesign,
-    file: str,
+    target: str,
     *,
     modes: int | None,
     other_gain: float | None,
     hardware: LoopHardware | None,
-    modal: bool = True,
-) -> AllModes:
-    """Return the designs of a file, each certified; ``modal`` requires one of modes."""
-    if hardware is not None and design.hardware is not None:
-        raise ProblemError("hardware must be left out where a design has a loop; got both.")
+    modal: bool,
+    mixed: bool,
+    reads_others: bool,
+) -> tuple[list[ModeDesign], int]:
+    """Return the designs of a file, each certified, and the number of its modes.
+
+    ``modal`` requires those of modes, ``mixed`` allows several.
+    """
     if isinstance(design, ModalFilters):
         design = design.start()
+    if hardware is not None and getattr(design, "hardware", None) is not None:
+        raise ProblemError("hardware must be left out where a design has a loop; got both.")
     if isinstance(design, MixedController):
+        if not mixed:
+            raise ProblemError(
+                f"target {target} holds one design, for the first modes, and at most one gain for "
+                f"all others; got {type(design).__name__}. Give a design."
+            )
         if other_gain is not None:
             raise ProblemError("other_gain goes with a design; here each mode has its own gain.")
-        parts, own = _mode_designs(design, file, hardware), design.n_modes
+        parts, controlled = _mode_designs(design, hardware), design.n_modes
         if not parts:
             raise ProblemError("at least one mode must have a gain above 0; all are 0.")
         for part in parts:
             require_exportable(part.design)
     else:
-        require_exportable(design)
+        require_exportable(design, reads_others=reads_others)
+        if design.other_sensors and (modes is not None or other_gain is not None):
+            raise ProblemError(
+                "modes and other_gain go with a design of one sensor; got one of several. Leave "
+                "them out."
+            )
         modal = modal or other_gain is not None
-        own = require_modal(design, file) if modal else len(design.controller.C)
-        parts = [ModeDesign(design, tuple(range(own)))]
-    count = own if modes is None else integer(modes, "modes", at_least=1)
-    if count < own:
-        raise ProblemError(f"modes must be at least {own}, those of the design; got {count}.")
+        controlled = require_modal(design) if modal else len(design.controller.C)
+        parts = [ModeDesign(design, tuple(range(controlled)))]
+    count = controlled if modes is None else integer(modes, "modes", at_least=1)
+    if count < controlled:
+        raise ProblemError(
+            f"modes must be at least {controlled}, those of the design; got {count}."
+        )
     if other_gain is not None:
         if modes is None:
             raise ProblemError("other_gain needs the number of modes of the RTC: give modes.")
-        if count == own:
+        if count == controlled:
             raise ProblemError(
-                f"other_gain must be left out: the design has all {own} modes. Or give modes, the "
-                "number of those of the RTC."
+                f"other_gain must be left out: the design has all {controlled} modes. Or give "
+                "modes, the number of those of the RTC."
             )
-        loop = parts[0].design.hardware
-        assert loop is not None  # require_modal refuses a design without a loop
-        others = integrator(loop.single_mode(), gain=number(other_gain, "other_gain", above=0))
-        parts.append(ModeDesign(others, tuple(range(own, count))))
-        own = count
-    return AllModes(parts=parts, own=own, count=count)
+        single = require_hardware(parts[0].design, "an export of modes").single_mode()
+        others = integrator(single, gain=number(other_gain, "other_gain", above=0))
+        parts.append(ModeDesign(others, tuple(range(controlled, count))))
+    return parts, count
 
 
-def _mode_designs(
-    control: MixedController, file: str, hardware: LoopHardware | None
-) -> list[ModeDesign]:
+def _mode_designs(control: MixedController, hardware: LoopHardware | None) -> list[ModeDesign]:
     """Return the design of each mode; modes that get no command have none."""
     if control.reconstructor is not None:
         raise ProblemError("the RTC reconstructs modes itself; got a reconstructor.")
     loop = control.hardware or hardware
     if loop is None:
         raise ProblemError("hardware must be given where no filter has a loop; got None.")
-    if control.filter is None:
-        found = []
-    elif isinstance(control.filter, ModalFilters):
+    designs: list[ModeDesign] = []
+    if isinstance(control.filter, ModalFilters):
         filtered, which = np.array(control.filtered), control.filter.which
-        found = [
+        designs += [
             ModeDesign(design, tuple(filtered[which == i].tolist()))
             for i, design in enumerate(control.filter.designs)
         ]
     elif isinstance(control.filter, Design):
-        require_modal(control.filter, file)
-        found = [ModeDesign(control.filter, tuple(control.filtered))]
-    else:
+        require_modal(control.filter)
+        designs.append(ModeDesign(control.filter, tuple(control.filtered)))
+    elif control.filter is not None:
         kind = type(control.filter).__name__
         raise ProblemError(f"the filter must be a certified design or ModalFilters; got {kind}.")
     laws: dict[tuple[float, float], list[int]] = {}
-    for mode in np.setdiff1d(np.arange(control.n_modes), control.filtered):
+    for mode in np.setdiff1d(np.arange(control.n_modes), control.filtered).tolist():
         laws.setdefault((float(control.gains[mode]), float(control.leak[mode])), []).append(mode)
     single = loop.single_mode()
     for (gain, leak), modes in laws.items():
         if gain > 0:
-            design = integrator(single, gain=gain, law=IntegratorLaw(leak=leak))
-            found.append(ModeDesign(design, tuple(int(mode) for mode in modes)))
-    return found
+            law = integrator(single, gain=gain, law=IntegratorLaw(leak=leak))
+            designs.append(ModeDesign(law, tuple(modes)))
+    return designs

@@ -12,49 +12,47 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import Check, Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.interop.export_checks import Exported
-from lbt_synth.interop.target import target_named
+from lbt_synth.interop.pipeline import export, target_named
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import close_loop
-from lbt_synth.loop.simulation.run import settling_frames, step_loop
+from lbt_synth.loop.simulation.run import Simulation, record_run, settling_frames, step_loop
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, float_array, frozen_copy, number
+from lbt_synth.validation import FloatArray, float_array, number
 
 _MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RehearsedLoop:
-    """Series of one of the loops, after both have settled."""
-
-    residual_nm: FloatArray  # (frames, n): residual, less noise that was given apart [nm]
-    commands: FloatArray  # (frames, m): commands that the mirror got
-    clipped_frames: int  # frames in which a command reached the limit
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rehearsal:
-    """A target and the design itself on the same series.
+    """A target and the design itself on the same series, after both loops have settled.
 
     Attributes
     ----------
-    target, design : RehearsedLoop
-        In the arithmetic of the target, and in double precision.
+    target, design : Simulation
+        In the arithmetic of the target, and in double precision; of one case each. The residual is
+        less noise that was given apart, and commands are those that the mirror got.
     settle_frames : int
         Frames at the beginning that are left out.
+    stroke : float
+        Largest modulus of a command; infinite without a limit.
     checks : tuple of Check
         The proof of what the target runs, as in its certificate.
     """
 
-    target: RehearsedLoop
-    design: RehearsedLoop
+    target: Simulation
+    design: Simulation
     settle_frames: int
+    stroke: float
     checks: tuple[Check, ...]
 
     @property
     def differences(self) -> FloatArray:
         """Commands of the target less those of the design, (frames, m)."""
-        return np.asarray(self.target.commands - self.design.commands)
+        return np.asarray(self.target.commands[0] - self.design.commands[0])
+
+    def clipped_frames(self, run: Simulation) -> int:
+        """Return the frames of a run in which a command reached the stroke."""
+        return int(np.sum(np.any(np.abs(run.commands[0]) >= self.stroke, axis=1)))
 
 
 def rehearse(
@@ -132,7 +130,8 @@ def rehearse(
     loop = close_loop(path, controller, sensor_gain=gain)
     loop.require_stable()
     settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * len(total)))
-    exported = _exported(design, target)
+    with TemporaryDirectory() as folder:
+        exported = export(target_named(target).path_in(Path(folder)), design, target)
     runs = []
     for running in (exported.start(limit), controller.start()):
         try:
@@ -143,26 +142,11 @@ def rehearse(
                 f"in the arithmetic of {target} the loop grows beyond all numbers: {error}",
                 status="arithmetic",
             ) from error
-        n, m = path.modes, path.n_commands
-        out = out[0, settle:]
-        commands = frozen_copy(out[:, n : n + m])
-        runs.append(
-            RehearsedLoop(
-                residual_nm=frozen_copy(out[:, :n]),
-                commands=commands,
-                clipped_frames=int(np.sum(np.any(np.abs(commands) >= limit, axis=1))),
-            )
-        )
+        runs.append(record_run(total[None], out, path, settle=settle, seed=0))
     return Rehearsal(
         target=runs[0],
         design=runs[1],
         settle_frames=settle,
+        stroke=limit,
         checks=exported.checks,
     )
-
-
-def _exported(design: Design, target: str) -> Exported:
-    """Export a design, and keep what was proved of it rather than the files."""
-    writer = target_named(target)
-    with TemporaryDirectory() as folder:
-        return writer.write(writer.path_in(Path(folder)), design)

@@ -4,8 +4,7 @@ import pytest
 from support.exports import lbt_config, lbt_designs
 
 import lbt_synth as lbt
-from lbt_synth.interop import export_checks
-from lbt_synth.interop.c import masked_terms
+from lbt_synth.interop import pipeline
 
 
 @pytest.fixture
@@ -21,11 +20,10 @@ def designs():
 @pytest.fixture
 def short_rehearsal(monkeypatch):
     """Rehearse few frames, in tests that do not look at what is found there."""
-    for module in (export_checks, masked_terms):
-        monkeypatch.setattr(module, "FRAMES", 100)
-    export_checks._own_commands.cache_clear()
+    monkeypatch.setattr(pipeline, "FRAMES", 100)
+    pipeline._own_commands.cache_clear()
     yield
-    export_checks._own_commands.cache_clear()
+    pipeline._own_commands.cache_clear()
 
 
 @pytest.fixture(scope="session")

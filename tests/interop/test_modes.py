@@ -1,6 +1,7 @@
 """Matrices of all modes: a design with integrators, filters for each mode."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def response(column, z):
 def steps(control, columns, frames=40):
     """Commands of a controller and of the matrix, run beside each other on white measurements."""
     rng = np.random.default_rng(0)
-    twin = lbt.interop.dao.direct_form.InnerLoop(columns)
+    twin = lbt.interop.dao.export.InnerLoop(columns)
     series = rng.standard_normal((frames, columns.shape[1]))
     return np.array([control.step(y) for y in series]), np.array([twin.step(y) for y in series])
 
@@ -33,7 +34,7 @@ def steps(control, columns, frames=40):
 def test_a_design_and_integrators_make_one_matrix(tmp_path, designs):
     gains = [0.0, 0.0, 0.5, 0.3, 0.0, 0.5]
     control = MixedController(filter=designs["integrator"], gains=gains, leak=0.99)
-    written = lbt.interop.export_dao(tmp_path / "k.npy", control, order=4)
+    written = lbt.interop.export(tmp_path / "k.npy", control, "dao", order=4)
     matrix = np.load(written.files[0])
     assert matrix.shape == (9, 6)
     own, found = steps(control, matrix)
@@ -49,23 +50,23 @@ def test_filters_of_all_modes_make_one_matrix(tmp_path):
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=50, direction=(1.0,))
     models = {"noise_nm": [5.0, 6.0, 7.0], "vibrations": {1: [line]}, "sensor_gain": 0.8}
     filters = modal_filters([AIR] * 3, **models)
-    matrix = np.load(lbt.interop.export_dao(tmp_path / "k.npy", filters).files[0])
+    matrix = np.load(lbt.interop.export(tmp_path / "k.npy", filters, "dao").files[0])
     z = np.exp(2j * np.pi * np.linspace(0.01, 0.49, 20))
     for mode in range(3):
         system = filters.design(mode).controller.to_statespace()
         expected = system.frequency_response(np.angle(z) / (2 * np.pi) * 800)[:, 0, 0]
         assert relative(response(matrix[:, mode].astype(float), z), expected) < 1e-4
     mixed = MixedController(filter=filters, gains=[0.4] * 5, filtered=[1, 2, 4])
-    both = np.load(lbt.interop.export_dao(tmp_path / "both.npy", mixed).files[0])
+    both = np.load(lbt.interop.export(tmp_path / "both.npy", mixed, "dao").files[0])
     assert np.array_equal(both[:, [1, 2, 4]], matrix)
     assert both[[0, 21]][:, [0, 3]].tolist() == np.float32([[0.4, 0.4], [1, 1]]).tolist()
 
 
 def test_an_integrator_for_each_further_mode(tmp_path, designs):
     target = tmp_path / "k.npy"
-    lbt.interop.export_dao(target, designs["kalman"], modes=4, other_gain=0.25)
+    lbt.interop.export(target, designs["kalman"], "dao", modes=4, other_gain=0.25)
     matrix = np.load(target)
-    plain = np.load(lbt.interop.export_dao(target, designs["kalman"], modes=2).files[0])
+    plain = np.load(lbt.interop.export(target, designs["kalman"], "dao", modes=2).files[0])
     assert np.array_equal(matrix[:, :2], plain)
     assert matrix[:, 2].tolist() == [0.25, *[0.0] * 20, 1.0, *[0.0] * 19]
 
@@ -84,7 +85,7 @@ def loop_commands(run, hardware, seed=4, frames=600):
 
 def test_cacao_holds_all_modes_in_one_matrix(tmp_path, designs):
     control = MixedController(filter=designs["hinf"], gains=GAINS)
-    written = lbt.interop.export_cacao(tmp_path / "pf.fits", control)
+    written = lbt.interop.export(tmp_path / "pf.fits", control, "cacao")
     matrix = fits.getdata(written.files[0])
     steps = matrix.shape[1] // 6
     assert matrix.shape == (6, 6 * steps)
@@ -93,7 +94,7 @@ def test_cacao_holds_all_modes_in_one_matrix(tmp_path, designs):
     assert np.array_equal(cube[2, :, 2], cube[5, :, 5])
     for i, j in ((0, 2), (2, 0), (2, 3), (5, 2)):
         assert not cube[i, :, j].any()
-    alone = lbt.interop.export_cacao(tmp_path / "own.fits", designs["hinf"], steps=steps)
+    alone = lbt.interop.export(tmp_path / "own.fits", designs["hinf"], "cacao", steps=steps)
     assert np.array_equal(fits.getdata(alone.files[0]).reshape(2, steps, 2), cube[:2, :, :2])
     own = loop_commands(control, designs["hinf"].hardware)
     assert relative(loop_commands(written.start(np.inf), designs["hinf"].hardware), own) < 1e-3
@@ -108,7 +109,7 @@ def test_c_source_holds_all_modes(tmp_path, designs, form, precision):
     """Compiled, in a loop; in estimator form the commands that it gave were applied."""
     control = MixedController(filter=designs["kalman"], gains=GAINS, leak=0.99)
     options = {"form": form, "precision": precision, "modes": 6}
-    written = lbt.interop.export_c(tmp_path / "ctl.c", control, **options)
+    written = lbt.interop.export(tmp_path / "ctl.c", control, "c", **options)
     theirs = Compiled(written.files[0], single=precision == "single")
     hardware = designs["kalman"].hardware
     own = loop_commands(control, hardware)
@@ -129,7 +130,7 @@ def test_c_source_holds_all_modes(tmp_path, designs, form, precision):
 
 def test_the_source_of_many_modes_proves_equal_ones_once(tmp_path, designs):
     options = {"modes": 120, "other_gain": 0.4, "form": "estimator"}
-    written = lbt.interop.export_c(tmp_path / "ctl.c", designs["kalman"], **options)
+    written = lbt.interop.export(tmp_path / "ctl.c", designs["kalman"], "c", **options)
     names = [check.name for check in written.checks if "spectral radius at" in check.name]
     assert len(names) == 2
     theirs = Compiled(written.files[0], single=False)
@@ -138,52 +139,50 @@ def test_the_source_of_many_modes_proves_equal_ones_once(tmp_path, designs):
 
 def test_a_damaged_copy_of_a_mode_is_found(tmp_path, designs, monkeypatch):
     """The proof reads each copy from the text of the source."""
-    from lbt_synth.interop.c import export as c_export
+    own = lbt.interop.target_named("c")
 
-    own = c_export.read_source
+    def damaged(files, like):
+        terms = own.read(files, like)
+        terms.gains[frozenset()][0, -1, -1] = 2.5  # of the last integrator
+        return terms
 
-    def damaged(*texts):
-        states, commands = own(*texts)
-        states[-1, -1] = 2.5  # the gain of the last integrator
-        return states, commands
-
-    monkeypatch.setattr(c_export, "read_source", damaged)
+    monkeypatch.setattr("lbt_synth.interop.c.export.TARGET", replace(own, read=damaged))
     with pytest.raises(
         lbt.errors.NumericalError, match=r"spectral radius .* \(modes 2, 3 and 4\) is"
     ):
-        lbt.interop.export_c(tmp_path / "k.c", designs["kalman"], modes=5, other_gain=0.4)
+        lbt.interop.export(tmp_path / "k.c", designs["kalman"], "c", modes=5, other_gain=0.4)
     assert not list(tmp_path.iterdir())
 
 
 def test_pyrtc_gets_the_gain_of_all_others_and_its_proof(tmp_path, designs):
     options = {"modes": 5, "other_gain": 0.4}
-    written = lbt.interop.export_pyrtc(tmp_path / "k", designs["hinf"], **options)
+    written = lbt.interop.export(tmp_path / "k", designs["hinf"], "pyrtc", **options)
     text = written.files[0].read_text()
     assert "other_gain: 0.4 " in text
     assert "num_modes: 5" in text
     names = [check.name for check in written.checks]
     assert any("spectral radius" in name and name.endswith("(modes 2, 3 and 4)") for name in names)
     with pytest.raises(lbt.errors.LbtSynthError, match="closed loop|stable"):
-        lbt.interop.export_pyrtc(tmp_path / "no", designs["hinf"], modes=9, other_gain=1.4)
+        lbt.interop.export(tmp_path / "no", designs["hinf"], "pyrtc", modes=9, other_gain=1.4)
     control = MixedController(filter=designs["hinf"], gains=GAINS)
-    with pytest.raises(lbt.errors.ProblemError, match="one gain file, for the first modes"):
-        lbt.interop.export_pyrtc(tmp_path / "no", control)
+    with pytest.raises(lbt.errors.ProblemError, match="one design, for the first modes"):
+        lbt.interop.export(tmp_path / "no", control, "pyrtc")
     assert not (tmp_path / "no").exists()
 
 
 def test_integrators_alone_need_a_loop(tmp_path):
     control = MixedController(gains=[0.5, 0.3])
     with pytest.raises(lbt.errors.ProblemError, match="hardware must be given"):
-        lbt.interop.export_dao(tmp_path / "k.npy", control)
+        lbt.interop.export(tmp_path / "k.npy", control, "dao")
     loop = lbt.LoopHardware(frame_rate_hz=500)
-    written = lbt.interop.export_dao(tmp_path / "k.npy", control, hardware=loop, order=1)
+    written = lbt.interop.export(tmp_path / "k.npy", control, "dao", hardware=loop, order=1)
     assert np.load(written.files[0])[0].tolist() == np.float32([0.5, 0.3]).tolist()
 
 
 def test_what_makes_no_matrix_is_refused(tmp_path, designs):
     def refused(control, match, **options):
         with pytest.raises(lbt.errors.LbtSynthError, match=match):
-            lbt.interop.export_dao(tmp_path / "k.npy", control, **options)
+            lbt.interop.export(tmp_path / "k.npy", control, "dao", **options)
 
     loop = {"hardware": lbt.LoopHardware(frame_rate_hz=500)}
     refused(MixedController(gains=[0.0, 0.0]), "at least one mode must have a gain", **loop)

@@ -8,8 +8,8 @@ import pytest
 from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
-from lbt_synth.interop.cacao.truncation import predictive_filter
-from lbt_synth.interop.target import target_named, target_names
+from lbt_synth.interop.cacao.export import predictive_filter
+from lbt_synth.interop.pipeline import target_named, target_names
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop.simulation.run import step_loop
 
@@ -29,15 +29,15 @@ def test_each_target_runs_beside_the_design(slow, name):
     run = lbt.interop.rehearse(slow, name, PHASE, noise=noise, sensor_gain=0.8)
     loop = lbt.close_loop(PATH, slow, sensor_gain=0.8)
     exact = filter_series(loop.system, np.hstack([PHASE, noise]))[run.settle_frames :]
-    assert np.allclose(run.design.residual_nm, exact[:, :2], atol=1e-9)
-    assert np.allclose(run.design.commands, exact[:, 2:4], atol=1e-9)
+    assert np.allclose(run.design.residual_nm[0], exact[:, :2], atol=1e-9)
+    assert np.allclose(run.design.commands[0], exact[:, 2:4], atol=1e-9)
     assert run.checks[0].name.startswith("spectral radius at sensor gains")
     assert all(check.passed for check in run.checks)
     single = name in ("cacao", "dao", "pyrtc")
     largest = np.max(np.abs(run.differences))
     assert (largest > 1e-9) == single
     assert largest < (0.01 if name != "cacao" else 1.0) * np.max(np.abs(PHASE))
-    assert run.target.clipped_frames == run.design.clipped_frames == 0
+    assert run.clipped_frames(run.target) == run.clipped_frames(run.design) == 0
 
 
 @pytest.mark.parametrize("name", ["cacao", "dao", "pyrtc"])
@@ -48,9 +48,9 @@ def test_a_target_that_knows_its_limit_comes_back(slow, name):
     run = lbt.interop.rehearse(slow, name, phase, stroke=50.0)
     start = run.settle_frames
     assert np.max(np.abs(run.target.commands)) == 50
-    assert 0 < run.target.clipped_frames <= 300
-    assert run.design.clipped_frames > 500  # the plain form winds up
-    back = run.target.residual_nm[600 - start :]
+    assert 0 < run.clipped_frames(run.target) <= 300
+    assert run.clipped_frames(run.design) > 500  # the plain form winds up
+    back = run.target.residual_nm[0, 600 - start :]
     assert np.max(np.abs(back[40:])) < 0.5
 
 
@@ -67,28 +67,24 @@ def quick():
 @pytest.mark.parametrize("name", target_names())
 def test_what_runs_is_what_is_exported(tmp_path, quick, name):
     target, total = target_named(name), PHASE[:600, :1]
-    written = target.write(target.path_in(tmp_path), quick)
+    written = lbt.interop.export(target.path_in(tmp_path), quick, name)
     rest = np.zeros((1, *total.shape))
     alone = step_loop(written.start(60.0), 1.0, quick.hardware, total[None], rest, stroke=60.0)[0]
     run = lbt.interop.rehearse(quick, name, total, stroke=60.0)
-    assert np.array_equal(run.target.commands, alone[run.settle_frames :, 1:2])
+    assert np.array_equal(run.target.commands[0], alone[run.settle_frames :, 1:2])
     assert [check.value for check in run.checks] == [check.value for check in written.checks]
     if name == "cacao":
         steps = json.loads(written.files[1].read_text())["steps"]
-        assert steps == predictive_filter(quick, quick.hardware).fewest_steps(0.01)
+        assert steps == predictive_filter(quick).fewest_steps(0.01)
 
 
 def test_a_loop_that_the_target_makes_unstable_is_named(tmp_path, slow, monkeypatch):
     wrong = lbt.Controller(
         A=np.eye(2), B=-0.4 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=PATH.dt_s
     )
-    found = target_named("c").write(tmp_path / "k.c", slow)
-    target = lbt.interop.Target(
-        arithmetic=target_named("c").arithmetic,
-        file="",
-        write=lambda *_: replace(found, start=lambda _: wrong.start()),
-    )
-    monkeypatch.setattr("lbt_synth.interop.c.export.TARGET", target)
+    found = lbt.interop.export(tmp_path / "k.c", slow, "c")
+    broken = replace(found, start=lambda _: wrong.start())
+    monkeypatch.setattr("lbt_synth.interop.rehearsal.export", lambda *_: broken)
     with pytest.raises(lbt.errors.NumericalError, match="of c the loop grows beyond all numbers"):
         lbt.interop.rehearse(slow, "c", np.vstack([PHASE] * 3))
 

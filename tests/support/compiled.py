@@ -49,50 +49,25 @@ def header_numbers(source, name):
     return {key: int(value) for key, value in found}
 
 
-class CompiledFilter:
-    """An exported filter of several sensors: its functions, its own state."""
-
-    def __init__(self, source, *, single=False):
-        self.name, self.library = source.stem, build(source)
-        self.real = np.float32 if single else np.float64
-        self.numbers = header_numbers(source, self.name)
-        reals = self.numbers["STATES"] + self.numbers["COMMANDS"]
-        self.state = np.full(reals * self.real().nbytes + 8, 7, dtype=np.uint8)  # memory as it was
-        self.u = np.zeros(self.numbers["COMMANDS"], dtype=self.real)
-        self.reset()
-
-    def reset(self):
-        getattr(self.library, f"{self.name}_reset")(ctypes.c_void_p(self.state.ctypes.data))
-
-    def phase(self, frames):
-        at = ctypes.c_void_p(self.state.ctypes.data)
-        getattr(self.library, f"{self.name}_phase")(at, ctypes.c_ulong(frames))
-
-    def step(self, y, fresh, applied):
-        """Take readings, what is new of them and applied commands; return the commands."""
-        arrays = [np.array(y, dtype=self.real), np.array(fresh, dtype=np.uint8)]
-        arrays += [np.array(applied, dtype=self.real), self.u]
-        sizes = [self.numbers[key] for key in ("MEASUREMENTS", "SENSORS", "COMMANDS", "COMMANDS")]
-        assert [array.size for array in arrays] == sizes
-        step = getattr(self.library, f"{self.name}_step")
-        self.status = step(*(ctypes.c_void_p(a.ctypes.data) for a in (self.state, *arrays)))
-        return self.u.astype(np.float64)
-
-
 class Compiled:
-    """One instance of an exported controller: ``step`` and ``reset``, its own state."""
+    """One instance of an exported controller: its functions, its own state.
+
+    One of several sensors is stepped with what is new and the applied commands, one in estimator
+    form with the applied commands.
+    """
 
     def __init__(self, source, *, name=None, single=False, library=None):
         self.name = name or source.stem
         self.real = np.float32 if single else np.float64
-        if library is None:
-            library = build(source)
-        self.library = library
-        sizes = header_numbers(source, self.name)
-        size = sizes["STATES"] + sizes["COMMANDS"]
+        self.library = build(source) if library is None else library
+        self.numbers = header_numbers(source, self.name)
+        size = self.numbers["STATES"] + self.numbers["COMMANDS"]
+        self.masked = "SENSORS" in self.numbers
+        self.estimator = "*applied" in source.with_suffix(".h").read_text()
+        if self.masked:  # a flag and a phase
+            size += 8 // self.real().nbytes
         self.state = np.full(size, 7.0, dtype=self.real)  # what was in the memory before
-        self.inputs = sizes["MEASUREMENTS"]
-        self.u = np.zeros(sizes["COMMANDS"], dtype=self.real)
+        self.u = np.zeros(self.numbers["COMMANDS"], dtype=self.real)
         self.reset()
 
     def _call(self, function, *arrays):
@@ -103,10 +78,20 @@ class Compiled:
     def reset(self):
         self._call("reset", self.state)
 
-    def step(self, y, *applied):
-        """The estimator form is given the applied commands, too."""
-        measured = np.array(y, dtype=self.real)
-        assert measured.shape == (self.inputs,)
-        given = [np.array(values, dtype=self.real) for values in applied]
-        self.held = self._call("step", self.state, measured, *given, self.u)
+    def phase(self, frames):
+        at = ctypes.c_void_p(self.state.ctypes.data)
+        getattr(self.library, f"{self.name}_phase")(at, ctypes.c_ulong(frames))
+
+    def step(self, y, *given):
+        """Take measurements, what is new of them and applied commands; return the commands.
+
+        By default its own commands were applied.
+        """
+        given = given or ([self.u] if self.estimator else [])
+        arrays = [np.array(y, dtype=self.real)]
+        assert arrays[0].shape == (self.numbers["MEASUREMENTS"],)
+        kinds = [np.uint8] * self.masked + [self.real]
+        arrays += [np.array(values, dtype=kind) for values, kind in zip(given, kinds, strict=False)]
+        assert not self.masked or arrays[1].size == self.numbers["SENSORS"]
+        self.status = self._call("step", self.state, *arrays, self.u)
         return self.u.astype(np.float64)

@@ -14,7 +14,7 @@ from scipy.io import loadmat
 from support.compiled import Compiled
 
 import lbt_synth as lbt
-from lbt_synth.interop.pyrtc.predictor import GainFilePredictor
+from lbt_synth.interop.pyrtc.plugin import GainFilePredictor
 
 FRAMES = 1000
 SINGLE = {"single": np.float32, "double": np.float64}
@@ -289,7 +289,7 @@ def judge(folder, seed):
         options = random_options(name, rng)
         target = lbt.interop.target_named(name)
         try:
-            written = target.write(target.path_in(folder), design, **options)
+            written = lbt.interop.export(target.path_in(folder), design, name, **options)
         except (lbt.errors.NumericalError, lbt.errors.ProblemError):
             verdicts[name] = None
             continue

@@ -1,258 +1,123 @@
-"""Export a controller as C99 source and header, rendered from the templates in this folder."""
+"""The target C: source and header in C99, rendered from the templates in this folder.
+
+The source needs no library, allocates nothing, and has no state of its own: it is passed in.
+Coefficients are exact, as hexadecimal numbers.
+"""
 
 from __future__ import annotations
 
-import math
-import os
 import re
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import NumericalError, OutputError, ProblemError
-from lbt_synth.interop.arithmetic_cost import frame_cost, has_straight_line_form
-from lbt_synth.interop.c.arithmetic import join, read_source
-from lbt_synth.interop.c.masked_export import export_masked
-from lbt_synth.interop.c.source_text import (
-    exact_constant,
-    render_source,
-    round_to_single,
-    wrap_sum,
+from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.interop.c.terms import (
+    NONE,
+    RunningSource,
+    SourceTerms,
+    as_computed,
+    count_gains,
+    frame_cost,
+    join,
+    read_source,
+    source_terms,
+    split,
+    used_readings,
 )
-from lbt_synth.interop.export_checks import (
-    FRAMES,
-    Exported,
-    provenance_lines,
-    require_certified,
-    require_exportable,
-    write_export,
-)
-from lbt_synth.interop.modes import ModalDesign, all_modes
-from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.interop.written_loop import ROUNDOFF, require_proved
-from lbt_synth.linear import Controller, estimator_form
-from lbt_synth.models import LoopHardware
+from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, choice
 
+MOST_GAINS = 1_000_000  # in the table: 8 MB of memory, 25 MB of source
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
 _LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_reset"
+_WIDTH = 96
 
 
-def export_c(
-    path: str | os.PathLike[str],
-    design: ModalDesign,
-    *,
-    form: str | None = None,
-    precision: str = "double",
-    name: str | None = None,
-    modes: int | None = None,
-    other_gain: float | None = None,
-    hardware: LoopHardware | None = None,
-    gain_digest: str | None = None,
-) -> Exported:
-    """Write a controller as a C99 source file and its header, both or none.
-
-    The source needs no library, allocates nothing, and has no state of its own: it is passed
-    in. ``<name>_reset(&state)`` sets the state to zero; ``<name>_step(&state, y, u)`` computes
-    ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``, in the same number of operations
-    each frame, and returns 0. If a measurement is not finite it returns 1: u is the last command
-    again, and the state stays. In estimator form ``<name>_step(&state, y, applied, u)`` takes the
-    commands that were applied in the last frame, too, and is stable by itself: nothing winds up
-    where commands are clipped or the loop is open. Coefficients are exact (hexadecimal). Units are
-    those of the design: nm rms of wavefront for a loop whose sensor and influence matrices are the
-    identity.
-
-    A design of several sensors has the estimator form, with all its fall-backs:
-    ``<name>_step(&state, y, fresh, applied, u)``, where ``fresh`` says for each sensor or channel
-    whether its reading is new and good. It returns flags on what it did not read.
-
-    Parameters
-    ----------
-    path : path-like
-        Source file to write, ending in ``.c``; the header, ending in ``.h``, goes beside it.
-    design : Design, MixedController or ModalFilters
-        The design; or, for unit sensor and influence matrices, a design with integrators for the
-        other modes, or a filter for each mode.
-    form : {"plain", "estimator"}, optional
-        Whether the controller assumes that its commands were applied, or is given those that
-        were (:func:`~lbt_synth.linear.estimator_form`). The default is ``estimator`` for a design
-        of several sensors, which has no other form, and ``plain`` for others.
-    precision : {"double", "single"}, optional
-        Type of all numbers, ``double`` or ``float``. Coefficients are rounded to it.
-    name : str, optional
-        Prefix of the C names; by default the name of the file without its ending.
-    modes : int, optional
-        Measurements and commands of the source; by default those of the design. Further modes get
-        the command 0, without ``other_gain``.
-    other_gain : float, optional
-        Gain of an integrator for each further mode.
-    hardware : LoopHardware, optional
-        Loop of the integrators, where no filter says which.
-    gain_digest : str, optional
-        SHA-256 of the gain file, for the comment (64 hexadecimal digits).
-
-    Returns
-    -------
-    Exported
-        Source, header and certificate, and the error of the chosen precision and of single:
-        terms are added in the order of the source, by a processor that rounds each of them.
-
-    Raises
-    ------
-    OutputError
-        If the ending is not ``.c``, or a file cannot be written.
-    ProblemError
-        If the name is no C identifier, or a coefficient does not fit single precision.
-    CertificateError
-        If the certificate that the design carries has a failed check.
-    NumericalError
-        If the loop is unstable with the rounded coefficients, the commands of a frame overflow,
-        a check of the loop fails in the arithmetic of the source, or there is no estimator form.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, tempfile, pathlib
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     written = lbt.interop.export_c(pathlib.Path(folder) / "slow.c", slow)
-    ...     [file.name for file in written.files]
-    ['slow.c', 'slow.h', 'slow.c.certificate.json']
-    """
-    target = _source_path(path)
-    header = target.with_suffix(".h")
+def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) -> list[SourceTerms]:
+    """Return the terms of designs, in a form and a precision."""
     choice(precision, "precision", ("double", "single"))
-    prefix = require_identifier(target.stem if name is None else name)
-    form = _checked_form(design, form)
-    if isinstance(design, Design) and design.other_sensors:
-        _require_one_sensor(modes, other_gain)
-        require_certified(design)
-        return export_masked(
-            target,
-            design,
-            name=prefix,
-            precision=precision,
-            gain_digest=gain_digest,
-            arithmetic=TARGET.arithmetic,
-        )
-    single = precision == "single"
-    whole = all_modes(
-        design,
-        "C source of all modes",
-        modes=modes,
-        other_gain=other_gain,
-        hardware=hardware,
-        modal=modes is not None,
-    )
-    given = form == "estimator"  # the applied commands
-    parts = [_written_part(part.design, given=given, single=single) for part in whole.parts]
-    joined = join(whole, parts, applied=given)
-    errors = {kind: joined.rehearsal_error(kind) for kind in (np.float64, np.float32)}
-    kind = np.float32 if single else np.float64
-    error = errors[kind]
-    _require_finite(error, precision)
-    lines = provenance_lines(whole.parts[0].design, gain_digest)
-    if single:  # in double precision the figure would depend on this machine's matrix products
-        lines.append(("precision", f"single: commands within {error:.1e} of the largest one"))
-    texts = render_code(
-        prefix,
-        header.name,
-        joined.controller,
-        lines,
-        applied=joined.applied,
-        single=single,
-        gain_digest=gain_digest,
-    )
-    checks = joined.prove(*read_source(*texts), ROUNDOFF[precision])
-    require_proved(checks, f"{precision} precision", "Try double precision.")
-    source, declarations = (text.encode("ascii") for text in texts)
-    return write_export(
-        {target: source, header: declarations},
-        target="c",
-        arithmetic=TARGET.arithmetic,
-        checks=checks,
-        gain_digest=gain_digest,
-        form=form,
-        precision=precision,
-        error=error,
-        error_single=errors[np.float32],
-        start=lambda _: joined.start(kind),
-        cost=frame_cost(joined.controller),
-    )
+    numbers = []
+    for design in designs:
+        several = bool(design.other_sensors)
+        kind = ("estimator" if several else "plain") if form is None else form
+        choice(kind, "form", ("plain", "estimator"))
+        if several and kind == "plain":
+            raise ProblemError(
+                "a design of several sensors is exported in estimator form alone, which is given "
+                "the applied commands; got form=plain. Leave it out."
+            )
+        terms = source_terms(design, form=kind)
+        if count_gains(terms) > MOST_GAINS:
+            raise ProblemError(
+                f"the gains of all phases and fall-backs must be at most {MOST_GAINS:,} numbers in "
+                f"C; got {count_gains(terms):,}, in a period of {len(terms.read)} frames. Choose "
+                "rates with a shorter common period, or leave out channels."
+            )
+        numbers.append(terms.rounded() if precision == "single" else terms)
+    return numbers
 
 
-def _require_one_sensor(modes: int | None, other_gain: float | None) -> None:
-    """Refuse options of designs of one sensor."""
-    if modes is not None or other_gain is not None:
-        raise ProblemError(
-            "modes and other_gain go with a design of one sensor; got one of several. Leave them "
-            "out."
-        )
+def _write(
+    place: Path,
+    terms: SourceTerms,
+    _: Design,
+    origin: Sequence[tuple[str, str]],
+    *,
+    name: str | None,
+    gain_digest: str | None,
+    **__: Any,
+) -> dict[Path, bytes]:
+    """Return source and header."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-
-def _source_path(path: str | os.PathLike[str]) -> Path:
-    """Return the path of the source, whose name compilers must take."""
-    target = Path(path)
-    if not _SOURCE.fullmatch(target.name):
+    if not _SOURCE.fullmatch(place.name):
         raise OutputError(
             "C source must end in .c, and its name have letters, digits and . _ + - only; got "
-            f"{target.name!r}.",
-            path=target,
+            f"{place.name!r}.",
+            path=place,
         )
-    return target
+    prefix = _require_identifier(place.stem if name is None else name)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {
+        "constant": lambda value: _exact_constant(value, single=terms.single),
+        "count": count_text,
+        "lines": _fill_lines,
+    }
+    header = place.with_suffix(".h")
+    values = {
+        "p": prefix,
+        "P": prefix.upper(),
+        "origin": origin,
+        "header_name": header.name,
+        "gain_digest": gain_digest,
+        "type": "float" if terms.single else "double",
+        "largest": "FLT_MAX" if terms.single else "DBL_MAX",
+        "inputs": f"const {prefix}_real *y, "
+        + "const unsigned char *fresh, " * terms.masked
+        + f"const {prefix}_real *applied, " * terms.applied,
+        **_described(terms),
+        **_written_out(terms, prefix),
+        **_tables(terms),
+    }
+    source, declarations = (
+        environment.get_template(f"controller.{ending}.jinja").render(values) for ending in "ch"
+    )
+    return {place: source.encode("ascii"), header: declarations.encode("ascii")}
 
 
-def _checked_form(design: ModalDesign, form: str | None) -> str:
-    """Return the form of the source; a filter of several sensors has one."""
-    several = isinstance(design, Design) and bool(design.other_sensors)
-    if form is None:
-        return "estimator" if several else "plain"
-    choice(form, "form", ("plain", "estimator"))
-    if several and form == "plain":
-        raise ProblemError(
-            "a design of several sensors is exported in estimator form alone, which is given the "
-            "applied commands; got form=plain. Leave it out."
-        )
-    return form
-
-
-def _require_finite(error: float, precision: str) -> None:
-    """Refuse commands that grow beyond all numbers of a precision."""
-    if not math.isfinite(error):
-        hint = {"single": "Try double precision.", "double": "Scale the states of the controller."}
-        raise NumericalError(
-            f"the commands must stay finite in {precision} precision; they grew beyond all "
-            f"numbers within {FRAMES} frames. {hint[precision]}",
-            status="arithmetic",
-            residual=error,
-        )
-
-
-def _written_part(design: Design, *, given: bool, single: bool) -> Controller:
-    """Return what is written; in estimator form its last inputs are the applied commands."""
-    written = design.controller
-    if given:
-        if design.hardware is None:
-            raise ProblemError(
-                "the estimator form needs the design of a loop: a bare filter has no commands to "
-                "be applied. Export it with form=plain."
-            )
-        own = estimator_form(design)
-        inputs = np.hstack([own.B, own.applied])
-        D = np.zeros((len(own.C), inputs.shape[1]))
-        written = Controller(A=own.A, B=inputs, C=own.C, D=D, dt_s=own.dt_s)
-    if single:
-        matrices = {name: getattr(written, name) for name in "ABCD"}
-        written = Controller(**round_to_single(matrices), dt_s=written.dt_s)
-    if not given:
-        require_exportable(design, written)
-    return written
-
-
-def require_identifier(name: str) -> str:
+def _require_identifier(name: str) -> str:
     """Return a prefix whose names are C and C++ identifiers that no standard reserves."""
     if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name) or len(name) > _LONGEST:
         raise ProblemError(
@@ -263,92 +128,206 @@ def require_identifier(name: str) -> str:
     return name
 
 
-def render_code(
-    prefix: str,
-    header_name: str,
-    controller: Controller,
-    provenance: Sequence[tuple[str, str]],
-    *,
-    applied: int,
-    single: bool,
-    gain_digest: str | None,
-) -> tuple[str, str]:
-    """Return the source and the header; ``provenance`` begins the comment of both.
-
-    The last ``applied`` inputs of the controller are the commands that were applied.
-    """
-    values = {
-        "p": prefix,
-        "P": prefix.upper(),
-        "n": controller.n_states,
-        "q": controller.B.shape[1] - applied,
-        "m": len(controller.C),
-        "applied": applied,
-        "controller": controller,
-        "matrices": _split_inputs(controller, applied),
-        "provenance": provenance,
-        "cost": frame_cost(controller),
-        "header_name": header_name,
-        "gain_digest": gain_digest,
-        "straight_line": _write_out(
-            prefix, controller, applied, zero=exact_constant(0.0, single=single)
-        )
-        if has_straight_line_form(controller)
-        else None,
-    }
-    return render_source("controller", single=single, **values)
+def _exact_constant(value: float, *, single: bool) -> str:
+    """Return an exact constant of a type; a value of single precision is already rounded."""
+    return (value.hex() if value else "0.0") + ("f" if single else "")
 
 
-def _split_inputs(controller: Controller, applied: int) -> dict[str, FloatArray]:
-    """Return A, B, C and D by name, and L, the columns of the applied commands."""
-    q = controller.B.shape[1] - applied
-    B, L = np.hsplit(controller.B, [q])
-    return {"A": controller.A, "B": B, "L": L, "C": controller.C, "D": controller.D[:, :q]}
+def _fill_lines(values: Iterable[str]) -> str:
+    """Return entries of an array, indented, over as many lines as they need."""
+    return textwrap.fill(", ".join(values), _WIDTH, initial_indent="    ", subsequent_indent="    ")
 
 
-def _write_out(prefix: str, controller: Controller, applied: int, *, zero: str) -> dict[str, Any]:
-    """Return one frame with each non-zero term written out; factors of 1 and -1 are signs."""
-    n, q = controller.n_states, controller.B.shape[1] - applied
-    coefficients: list[tuple[str, float]] = []
-    sums: dict[str, str] = {}
-    # a command is computed from the new state n0, n1, ...
-    for result, state, on_state, on_y in (("n", "x", "A", "B"), ("u", "n", "C", "D")):
-        rows = np.hstack([getattr(controller, on_state), getattr(controller, on_y)])
-        for i, row in enumerate(rows.tolist()):
-            terms: list[tuple[str, str]] = []
-            for j in np.flatnonzero(row):
-                name, place = f"{state}{j}", f"{on_state}[{i}][{j}]"
-                if j >= n:
-                    name, place = f"y{j - n}", f"{on_y}[{i}][{j - n}]"
-                if j >= n + q:
-                    name, place = f"a{j - n - q}", f"L[{i}][{j - n - q}]"
-                factor = ""
-                if abs(row[j]) != 1:
-                    factor = f"c[{len(coefficients)}] * "
-                    coefficients.append((place, row[j]))
-                terms.append(("-" if row[j] == -1 else "+", factor + name))
-            start = f"    const {prefix}_real {result}{i} ="
-            sums[f"{result}{i}"] = wrap_sum(terms or [("+", zero)], len(start))
-    used = np.flatnonzero(np.vstack([controller.B, controller.D]).any(axis=0)).tolist()
+def _described(terms: SourceTerms) -> dict[str, Any]:
+    """Return what the comments, the header and the branches of the template need."""
+    (n, q, m), form = terms.sizes, "plain: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)"
+    if terms.applied:
+        form = "estimator: x(k+1) = A x(k) + L u_applied(k-1) + B y(k), u(k) = C x(k+1)"
+    if terms.masked:
+        form = "estimator: x = A x + L u_applied + K (y + G x + J u_applied), u = C x"
     return {
-        "states": np.flatnonzero(controller.A.any(axis=0)).tolist(),
-        "measurements": [i for i in used if i < q],
-        "applied": [i - q for i in used if i >= q],
-        "coefficients": coefficients,
-        "sums": sums,
+        "n": n,
+        "q": q,
+        "m": m,
+        "form": form,
+        "masked": terms.masked,
+        "applied": terms.applied,
+        "dense": terms.dense,
+        "estimates": terms.gains[NONE].shape[1],
+        "period": len(terms.read),
+        "frame_s": terms.dt_s,
+        "cost": frame_cost(terms),
+        "units": _describe_units(terms),
     }
+
+
+def _describe_units(terms: SourceTerms) -> list[dict[str, Any]]:
+    """Return name, identifier, measurements and period of each sensor and channel."""
+    words = [re.sub(r"[^A-Z0-9]+", "_", unit.upper())[:24].strip("_") for unit in terms.rows]
+    if len(set(words)) < len(words) or not all(words):  # names that differ in other letters alone
+        words = [f"{word}_{i}".strip("_") for i, word in enumerate(words)]
+    return [
+        {
+            "name": comment_text(unit),
+            "identifier": word,
+            "bit": 1 << i,
+            "rows": list(range(own.start, own.stop)),
+            "first": own.start,
+            "last": own.stop - 1,
+            "every": len(terms.read) // np.count_nonzero(terms.read[:, own.start]),
+        }
+        for i, (word, (unit, own)) in enumerate(zip(words, terms.rows.items(), strict=True))
+    ]
+
+
+def _written_out(terms: SourceTerms, prefix: str) -> dict[str, Any]:
+    """Return the sums of a frame with each non-zero term; factors of 1 and -1 are signs."""
+    s, q, m = terms.sizes
+    constants: list[tuple[str, float]] = []
+    varying: list[tuple[str, list[float]]] = []  # what changes from phase to phase
+    used: dict[str, set[int]] = {"x": set(), "y": set(), "a": set()}
+    states, applied, readings = (
+        [f"{kind}{j}" for j in range(size)] for kind, size in zip("xay", (s, m, q), strict=True)
+    )
+
+    def term(place: str, values: FloatArray, signal: str) -> tuple[str, str]:
+        if signal[0] in used:
+            used[signal[0]].add(int(signal[1:]))
+        value = float(values[0])
+        if np.any(values != value):
+            varying.append((place, values.tolist()))
+            return "+", f"v[{len(varying) - 1}] * {signal}"
+        if abs(value) == 1:
+            return "+" if value > 0 else "-", signal
+        constants.append((place, value))
+        return "+", f"c[{len(constants) - 1}] * {signal}"
+
+    def sums(
+        names: Sequence[str],
+        matrix: FloatArray,
+        signals: Sequence[str],
+        start: str,
+        begin: str = "",
+    ) -> list[str]:
+        """Return a sum for each row of (N, rows, columns); columns have the names of matrices."""
+        out = []
+        for i in range(matrix.shape[1]):
+            some = [("+", begin.format(i))] if begin else []
+            used_columns = np.flatnonzero(matrix[:, i].any(axis=0)).tolist()
+            some += [term(names[j].format(i), matrix[:, i, j], signals[j]) for j in used_columns]
+            zero = _exact_constant(0.0, single=terms.single)
+            out.append(_wrap_sum(some or [("+", zero)], len(start.format(i))))
+        return out
+
+    def columns(**sizes: int) -> list[str]:
+        return [f"{name}[{{}}][{j}]" for name, size in sizes.items() for j in range(size)]
+
+    out: dict[str, Any] = {"errors": [], "states": [], "commands": []}
+    if not terms.dense:
+        start = f"    const {prefix}_real u{{}} ="
+        transition, known = terms.transition, [*states, *applied]
+        if terms.masked:
+            names, line = columns(G=s, J=m), "        error[count++] ="
+            out["errors"] = sums(names, terms.innovation, known, line, begin="y[{}]")
+        else:
+            transition = np.concatenate([transition, terms.gains[NONE]], axis=2)
+        names = columns(A=s, L=m, B=q)
+        out["states"] = sums(names, transition, [*known, *readings], start)
+        new = [f"state->x[{j}]" if terms.masked else f"n{j}" for j in range(s)]
+        out["commands"] = sums(columns(C=s, D=q), terms.command[None], [*new, *readings], start)
+    named = {kind: sorted(numbers) for kind, numbers in used.items()}
+    return {**out, "constants": constants, "varying": varying, "used": named}
+
+
+def _wrap_sum(terms: Sequence[tuple[str, str]], column: int) -> str:
+    """Return a sum of (sign, term) that begins at a column, its terms wrapped over lines."""
+    text = " ".join(f"{sign} {term}".replace(" ", "\0") for sign, term in terms)
+    text = text.removeprefix("+\0").replace("-\0", "-", text.startswith("-"))
+    begin, more = " " * (column + 1), " " * 8
+    wrapped = textwrap.fill(
+        text, _WIDTH - 1, initial_indent=begin, subsequent_indent=more, break_long_words=False
+    )
+    return wrapped[column:].replace("\0", " ")
+
+
+def _tables(terms: SourceTerms) -> dict[str, Any]:
+    """Return whole matrices, or the gains of each phase and of each set that is missing."""
+    tables: list[tuple[str, int, list[tuple[str, list[float]]]]] = []
+    if terms.dense:
+        s, _, m = terms.sizes
+        for name, matrix in (
+            ("transition", terms.transition[0][:, : s + m * terms.applied]),
+            ("gains", terms.gains[NONE][0]),
+            ("output", terms.command),
+        ):
+            columns = [(f"[:][{j}]", column) for j, column in enumerate(matrix.T.tolist())]
+            tables.append((name, matrix.size, columns))
+    if not terms.masked:
+        return {"tables": tables, "due": [], "first": [], "sets": 0}
+    units, gains = tuple(terms.rows), []
+    sets = [
+        frozenset(unit for i, unit in enumerate(units) if mask >> i & 1)
+        for mask in range(1 << len(units))
+    ]
+    used = [used_readings(terms, missing) for missing in sets]
+    first, count = [], 0
+    for phase in range(len(terms.read)):
+        begins = []
+        for mask, missing in enumerate(sets):
+            columns = terms.gains[missing][phase][:, used[mask][phase]].T.tolist()
+            begins.append(str(count))
+            count += sum(map(len, columns))
+            gains += [(f"phase {phase}, missing {mask}", column) for column in columns]
+        first.append(begins)
+    places = [own.start for own in terms.rows.values()]
+    due = map(str, (terms.read[:, places] @ (1 << np.arange(len(places)))).tolist())
+    tables.append(("gains", count, gains))
+    return {"tables": tables, "due": list(due), "first": first, "sets": len(sets)}
+
+
+def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
+    """Return the terms in the text of the source, as a compiler reads it."""
+    return read_source(next(iter(files.values())).decode("ascii"), like)
+
+
+def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
+    """Return what the certificate says of the source."""
+    form: dict[str, Any] = {"form": "estimator" if terms.applied else "plain"}
+    if terms.masked:
+        form |= {"period": len(terms.read), "sensors": list(terms.rows)}
+    return form
 
 
 TARGET = Target(
     arithmetic=Arithmetic(
         program="real-time computers, from C99 source",
         precision="double or single",
-        sums="each row of [A, B] and of [C, D] from left to right",
+        sums="from left to right: states, applied commands, readings; commands from new states",
         state="new state: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)",
         clipping="yours: the estimator form takes the applied commands, the plain form none",
         limits="none",
     ),
     file="source and header (.c, .h)",
-    write=export_c,
-    endings=(".c", ".h"),
+    options={
+        "form": None,
+        "precision": "double",
+        "name": None,
+        "modes": None,
+        "other_gain": None,
+    },
+    round=_round,
+    write=_write,
+    read=_read,
+    computed=as_computed,
+    start=lambda terms, _: RunningSource(terms),
+    single=lambda terms: terms if terms.single else terms.rounded(),
+    cost=frame_cost,
+    join=join,
+    split=split,
+    facts=_facts,
+    hint="Try double precision.",
+    endings=(".c",),
+    beside=(".h",),
+    modal=None,
+    reads_others=True,
 )

@@ -1,34 +1,53 @@
-"""Export a controller as the predictive filter that cacao multiplies by its modal history."""
+"""The target cacao: a controller as a filter of the pseudo-open-loop history, cut after some steps.
+
+In the loop that a design believes, the command is a stable filter Q of the pseudo-open-loop
+measurement, whatever the controller (:func:`lbt_synth.loop.youla_controller`), and every stable Q
+keeps that loop stable. At the sensor gain g, with the path L of norm 1, the commands are
+``Q w / D`` with ``D = 1 - (1 - g) L Q``. Without a part E of Q they change by ``E w / D D'``, where
+``D' = D + (1 - g) L E``: no more than a small gain, ``|1 - g| |E / D| < 1``, allows.
+
+For all gains of an interval: ``|1 - g| |1 / D|`` is one over the least singular value, over
+frequency, of ``p - L Q``, ``p = 1 / (1 - g)``. That distance changes by no more than p does, which
+bounds it between two gains.
+"""
 
 from __future__ import annotations
 
 import io
-import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Check, Design
-from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.interop.cacao.truncation import CutFilter, predictive_filter
-from lbt_synth.interop.export_checks import (
-    Exported,
-    join_labels,
-    provenance_lines,
-    rehearsal_error,
-    require_modal,
-    write_export,
+from lbt_synth.interop.modes import ModeDesign
+from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
+from lbt_synth.interop.proof import (
+    ROUNDOFF,
+    Written,
+    mode_variances,
+    proved_gains,
+    scenario_gains,
 )
-from lbt_synth.interop.modes import ModalDesign, all_modes
-from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.interop.written_loop import require_proved
+from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.atomic_files import require_ending
+from lbt_synth.storage.array_file import open_fits
 from lbt_synth.validation import FloatArray, integer, number
 
 LONGEST_DELAY = 8  # frames; modalfilter keeps the commands of ten frames
+_LONGEST = 1 << 17  # steps that are looked for
+_CLOSE = 0.5  # of the least distance that is computed: a bound on all others
+_ROOM = 0.98  # of the loss, for what is rounded
+_MOST_NUMBERS = 100_000_000  # of the matrix: 400 MB
+_MOST_LOSS = 0.01
+_SIGN = "mirror = + PFmat history; the matrix holds the controller with its sign changed"
+_Numbers = tuple[NDArray[np.float32], float]  # command, step, mode of the history; delay [frames]
 
 
 class AppliedFilter:
@@ -78,176 +97,291 @@ class AppliedFilter:
         return 0.0 - u.astype(np.float64)
 
 
-_FILE = "a predictive filter"
-_MOST_NUMBERS = 100_000_000  # of the matrix: 400 MB
-_MOST_LOSS = 0.01
-_SIGN = "mirror = + PFmat history; the matrix holds the controller with its sign changed"
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PredictiveFilter:
+    """The filter from the pseudo-open-loop measurements to the commands of a design."""
+
+    design: Design
+    hardware: LoopHardware
+    system: StateSpace
+    _steering: dict[float, tuple[ClosedLoop, StateSpace, float]] = field(default_factory=dict)
+
+    def taps(self, steps: int) -> FloatArray:
+        """Return the first values of the impulse response, (steps, m, m)."""
+        values, x = [self.system.D], self.system.B
+        for _ in range(steps - 1):
+            values.append(self.system.C @ x)
+            x = self.system.A @ x
+        return np.array(values)
+
+    def at(self, gain: float) -> tuple[ClosedLoop, StateSpace, float]:
+        """Return the loop at a sensor gain, the filter 1 / D and its norm, made once."""
+        if gain not in self._steering:
+            loop = close_loop(self.hardware, self.design.controller, sensor_gain=gain)
+            s, same = loop.output_sensitivity(), np.eye(self.hardware.modes)
+            inverse = replace(s, C=(1 - 1 / gain) * s.C, D=(1 - 1 / gain) * s.D + same / gain)
+            self._steering[gain] = loop, inverse, float(hinf_norm(inverse))
+        return self._steering[gain]
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """Sensor gains for which the small gain is proved."""
+        return proved_gains(self.design, self.hardware)
+
+    def least_distance(self, enough: float) -> float:
+        """Return a lower bound on the distance of L Q from ``1 / (1 - g)`` within the interval.
+
+        Where one is found that is not above ``enough``, it is returned.
+        """
+        least = float("inf")
+        for end, stop in self._places():
+            own = self._distance(end)
+            if stop is None:  # beyond this place the distance is larger than at the end
+                stop = float(np.copysign(float(hinf_norm(self.system)) + own, end))
+            parts = [((end, own), (stop, self._distance(stop)))]
+            while parts:
+                (a, at_a), (b, at_b) = parts.pop()
+                least = min(least, at_a, at_b)
+                if least <= enough:
+                    return least
+                if (at_a + at_b - abs(b - a)) / 2 < _CLOSE * least:
+                    middle = (a + b) / 2
+                    between = middle, self._distance(middle)
+                    parts += [((a, at_a), between), (between, (b, at_b))]
+        return _CLOSE * least
+
+    def _places(self) -> list[tuple[float, float | None]]:
+        """Return the intervals of ``1 / (1 - g)``; at g = 1 one goes on without end."""
+        low, high = self.interval
+        out: list[tuple[float, float | None]] = []
+        if low < 1:
+            out.append((1 / (1 - low), 1 / (1 - high) if high < 1 else None))
+        if high > 1:
+            out.append((1 / (1 - high), 1 / (1 - low) if low > 1 else None))
+        return out
+
+    def _distance(self, place: float) -> float:
+        return abs(place) / self.at(1 - 1 / place)[2]
+
+    @cached_property
+    def sizes_nm(self) -> dict[float, tuple[float, float]]:
+        """The rms of the pseudo-open loop, all modes, and that of the least residual of a mode.
+
+        At each sensor gain of the proof.
+        """
+        every, sizes = slice(self.hardware.modes), {}
+        for gain in scenario_gains(self.design):
+            if self.interval[0] <= gain <= self.interval[1]:
+                loop, s, _ = self.at(gain)
+                pol = replace(s, B=np.hstack([gain * s.B, s.B]), D=np.hstack([gain * s.D, s.D]))
+                seen, left = (
+                    mode_variances(self.design, one, every)
+                    for one in (replace(loop, system=pol), loop)
+                )
+                sizes[gain] = float(np.sqrt(np.sum(seen))), float(np.sqrt(np.min(left)))
+        return sizes
+
+    def fewest_steps(self, loss: float) -> int:
+        """Return the steps after which what is cut off costs at most that part of the residual."""
+        high = 1
+        while not self._is_enough(high, loss):
+            high *= 2
+            if high > _LONGEST:
+                raise NumericalError(
+                    f"the filter must lose at most {100 * loss:.3g} % of residual; cut after "
+                    f"{_LONGEST} steps it may still lose more. Design for wider lines, or use a "
+                    "target with states.",
+                    status="steps",
+                    residual=_LONGEST,
+                )
+        low = high // 2
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if self._is_enough(middle, loss) else (middle, high)
+        return high
+
+    def _is_enough(self, steps: int, loss: float) -> bool:
+        cut = CutFilter(whole=self, steps=steps)
+        if cut.norm > loss or cut.small_gain >= 1:
+            return False
+        return all(
+            cut.residual_nm(gain) <= _ROOM * loss * own for gain, (_, own) in self.sizes_nm.items()
+        )
 
 
-def export_cacao(
-    path: str | os.PathLike[str],
-    design: ModalDesign,
-    *,
-    steps: int | None = None,
-    loss: float = _MOST_LOSS,
-    modes: int | None = None,
-    other_gain: float | None = None,
-    hardware: LoopHardware | None = None,
-    gain_digest: str | None = None,
-) -> Exported:
-    """Write a controller as the matrix of cacao's predictive filter, of finite length.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CutFilter:
+    """What a filter that is cut after some steps lacks, and the taps that are left, as rounded."""
 
-    cacao multiplies a matrix by the recent pseudo-open-loop values of its modes. The controller,
-    as a filter of that history, is stable; it is cut after some steps. What is cut off and rounded
-    is bounded in the loop before anything is written.
+    whole: PredictiveFilter
+    steps: int
+    taps: FloatArray | None = None  # (steps, m, m)
 
-    Parameters
-    ----------
-    path : path-like
-        File to write, ending in ``.fits``. The proof goes beside it, with
-        ``.certificate.json`` after its name.
-    design : Design, MixedController or ModalFilters
-        Design with unit sensor and influence matrices, whose mirror settles at once; or a design
-        with integrators for the other modes; or a filter for each mode.
-    steps : int, optional
-        Steps of the history; by default as many as the loss needs.
-    loss : float, optional
-        Relative loss of residual, at each sensor gain of the proof, at which the length is chosen;
-        at most 0.01, which is the limit of the proof.
-    modes : int, optional
-        Modes of a frame; by default those of the design. Further ones get no command, without
-        ``other_gain``.
-    other_gain : float, optional
-        Gain of an integrator for each further mode.
-    hardware : LoopHardware, optional
-        Loop of the integrators, where no filter says which.
-    gain_digest : str, optional
-        SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
+    @cached_property
+    def norm(self) -> float:
+        """Bound on the norm of what is left out: what is cut off, and what taps are rounded by."""
+        system = self.whole.system
+        late = system.C @ np.linalg.matrix_power(system.A, self.steps - 1)
+        norm = float(hinf_norm(replace(system, C=late @ system.A, D=late @ system.B)))
+        if self.taps is not None:
+            off = self.whole.taps(self.steps) - self.taps
+            norm += float(np.sum(np.linalg.norm(off, ord=2, axis=(1, 2))))
+        return norm
 
-    Returns
-    -------
-    Exported
-        Matrix and certificate, the error in single precision, and the checks.
+    def _gain_around(self, gain: float) -> float:
+        return abs(1 - gain) * self.whole.at(gain)[2] * self.norm
 
-    Raises
-    ------
-    OutputError
-        If the ending is another, or a file cannot be written.
-    ProblemError
-        If the design is not of such a loop, or a number is out of its range.
-    CertificateError
-        If the certificate that the design carries has a failed check.
-    NumericalError
-        If the filter is too long, or a check fails; ``residual`` holds its value.
+    @cached_property
+    def small_gain(self) -> float:
+        """Bound on the gain around the loop of what is left out; below 1 it keeps that stable."""
+        return self.norm / self.whole.least_distance(self.norm)
 
-    Examples
-    --------
-    >>> import lbt_synth as lbt, tempfile, pathlib
-    >>> from astropy.io import fits
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = pathlib.Path(folder) / "slow.fits"
-    ...     _ = lbt.interop.export_cacao(file, slow, steps=64)
-    ...     fits.getdata(file).shape
-    (2, 128)
-    """
-    target = require_ending(path, _FILE, (".fits",))
-    whole = all_modes(design, _FILE, modes=modes, other_gain=other_gain, hardware=hardware)
-    limit = number(loss, "loss", above=0, at_most=_MOST_LOSS)
-    delay = _require_loop(whole.parts[0].design).delay_frames
-    filters = [predictive_filter(own, _require_loop(own)) for own, _ in whole.parts]
-    if steps is None:
-        count = max(2, *(found.fewest_steps(limit) for found in filters))
-    else:
-        count = integer(steps, "steps", at_least=2)
-    _require_small(count, whole.count)
-    # command, step, mode of the history
-    cube = np.zeros((whole.count, count, whole.count), dtype=np.float32)
-    checks: list[Check] = []
-    error = 0.0
-    for part, found in zip(whole.parts, filters, strict=True):
-        own = -found.taps(count).swapaxes(0, 1).astype(np.float32)
-        taps = -own.swapaxes(0, 1).astype(np.float64)
-        proved = CutFilter(whole=found, steps=count, taps=taps).prove()
-        if not all(check.passed for check in proved):
-            arithmetic = f"single precision, cut after {count} steps"
-            require_proved(proved, arithmetic, _advice(count, found.fewest_steps(_MOST_LOSS)))
-        checks += whole.name_checks(part, proved)
-        error = max(error, rehearsal_error(part.design, AppliedFilter(_flat(own), delay)))
-        for modes_of_copy in part.copies:
-            cube[np.ix_(modes_of_copy, range(count), modes_of_copy)] = own
-    first, matrix = whole.parts[0].design, _flat(cube)
-    content = _matrix_bytes(matrix, first, provenance_lines(first, gain_digest), count)
-    return write_export(
-        {target: content},
-        target="cacao",
-        arithmetic=TARGET.arithmetic,
-        checks=checks,
-        gain_digest=gain_digest,
-        steps=count,
-        modes=whole.count,
-        latency_frames=delay + 1,
-        sign=_SIGN,
-        error=error,
-        start=lambda limit: AppliedFilter(matrix, delay, limit),
-    )
+    def _peak(self, gain: float) -> float:
+        """Bound on 1 / D' at a sensor gain."""
+        around = self._gain_around(gain)
+        return self.whole.at(gain)[2] / (1 - around) if around < 1 else float("inf")
+
+    def response(self, gain: float) -> float:
+        """Bound the change of the sensitivities at a sensor gain."""
+        return max(gain, 1.0) * self.norm * self.whole.at(gain)[2] * self._peak(gain)
+
+    def residual_nm(self, gain: float) -> float:
+        """Bound the rms of the residual's change at a sensor gain, over all modes."""
+        return self._peak(gain) * self.norm * self.whole.sizes_nm[gain][0]
+
+    def as_computed(self, taps: FloatArray) -> Written:
+        """Return the filter of the design as a controller, and the rounding of the taps' sums.
+
+        Products are added in any order.
+        """
+        hardware, s = self.whole.hardware, self.whole.system
+        m, n = hardware.modes, s.n_states
+        # the last command is a state
+        parameter = Controller(
+            A=np.block([[s.A, np.zeros((n, m))], [s.C, np.zeros((m, m))]]),
+            B=np.vstack([s.B, s.D]),
+            C=np.eye(m, n + m, k=n),
+            D=np.zeros((m, m)),
+            dt_s=s.dt_s,
+        )
+        controller = youla_controller(hardware, parameter)
+        # noise in the product is part of the command; noise in the history comes as a measurement
+        command = np.eye(controller.n_states, m, k=-n)
+        entry = replace(controller, B=np.hstack([command, controller.B]), D=np.zeros((m, 2 * m)))
+        sizes = np.abs(np.hstack([*taps]))
+
+        def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
+            terms = sizes * np.tile(measured + commands, len(taps))
+            largest = np.sum(terms, axis=1)
+            sums = np.sum(terms**2, axis=1) + largest**2 * terms.shape[1]
+            history = 3 * commands**2 + (measured + commands) ** 2
+            return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate([sums, history]))
+
+        low, high = self.whole.interval
+        name = f"small gain of what is left out, sensor gains {low:.4g} to {high:.4g}"
+        how = "level sets, bound between gains"
+        return Written(
+            controllers={frozenset(): controller},
+            entry=entry,
+            variance=variance,
+            residual_change_nm=self.residual_nm,
+            response_change=self.response,
+            checks=(Check(name, self.small_gain, 1.0, how),),
+        )
 
 
-def _require_loop(design: Design) -> LoopHardware:
-    """Return the loop of a design; refuse one that cacao's history does not know."""
-    require_modal(design, _FILE)
-    hardware = require_hardware(design, _FILE)
-    if hardware.mirror is not None or hardware.delay_frames > LONGEST_DELAY:
+@lru_cache(maxsize=8)
+def predictive_filter(design: Design) -> PredictiveFilter:
+    """Return the filter of a design; refuse a loop that cacao's history does not know."""
+    hardware = design.hardware
+    if hardware is None or hardware.mirror is not None or hardware.delay_frames > LONGEST_DELAY:
         raise ProblemError(
             "the mirror must settle at once, with a total delay of at most "
             f"{LONGEST_DELAY} frames: cacao's history knows a delay alone. Use another target."
         )
-    return hardware
+    loop = close_loop(hardware, design.controller)
+    loop.require_stable()
+    s, n = loop.commanding(), hardware.modes
+    system = replace(s, B=s.B[:, n:], D=s.D[:, n:]).balanced()
+    return PredictiveFilter(design=design, hardware=hardware, system=system)
 
 
-def _require_small(steps: int, modes: int) -> None:
-    """Refuse a matrix that no computer multiplies in a frame."""
-    if steps * modes**2 > _MOST_NUMBERS:
+def _round(
+    designs: Sequence[Design], *, steps: int | None, loss: float, **_: Any
+) -> list[_Numbers]:
+    """Return the matrix of each design, all of the same length."""
+    limit = number(loss, "loss", above=0, at_most=_MOST_LOSS)
+    filters = [predictive_filter(design) for design in designs]
+    if steps is None:
+        count = max(2, *(whole.fewest_steps(limit) for whole in filters))
+    else:
+        count = integer(steps, "steps", at_least=2)
+    delay = filters[0].hardware.delay_frames
+    cubes = (-whole.taps(count).swapaxes(0, 1).astype(np.float32) for whole in filters)
+    return [(cube, delay) for cube in cubes]
+
+
+def _as_computed(design: Design, numbers: _Numbers) -> Written:
+    """Return what is proved of a matrix."""
+    taps = -numbers[0].swapaxes(0, 1).astype(np.float64)
+    cut = CutFilter(whole=predictive_filter(design), steps=len(taps), taps=taps)
+    return cut.as_computed(taps)
+
+
+def _join(numbers: Sequence[_Numbers], parts: Sequence[ModeDesign], count: int) -> _Numbers:
+    """Return the matrix of all modes; refuse one that no computer multiplies in a frame."""
+    (first, delay), *_ = numbers
+    steps = first.shape[1]
+    if steps * count**2 > _MOST_NUMBERS:
         raise NumericalError(
-            f"the matrix must have at most {_MOST_NUMBERS:,} numbers; got {steps} steps of {modes} "
+            f"the matrix must have at most {_MOST_NUMBERS:,} numbers; got {steps} steps of {count} "
             "modes. Give fewer steps or modes, or make a robust design that is a filter of finite "
             "length: pole 0, states null, and as many functions as steps.",
             status="steps",
             residual=steps,
         )
+    whole = np.zeros((count, steps, count), dtype=np.float32)
+    for (cube, _), part in zip(numbers, parts, strict=True):
+        for modes in part.copies:
+            whole[np.ix_(modes, range(steps), modes)] = cube
+    return whole, delay
 
 
-def _advice(steps: int, fewest: int) -> str:
-    """Return what to try for a filter that fails."""
-    if steps < fewest:
-        return f"Give at least {fewest} steps, or none to have them chosen."
-    return "Use a target with states, such as c or pyrtc."
+def _split(whole: _Numbers, parts: Sequence[ModeDesign], _: object) -> list[list[_Numbers]]:
+    """Return the matrix of each copy of each design."""
+    cube, delay = whole
+    steps = range(cube.shape[1])
+    return [[(cube[np.ix_(m, steps, m)], delay) for m in part.copies] for part in parts]
 
 
-def _flat(cube: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the matrix (m, steps * m) of (m, steps, m), the newest frame first."""
-    return cube.reshape(len(cube), -1)
-
-
-def _matrix_bytes(
-    matrix: NDArray[np.float32], design: Design, lines: list[tuple[str, str]], steps: int
-) -> bytes:
+def _write(
+    place: Path, whole: _Numbers, design: Design, origin: Sequence[tuple[str, str]], **_: Any
+) -> dict[Path, bytes]:
     """Return a FITS file with the matrix as its primary image, which milk loads as a stream."""
     from astropy.io import fits
 
-    unit = fits.PrimaryHDU(data=matrix)
-    cards: dict[str, Any] = {
-        "METHOD": (design.method, "synthesis"),
-        "STEPS": (steps, "frames of history, the newest first"),
-        "MODES": (len(matrix), "modes of a frame"),
-    }
-    unit.header.update(cards)
-    for line in (*join_labels(lines), _SIGN):
+    modes, steps, _columns = whole[0].shape
+    unit = fits.PrimaryHDU(data=_flat(whole))
+    unit.header["METHOD"] = design.method, "synthesis"
+    unit.header["STEPS"] = steps, "frames of history, the newest first"
+    unit.header["MODES"] = modes, "modes of a frame"
+    for line in (*join_labels(origin), _SIGN):
         unit.header.add_comment(line)
     unit.add_checksum(when="of this unit")
     buffer = io.BytesIO()
     unit.writeto(buffer)
-    return buffer.getvalue()
+    return {place: buffer.getvalue()}
+
+
+def _flat(numbers: _Numbers) -> NDArray[np.float32]:
+    """Return the matrix (m, steps * m), the newest frame first."""
+    return numbers[0].reshape(len(numbers[0]), -1)
+
+
+def _read(files: Mapping[Path, bytes], like: _Numbers) -> _Numbers:
+    """Return the matrix that a file holds."""
+    with open_fits(next(iter(files.values()))) as units:
+        return np.array(units[0].data, dtype=np.float32).reshape(like[0].shape), like[1]
 
 
 TARGET = Target(
@@ -260,6 +394,20 @@ TARGET = Target(
         limits="finite impulse response; a mirror that settles, a delay of at most 8 frames",
     ),
     file="matrix of single precision (.fits) and its certificate",
-    write=export_cacao,
+    options={"steps": None, "loss": _MOST_LOSS, "modes": None, "other_gain": None},
+    round=_round,
+    write=_write,
+    read=_read,
+    computed=_as_computed,
+    start=lambda numbers, limit: AppliedFilter(_flat(numbers), numbers[1], limit),
+    single=lambda numbers: numbers,
+    join=_join,
+    split=_split,
+    facts=lambda whole, **_: {
+        "steps": whole[0].shape[1],
+        "latency_frames": whole[1] + 1,
+        "sign": _SIGN,
+    },
+    hint="Give more steps, or none to have them chosen; or use a target with states, such as c.",
     endings=(".fits",),
 )

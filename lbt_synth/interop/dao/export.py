@@ -1,174 +1,200 @@
-"""Export a controller as the matrix that Durham's dao real-time computers load."""
+"""The target dao: the matrix that Durham's dao real-time computers load, one column per mode.
+
+Per mode ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)`` in single precision;
+rows ``0 .. M`` of a matrix (2 M + 1, modes) are b, rows ``M+1 .. 2M`` are a.
+"""
 
 from __future__ import annotations
 
 import io
-import os
-from dataclasses import replace
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
 
-from lbt_synth.design import Check, Design, ShapedDesign
-from lbt_synth.design.result import require_hardware
-from lbt_synth.interop.dao.direct_form import InnerLoop, direct_form, direct_form_rows
-from lbt_synth.interop.dao.refit import (
-    DirectFormLoop,
-    refit,
-    round_together,
-    shaped_mode_loop,
-)
-from lbt_synth.interop.export_checks import (
-    Exported,
-    join_labels,
-    provenance_lines,
-    rehearsal_error,
-    write_export,
-)
-from lbt_synth.interop.modes import ModalDesign, all_modes
-from lbt_synth.interop.target import Arithmetic, Target
-from lbt_synth.interop.written_loop import ROUNDOFF, Rounding, prove_written, require_proved
-from lbt_synth.linear import Controller
-from lbt_synth.models import LoopHardware
-from lbt_synth.storage.array_file import fits_bytes
-from lbt_synth.storage.atomic_files import require_ending
-from lbt_synth.validation import FloatArray, integer
+from lbt_synth.design import Design
+from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
+from lbt_synth.interop.modes import ModeDesign
+from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
+from lbt_synth.interop.proof import ROUNDOFF, Written, prove_written, sums_variance
+from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.storage.array_file import fits_bytes, open_fits
+from lbt_synth.validation import FloatArray, frozen_copy, integer
 
-_HINT = "Design with fewer states or less accurate models, or use a target in double precision."
-_OWN = "of the gain file, rounded"
-_AGAIN = "made again for single precision; the loop keeps what the gain file promises"
+_Matrix: TypeAlias = NDArray[np.float32]
+_COUPLED = 1e-9  # of the largest entry of a matrix; less is what a solver leaves of a zero
+_NEGLIGIBLE = 1e-13  # of the largest coefficient; single precision has no use for less
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
 
 
-def export_dao(
-    path: str | os.PathLike[str],
-    design: ModalDesign,
-    *,
-    order: int = 20,
-    modes: int | None = None,
-    other_gain: float | None = None,
-    hardware: LoopHardware | None = None,
-    gain_digest: str | None = None,
-) -> Exported:
-    """Write a controller as the matrix of a dao real-time computer, one column per mode.
+def direct_form_rows(controller: Controller, order: int) -> FloatArray:
+    """Return the matrix (2 order + 1, modes) of a controller, before it is rounded."""
+    rows = np.zeros((2 * order + 1, len(controller.C)))
+    for mode, (num, den) in enumerate(mode_polynomials(controller)):
+        needed = len(den) - 1
+        if needed > order:
+            raise ProblemError(
+                f"order must be at least {needed}, that of the controller of mode {mode + 1}; got "
+                f"{order}. Raise it there and in the RTC's configuration, or design with fewer "
+                "states."
+            )
+        rows[: needed + 1, mode] = num
+        rows[order + 1 : order + 1 + needed, mode] = -den[1:]
+    return rows
 
-    The RTC computes ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)`` per mode
-    in single precision. Rows ``0 .. M`` of the matrix are ``b``, rows ``M+1 .. 2M`` are ``a``.
-    The loop is closed around the rounded coefficients before anything is written, at the sensor
-    gains of the design, and the rounding of the sums counts as noise. A shaped design whose own
-    coefficients fail is made again, with all the coefficients that the order has.
 
-    Parameters
-    ----------
-    path : path-like
-        File to write, ending in ``.npy`` or ``.fits``. The proof goes beside it, with
-        ``.certificate.json`` after its name.
-    design : Design, MixedController or ModalFilters
-        Design whose modes decouple, with unit sensor and influence matrices; or a design with
-        integrators for the other modes; or a filter for each mode.
-    order : int, optional
-        M of the RTC's configuration; its own default is 20.
-    modes : int, optional
-        Columns of the matrix; by default those of the design. Further columns are zero, and their
-        modes get no command, without ``other_gain``.
-    other_gain : float, optional
-        Gain of an integrator for each further mode.
-    hardware : LoopHardware, optional
-        Loop of the integrators, where no filter says which.
-    gain_digest : str, optional
-        SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
+def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArray]]:
+    """Return numerator and denominator (k,) of each mode in powers of ``z^-1``.
 
-    Returns
-    -------
-    Exported
-        Matrix and certificate, the error in double and in single precision, and the checks.
-
-    Raises
-    ------
-    OutputError
-        If the ending is neither, or a file cannot be written.
-    ProblemError
-        If the design is not of such a loop, its modes are coupled, or the order is too low.
-    CertificateError
-        If the certificate that the design carries has a failed check.
-    NumericalError
-        If a check fails in the arithmetic of the RTC; ``residual`` holds its value.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, numpy as np, tempfile, pathlib
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = pathlib.Path(folder) / "slow.npy"
-    ...     _ = lbt.interop.export_dao(file, slow, order=1, modes=3)
-    ...     np.load(file).tolist()
-    [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
+    States that a mode does not drive, or does not show in its command, are left out. Denominators
+    begin with 1.
     """
-    target = require_ending(path, "a matrix of dao", (".npy", ".fits"))
-    whole = all_modes(design, "a dao matrix", modes=modes, other_gain=other_gain, hardware=hardware)
-    order = integer(order, "order", at_least=1)
-    matrix = np.zeros((2 * order + 1, whole.count), dtype=np.float32)
-    checks: list[Check] = []
-    again, error = False, 0.0
-    for part in whole.parts:
-        proved = _proved_columns(part.design, order)
-        matrix[:, part.modes] = proved.columns
-        again |= proved.made_again
-        error = max(error, rehearsal_error(part.design, InnerLoop(proved.columns)))
-        checks += whole.name_checks(part, proved.checks)
-    first = whole.parts[0].design
-    lines = provenance_lines(first, gain_digest)
-    content = _matrix_bytes(matrix, first, lines, fits=target.suffix.lower() == ".fits")
-    written = write_export(
-        {target: content},
-        target="dao",
-        arithmetic=TARGET.arithmetic,
-        checks=checks,
-        gain_digest=gain_digest,
-        order=order,
-        modes=whole.count,
-        sign=_SIGN,
-        coefficients=_AGAIN if again else _OWN,
-        error=error,
-        start=lambda limit: InnerLoop(matrix[:, : whole.own], limit=limit),
+    system, size = controller.to_statespace().balanced(), controller.n_states
+    m, q = system.D.shape
+    if m != q:
+        raise ProblemError(
+            f"a filter per mode needs as many commands as measurements; got {m} commands and {q} "
+            "measurements. Use a target of matrices, such as c."
+        )
+    A, B, C, D = (_links(getattr(system, name)) for name in "ABCD")
+    paths = np.linalg.matrix_power(A | np.eye(size, dtype=np.bool_), size)
+    reached, shown = paths @ B, C @ paths
+    coupled = np.argwhere((D | (C @ reached)) & ~np.eye(m, dtype=np.bool_))
+    if coupled.size:
+        raise ProblemError(
+            f"the modes must decouple; here measurement {coupled[0, 1] + 1} moves command "
+            f"{coupled[0, 0] + 1}. Use a target of matrices, such as c."
+        )
+    inside = [np.flatnonzero(reached[:, mode] & shown[mode]) for mode in range(m)]
+    return [_polynomials(system, mode, states) for mode, states in enumerate(inside)]
+
+
+def _links(matrix: FloatArray) -> NDArray[np.bool_]:
+    """Return which entries couple, (rows, columns)."""
+    return np.asarray(np.abs(matrix) > _COUPLED * np.max(np.abs(matrix), initial=0.0))
+
+
+def _polynomials(
+    system: StateSpace, mode: int, states: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the quotient ``c adj(zI - A) b / det(zI - A) + d`` of some states of a mode."""
+    A = system.A[np.ix_(states, states)]
+    b, c, d = system.B[states, mode], system.C[mode, states], system.D[mode, mode]
+    with np.errstate(all="ignore"):  # what overflows is refused once it is rounded
+        den, entry = _characteristic(A), np.outer(b, c)
+        scale = 1 / (np.max(np.abs(entry), initial=0.0) or 1.0)
+        # det(zI - A + b c) = det(zI - A) + c adj(zI - A) b
+        num = d * den + (_characteristic(A - scale * entry) - den) / scale
+        shares = [np.abs(values) / (np.max(np.abs(values)) or 1.0) for values in (num, den)]
+    used = ~(np.max(shares, axis=0) <= _NEGLIGIBLE)  # what is no number is used, and refused
+    count = 1 + int(np.flatnonzero(used)[-1])
+    return num[:count], den[:count]
+
+
+def _characteristic(A: FloatArray) -> FloatArray:
+    """Return the characteristic polynomial, highest power first."""
+    if not A.size:
+        return np.ones(1)
+    finite = bool(np.all(np.isfinite(A)))
+    return np.asarray(np.real(np.poly(A))) if finite else np.full(len(A) + 1, np.nan)
+
+
+def direct_form(rows: FloatArray, dt_s: float) -> Controller:
+    """Return the controller of a matrix (2 M + 1, modes), whose first states are the commands."""
+    if not np.all(np.isfinite(rows)):
+        raise NumericalError(
+            "the coefficients must be numbers of single precision; some are beyond its range. "
+            "Try a target that keeps the states (c, matlab), or a design with fewer states.",
+            status="overflow",
+        )
+    order, modes = len(rows) // 2, rows.shape[1]
+    step = np.eye(order + 1, k=1)  # x_j(k) = x_{j+1}(k-1) + b_j y(k) + a_j u(k-1)
+    feedback = np.vstack([rows[order + 1 :], np.zeros((1, modes))])
+    return Controller(
+        A=block_diag(*(step + np.outer(a, np.eye(1, order + 1)) for a in feedback.T)),
+        B=block_diag(*rows[: order + 1].T[:, :, None]),
+        C=frozen_copy(np.kron(np.eye(modes), np.eye(1, order + 1))),
+        D=np.zeros((modes, modes)),
+        dt_s=dt_s,
     )
-    return replace(written, made_again=again)
 
 
-class _Proved(NamedTuple):
-    """Columns (2 M + 1, n) of a design, and what was checked of them."""
+class InnerLoop:
+    """Per mode, ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, in single precision.
 
-    columns: NDArray[np.float32]
-    checks: tuple[Check, ...]
-    made_again: bool
+    The products are added one by one, in the order of the matrix's rows. The voltages are
+    ``-to_actuators u`` of a matrix (actuators, modes), by default the identity; where one exceeds
+    the limit it is clipped, and the memory holds the commands that were applied.
+    """
+
+    def __init__(
+        self, matrix: ArrayLike, to_actuators: ArrayLike | None = None, limit: float = np.inf
+    ) -> None:
+        self._rows = np.asarray(matrix, dtype=np.float32)
+        if self._rows.ndim != 2 or len(self._rows) % 2 == 0:
+            raise DimensionError(
+                "the matrix must have 2 M + 1 rows and one column per mode; got shape "
+                f"{self._rows.shape}."
+            )
+        modes = self._rows.shape[1]
+        self._to_actuators = np.asarray(
+            np.eye(modes) if to_actuators is None else to_actuators, dtype=np.float32
+        )
+        if self._to_actuators.ndim != 2 or self._to_actuators.shape[1] != modes:
+            raise DimensionError(
+                f"to_actuators must have {modes} columns, one per mode; got shape "
+                f"{self._to_actuators.shape}."
+            )
+        self._to_modes = np.linalg.pinv(self._to_actuators).astype(np.float32)
+        self._limit = np.float32(limit)
+        self._past = len(self._rows) // 2  # M
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._memory: _Matrix = np.zeros_like(self._rows)
+
+    def step(self, y: ArrayLike) -> FloatArray:
+        """Take y(k), (modes,), return the commands that were applied, (modes,)."""
+        memory, first = self._memory, self._past + 1
+        memory[1:first] = memory[: first - 1].copy()
+        memory[0] = y
+        u = np.add.accumulate(self._rows * memory, axis=0)[-1]
+        voltages = -(self._to_actuators @ u)
+        if np.any(np.abs(voltages) > self._limit):
+            u = -(self._to_modes @ np.clip(voltages, -self._limit, self._limit))
+        memory[first + 1 :] = memory[first:-1].copy()
+        memory[first : first + 1] = u  # nothing to write at M = 0
+        return np.asarray(u, dtype=np.float64)
 
 
-def _proved_columns(design: Design, order: int) -> _Proved:
-    """Return the columns of a design, proved in the arithmetic of the RTC."""
-    exact = direct_form_rows(design.controller, order)
-    with np.errstate(over="ignore"):  # what is beyond the range becomes infinite, and is refused
-        rounded = exact.astype(np.float32)
-    loops = _mode_loops(design, order)
-    checks = prove_written(design, *_as_computed(rounded, design, loops))
-    made_again = False
-    if isinstance(design, ShapedDesign) and not all(check.passed for check in checks):
-        made_again = _can_make_again(exact)
-        if made_again:
-            rounded = _made_again(design, exact)
-            checks = prove_written(design, *_as_computed(rounded, design, loops))
-    require_proved(checks, "single precision, in direct form", _HINT)
-    return _Proved(rounded, checks, made_again)
+def _round(designs: Sequence[Design], *, order: int, **_: Any) -> list[_Matrix]:
+    """Return the columns (2 M + 1, n) of each design, made again where a shaped one fails."""
+    integer(order, "order", at_least=1)
+    numbers = []
+    for design in designs:
+        exact = direct_form_rows(design.controller, order)
+        with np.errstate(over="ignore"):  # what is beyond the range becomes infinite, and refused
+            rounded = exact.astype(np.float32)
+        if design.mode_specifications:
+            checks = prove_written(design, _as_computed(design, rounded))
+            if not all(check.passed for check in checks):
+                rounded = make_again(design, exact)
+        numbers.append(rounded)
+    return numbers
 
 
-def _as_computed(
-    rounded: NDArray[np.float32], design: Design, loops: list[DirectFormLoop]
-) -> tuple[Controller, Rounding]:
+def _as_computed(design: Design, rounded: _Matrix) -> Written:
     """Return the controller with the matrix's numbers, and what its arithmetic adds."""
     rows, dt_s = rounded.astype(np.float64), design.controller.dt_s
     order, added = len(rows) // 2, rows.copy()
     added[: order + 1] = np.eye(order + 1, 1)  # an error of the sum enters as b_0 y(k) does
-    written, entry = (direct_form(matrix, dt_s) for matrix in (rows, added))
+    controller, entry = (direct_form(matrix, dt_s) for matrix in (rows, added))
+    loops: list[DirectFormLoop] = mode_loops(design, order)
 
     def variance(sensor_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         """Add up the rounding of each product and of each partial sum."""
@@ -176,58 +202,52 @@ def _as_computed(
             columns = zip(loops, rows.T, strict=True)
             return np.array([loop.sums_nm2(column, sensor_gain) for loop, column in columns])
         sizes = np.where(np.arange(len(rows))[:, None] <= order, measured, commands)
-        terms = np.abs(rows) * sizes  # a bound: their signs and correlations are not used
-        squares = terms**2 + np.cumsum(terms, axis=0) ** 2
-        return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.sum(squares, axis=0))
+        # a bound: signs and correlations are not used
+        bound = sums_variance((rows * sizes).T, 0, ROUNDOFF["single"])
+        return bound(sensor_gain, np.ones(len(rows)), np.zeros(0))
 
-    return written, Rounding(entry=entry, variance=variance)
-
-
-def _mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
-    """Return the loop of each mode of a shaped design, made once for equal ones; none of others."""
-    if not isinstance(design, ShapedDesign):
-        return []
-    hardware = require_hardware(design, "dao")
-    found = {
-        mode: shaped_mode_loop(hardware, design.specifications[mode], order)
-        for mode in set(design.first_equal_modes)
-    }
-    return [found[mode] for mode in design.first_equal_modes]
+    return Written(controllers={frozenset(): controller}, entry=entry, variance=variance)
 
 
-def _can_make_again(exact: FloatArray) -> bool:
-    """Whether the controller of each mode is a starting point: of an even order, not late."""
-    odd = (len(exact) // 2) % 2
-    unused = exact[[len(exact) // 2, -1]]
-    return bool(exact[0].all()) and not (odd and unused.any())
+def _join(numbers: Sequence[_Matrix], parts: Sequence[ModeDesign], count: int) -> _Matrix:
+    """Return the matrix of all modes; further columns are zero."""
+    matrix = np.zeros((len(numbers[0]), count), dtype=np.float32)
+    for columns, part in zip(numbers, parts, strict=True):
+        matrix[:, list(part.modes)] = columns
+    return matrix
 
 
-def _made_again(design: ShapedDesign, exact: FloatArray) -> NDArray[np.float32]:
-    """Return the matrix of controllers made for this arithmetic; equal modes are made once."""
-    order = len(exact) // 2
-    used = np.arange(len(exact))
-    if order % 2:  # the search takes coefficients in pairs
-        used = np.delete(used, [order, 2 * order])
-    loops = _mode_loops(design, order - order % 2)
-    modes = design.first_equal_modes
-    made = {k: round_together(loops[k], refit(loops[k], exact[used, k])) for k in set(modes)}
-    rounded = np.zeros(exact.shape, dtype=np.float32)
-    rounded[used] = np.stack([made[k] for k in modes], axis=1)
-    return rounded
-
-
-def _matrix_bytes(
-    matrix: NDArray[np.float32], design: Design, lines: list[tuple[str, str]], *, fits: bool
-) -> bytes:
-    if fits:
+def _write(
+    place: Path, matrix: _Matrix, design: Design, origin: Sequence[tuple[str, str]], **_: Any
+) -> dict[Path, bytes]:
+    """Return the matrix as FITS or as a file of numpy, by the ending."""
+    if place.suffix.lower() == ".fits":
         cards: dict[str, Any] = {
             "METHOD": (design.method, "synthesis"),
             "ORDER": (len(matrix) // 2, "M: rows b_0..b_M, then a_1..a_M"),
         }
-        return fits_bytes(cards, {"K_MAT": matrix}, comments=[*join_labels(lines), _SIGN])
+        comments = [*join_labels(origin), _SIGN]
+        return {place: fits_bytes(cards, {"K_MAT": matrix}, comments=comments)}
     buffer = io.BytesIO()
     np.save(buffer, matrix, allow_pickle=False)
-    return buffer.getvalue()
+    return {place: buffer.getvalue()}
+
+
+def _read(files: Mapping[Path, bytes], _: _Matrix) -> _Matrix:
+    """Return the matrix that a file holds."""
+    ((place, content),) = files.items()
+    if place.suffix.lower() == ".fits":
+        with open_fits(content) as units:
+            return np.array(units["K_MAT"].data, dtype=np.float32)
+    return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+
+
+def _remark(design: Design, columns: _Matrix) -> str:
+    """Return that coefficients are not those of the gain file."""
+    exact = direct_form_rows(design.controller, len(columns) // 2)
+    if np.array_equal(columns, exact.astype(np.float32)):
+        return ""
+    return "made again for single precision; the loop keeps what the gain file promises"
 
 
 TARGET = Target(
@@ -240,6 +260,19 @@ TARGET = Target(
         limits="one transfer function per mode, of order M at most",
     ),
     file="matrix of single precision (.npy, .fits) and its certificate (.json)",
-    write=export_dao,
-    endings=(".npy",),
+    options={"order": 20, "modes": None, "other_gain": None},
+    round=_round,
+    write=_write,
+    read=_read,
+    computed=_as_computed,
+    start=lambda matrix, limit: InnerLoop(matrix, limit=limit),
+    single=lambda matrix: matrix,
+    join=_join,
+    split=lambda matrix, parts, _: [
+        [matrix[:, list(copy)] for copy in part.copies] for part in parts
+    ],
+    facts=lambda _, **options: {"sign": _SIGN},
+    remark=_remark,
+    hint="Design with fewer states or less accurate models, or use a target in double precision.",
+    endings=(".npy", ".fits"),
 )

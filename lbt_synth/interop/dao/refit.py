@@ -15,16 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.design.shaping.channel import Channel, laguerre_basis
-from lbt_synth.design.shaping.objectives import (
-    ResidualVariance,
-    VibrationBand,
-    leaves,
-    spectrum_of,
-)
+from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.design.shaping.uncertainty import SensorGainRange
-from lbt_synth.interop.written_loop import ROUNDOFF
+from lbt_synth.interop.proof import ROUNDOFF
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -54,19 +51,8 @@ _ORDERS = 3000  # in which the coefficients are rounded; the best one counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scenario:
-    """What disturbs one mode at a sensor gain, at the loop's frequencies."""
-
-    sensor_gain: float
-    phase_nm2: FloatArray  # (F,) power of turbulence and skirts at each node
-    noise_nm2: FloatArray  # (F,)
-    line_nm: FloatArray  # (F,) rms of the vibration that may be there, or 0
-    spread_nm2: FloatArray  # (F,) its power, spread evenly over its band
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DirectFormLoop:
-    """One mode, whose controller is ``c = (b_0 .. b_M, a_1 .. a_M)``.
+    """One mode, whose controller is ``c = (b_0 .. b_M, a_1 .. a_M)``, in S scenarios.
 
     With the path of the loop L (delay and mirror) and the polynomials in ``z^-1``
     ``b = sum b_j z^-j`` and ``a = 1 - sum a_i z^-i``, the loop at the sensor gain g has the
@@ -77,52 +63,50 @@ class DirectFormLoop:
     path: ComplexArray  # (F,)
     path_taps: FloatArray  # of the path, in powers of z^-1
     shares: FloatArray  # (F,) of the frequencies that a node stands for; their sum is 1
-    scenarios: tuple[Scenario, ...]
+    gains: tuple[float, ...]  # (S,) sensor gain of each scenario
+    phase_nm2: FloatArray  # (S, F) power of turbulence and skirts at each node
+    noise_nm2: FloatArray  # (S, F)
+    line_nm: FloatArray  # (S, F) rms of the vibration that may be there, or 0
+    spread_nm2: FloatArray  # (S, F) its power, spread evenly over its band
     low: float  # ends of the sensor gains for which the loop is to be stable
     high: float
 
-    @property
-    def order(self) -> int:
-        """M."""
-        return int(self.powers.shape[1]) - 1
-
     def polynomials(self, c: FloatArray, sensor_gain: float) -> tuple[ComplexArray, ...]:
         """Return a, b and p at the nodes, (F,) each."""
-        b = self.powers @ c[: self.order + 1]
-        a = 1 - self.powers[:, 1:] @ c[self.order + 1 :]
+        M = c.size // 2
+        b, a = self.powers @ c[: M + 1], 1 - self.powers[:, 1:] @ c[M + 1 :]
         return a, b, a + sensor_gain * self.path * b
 
     def slopes(self) -> tuple[ComplexArray, ComplexArray]:
         """Return the slopes of a and of L b, (F, 2 M + 1) each."""
-        size, M = self.path.size, self.order
-        of_a = np.hstack([np.zeros((size, M + 1)), -self.powers[:, 1:]])
-        of_b = np.hstack([self.path[:, None] * self.powers, np.zeros((size, M))])
+        of_a = np.hstack([np.zeros_like(self.powers), -self.powers[:, 1:]])
+        of_b = np.hstack([self.path[:, None] * self.powers, np.zeros_like(self.powers[:, 1:])])
         return of_a, of_b
 
     def residuals_nm(self, c: FloatArray, *, rounding: bool = False) -> FloatArray:
         """Return the rms of the residual in each scenario, in exact or in rounded arithmetic."""
         variances = []
-        for s in self.scenarios:
-            a, b, p = self.polynomials(c, s.sensor_gain)
-            variance = s.phase_nm2 @ np.abs(a / p) ** 2
-            variance += s.noise_nm2 @ np.abs(self.path * b / p) ** 2
-            variance += np.max(s.line_nm * np.abs(a / p)) ** 2
+        for s, gain in enumerate(self.gains):
+            a, b, p = self.polynomials(c, gain)
+            variance = self.phase_nm2[s] @ np.abs(a / p) ** 2
+            variance += self.noise_nm2[s] @ np.abs(self.path * b / p) ** 2
+            variance += np.max(self.line_nm[s] * np.abs(a / p)) ** 2
             if rounding:
-                entering = self.shares @ np.abs(self.path / p) ** 2
-                variance += self.sums_nm2(c, s.sensor_gain) * entering
+                variance += self.sums_nm2(c, gain) * (self.shares @ np.abs(self.path / p) ** 2)
             variances.append(variance)
         return np.sqrt(variances)
 
-    def rounding_matrix(self, c: FloatArray, s: Scenario) -> FloatArray:
+    def rounding_matrix(self, c: FloatArray, s: int) -> FloatArray:
         """Return the matrix V with which ``c' V c`` is the variance of the sums' rounding [nm^2].
 
         Each product and each partial sum is rounded. Their sizes are those of the measurements and
         commands that the loop around c remembers.
         """
-        a, b, p = self.polynomials(c, s.sensor_gain)
+        gain = self.gains[s]
+        a, b, p = self.polynomials(c, gain)
         memory = np.hstack([self.powers * (a / p)[:, None], self.powers[:, 1:] * (b / p)[:, None]])
-        phase = s.phase_nm2 + s.spread_nm2
-        size = np.sqrt(s.sensor_gain**2 * phase + s.noise_nm2)[:, None] * memory
+        phase = self.phase_nm2[s] + self.spread_nm2[s]
+        size = np.sqrt(gain**2 * phase + self.noise_nm2[s])[:, None] * memory
         moments = (size.conj().T @ size).real
         index = np.arange(c.size)
         after = c.size - np.maximum(np.maximum.outer(index, index), 1)  # sums that hold both terms
@@ -131,12 +115,11 @@ class DirectFormLoop:
 
     def sums_nm2(self, c: FloatArray, sensor_gain: float) -> float:
         """Return the variance of the rounding of the sums at a sensor gain of a scenario."""
-        (scenario,) = (s for s in self.scenarios if s.sensor_gain == sensor_gain)
-        return float(c @ self.rounding_matrix(c, scenario) @ c)
+        return float(c @ self.rounding_matrix(c, self.gains.index(sensor_gain)) @ c)
 
     def radius(self, c: FloatArray) -> float:
         """Return the largest spectral radius over the sensor gains."""
-        M, extra = self.order, self.path_taps.size - 1
+        M, extra = c.size // 2, self.path_taps.size - 1
         gains = np.append(np.geomspace(self.low, self.high, _GAINS), 1.0)
         a = np.concatenate([[1.0], -c[M + 1 :], np.zeros(extra)])
         p = a + gains[:, None] * np.convolve(self.path_taps, c[: M + 1])
@@ -144,62 +127,88 @@ class DirectFormLoop:
         companion[:, 0] = -p[:, 1:] / p[:, :1]
         return float(np.max(np.abs(np.linalg.eigvals(companion))))
 
+    @property
+    def bounded_gains(self) -> list[float]:
+        """Sensor gains at which the sensitivity has limits."""
+        return sorted({1.0, self.low, self.high, *self.gains})
 
-def shaped_mode_loop(
-    hardware: LoopHardware, specification: Specification, order: int
-) -> DirectFormLoop:
+
+def mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
+    """Return the loop of each mode of a shaped design, made once for equal ones; none of others."""
+    if not design.mode_specifications:
+        return []
+    hardware, modes = require_hardware(design, "dao"), design.first_equal_modes
+    loops = {k: mode_loop(hardware, design.mode_specifications[k], order) for k in set(modes)}
+    return [loops[k] for k in modes]
+
+
+def mode_loop(hardware: LoopHardware, specification: Specification, order: int) -> DirectFormLoop:
     """Return the loop of one mode of a shaped design, at the frequencies that it was shaped at."""
     single = hardware.single_mode()
     channel = Channel(hardware=single, basis=laguerre_basis(1, 0.0, dt_s=single.dt_s))
     grid = specification.grid(channel, fineness=2)
+    more = [grid.points_hz, *(grid.within(*band) for band in specification.bands_hz)]
+    f = np.concatenate([grid.nodes_hz, *more])
+    width = np.concatenate([grid.weights_hz, np.zeros(f.size - grid.nodes_hz.size)])
     terms = leaves(specification.objective)
-    bands = [term for term in terms if isinstance(term, VibrationBand)]
-    inside = [grid.within(band.low_hz, band.high_hz) for band in bands]
-    more = np.concatenate([grid.points_hz, *inside])
-    f = np.concatenate([grid.nodes_hz, more])
-    width = np.concatenate([grid.weights_hz, np.zeros(more.size)])
-    scenarios = []
-    for gain in sorted({term.sensor_gain for term in terms}, reverse=True):
-        phase, noise, line, spread = np.zeros((4, f.size))
-        for term in terms:
-            if term.sensor_gain != gain:
-                continue
-            spectrum = spectrum_of(term, single.frame_rate_hz)
-            phase += 0.0 if spectrum is None else width * spectrum.psd(f)
-            if isinstance(term, ResidualVariance):
-                noise += width / channel.nyquist_hz * term.noise_nm**2
-            else:
-                covered = (f >= term.low_hz) & (f <= term.high_hz)
-                line = np.hypot(line, np.where(covered, term.rms_nm, 0.0))
-                evenly = np.where(covered, width, 0.0)
-                spread += term.rms_nm**2 * evenly / np.sum(evenly)
-        scenarios.append(
-            Scenario(
-                sensor_gain=gain, phase_nm2=phase, noise_nm2=noise, line_nm=line, spread_nm2=spread
-            )
-        )
+    gains = tuple(sorted({term.sensor_gain for term in terms}, reverse=True))
+    phase, noise, line, spread = np.zeros((4, len(gains), f.size))
+    for term in terms:
+        s, spectrum = gains.index(term.sensor_gain), spectrum_of(term, single.frame_rate_hz)
+        phase[s] += 0.0 if spectrum is None else width * spectrum.psd(f)
+        if isinstance(term, ResidualVariance):
+            noise[s] += width / channel.nyquist_hz * term.noise_nm**2
+        else:
+            covered = (f >= term.low_hz) & (f <= term.high_hz)
+            line[s] = np.hypot(line[s], np.where(covered, term.rms_nm, 0.0))
+            evenly = np.where(covered, width, 0.0)
+            spread[s] += term.rms_nm**2 * evenly / np.sum(evenly)
     ranges = [d for d in specification.demands if isinstance(d, SensorGainRange)]
-    powers = np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(order + 1)))
     taps = np.concatenate([[0.0], single.mirror_taps])
+    powers = np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(max(order + 1, taps.size))))
     return DirectFormLoop(
-        powers=powers,
-        path=np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(taps.size))) @ taps,
+        powers=powers[:, : order + 1],
+        path=powers[:, : taps.size] @ taps,
         path_taps=taps,
         shares=width / channel.nyquist_hz,
-        scenarios=tuple(scenarios),
+        gains=gains,
+        phase_nm2=phase,
+        noise_nm2=noise,
+        line_nm=line,
+        spread_nm2=spread,
         low=min([1.0, *(r.low for r in ranges)]),
         high=max([1.0, *(r.high for r in ranges)]),
     )
 
 
+def make_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
+    """Return a matrix made for this arithmetic of that of a shaped design; equal modes once.
+
+    The search takes coefficients in pairs, and begins with b_0: where there is none, or an odd
+    order is needed, the rounded matrix is returned.
+    """
+    order, used = len(exact) // 2, np.arange(len(exact))
+    rounded = exact.astype(np.float32)
+    odd, modes = order % 2, design.first_equal_modes
+    if not exact[0].all() or (odd and exact[[order, -1]].any()):
+        return rounded
+    if odd:
+        used = np.delete(used, [order, 2 * order])
+    loops = mode_loops(design, order - odd)
+    made = {k: round_together(loops[k], refit(loops[k], exact[used, k])) for k in set(modes)}
+    rounded[used] = np.stack([made[k] for k in modes], axis=1)
+    return rounded
+
+
 def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
     """Return coefficients (2 M + 1,), M even, whose loop leaves least, rounding included."""
     allowed_nm, limits = loop.residuals_nm(exact), _limits(loop, exact)
-    least_damping = _DAMPED * (1 - loop.radius(exact))
-    theta, weights = _sections(_widened(loop, exact), loop.order), np.ones(len(loop.scenarios))
+    damped = 1 - _DAMPED * (1 - loop.radius(exact))
+    theta, weights = _sections(_widened(exact)), np.ones(len(loop.gains))
+    c = exact
     for rounding, steepness, modulus in _STEPS:
-        goals = _Goals(np.sqrt(weights) / allowed_nm, rounding, limits, steepness, modulus)
-        theta = _search(loop, goals, theta, 1 - least_damping)
+        shares = np.sqrt(weights) / allowed_nm
+        theta = _search(loop, theta, damped, (shares, rounding, limits, steepness, modulus))
         c = _coefficients(theta)
         lost = loop.residuals_nm(c, rounding=True) / allowed_nm
         if np.max(lost) < _ENOUGH and steepness == _STEPS[-1][1]:
@@ -218,7 +227,7 @@ def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float3
     """
     of_a, of_b = loop.slopes()
     seen = np.concatenate(
-        [(of_a + g * of_b) / loop.polynomials(exact, g)[2][:, None] for g in _gains(loop)]
+        [(of_a + g * of_b) / loop.polynomials(exact, g)[2][:, None] for g in loop.bounded_gains]
     )
     used = np.flatnonzero(exact)
     step = np.spacing(np.abs(exact[used]).astype(np.float32)).astype(np.float64)
@@ -239,30 +248,16 @@ def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float3
     return rounded
 
 
-@dataclass(frozen=True, slots=True)
-class _Goals:
-    """What a search makes small."""
-
-    shares: FloatArray  # (scenarios,) weight of a nanometre of residual
-    rounding: float  # weight of the rounding in it
-    limits: dict[float, FloatArray]  # largest modulus of the sensitivity at each node, by gain
-    steepness: float  # weight of what exceeds a limit
-    modulus: float  # largest squared modulus of the roots far from z = 1
-
-
-def _gains(loop: DirectFormLoop) -> list[float]:
-    return sorted({1.0, loop.low, loop.high, *(s.sensor_gain for s in loop.scenarios)})
-
-
-def _widened(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
+def _widened(exact: FloatArray) -> FloatArray:
     """Multiply both polynomials by a factor with roots away from z = 1, up to the order."""
-    M = loop.order
+    M = exact.size // 2
     b, a = np.trim_zeros(exact[: M + 1], "b"), np.r_[1.0, -np.trim_zeros(exact[M + 1 :], "b")]
     spare = M + 1 - max(b.size, a.size)
     angles = np.linspace(np.pi / 2, np.pi, spare // 2, endpoint=False)
-    roots = np.concatenate([_RADIUS * np.exp(1j * angles), [-_RADIUS] * (spare % 2)])
-    factor = np.poly(np.concatenate([roots, roots[: spare // 2].conj()])).real
-    wide = np.zeros(2 * M + 1)
+    roots = _RADIUS * np.concatenate(
+        [np.exp(1j * angles), np.exp(-1j * angles), [-1] * (spare % 2)]
+    )
+    factor, wide = np.poly(roots).real, np.zeros(2 * M + 1)
     b, a = np.convolve(b, factor), np.convolve(a, factor)
     wide[: b.size], wide[M + 1 : M + a.size] = b, -a[1:]
     return wide
@@ -271,55 +266,51 @@ def _widened(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
 def _limits(loop: DirectFormLoop, exact: FloatArray) -> dict[float, FloatArray]:
     """Return what the sensitivity of the design does not exceed: in the bands, and everywhere."""
     limits = {}
-    for gain in _gains(loop):
+    for gain in loop.bounded_gains:
         a, _, p = loop.polynomials(exact, gain)
         S = np.abs(a / p)
         limits[gain] = np.full(S.size, np.max(S) if gain in (1.0, loop.low, loop.high) else np.inf)
-        for s in loop.scenarios:
-            band = s.line_nm > 0
-            if s.sensor_gain == gain and np.any(band):
-                limits[gain][band] = np.max((s.line_nm * S)[band]) / s.line_nm[band]
+        for line in (loop.line_nm[s] for s, g in enumerate(loop.gains) if g == gain):
+            if np.any(band := line > 0):
+                limits[gain][band] = np.max((line * S)[band]) / line[band]
     return limits
 
 
+# weight (S,) of a nanometre of residual; that of the rounding in it; largest modulus of the
+# sensitivity at each node, by gain; weight of what exceeds it; largest squared modulus of the roots
+# far from z = 1
+_Goals = tuple[FloatArray, float, dict[float, FloatArray], float, float]
+
+
 def _search(
-    loop: DirectFormLoop, goals: _Goals, theta: FloatArray, largest_radius: float
+    loop: DirectFormLoop, theta: FloatArray, largest_radius: float, goals: _Goals
 ) -> FloatArray:
     """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken."""
     latest: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def rows(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        key = x.tobytes()
-        if key not in latest:
+        if x.tobytes() not in latest:
             latest.clear()
-            latest[key] = _rows(loop, goals, x)
-        return latest[key]
-
-    count = rows(theta)[0].size
+            latest[x.tobytes()] = _rows(loop, goals, x)
+        return latest[x.tobytes()]
 
     def errors(x: FloatArray) -> FloatArray:
         stable = loop.radius(_coefficients(x)) < largest_radius
-        return rows(x)[0] if stable else np.full(count, _UNSTABLE)
+        return rows(x)[0] if stable else np.full_like(rows(x)[0], _UNSTABLE)
 
     def slopes(x: FloatArray) -> FloatArray:
         return rows(x)[1]
 
     found = least_squares(
-        errors,
-        theta,
-        jac=slopes,
-        x_scale="jac",
-        max_nfev=_EVALUATIONS,
-        ftol=1e-5,
-        xtol=1e-12,
+        errors, theta, jac=slopes, x_scale="jac", max_nfev=_EVALUATIONS, ftol=1e-5, xtol=1e-12
     )
     return np.asarray(found.x)
 
 
 def _rows(loop: DirectFormLoop, goals: _Goals, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the errors whose squares are minimised, and their Jacobian."""
-    c = _coefficients(theta)
-    of_a, of_b = loop.slopes()
+    shares, rounding, limits, steepness, modulus = goals
+    c, (of_a, of_b) = _coefficients(theta), loop.slopes()
     blocks: list[tuple[FloatArray, FloatArray]] = []
 
     def small(size: ComplexArray, slope: ComplexArray) -> None:
@@ -327,10 +318,10 @@ def _rows(loop: DirectFormLoop, goals: _Goals, theta: FloatArray) -> tuple[Float
 
     def below(size: FloatArray, slope: FloatArray, limit: FloatArray | float) -> None:
         over = np.maximum(size / limit - 1 + _ROOM, 0.0)
-        share = goals.steepness * (over > 0) / limit
-        blocks.append((goals.steepness * over, share[:, None] * slope))
+        share = steepness * (over > 0) / limit
+        blocks.append((steepness * over, share[:, None] * slope))
 
-    for gain, limit in goals.limits.items():
+    for gain, limit in limits.items():
         a, b, p = loop.polynomials(c, gain)
         S, T, dp = a / p, loop.path * b / p, of_a + gain * of_b
         dS, dT = (of_a - S[:, None] * dp) / p[:, None], (of_b - T[:, None] * dp) / p[:, None]
@@ -339,40 +330,33 @@ def _rows(loop: DirectFormLoop, goals: _Goals, theta: FloatArray) -> tuple[Float
             below(T.real, dT.real, 1 / (1 - loop.low))
         if gain == 1 and loop.high > 1:
             below(-T.real, -dT.real, 1 / (loop.high - 1))
-        for s, share in zip(loop.scenarios, goals.shares, strict=True):
-            if s.sensor_gain != gain:
-                continue
-            size = share * np.sqrt(s.phase_nm2 + _LINE * s.spread_nm2)
+        for s in (s for s, g in enumerate(loop.gains) if g == gain):
+            size = shares[s] * np.sqrt(loop.phase_nm2[s] + _LINE * loop.spread_nm2[s])
             small(size * S, size[:, None] * dS)
-            size = share * np.sqrt(s.noise_nm2)
+            size = shares[s] * np.sqrt(loop.noise_nm2[s])
             small(size * T, size[:, None] * dT)
             V = loop.rounding_matrix(c, s)  # its own slopes are left out
             sums = np.sqrt(c @ V @ c)
-            entry = share * goals.rounding * np.sqrt(loop.shares) * loop.path / p
+            entry = shares[s] * rounding * np.sqrt(loop.shares) * loop.path / p
             small(entry * sums, entry[:, None] * (V @ c / sums - sums * dp / p[:, None]))
     # slopes in theta: each coefficient is linear in each number of theta
     moved = np.array([_coefficients(theta + unit) - c for unit in np.eye(theta.size)]).T
     errors, slopes = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    roots, root_slopes = _root_rows(theta, goals.modulus)
-    return np.concatenate([errors, roots]), np.concatenate([slopes @ moved, root_slopes])
-
-
-def _root_rows(theta: FloatArray, modulus: float) -> tuple[FloatArray, FloatArray]:
-    """Keep the roots far from z = 1 well inside the circle: the loop does not see them."""
+    # keep the roots far from z = 1 well inside the circle: the loop does not see them
     M = theta.size // 2
     first = np.concatenate([np.arange(0, M, 2), np.arange(M + 1, 2 * M + 1, 2)])
     over = np.where(theta[first] > _FAR, np.maximum(theta[first + 1] - modulus, 0.0), 0.0)
-    slopes = np.zeros((first.size, theta.size))
-    slopes[np.arange(first.size), first + 1] = _STIFF * (over > 0)
-    return _STIFF * over, slopes
+    root_slopes = np.zeros((first.size, theta.size))
+    root_slopes[np.arange(first.size), first + 1] = _STIFF * (over > 0)
+    return np.r_[errors, _STIFF * over], np.vstack([slopes @ moved, root_slopes])
 
 
-def _sections(c: FloatArray, order: int) -> FloatArray:
+def _sections(c: FloatArray) -> FloatArray:
     """Return theta: the quadratic sections of a, the factor of b, the sections of b."""
-    parts = []
-    for polynomial in (np.r_[1.0, -c[order + 1 :]], c[: order + 1] / c[0]):
+    M, parts = c.size // 2, []
+    for polynomial in (np.r_[1.0, -c[M + 1 :]], c[: M + 1] / c[0]):
         roots = np.roots(polynomial)
-        roots = np.concatenate([roots, np.zeros(order - roots.size)])
+        roots = np.concatenate([roots, np.zeros(M - roots.size)])
         pairs, real = roots[roots.imag > 0], np.sort(roots[roots.imag == 0].real)
         first = np.concatenate([-2 * pairs.real, -(real[::2] + real[1::2])])
         second = np.concatenate([np.abs(pairs) ** 2, real[::2] * real[1::2]])

@@ -1,35 +1,43 @@
-"""Export a controller as a configuration that pyRTC starts."""
+"""The target pyRTC: a folder with a configuration that it starts, and all that it refers to.
+
+The gain file goes into the folder; inside pyRTC it is certified again before it runs.
+
+pyRTC measures ``residual(k) = phase - c[0] u(k-1) - c[1] u(k-2) - ..``, in units of its commands,
+and gives the predictor ``residual(k) + u(k-d)``, with the command that it *sent* d frames before.
+The filter that returns the controller's commands is the controller in its own loop: what it knows
+of the phase does not depend on its past commands, so that nothing winds up. Where the mirror's
+answer c is not a delay of d frames, the filter corrects the series by the commands that it sent.
+"""
 
 from __future__ import annotations
 
 import io
 import json
-import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from lbt_synth.design import Check, Design
+from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.interop.export_checks import (
-    Exported,
-    join_labels,
-    provenance_lines,
-    rehearsal_error,
-    write_export,
-)
-from lbt_synth.interop.modes import all_modes
-from lbt_synth.interop.pyrtc.pol_filter import InnerLoop, pol_filter
-from lbt_synth.interop.target import CERTIFICATE, Arithmetic, Target
-from lbt_synth.interop.written_loop import prove_written, require_proved
-from lbt_synth.storage.atomic_files import make_directory
+from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target, join_labels
+from lbt_synth.interop.proof import ROUNDOFF, Written
+from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.loop import close_loop
+from lbt_synth.models import LoopHardware
+from lbt_synth.storage.array_file import open_fits
 from lbt_synth.validation import FloatArray
 
+_LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single precision
 _FIT_SECONDS = 20.0  # of pseudo-open-loop series that fit_predictor identifies
 _CONFIG, _GAIN, _RESPONSE = "config.yaml", "gain.fits", "interaction_matrix.npz"
-_HINT = "Design with less accurate models, or for lower sensor gains."
 _SYSTEM = """\
 {origin}
 #
@@ -62,112 +70,183 @@ loop:
 """
 
 
-def export_pyrtc(
-    path: str | os.PathLike[str],
-    design: Design,
-    *,
-    modes: int | None = None,
-    other_gain: float | None = None,
-    gain_digest: str | None = None,
-) -> Exported:
-    """Write a folder with a configuration that pyRTC starts, and all that it refers to.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PolFilter:
+    """A controller in the units of pyRTC's commands."""
 
-    The gain file goes into the folder; inside pyRTC it is certified again before it runs. pyRTC
-    computes signals and commands in single precision, and the predictor is a stable filter in
-    double precision. The loop is closed around that arithmetic before anything is written.
+    hardware: LoopHardware  # of its loop
+    delay_frames: int  # after which pyRTC takes a command away
+    response: FloatArray  # from commands to measurements, (m, m): its interaction matrix
+    # what the last commands, u(k-1) first, are of the correction that measurement k sees, (frames,)
+    taps: FloatArray
+    system: StateSpace  # from phase and noise without a correction to the command, (m,); stable
 
-    Parameters
-    ----------
-    path : path-like
-        Folder to write; it is made if its parent is there.
-    design : Design
-        Design with as many measurements as commands.
-    modes : int, optional
-        Modes of the loop; by default those of the design, which come first. Further ones get no
-        command, without ``other_gain``.
-    other_gain : float, optional
-        Gain of an integrator for each further mode.
-    gain_digest : str, optional
-        SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
+    @property
+    def reconstructor(self) -> FloatArray:
+        """From measurements to residuals, (m, m), in the precision of pyRTC."""
+        return np.linalg.pinv(self.response).astype(np.float32).astype(np.float64)
 
-    Returns
-    -------
-    Exported
-        Configuration, gain file, interaction matrix and certificate, the error of the commands
-        in pyRTC's arithmetic, and the checks.
+    @property
+    def is_whole(self) -> bool:
+        """Whether the series of pyRTC needs no correction."""
+        return not np.any(self.tap_error)
 
-    Raises
-    ------
-    OutputError
-        If the folder or a file cannot be written.
-    ProblemError
-        If the design is not of such a loop.
-    CertificateError
-        If the certificate that the design carries has a failed check.
-    NumericalError
-        If a check fails in the arithmetic of pyRTC; ``residual`` holds its value.
+    @property
+    def tap_error(self) -> FloatArray:
+        """Return what pyRTC leaves of the last commands in its series, (frames,)."""
+        out = self.taps.copy()
+        out[self.delay_frames - 1] -= 1
+        return out
 
-    Examples
-    --------
-    >>> import lbt_synth as lbt, tempfile, pathlib
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     written = lbt.interop.export_pyrtc(pathlib.Path(folder) / "slow", slow)
-    ...     sorted(file.name for file in written.files)
-    ['config.yaml', 'config.yaml.certificate.json', 'gain.fits', 'interaction_matrix.npz']
+    def as_computed(self) -> Written:
+        """Return the controller that pyRTC's loop computes, and what its arithmetic adds.
+
+        The states are those of the filter and the commands sent; noise enters the residual and
+        the command that is sent.
+        """
+        s, R, m, d = self.system, self.reconstructor, len(self.response), len(self.taps)
+        n = s.n_states
+        A = np.zeros((n + d * m, n + d * m))
+        A[: n + m, :n] = np.vstack([s.A, s.C])
+        A[n + m :, n:-m] = np.eye((d - 1) * m)
+        entry = np.zeros((len(A), 2 * m))
+        entry[: n + m, :m] = np.vstack([s.B, s.D])
+        entry[n : n + m, m:] = np.eye(m)
+        A[:, n:] += np.kron(self.taps, entry[:, :m])
+        C = np.zeros((m, len(A)))
+        C[:, n : n + m] = np.eye(m)  # the command sent, in the new state
+        whole = Controller(A=A, B=entry[:, :m] @ R, C=C, D=np.zeros((m, m)), dt_s=s.dt_s)
+
+        def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
+            """Bound the rounding of the signal, of its product, of the sum and of the command."""
+            terms = np.abs(R) * measured
+            residual = np.sum(terms, axis=1)
+            squares = [
+                2 * np.sum(terms**2, axis=1)
+                + np.sum(np.cumsum(terms, axis=1) ** 2, axis=1)
+                + (residual + commands) ** 2,
+                commands**2,
+            ]
+            return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate(squares))
+
+        entered = replace(whole, B=entry, D=np.zeros((m, 2 * m)))
+        return Written(controllers={frozenset(): whole}, entry=entered, variance=variance)
+
+
+class InnerLoop:
+    """A filter as pyRTC runs it: signals and commands in single precision, the filter in double.
+
+    It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
     """
-    folder = Path(path)
-    if not isinstance(design, Design):
+
+    def __init__(self, whole: PolFilter, limit: float = np.inf) -> None:
+        self._whole, self._limit, self._tap_error = whole, limit, whole.tap_error
+        self._reconstructor = whole.reconstructor.astype(np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._state = np.zeros(self._whole.system.n_states)
+        # commands that were sent, the last first
+        self._sent = np.zeros((len(self._tap_error), len(self._whole.response)))
+
+    def step(self, y: ArrayLike) -> FloatArray:
+        """Take y(k), (m,), return u(k), (m,)."""
+        residual = self._reconstructor @ np.asarray(y, dtype=np.float32)
+        pol = residual + self._sent[self._whole.delay_frames - 1].astype(np.float32)
+        return self.step_pol(pol.astype(np.float64))
+
+    def step_pol(self, pol: FloatArray, *, flat: bool = False) -> FloatArray:
+        """Take the series of pyRTC, (m,), return the command u that it sends, (m,).
+
+        Values that are not finite leave the state as it is, and repeat the last command. ``flat``
+        sends zeros.
+        """
+        s, u = self._whole.system, self._sent[0]
+        if np.isfinite(pol).all():
+            seen = pol + self._tap_error @ self._sent
+            u = np.clip(s.C @ self._state + s.D @ seen, -self._limit, self._limit)
+            self._state = s.A @ self._state + s.B @ seen
+        sent = 0 * u if flat else u.astype(np.float32).astype(np.float64)
+        self._sent = np.vstack([sent, self._sent[:-1]])
+        return np.asarray(sent)
+
+
+def pol_filter(design: Design) -> PolFilter:
+    """Return the filter that gives a design's commands in pyRTC; refuse a loop it cannot hold."""
+    hardware = require_hardware(design, "pyRTC")
+    response = hardware.sensor @ hardware.influence
+    q, m = response.shape
+    if q != m or np.linalg.cond(response) > _LARGEST_CONDITION:
         raise ProblemError(
-            "pyRTC's configuration names one gain file, for the first modes, and one gain for all "
-            f"others; got {type(design).__name__}. Give a design, modes and other_gain."
+            "pyRTC's predictors get one residual per command, so that the commands must show in "
+            f"as many measurements; got {q} measurements of {m} commands, with a condition number "
+            f"of {np.linalg.cond(response):.3g} (limit {_LARGEST_CONDITION:g}). Design for the "
+            "modes."
         )
-    whole = all_modes(
-        design, _CONFIG, modes=modes, other_gain=other_gain, hardware=None, modal=False
-    )
-    found = pol_filter(design)
-    origin = "\n".join(f"# {line}" for line in join_labels(provenance_lines(design, gain_digest)))
-    checks: list[Check] = []
-    worst = 0.0
-    for part in whole.parts:
-        proved = prove_written(part.design, *pol_filter(part.design).as_computed())
-        require_proved(proved, "the arithmetic of pyRTC", _HINT)
-        checks += whole.name_checks(part, proved)
-        worst = max(worst, rehearsal_error(part.design, InnerLoop(part.design)))
-    make_directory(folder, parents=False)
-    contents = {
-        _CONFIG: _SYSTEM.format(
-            origin=origin,
-            size=whole.count,
-            response=_RESPONSE,
-            gain=_GAIN,
-            delay=found.delay_frames,
-            fit=int(_FIT_SECONDS / found.system.dt_s),
-            other_gain=float(other_gain or 0.0),
-        ).encode(),
-        _RESPONSE: _response_bytes(found.response, whole.count),
-        _GAIN: save_gain(folder / _GAIN, design).read_bytes(),
-    }
-    return write_export(
-        {folder / name: content for name, content in contents.items()},
-        target="pyrtc",
-        arithmetic=TARGET.arithmetic,
-        checks=checks,
-        gain_digest=gain_digest,
-        delay_frames=found.delay_frames,
-        modes=whole.count,
-        error=worst,
-        start=lambda limit: InnerLoop(design, limit),
+    return filter_of(hardware, design.controller, response)
+
+
+def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> PolFilter:
+    """Return the filter of a controller, for a response (m, m) from commands to measurements."""
+    m = len(response)
+    own = replace(own, B=own.B @ response, D=own.D @ response)
+    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
+    whole = close_loop(modal, own).commanding()
+    delay = max(1, int(hardware.delay_frames + 0.5))
+    taps = np.zeros(max(delay, len(hardware.mirror_taps)))
+    taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
+    return PolFilter(
+        hardware=hardware,
+        delay_frames=delay,
+        response=response,
+        taps=taps,
+        system=replace(whole, B=whole.B[:, m:], D=whole.D[:, m:]),
     )
 
 
-def _response_bytes(response: FloatArray, modes: int) -> bytes:
-    """Write an interaction matrix as pyRTC does: the matrix, and a record of what it is."""
-    whole = block_diag(response, np.eye(modes - len(response)))
+def _write(
+    folder: Path,
+    whole: tuple[PolFilter, ...],
+    design: Design,
+    origin: Sequence[tuple[str, str]],
+    *,
+    modes: int | None,
+    other_gain: float | None,
+    **_: Any,
+) -> dict[Path, bytes]:
+    """Return configuration, gain file, and interaction matrix as pyRTC writes it."""
+    first = whole[0]
+    count = len(first.response) if modes is None else modes
+    config = _SYSTEM.format(
+        origin="\n".join(f"# {line}" for line in join_labels(origin)),
+        size=count,
+        response=_RESPONSE,
+        gain=_GAIN,
+        delay=first.delay_frames,
+        fit=int(_FIT_SECONDS / first.system.dt_s),
+        other_gain=float(other_gain or 0.0),
+    )
+    matrix = block_diag(first.response, np.eye(count - len(first.response)))
     record = {"format": 2, "kind": "interaction_matrix", "image_axes": "yx"}
     buffer = io.BytesIO()
-    np.savez(buffer, data=whole, pyrtc_calibration=np.array(json.dumps(record)))
-    return buffer.getvalue()
+    np.savez(buffer, data=matrix, pyrtc_calibration=np.array(json.dumps(record)))
+    with TemporaryDirectory() as place:
+        gain = save_gain(Path(place) / _GAIN, design).read_bytes()
+    contents = {_CONFIG: config.encode(), _RESPONSE: buffer.getvalue(), _GAIN: gain}
+    return {folder / name: content for name, content in contents.items()}
+
+
+def _read(files: Mapping[Path, bytes], like: tuple[PolFilter, ...]) -> tuple[PolFilter, ...]:
+    """Return the filter of the controller and of the interaction matrix in the files."""
+    named = {path.name: content for path, content in files.items()}
+    with open_fits(named[_GAIN]) as units:
+        held = {name: np.array(units[name].data, dtype=np.float64) for name in "ABCD"}
+    m = len(like[0].response)
+    response = np.load(io.BytesIO(named[_RESPONSE]))["data"][:m, :m]
+    hardware = like[0].hardware
+    controller = Controller(**held, dt_s=hardware.dt_s)
+    return filter_of(hardware, controller, response), *like[1:]
 
 
 TARGET = Target(
@@ -180,6 +259,18 @@ TARGET = Target(
         limits="as many measurements as commands",
     ),
     file="folder with the configuration, the gain file and their certificate",
-    write=export_pyrtc,
+    options={"modes": None, "other_gain": None},
+    round=lambda designs, **_: [(pol_filter(design),) for design in designs],
+    write=_write,
+    read=_read,
+    computed=lambda _, filters: filters[0].as_computed(),
+    start=lambda filters, limit: InnerLoop(filters[0], limit),
+    single=lambda filters: filters,
+    join=lambda numbers, parts, count: tuple(filters[0] for filters in numbers),
+    split=lambda whole, parts, numbers: [[(one,)] for one in whole],
+    facts=lambda whole, **_: {"delay_frames": whole[0].delay_frames},
+    hint="Design with less accurate models, or for lower sensor gains.",
     contents=(_CONFIG, _GAIN, _RESPONSE, _CONFIG + CERTIFICATE),
+    modal=False,
+    mixed=False,
 )

@@ -5,14 +5,20 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from lbt_synth.errors import ProblemError
-from lbt_synth.interop.pyrtc.predictor import GainFilePredictor
-from lbt_synth.validation import FloatArray
+from lbt_synth.design import Design, integrator
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import GainFileError, ProblemError
+from lbt_synth.files import load_gain
+from lbt_synth.identification import design_from_record, loop_record
+from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
+from lbt_synth.methods.registry import record_methods
+from lbt_synth.validation import FloatArray, integer, number
 
 PREDICTOR = "lbt_synth"
 _ANSWER_SECONDS = 20.0  # a first frame may compile code
+_FITTED_NM = 100.0  # rms of a series that is identified
 
 
 def register() -> Any:
@@ -93,3 +99,120 @@ class SimulatedTelescope:
             if found.frame_id == frame:
                 return -np.asarray(found.payload[: measured.size], dtype=np.float64)
             seen = found.count
+
+
+class GainFilePredictor:
+    """The controller of a gain file, which is certified again before it runs.
+
+    The first frames, which fill the loop's memory of commands, get the command 0. A residual that
+    is not finite leaves the filter as it is, and repeats the last command.
+
+    Parameters
+    ----------
+    num_modes : int
+        Modes of the loop; those of the gain file come first.
+    horizon : int
+        Frames from a command to the residual that shows it: ``delay_frames`` of the configuration.
+    gain_file : path-like
+        Gain file of the controller.
+    other_gain : float, optional
+        Gain of the integrator of each further mode, ``u(k) = u(k-1) + gain residual(k)``.
+    command_limit : float, optional
+        Largest modulus of a command: the loop does not see what a corrector clips.
+    """
+
+    def __init__(
+        self,
+        num_modes: int,
+        horizon: int = 2,
+        *,
+        gain_file: str,
+        other_gain: float = 0.0,
+        command_limit: float | None = None,
+    ) -> None:
+        self.num_modes = integer(num_modes, "num_modes", at_least=1)
+        self.horizon = integer(horizon, "predictor.delay_frames", at_least=1)
+        self.fitted = False
+        self._sent: NDArray[np.float32]  # to the further modes, the last command first
+        self._other_gain = number(other_gain, "predictor.other_gain", at_least=0)
+        self._limit = np.inf
+        if command_limit is not None:
+            self._limit = number(command_limit, "predictor.command_limit", above=0)
+        self._gain_file = gain_file
+        try:
+            design = load_gain(gain_file)
+        except GainFileError as error:
+            raise error from None  # in the log of pyRTC one sentence, without how it was found
+        self._take(design)
+
+    def _take(self, design: Design) -> None:
+        """Run another design, from a state of zero."""
+        found = pol_filter(design)
+        if found.delay_frames != self.horizon:
+            raise ProblemError(
+                f"predictor.delay_frames must be {found.delay_frames}, that of {self._gain_file}; "
+                f"got {self.horizon}. Design for the delay of this loop."
+            )
+        self._own = len(found.response)
+        if self._own > self.num_modes:
+            raise ProblemError(
+                f"the loop must control at least the {self._own} modes of {self._gain_file}; got "
+                f"{self.num_modes}. Lower loop.num_dropped_modes, or raise wfc.num_modes."
+            )
+        if self._other_gain > 0:  # refused where its loop is unstable
+            hardware = require_hardware(design, "pyRTC")
+            integrator(hardware.single_mode(), gain=self._other_gain)
+        self._design, self._found = design, found
+        self._filter = InnerLoop(found, self._limit)
+        self.reset()
+
+    def fit(self, pol_history: ArrayLike) -> GainFilePredictor:
+        """Identify the loop from its pseudo-open-loop series, and design for it again.
+
+        The method is that of the gain file, or the best one where that needs more than a record.
+        """
+        history = np.asarray(pol_history, dtype=np.float64)[:, : self._own]
+        hardware = require_hardware(self._design, "pyRTC")
+        if not self._found.is_whole:
+            raise ProblemError(
+                "pyRTC's series is the phase for a mirror that settles at once and a delay of "
+                f"whole frames; that of {self._gain_file} is another. Try lbt-synth auto on a "
+                "record."
+            )
+        # in any unit: a controller does not depend on it
+        size = float(np.std(history[np.isfinite(history)])) or 1.0
+        record = loop_record(
+            history * (_FITTED_NM / size),
+            frame_rate_hz=hardware.frame_rate_hz,
+            delay_frames=self.horizon,
+            unit="nm",
+        )
+        method = self._design.method
+        known = method if method in record_methods() else None
+        self._take(design_from_record(record, method=known).design)
+        self.fitted = True
+        return self
+
+    def update(self, pol: ArrayLike) -> None:
+        """Take the pseudo-open-loop values of a frame, (modes,)."""
+        now = np.asarray(pol, dtype=np.float64).reshape(self.num_modes)
+        flat, own, rest = self._frames < self.horizon, slice(self._own), slice(self._own, None)
+        self._command[own] = self._filter.step_pol(now[own], flat=flat)
+        if not flat and np.isfinite(now[rest]).all():
+            residual = now[rest] - self._sent[-1]
+            moved = self._command[rest] + self._other_gain * residual
+            self._command[rest] = np.clip(moved, -self._limit, self._limit)
+        self._sent = np.vstack([self._command[rest].astype(np.float32), self._sent[:-1]])
+        self._frames += 1
+
+    def predict(self) -> FloatArray:
+        """Return the command with pyRTC's sign, the phase that it will cancel, (modes,)."""
+        return self._command.copy()
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._filter.reset()
+        self._command: FloatArray = np.zeros(self.num_modes)
+        rest = self.num_modes - self._own
+        self._sent = np.zeros((self.horizon, rest), dtype=np.float32)
+        self._frames: int = 0

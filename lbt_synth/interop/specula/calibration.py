@@ -16,8 +16,13 @@ import numpy.typing as npt
 
 from lbt_synth.design.modal import Reconstructor, reconstructor
 from lbt_synth.errors import OutputError
-from lbt_synth.interop.specula.optics import Modes, Optics, make_modes, specula_version
-from lbt_synth.interop.specula.system import EndToEndSystem
+from lbt_synth.interop.specula.optics import (
+    EndToEndSystem,
+    Modes,
+    Optics,
+    make_modes,
+    specula_version,
+)
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance

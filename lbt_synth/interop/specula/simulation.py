@@ -2,38 +2,242 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.design.modal import MixedController
-from lbt_synth.errors import ProblemError
-from lbt_synth.interop.specula.accompanied_filter import accompany_filter
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop.specula.calibration import Calibration, cache_directory, calibrate
-from lbt_synth.interop.specula.end_to_end_run import EndToEndRun
-from lbt_synth.interop.specula.optics import Modes, Optics
-from lbt_synth.interop.specula.system import EndToEndSystem
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.interop.specula.optics import EndToEndSystem, Modes, Optics
+from lbt_synth.linear import Controller
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_parts
+from lbt_synth.loop.simulation.failing_sensors import draw_others
 from lbt_synth.loop.simulation.run import SteppedController, step_controller
-from lbt_synth.models import Truth
+from lbt_synth.models import (
+    DriftingVibration,
+    LoopHardware,
+    PositionLoop,
+    SinusoidalVibration,
+    Truth,
+    Vibration,
+)
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.vibration import TrueVibration
 from lbt_synth.validation import (
     FloatArray,
     NotNegative,
     check_fields,
-    integer,
     number,
     require_instance,
 )
 
 RAMP_FRAMES = 200
 LARGEST_SEED = 2**31 - 2  # the detector doubles it, in 32 bits
+_BATCHES = 8
+_TIP_TILT = slice(2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EndToEndRun:
+    """Series and images of a closed loop, after it has settled.
+
+    Row k of a series is frame k: ``measurements`` y(k) come from the exposure of frame
+    k-1, ``commands`` u(k) from y(k), and ``residual_nm`` is the phase of exposure k.
+
+    Attributes
+    ----------
+    system : EndToEndSystem
+        What was simulated.
+    strehl_series : (frames,) ndarray
+        Intensity in the image's centre over that of a perfect image, frame by frame.
+    other_modes_series : (frames,) ndarray
+        The same for the phase without tip and tilt.
+    measurements, commands, residual_nm : (frames, modes) ndarray
+        Modal coefficients [nm rms].
+    psf : (h, h) ndarray
+        Mean image, of sum 1.
+    psf_pixel_mas : float
+        Its pixel [mas].
+    seed : int
+        Seed of turbulence, vibrations and noise.
+    settle_frames : int
+        Frames run before these, and dropped.
+    seconds : float
+        Time that the loop took [s].
+    """
+
+    system: EndToEndSystem
+    strehl_series: FloatArray
+    other_modes_series: FloatArray
+    measurements: FloatArray
+    commands: FloatArray
+    residual_nm: FloatArray
+    psf: FloatArray
+    psf_pixel_mas: float
+    seed: int
+    settle_frames: int
+    seconds: float
+
+    @property
+    def frames(self) -> int:
+        """Frames of the exposure."""
+        return len(self.strehl_series)
+
+    @property
+    def strehl(self) -> float:
+        """Strehl ratio of the long exposure."""
+        return float(np.mean(self.strehl_series))
+
+    @property
+    def strehl_error(self) -> float:
+        """Standard error of the Strehl ratio, from eight batches of frames; nan for short runs.
+
+        It holds for this turbulence: what changes more slowly than a batch counts too little, and
+        other seeds scatter more.
+        """
+        batches = np.array_split(self.strehl_series, _BATCHES)
+        if len(self.strehl_series) < 2 * _BATCHES:
+            return float("nan")
+        means = [float(np.mean(batch)) for batch in batches]
+        return float(np.std(means, ddof=1) / np.sqrt(_BATCHES))
+
+    @property
+    def other_modes_strehl(self) -> float:
+        """Strehl ratio of the long exposure if tip and tilt were perfect."""
+        return float(np.mean(self.other_modes_series))
+
+    @property
+    def rms_nm(self) -> FloatArray:
+        """Residual of each mode [nm rms], (modes,)."""
+        return np.asarray(np.sqrt(np.mean(self.residual_nm**2, axis=0)))
+
+    @property
+    def optical_gain(self) -> FloatArray:
+        """Gain of the sensor in the loop, for each mode, (modes,).
+
+        Regression of the measurements on the true residual, which does not yet contain the noise
+        of its measurement.
+        """
+        return self._regress(slice(None), axis=0)[0]
+
+    @property
+    def optical_gain_error(self) -> FloatArray:
+        """Standard error of each optical gain, for noise that is white, (modes,)."""
+        return self._regress(slice(None), axis=0)[1]
+
+    @property
+    def tip_tilt_gain(self) -> float:
+        """Optical gain of tip and tilt together."""
+        return float(self._regress(_TIP_TILT)[0])
+
+    @property
+    def tip_tilt_gain_error(self) -> float:
+        """Standard error of the optical gain of tip and tilt."""
+        return float(self._regress(_TIP_TILT)[1])
+
+    @property
+    def tip_tilt_noise_nm(self) -> float:
+        """Measured tip and tilt that the optical gain does not explain [nm rms per mode]."""
+        return float(self._regress(_TIP_TILT)[2])
+
+    def summary(self) -> dict[str, Any]:
+        """Return the main numbers; None stands for NaN, which JSON does not have."""
+        rms = self.rms_nm
+        return {
+            "strehl": self.strehl,
+            "strehl_error": None if math.isnan(self.strehl_error) else self.strehl_error,
+            "other_modes_strehl": self.other_modes_strehl,
+            "tip_rms_nm": float(rms[0]),
+            "tilt_rms_nm": float(rms[1]),
+            "other_modes_rms_nm": float((rms[2:] ** 2).sum() ** 0.5),
+            "tip_tilt_gain": self.tip_tilt_gain,
+            "tip_tilt_gain_error": self.tip_tilt_gain_error,
+            "tip_tilt_noise_nm": self.tip_tilt_noise_nm,
+        }
+
+    def _regress(
+        self, modes: slice, axis: int | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the gain of modes, each or together, its standard error, and the rest [nm rms]."""
+        y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
+        power = np.sum(phase**2, axis=axis)
+        gain = np.asarray(np.sum(y * phase, axis=axis) / power)
+        left = np.mean((y - gain * phase) ** 2, axis=axis)
+        return gain, np.asarray(np.sqrt(left / power)), np.asarray(np.sqrt(left))
+
+
+@dataclass(kw_only=True, eq=False)
+class AccompaniedFilter:
+    """A filter of several sensors to step with the pyramid alone: it has the other readings."""
+
+    controller: Controller
+    others: FloatArray  # readings of the other sensors in each frame, (frames, q)
+    hardware: LoopHardware  # that the filter is designed for
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to the first frame, with all states zero."""
+        self._frame, self._running = 0, self.controller.start()
+
+    def step(self, y: FloatArray) -> FloatArray:
+        """Take the measurements of the loop's own sensor in the next frame, return the commands."""
+        if self._frame >= len(self.others):
+            raise ProblemError(
+                f"the other sensors have readings for {len(self.others)} frames; a frame more was "
+                "asked for. Give the set-up that makes the controller the frames of the run."
+            )
+        measured = np.concatenate([y, self.others[self._frame]])
+        self._frame += 1
+        return self._running.step(measured)
+
+
+def unread_sensors(design: Design) -> tuple[str, ...]:
+    """Return the sensors that an end-to-end simulation does not have: further wavefront sensors."""
+    hardware = design.hardware
+    return () if hardware is None else tuple(s.name for s in hardware.suite.wavefront)
+
+
+def accompany_filter(
+    design: Design, shaken: Truth, *, frames: int, settle_frames: int, seed: int
+) -> AccompaniedFilter:
+    """Return a filter of tip and tilt with the readings of its accelerometers in a run.
+
+    Its fall-back runs where it has wavefront sensors beside the pyramid. ``shaken`` has the
+    vibrations of the run, and how channels move with them; frames and seed are those of
+    :func:`run_end_to_end`, whose motions the readings follow.
+    """
+    hardware = require_hardware(design, "an end-to-end simulation")
+    channels = hardware.suite.channels
+    if (hardware.n_measurements, hardware.n_commands) != (2, 2):
+        raise DimensionError(
+            "the filter must map two measurements of the loop's own sensor, tip and tilt, to two "
+            f"commands; got {hardware.n_measurements} to {hardware.n_commands}."
+        )
+    if channels and not any(shaken.motions):
+        raise ProblemError(
+            f"no vibration of the simulation moves a channel of the design ({', '.join(channels)})."
+            " Give sensors, and accelerometers of each vibration, in the configuration."
+        )
+    missing = frozenset(unread_sensors(design))
+    size = {"frames": settle_frames + frames, "cases": 1, "zero_frame": settle_frames}
+    rng = np.random.default_rng(seed)
+    _, lines = draw_parts(shaken, hardware, rng=rng, oscillators=True, **size)
+    (own_rng,) = rng.spawn(1)
+    others = draw_others(shaken, hardware, lines, own_rng, **size)
+    return AccompaniedFilter(
+        controller=design.controllers[missing], others=others[0], hardware=hardware
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,9 +310,14 @@ class EndToEndSetup:
         tip_tilt_gain : float, optional
             Integrator gain of tip and tilt where there is no filter.
         """
-        if isinstance(filter, Design) and filter.other_sensors:
-            shaken = Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
-            filter = accompany_filter(filter, shaken, **self._length)  # noqa: A001
+        if getattr(filter, "other_sensors", ()):
+            filter = accompany_filter(  # noqa: A001
+                filter,
+                self.shaken,
+                frames=self.frames,
+                settle_frames=self.settle_frames,
+                seed=self.seed,
+            )
         hardware = getattr(filter, "hardware", None)
         mine = self.system.hardware
         if hardware is not None and (hardware.frame_rate_hz, hardware.delay_frames) != (
@@ -130,6 +339,11 @@ class EndToEndSetup:
             gains[:2] = number(tip_tilt_gain, "tip_tilt_gain", at_least=0)
         return MixedController(filter=filter, gains=gains, leak=self.leaks)
 
+    @property
+    def shaken(self) -> Truth:
+        """The vibrations, and how channels of accelerometers move with them."""
+        return Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
+
     def run(
         self,
         filter: Any,  # noqa: A002
@@ -137,35 +351,77 @@ class EndToEndSetup:
         tip_tilt_gain: float | None = None,
         **options: Any,
     ) -> EndToEndRun:
-        """Close the loop with :meth:`controller`.
+        """Close the loop with :meth:`controller`, with options of :func:`run_end_to_end`."""
+        return run_end_to_end(self, self.controller(filter, tip_tilt_gain=tip_tilt_gain), **options)
 
-        The options are calibration, cache and progress, as of :func:`run_end_to_end`.
+    def case(
+        self,
+        controller: Controller | None,
+        *,
+        vibrations: Sequence[TrueVibration] = (),
+        seed: int = 0,
+    ) -> dict[str, Any]:
+        """Return all that a run depends on, in values that JSON can hold.
+
+        Vibrations and seed replace those of the set-up. Without a controller, integrators control
+        tip and tilt.
         """
-        control = self.controller(filter, tip_tilt_gain=tip_tilt_gain)
-        return run_end_to_end(
-            self.system,
-            control,
-            vibrations=self.vibrations,
-            motions=self.motions,
-            **self._length,
-            **options,
-        )
+        settings = asdict(replace(self, vibrations=tuple(vibrations), seed=seed, motions=()))
+        lines, system = list(settings.pop("vibrations")), settings.pop("system")
+        settings.pop("motions")  # a case has no channels
+        hardware = system.pop("hardware")  # its two matrices are the identity
+        kept = ("frame_rate_hz", "delay_frames", "mirror")
+        matrices = None
+        if controller is not None:
+            matrices = {name: getattr(controller, name).tolist() for name in "ABCD"}
+            matrices["dt_s"] = controller.dt_s
+        return {
+            "versions": {name: _installed_version(name) for name in ("lbt-synth", "specula")},
+            "system": system,
+            "hardware": {name: hardware[name] for name in kept},
+            "setup": settings,
+            "vibrations": lines,
+            "controller": matrices,
+        }
 
-    @property
-    def _length(self) -> dict[str, Any]:
-        """Length and seed of a run."""
-        return {name: getattr(self, name) for name in ("frames", "settle_frames", "seed")}
+
+def run_case(
+    case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
+) -> dict[str, Any]:
+    """Run what :meth:`EndToEndSetup.case` returned, and return its summary.
+
+    ``cache`` is the directory of calibrations and phase screens.
+    """
+    mirror = case["hardware"]["mirror"]
+    mirror = None if mirror is None else PositionLoop(**mirror)
+    system = EndToEndSystem(
+        hardware=LoopHardware(**{**case["hardware"], "mirror": mirror}), **case["system"]
+    )
+    lines = tuple(_build_vibration(line) for line in case["vibrations"])
+    setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
+    matrices = case["controller"]
+    return setup.run(matrices and Controller(**matrices), cache=cache).summary()
+
+
+def _installed_version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _build_vibration(line: Mapping[str, Any]) -> TrueVibration:
+    """Rebuild a vibration; its fields tell which of the three types it has."""
+    values = {**line, "direction": tuple(line["direction"])}
+    if "start_hz" in line:
+        return DriftingVibration(**values)
+    return Vibration(**values) if "damping" in line else SinusoidalVibration(**values)
 
 
 def run_end_to_end(
-    system: EndToEndSystem,
+    setup: EndToEndSetup,
     controller: SteppedController,
     *,
-    vibrations: Sequence[TrueVibration] = (),
-    motions: Motions = (),
-    frames: int = 1600,
-    settle_frames: int = 400,
-    seed: int = 0,
     calibration: Calibration | None = None,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
@@ -184,22 +440,10 @@ def run_end_to_end(
 
     Parameters
     ----------
-    system : EndToEndSystem
-        Telescope, air, pyramid, mirror and camera.
+    setup : EndToEndSetup
+        Telescope, vibrations, length and seed.
     controller : object with ``step(y)`` and ``reset()``
         From modal measurements to modal commands, (modes,), such as :class:`MixedController`.
-    vibrations : sequence of Vibration, SinusoidalVibration or DriftingVibration, optional
-        Vibrations of tip and tilt; their direction has two components. A drift begins with
-        the exposure.
-    motions : tuple of mapping, optional
-        For each vibration, how channels of accelerometers move with it. A resonance that channels
-        see is a continuous oscillator, others are AR2 processes.
-    frames : int, optional
-        Frames of the exposure.
-    settle_frames : int, optional
-        Frames run before and dropped, at least 200.
-    seed : int, optional
-        Seed of turbulence, vibrations and noise.
     calibration : Calibration, optional
         Calibration of the system; by default from the cache, or measured.
     cache : path-like, optional
@@ -217,8 +461,7 @@ def run_end_to_end(
     MissingExtraError
         If SPECULA is missing.
     ProblemError
-        If a value is out of range, or the controller does not return one finite command per
-        mode.
+        If the controller does not return one finite command per mode.
     OutputError
         If the cache cannot be written.
 
@@ -228,29 +471,26 @@ def run_end_to_end(
     >>> config = lbt.load_config("examples/lbt.yaml")
     >>> setup, design = config.end_to_end, lbt.kalman(config.plant)
     >>> control = setup.controller(design)
-    >>> run = lbt.interop.run_end_to_end(setup.system, control)        # doctest: +SKIP
+    >>> run = lbt.interop.run_end_to_end(setup, control)        # doctest: +SKIP
 
     It takes half a minute; what cannot run is refused at once:
 
-    >>> lbt.interop.run_end_to_end(setup.system, design)
+    >>> lbt.interop.run_end_to_end(setup, design)
     Traceback (most recent call last):
         ...
     lbt_synth.errors.ProblemError: controller must have step(y) and reset(), as MixedController \
 has; got FilterDesign.
     """
-    require_instance(system, EndToEndSystem)
+    require_instance(setup, EndToEndSetup)
     if not isinstance(controller, SteppedController):
         raise ProblemError(
             "controller must have step(y) and reset(), as MixedController has; "
             f"got {type(controller).__name__}."
         )
-    frames = integer(frames, "frames", at_least=2)
-    settle = integer(settle_frames, "settle_frames", at_least=RAMP_FRAMES)
-    seed = integer(seed, "seed", at_least=0, at_most=LARGEST_SEED)
-    shaken = Truth(turbulence=None, vibrations=tuple(vibrations), motions=motions)
-    total = settle + frames
+    system, settle, seed = setup.system, setup.settle_frames, setup.seed
+    total = settle + setup.frames
     tilts = draw_disturbance(
-        shaken,
+        setup.shaken,
         system.hardware,
         frames=total,
         cases=1,

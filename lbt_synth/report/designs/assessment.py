@@ -11,7 +11,7 @@ from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.interop import frame_cost
-from lbt_synth.interop.arithmetic_cost import FrameCost
+from lbt_synth.interop.c.terms import FrameCost
 from lbt_synth.linear import Controller, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import (

@@ -14,7 +14,7 @@ import numpy as np
 from lbt_synth.design import Design, integrator
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.interop import EndToEndSetup, calibrate
-from lbt_synth.interop.specula.cases import make_case, run_case
+from lbt_synth.interop.specula.simulation import run_case
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.methods.request import reference_design
@@ -195,8 +195,8 @@ def _plan_row(
         controller=controller,
         truth=replace(given.PAPER_TRUTH, vibrations=shakes),
         cases={
-            f"{name or method}-vibration-{vibration}-seed-{seed}": make_case(
-                setup, controller, vibrations=shakes, seed=seed
+            f"{name or method}-vibration-{vibration}-seed-{seed}": setup.case(
+                controller, vibrations=shakes, seed=seed
             )
             for seed in seeds
         },

@@ -1,5 +1,6 @@
 """The exported C source, compiled and run beside the controller."""
 
+import json
 import os
 import re
 import subprocess
@@ -10,12 +11,16 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.compiled import STRICT, Compiled, compiler
+from support.compiled import STRICT, Compiled, compiler, header_numbers
 from support.exports import bare_design, lbt_config, lbt_designs, relative
 
 import lbt_synth as lbt
-from lbt_synth.interop.c.arithmetic import SourceTerms
-from lbt_synth.interop.export_checks import rehearsal_error
+from lbt_synth.errors import CertificateError, NumericalError, ProblemError
+from lbt_synth.interop import pipeline
+from lbt_synth.interop.c import export as c_export
+from lbt_synth.interop.c.terms import RunningSource, source_terms
+from lbt_synth.interop.pipeline import rehearsal_error, target_named, target_names
+from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
 
 FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
@@ -28,7 +33,7 @@ def exported(tmp_path_factory):
     @cache
     def write(name, precision="double"):
         target = tmp_path_factory.mktemp("exported") / "ctl.c"
-        return lbt.interop.export_c(target, lbt_designs()[name], precision=precision)
+        return lbt.interop.export(target, lbt_designs()[name], "c", precision=precision)
 
     return write
 
@@ -74,20 +79,66 @@ def test_the_rehearsal_is_the_arithmetic_of_the_source(exported, designs, name, 
         assert written.error_single == written.error
     else:
         assert 1e-9 < written.error_single < LIMITS["single"]
-    ours = SourceTerms(design.controller, np.float32 if single else np.float64)
+    terms = source_terms(design)
+    ours = RunningSource(terms.rounded() if single else terms)
     theirs.reset()
     for y in np.random.default_rng(6).standard_normal((50, 2)):
         assert np.array_equal(ours.step(y), theirs.step(y))
 
 
-@pytest.mark.parametrize("precision", LIMITS)
-def test_the_compiled_integrator_on_given_measurements(exported, designs, precision):
-    written = exported("integrator", precision)
-    theirs = Compiled(written.files[0], single=precision == "single")
-    ours = designs["integrator"].controller.start()
-    series = np.random.default_rng(1).standard_normal((FRAMES, 2))
-    found = [theirs.step(y) for y in series]
-    assert relative(found, np.array([ours.step(y) for y in series])) < LIMITS[precision]
+FORMS = [{"form": form, "precision": p} for form in ("plain", "estimator") for p in LIMITS]
+
+
+@pytest.mark.parametrize("options", FORMS, ids=lambda options: "-".join(options.values()))
+@pytest.mark.parametrize("name", ["kalman", "turned"])
+def test_what_is_not_finite_holds_command_and_state(tmp_path, designs, name, options):
+    """In arrays of their own, and where commands share one with the measurements."""
+    source = lbt.interop.export(tmp_path / "ctl.c", designs[name], "c", **options).files[0]
+    theirs, clean = (Compiled(source, single=options["precision"] == "single") for _ in range(2))
+    before, more = np.zeros(2), options["form"] == "estimator"
+    for y in np.random.default_rng(4).standard_normal((20, 2)):
+        for bad in (np.nan, np.inf, -np.inf):
+            state = theirs.state.copy()
+            for place in range(2 + 2 * more):
+                inputs = np.ones(2 + 2 * more)
+                inputs[place] = bad
+                theirs.u[:] = 99.0
+                assert np.array_equal(theirs.step(*inputs.reshape(-1, 2)), before)
+                assert theirs.status == 1
+                assert np.array_equal(theirs.state, state)
+        given = [y, before][: 1 + more]
+        both = np.array([np.nan, 1.0], dtype=theirs.real)
+        theirs._call("step", theirs.state, *[both] * (2 + more))
+        assert np.array_equal(both, before)
+        before = clean.step(*given)
+        assert np.array_equal(theirs.step(*given), before)
+        assert theirs.status == clean.status == 0
+
+
+@pytest.mark.parametrize("name", ["kalman", "turned", "sensors"])
+def test_reset_forgets(exported, sensor_files, name):
+    files = sensor_files["double"].files if name == "sensors" else exported(name).files
+    theirs, sensors = Compiled(files[0]), name == "sensors"
+    series = np.random.default_rng(4).standard_normal((20, 6 if sensors else 2))
+    runs = []
+    for _ in range(2):
+        theirs.reset()
+        more = [[fresh_in(k, ()), y[:2]] if sensors else [] for k, y in enumerate(series)]
+        runs.append([theirs.step(y, *given) for y, given in zip(series, more, strict=True)])
+        theirs.step(series[0], *([[0, 0, 0, 0], [5.0, 5.0]] if sensors else []))
+    assert np.array_equal(*runs)
+    theirs.reset()
+    if not sensors:
+        assert np.array_equal(theirs.step([np.nan, 1.0]), [0.0, 0.0])
+
+
+def test_measurements_and_commands_in_one_array(exported, designs):
+    for name in ("kalman", "turned"):
+        theirs, ours = Compiled(exported(name).files[0]), designs[name].controller.start()
+        for y in np.random.default_rng(5).standard_normal((5, 2)):
+            both = y.copy()
+            theirs._call("step", theirs.state, both, both)
+            assert np.allclose(both, ours.step(y), rtol=1e-12, atol=1e-12)
 
 
 @st.composite
@@ -114,7 +165,9 @@ def controllers(draw):
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(controller=controllers(), precision=st.sampled_from(list(LIMITS)))
 def test_any_stable_controller(tmp_path, controller, precision):
-    written = lbt.interop.export_c(tmp_path / "any.c", bare_design(controller), precision=precision)
+    written = lbt.interop.export(
+        tmp_path / "any.c", bare_design(controller), "c", precision=precision
+    )
     theirs = Compiled(written.files[0], single=precision == "single")
     ours = controller.start()
     series = np.random.default_rng(2).standard_normal((200, controller.B.shape[1]))
@@ -137,77 +190,6 @@ def test_two_loops_at_once_do_not_meet(exported, designs, name):
             assert np.allclose(instance.step(y), own.step(y), rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("precision", ["double", "single"])
-@pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_a_measurement_that_is_not_finite_holds_command_and_state(exported, name, precision):
-    source = exported(name, precision).files[0]
-    theirs, undisturbed = (Compiled(source, single=precision == "single") for _ in range(2))
-    before = np.zeros(2)
-    for k, y in enumerate(np.random.default_rng(4).standard_normal((20, 2))):
-        for bad in (np.nan, np.inf, -np.inf):
-            state = theirs.state.copy()
-            theirs.u[:] = 99.0
-            assert np.array_equal(theirs.step([bad, 1.0] if k % 2 else [1.0, bad]), before)
-            assert theirs.held == 1
-            assert np.array_equal(theirs.state, state)
-        before = undisturbed.step(y)
-        assert np.array_equal(theirs.step(y), before)
-        assert theirs.held == undisturbed.held == 0
-
-
-def test_a_command_is_held_where_it_shares_its_array_with_the_measurements(exported):
-    theirs = Compiled(exported("kalman").files[0])
-    last = theirs.step([1.0, -2.0])
-    both = np.array([3.0, np.nan])
-    assert theirs._call("step", theirs.state, both, both) == 1
-    assert np.array_equal(both, last)
-
-
-@pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_reset_forgets(exported, name):
-    theirs = Compiled(exported(name).files[0])
-    series = np.random.default_rng(4).standard_normal((20, 2))
-    first = [theirs.step(y) for y in series]
-    theirs.reset()
-    assert np.array_equal(theirs.step([np.nan, 1.0]), [0.0, 0.0])
-    assert np.array_equal([theirs.step(y) for y in series], first)
-
-
-def test_flags_that_hide_such_measurements_are_refused(tmp_path, exported):
-    source = exported("integrator").files[0]
-    command = [compiler(), "-std=c99", "-ffast-math", "-c", source, "-o", tmp_path / "ctl.o"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode != 0
-    assert "compile without -ffast-math" in done.stderr
-
-
-def test_measurements_and_commands_in_one_array(exported, designs):
-    for name in ("kalman", "turned"):
-        theirs = Compiled(exported(name).files[0])
-        ours = designs[name].controller.start()
-        for y in np.random.default_rng(5).standard_normal((5, 2)):
-            both = y.copy()
-            theirs._call("step", theirs.state, both, both)
-            assert np.allclose(both, ours.step(y), rtol=1e-12, atol=1e-12)
-
-
-def test_the_header_is_fit_for_cpp(tmp_path, exported):
-    source = exported("kalman", "single").files[0]
-    user = tmp_path / "user.cpp"
-    user.write_text(
-        '#include "ctl.h"\n#include "ctl.h"\n'
-        "int main() { ctl_state s; float y[CTL_MEASUREMENTS] = {0}, u[CTL_COMMANDS];\n"
-        "ctl_reset(&s); ctl_step(&s, y, u); return u[0] == 0.0f ? 0 : 1; }\n"
-    )
-    flags = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-I", source.parent]
-    subprocess.run([compiler(), *STRICT, "-c", source, "-o", tmp_path / "ctl.o"], check=True)
-    program = tmp_path / "user"
-    subprocess.run(
-        [compiler("c++"), "-std=c++98", *flags, user, tmp_path / "ctl.o", "-o", program], check=True
-    )
-    subprocess.run([program], check=True)
-
-
 def test_coefficients_are_exact_and_explained(exported, designs):
     controller = designs["kalman"].controller
     text = exported("kalman").files[0].read_text()
@@ -220,7 +202,7 @@ def test_coefficients_are_exact_and_explained(exported, designs):
 
 def test_the_comment_says_where_it_comes_from(tmp_path, designs):
     sha = "ab" * 32
-    written = lbt.interop.export_c(tmp_path / "k.c", designs["kalman"], gain_digest=sha)
+    written = lbt.interop.export(tmp_path / "k.c", designs["kalman"], "c", gain_digest=sha)
     for file in written.files[:2]:
         text = file.read_text()
         for part in (lbt.__version__, "kalman (riccati)", sha, "800.0 Hz", "2.0 frames", "nm rms"):
@@ -243,7 +225,7 @@ def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
             checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0)
         ),
     )
-    written = lbt.interop.export_c(tmp_path / "k.c", design)
+    written = lbt.interop.export(tmp_path / "k.c", design, "c")
     Compiled(written.files[0])
     code = written.files[0].read_text()
     assert code.isascii()
@@ -251,19 +233,9 @@ def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
     assert "main" not in code.split("*/", 1)[1]
 
 
-@pytest.mark.parametrize("precision", LIMITS)
-def test_the_same_design_is_the_same_source(tmp_path, exported, designs, precision):
-    again = lbt.interop.export_c(tmp_path / "ctl.c", designs["hinf"], precision=precision)
-    texts = [
-        [file.read_bytes() for file in files]
-        for files in (exported("hinf", precision).files, again.files)
-    ]
-    assert texts[0] == texts[1]
-
-
 def test_a_name_of_its_own(tmp_path, designs):
-    written = lbt.interop.export_c(
-        tmp_path / "tip-tilt.v2.c", designs["integrator"], name="Tip_tilt2"
+    written = lbt.interop.export(
+        tmp_path / "tip-tilt.v2.c", designs["integrator"], "c", name="Tip_tilt2"
     )
     assert '#include "tip-tilt.v2.h"' in written.files[0].read_text()
     assert Compiled(written.files[0], name="Tip_tilt2").step([1.0, 0.0])[1] == 0
@@ -274,53 +246,50 @@ def test_a_name_of_its_own(tmp_path, designs):
 )
 def test_names_that_are_no_identifiers(tmp_path, designs, name):
     with pytest.raises(lbt.errors.ProblemError, match="prefix of the C names must"):
-        lbt.interop.export_c(tmp_path / "k.c", designs["integrator"], name=name)
+        lbt.interop.export(tmp_path / "k.c", designs["integrator"], "c", name=name)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("file", ["k.h", "k", "k.C", 'k".c', "k\\.c", "k\n.c", ".."])
 def test_files_that_are_no_source(tmp_path, designs, file):
     with pytest.raises(lbt.errors.OutputError, match=r"must end in \.c"):
-        lbt.interop.export_c(tmp_path / file, designs["integrator"], name="k")
+        lbt.interop.export(tmp_path / file, designs["integrator"], "c", name="k")
 
 
 def test_single_precision_has_a_largest_number(tmp_path):
     huge = lbt.Controller(A=[[0.5]], B=[[1e39]], C=[[1e-39]], D=[[0.0]])
-    lbt.interop.export_c(tmp_path / "k.c", bare_design(huge))
+    lbt.interop.export(tmp_path / "k.c", bare_design(huge), "c")
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"below 3.4e\+38 in single precision; got 1e\+39 in B"
+        lbt.errors.ProblemError, match=r"below 3.4e\+38 in single precision; got 1e\+39 in gains"
     ):
-        lbt.interop.export_c(tmp_path / "single.c", bare_design(huge), precision="single")
+        lbt.interop.export(tmp_path / "single.c", bare_design(huge), "c", precision="single")
     assert not list(tmp_path.glob("single*"))
 
 
 def test_arithmetic_that_overflows_is_refused(tmp_path):
     """Coefficients that fit, products that do not."""
     steep = lbt.Controller(A=[[0.5]], B=[[1e30]], C=[[1e30]], D=[[0.0]])
-    lbt.interop.export_c(tmp_path / "k.c", bare_design(steep))
+    lbt.interop.export(tmp_path / "k.c", bare_design(steep), "c")
     with pytest.raises(lbt.errors.NumericalError, match="must stay finite in single precision"):
-        lbt.interop.export_c(tmp_path / "single.c", bare_design(steep), precision="single")
+        lbt.interop.export(tmp_path / "single.c", bare_design(steep), "c", precision="single")
     assert not list(tmp_path.glob("single*"))
 
 
 def test_a_loop_that_rounding_would_break_is_refused(tmp_path, loaded):
     brink = lbt.integrator(loaded.hardware, gain=1 - 1e-8)  # stable below 1; rounds to 1
-    lbt.interop.export_c(tmp_path / "k.c", brink)
-    with pytest.raises(lbt.errors.NumericalError, match="as they would be written is unstable"):
-        lbt.interop.export_c(tmp_path / "single.c", brink, precision="single")
+    lbt.interop.export(tmp_path / "k.c", brink, "c")
+    with pytest.raises(
+        lbt.errors.NumericalError, match="what its design promises .* spectral radius"
+    ):
+        lbt.interop.export(tmp_path / "single.c", brink, "c", precision="single")
     assert not list(tmp_path.glob("single*"))
-
-
-def test_precision_is_one_of_two(tmp_path, designs):
-    with pytest.raises(lbt.errors.ProblemError, match="precision must be one of double, single"):
-        lbt.interop.export_c(tmp_path / "k.c", designs["integrator"], precision="half")
 
 
 @pytest.mark.usefixtures("short_rehearsal")
 def test_source_and_header_are_both_written_or_none(tmp_path, designs, monkeypatch):
     before = {
         file: file.read_bytes()
-        for file in lbt.interop.export_c(tmp_path / "k.c", designs["kalman"]).files
+        for file in lbt.interop.export(tmp_path / "k.c", designs["kalman"], "c").files
     }
     real, calls = os.fsync, []
 
@@ -334,10 +303,304 @@ def test_source_and_header_are_both_written_or_none(tmp_path, designs, monkeypat
         patched.setattr(os, "fsync", full)
         for name in ("k.c", "new.c"):
             with pytest.raises(lbt.errors.OutputError, match=r"cannot write .*: No space left"):
-                lbt.interop.export_c(tmp_path / name, designs["hinf"])
+                lbt.interop.export(tmp_path / name, designs["hinf"], "c")
     assert len(calls) == 4
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
     (tmp_path / "taken.h").mkdir()
     with pytest.raises(lbt.errors.OutputError, match=r"taken\.h is a directory"):
-        lbt.interop.export_c(tmp_path / "taken.c", designs["hinf"])
+        lbt.interop.export(tmp_path / "taken.c", designs["hinf"], "c")
     assert not (tmp_path / "taken.c").exists()
+
+
+SENSOR_FRAMES = 1200
+DROPS = (
+    Drop(unit="m1", start_s=0.1, end_s=0.301),
+    Drop(unit="slow", start_s=0.2, end_s=0.5),
+    Drop(unit="wavefront", start_s=0.25, end_s=0.3),
+    Drop(unit="m2", start_s=0.901),
+)
+UNITS = ("wavefront", "slow", "m1", "m2")
+MISSING, NOT_FINITE, NOT_DUE, NOT_APPLIED = 1, 2, 4, 8
+
+
+@pytest.fixture(scope="module")
+def sensor_files(sensors_design, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("masked_c")
+    return {
+        precision: lbt.interop.export(
+            folder / f"{precision}.c", sensors_design, "c", precision=precision
+        )
+        for precision in ("double", "single")
+    }
+
+
+@pytest.fixture
+def theirs(sensor_files):
+    return Compiled(sensor_files["double"].files[0])
+
+
+def run_sensors(sensors_design, config, filters):
+    """A run in which sensors fail, alone and together; its readings and commands."""
+    return simulate_sensors(
+        filters,
+        config.truth,
+        hardware=sensors_design.hardware,
+        frames=SENSOR_FRAMES,
+        settle_frames=0,
+        drops=DROPS,
+    )
+
+
+@pytest.fixture(scope="module")
+def simulated(sensors_design, sensors_config):
+    """That run with the filters of the design."""
+    return run_sensors(sensors_design, sensors_config, sensors_design.controllers)
+
+
+def fresh_in(k, missing=None):
+    """What is new in a frame: the slow sensor is read in every second one."""
+    away = {d.unit for d in DROPS if d.covers(k * 1e-3 + 1e-9)} if missing is None else missing
+    return [unit not in away and not (unit == "slow" and k % 2) for unit in UNITS]
+
+
+def test_the_commands_are_those_of_the_simulation(simulated, theirs):
+    """On the same readings and applied commands, with sensors missing."""
+    last, found = np.zeros(2), []
+    for k, (y, u) in enumerate(zip(simulated.measurements[0], simulated.commands[0], strict=True)):
+        fresh = fresh_in(k)
+        stale = np.where(np.repeat(fresh, [2, 2, 1, 1]), y, np.nan)  # nobody looks at the others
+        found.append(theirs.step(stale, fresh, last))
+        assert theirs.status == MISSING * any(d.covers(k * 1e-3 + 1e-9) for d in DROPS)
+        last = u
+    assert relative(found, simulated.commands[0]) < 1e-9
+
+
+@pytest.mark.parametrize(("precision", "limit"), [("double", 1e-9), ("single", 1e-3)])
+def test_the_compiled_filter_closes_the_loop(
+    sensors_design, sensors_config, simulated, sensor_files, precision, limit
+):
+    """The simulation with the compiled source as its filters, for each set that is missing."""
+    theirs = Compiled(sensor_files[precision].files[0], single=precision == "single")
+    frame = iter(range(SENSOR_FRAMES))
+
+    class Stepped:
+        """What a filter multiplies its new state by, which is y, to get the commands."""
+
+        def __init__(self, missing):
+            self.missing = missing
+
+        def __matmul__(self, y):
+            return theirs.step(y[:, 0], fresh_in(next(frame), self.missing), theirs.u)[:, None]
+
+    class Filter:
+        n_states = sensors_design.problem.n_measurements
+
+        def __init__(self, missing):
+            self.missing = missing
+
+        def stacks(self):
+            A, B, D = np.zeros((2, 6, 6)), np.tile(np.eye(6), (2, 1, 1)), np.zeros((2, 2, 6))
+            return A, B, [Stepped(self.missing)] * 2, D
+
+    filters = {some: Filter(some) for some in sensors_design.controllers}
+    found = run_sensors(sensors_design, sensors_config, filters)
+    assert relative(found.commands, simulated.commands) < limit
+    assert relative(found.residual_nm, simulated.residual_nm) < limit
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_with_sensors_missing_it_is_that_arithmetic(sensors_design, sensor_files, precision):
+    """Bit for bit, with what is new drawn at random."""
+    single = precision == "single"
+    theirs = Compiled(sensor_files[precision].files[0], single=single)
+    ours = sensor_files[precision].start(np.inf)
+    rng = np.random.default_rng(0)
+    for k in range(300):
+        y, applied = rng.standard_normal(6), rng.standard_normal(2)
+        fresh = (rng.random(4) < 0.8) & fresh_in(k, ())
+        given = dict(zip(UNITS, fresh, strict=True))
+        assert np.array_equal(theirs.step(y, fresh, applied), ours.step(y, given, applied))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_reading_that_is_not_finite_is_not_fresh(theirs, sensor_files, bad):
+    other = Compiled(sensor_files["double"].files[0])
+    for k, y in enumerate(np.random.default_rng(1).standard_normal((20, 6))):
+        fresh, without = fresh_in(k, ()), fresh_in(k, ("wavefront", "m2"))
+        expected = other.step(y, without, other.u)
+        y[[1, 5]] = bad
+        assert np.array_equal(theirs.step(y, fresh, theirs.u), expected)
+        assert theirs.status == MISSING | NOT_FINITE
+        assert other.status == MISSING
+        assert np.array_equal(theirs.state, other.state)
+
+
+def test_a_sensor_that_is_not_due_is_not_read(theirs, sensor_files):
+    other = Compiled(sensor_files["double"].files[0])
+    for k, y in enumerate(np.random.default_rng(2).standard_normal((20, 6))):
+        expected = other.step(y, fresh_in(k, ()), other.u)
+        assert np.array_equal(theirs.step(y, [1, 1, 1, 1], theirs.u), expected)
+        assert theirs.status == NOT_DUE * (k % 2)
+        assert other.status == 0
+
+
+def test_a_slip_of_the_phase_is_seen_and_mended(theirs, sensor_files):
+    """The slow sensor is missing from a frame in which it is due until it is read again."""
+    seen = []
+    for k in range(8):
+        if k == 5:
+            theirs.phase(10_001)  # of an odd number of frames
+        theirs.step(np.zeros(6), [1, (k + 1) % 2 == 0, 1, 1], np.zeros(2))
+        seen.append(theirs.status)
+    slipped = [MISSING, MISSING | NOT_DUE]
+    assert seen[:5] == [*slipped, *slipped, MISSING]
+    assert seen[5:] == [MISSING | NOT_DUE, MISSING, MISSING | NOT_DUE]
+    theirs.phase(0)
+    theirs.step(np.zeros(6), [1, 1, 1, 1], np.zeros(2))
+    assert theirs.status == 0
+
+
+def test_commands_that_are_not_finite_are_taken_for_the_last_ones(theirs, sensor_files):
+    other = Compiled(sensor_files["double"].files[0])
+    for k, y in enumerate(np.random.default_rng(3).standard_normal((10, 6))):
+        expected = other.step(y, fresh_in(k, ()), other.u)
+        assert np.array_equal(theirs.step(y, fresh_in(k, ()), [theirs.u[0], np.nan]), expected)
+        assert theirs.status == NOT_APPLIED
+    assert np.any(theirs.u)
+
+
+def renamed(sensors_design, names):
+    """The design with other names of its sensor and channels."""
+    sensors = sensors_design.problem.hardware.suite.sensors
+    slow, mirror = replace(sensors[0], name=names[0]), replace(sensors[1], channels=names[1:])
+    suite = lbt.models.SensorSuite(sensors=(slow, mirror))
+    place = dict(zip(sensors[1].channels, names[1:], strict=True))
+    motions = tuple({place[c]: m for c, m in own.items()} for own in sensors_design.problem.motions)
+    return lbt.kalman(sensors_design.problem.own_sensor_alone().with_sensors(suite, motions))
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (("slow one", "2nd", "m*/"), ["WAVEFRONT", "SLOW_ONE", "2ND", "M"]),
+        (("m-1", "m_1", "ä"), ["WAVEFRONT_0", "M_1_1", "M_1_2", "3"]),
+        (("x" * 30, "int", "\\\n*/"), ["WAVEFRONT_0", "X" * 24 + "_1", "INT_2", "3"]),
+    ],
+)
+def test_names_of_sensors_that_are_no_identifiers(tmp_path, sensors_design, names, found):
+    files = lbt.interop.export(tmp_path / "odd.c", renamed(sensors_design, names), "c").files
+    header = files[1].read_text()
+    assert re.findall(r"ODD_SENSOR_(\w+) = ", header) == found
+    assert header.isascii()
+    assert header.count("/*") == header.count("*/")
+    Compiled(files[0]).step(np.zeros(6), [1, 1, 1, 1], np.zeros(2))
+
+
+def test_what_has_no_source_is_refused(tmp_path, sensors_design):
+    failed = lbt.design.Check("of a test", 1.0, 0.5, "hand")
+    wrong = replace(
+        sensors_design, certificate=replace(sensors_design.certificate, checks=(failed,))
+    )
+    for design, options, error, words in (
+        (sensors_design, {"form": "plain"}, ProblemError, "in estimator form alone"),
+        (sensors_design, {"name": "kal-man"}, ProblemError, "prefix of the C names must"),
+        (wrong, {}, CertificateError, "of a test"),
+        (sensors_design, {"precision": "half"}, ProblemError, "must be one of double, single"),
+    ):
+        with pytest.raises(error, match=words):
+            lbt.interop.export(tmp_path / "k.c", design, "c", **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+def test_a_table_that_is_too_long_is_refused(tmp_path, sensors_design, monkeypatch):
+    terms = source_terms(sensors_design)
+    count = sum(np.count_nonzero(gains.any(axis=1)) for gains in terms.gains.values())
+    count *= sensors_design.problem.n_states
+    monkeypatch.setattr(c_export, "MOST_GAINS", count)
+    lbt.interop.export(tmp_path / "k.c", sensors_design, "c")
+    monkeypatch.setattr(c_export, "MOST_GAINS", count - 1)
+    with pytest.raises(ProblemError, match=rf"got {count:,}, in a period of 2 frames"):
+        lbt.interop.export(tmp_path / "long.c", sensors_design, "c")
+
+
+def test_commands_that_are_off_are_refused(tmp_path, sensors_design, monkeypatch):
+    monkeypatch.setattr(pipeline, "_LARGEST_ERROR", 1e-9)
+    lbt.interop.export(tmp_path / "k.c", sensors_design, "c")
+    with pytest.raises(NumericalError, match=r"in a rehearsal.*Try double precision"):
+        lbt.interop.export(tmp_path / "single.c", sensors_design, "c", precision="single")
+    assert not list(tmp_path.glob("single*"))
+
+
+@pytest.mark.parametrize("target", sorted({*target_names()} - {"c"}))
+def test_other_targets_refuse_it(tmp_path, sensors_design, target):
+    own = target_named(target)
+    with pytest.raises(ProblemError, match="this design reads slow, m1, m2 beside"):
+        lbt.interop.export(own.path_in(tmp_path), sensors_design, target)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_certificate_beside_the_source(sensor_files):
+    for precision, exported in sensor_files.items():
+        beside = json.loads(exported.files[2].read_text())
+        assert (beside["form"], beside["precision"]) == ("estimator", precision)
+        assert (beside["period"], beside["sensors"]) == (2, list(UNITS))
+        assert [check["passed"] for check in beside["checks"]] == [True] * 6
+        assert beside["checks"][-1]["value"] == exported.error
+    assert sensor_files["double"].error < 1e-11 < sensor_files["single"].error < 1e-3
+    assert sensor_files["double"].error_single == sensor_files["single"].error
+
+
+def test_the_cost_is_that_of_the_source(sensor_files):
+    """Products of a frame in which all is read, and numbers, counted in the text."""
+    text, cost = sensor_files["double"].files[0].read_text(), sensor_files["double"].cost
+    sizes = header_numbers(sensor_files["double"].files[0], "double")
+    constants, gains = (int(re.search(rf"real {a}\[(\d+)\]", text)[1]) for a in ("c", "gains"))
+    varying = int(re.search(r"real varying\[DOUBLE_PERIOD\]\[(\d+)\]", text)[1])
+    assert cost.coefficients == constants + 2 * varying + gains
+    products = len(re.findall(r"[cv]\[\d+\] \*", text.split("int double_step")[1]))
+    estimates = int(re.search(r"add\(state->x, (\d+), gains", text)[1])
+    assert cost.multiplications == products + 6 * estimates
+    assert cost.states == sizes["STATES"] + sizes["COMMANDS"]
+
+
+def test_a_source_that_is_stepped_without_more_is_that_of_all_sensors(sensors_design):
+    """What is due is new, and its own commands are applied: the controller of the design."""
+    source, own = RunningSource(source_terms(sensors_design)), sensors_design.controller
+    x = np.zeros(own.n_states)
+    for k, y in enumerate(np.random.default_rng(5).standard_normal((30, 6))):
+        x = own.A[k % 2] @ x + own.B[k % 2] @ y
+        assert source.step(y) == pytest.approx(own.C[0] @ x, rel=1e-9)
+
+
+CPP = """
+#include "{0}"
+#include "{0}"
+int main() {{ {1}_state s; float y[{2}_MEASUREMENTS] = {{0}}, u[{2}_COMMANDS] = {{0}};
+{3}{1}_reset(&s); {1}_step(&s, y, {4}u); return u[0] == 0.0f ? 0 : 1; }}
+"""
+
+
+def test_the_headers_are_fit_for_cpp(tmp_path, exported, sensor_files):
+    fresh = "unsigned char fresh[SINGLE_SENSORS] = {0}; fresh[SINGLE_SENSOR_M1] = 1;\n"
+    for source, more, inputs in (
+        (exported("kalman", "single").files[0], "", ""),
+        (sensor_files["single"].files[0], fresh, "fresh, u, "),
+    ):
+        name, user = source.stem, tmp_path / f"{source.stem}.cpp"
+        header = source.with_suffix(".h")
+        user.write_text(CPP.format(header, name, name.upper(), more, inputs))
+        built, program = tmp_path / f"{name}.o", tmp_path / name
+        subprocess.run([compiler(), *STRICT, "-c", source, "-o", built], check=True)
+        strict = ["-std=c++98", "-pedantic", "-Wall", "-Wextra", "-Werror"]
+        subprocess.run([compiler("c++"), *strict, user, built, "-o", program], check=True)
+        subprocess.run([program], check=True)
+
+
+def test_flags_that_hide_what_is_not_finite_are_refused(tmp_path, exported, sensor_files):
+    for written in (exported("integrator"), sensor_files["double"]):
+        command = [compiler(), *STRICT, "-ffast-math", "-c", written.files[0]]
+        done = subprocess.run([*command, "-o", tmp_path / "k.o"], capture_output=True, text=True)
+        assert done.returncode != 0
+        assert "compile without -ffast-math" in done.stderr

@@ -5,16 +5,16 @@ import pytest
 
 import lbt_synth as lbt
 from lbt_synth.interop.dao import refit
-from lbt_synth.interop.dao.direct_form import direct_form, direct_form_rows
-from lbt_synth.interop.dao.refit import ROUNDING, _widened, round_together, shaped_mode_loop
-from lbt_synth.interop.written_loop import _rounding_left
+from lbt_synth.interop.dao.export import direct_form, direct_form_rows
+from lbt_synth.interop.dao.refit import ROUNDING, _widened, mode_loop, round_together
+from lbt_synth.interop.proof import _rounding_left
 from lbt_synth.loop.closed_loop import radii_by_gain
 
 
 @pytest.fixture(scope="module")
 def case(shaped):
     rows = direct_form_rows(shaped.controller, 20)[:, 0]
-    return shaped_mode_loop(shaped.hardware, shaped.specifications[0], 20), rows
+    return mode_loop(shaped.hardware, shaped.specifications[0], 20), rows
 
 
 def rounding_nm(loop, c):
@@ -26,15 +26,13 @@ def test_residuals_are_those_of_the_design(case, shaped):
     loop, c = case
     (specification,) = shaped.specifications
     expected = []
-    for s in loop.scenarios:
-        around = lbt.close_loop(shaped.hardware, shaped.controller, sensor_gain=s.sensor_gain)
+    for gain in loop.gains:
+        around = lbt.close_loop(shaped.hardware, shaped.controller, sensor_gain=gain)
         air, line, *_ = specification.objective.terms
-        truth = lbt.Truth(
-            turbulence=air.turbulence, noise_nm=air.noise_nm, sensor_gain=s.sensor_gain
-        )
+        truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, sensor_gain=gain)
         budget = lbt.residual_budget(around, truth)
         expected.append(np.hypot(budget.rms_nm, line.rms_nm * line.peak(around.rejection())))
-    assert [s.sensor_gain for s in loop.scenarios] == [1.0, 0.6]
+    assert loop.gains == (1.0, 0.6)
     assert loop.residuals_nm(c) == pytest.approx(expected, rel=2e-3)
 
 
@@ -50,7 +48,6 @@ def test_sums_are_as_large_as_in_a_simulation(case):
     """White measurements into an FIR filter have known partial sums; the loop's are simulated."""
     loop, c = case
     rng = np.random.default_rng(2)
-    scenario = loop.scenarios[0]
     b, a = c[:21], c[21:]
     frames = 40_000
     air = np.zeros(frames)
@@ -67,7 +64,7 @@ def test_sums_are_as_large_as_in_a_simulation(case):
         residual = air[k] + line[k] - u[k + 19]
         squares += np.sum(terms**2), np.sum(np.cumsum(terms)[1:] ** 2)
     expected = ROUNDING * squares.sum() / frames
-    assert loop.sums_nm2(c, scenario.sensor_gain) == pytest.approx(expected, rel=0.15)
+    assert loop.sums_nm2(c, loop.gains[0]) == pytest.approx(expected, rel=0.15)
 
 
 def test_rounding_in_the_loop_is_that_of_the_lyapunov_equation(case, shaped):
@@ -76,7 +73,7 @@ def test_rounding_in_the_loop_is_that_of_the_lyapunov_equation(case, shaped):
     A factor common to both polynomials keeps the state-space loop well conditioned.
     """
     loop, own = case
-    c = _widened(loop, own)
+    c = _widened(own)
     added = np.concatenate([np.eye(21)[0], c[21:]])
     written, entry = (direct_form(x[:, None], shaped.controller.dt_s) for x in (c, added))
     variance = np.array([loop.sums_nm2(c, 1.0)])
@@ -85,14 +82,13 @@ def test_rounding_in_the_loop_is_that_of_the_lyapunov_equation(case, shaped):
 
 
 def test_sections_give_back_the_coefficients(case):
-    loop, c = case
-    wide = _widened(loop, c)
-    assert refit._coefficients(refit._sections(wide, loop.order)) == pytest.approx(wide, abs=1e-9)
+    wide = _widened(case[1])
+    assert refit._coefficients(refit._sections(wide)) == pytest.approx(wide, abs=1e-9)
 
 
 def test_a_common_factor_leaves_the_loop_as_it_is(case):
     loop, c = case
-    wide = _widened(loop, c)
+    wide = _widened(c)
     assert loop.residuals_nm(wide) == pytest.approx(loop.residuals_nm(c), rel=1e-6)
     assert rounding_nm(loop, wide)[0] < 0.2 * rounding_nm(loop, c)[0]
 
@@ -100,9 +96,9 @@ def test_a_common_factor_leaves_the_loop_as_it_is(case):
 def test_slopes_are_those_of_finite_differences(case):
     """Without the rounding, whose memory counts as constant."""
     loop, c = case
-    theta = refit._sections(_widened(loop, c), loop.order)
+    theta = refit._sections(_widened(c))
     shares = 1 / loop.residuals_nm(c)
-    goals = refit._Goals(shares, 0.0, refit._limits(loop, c), 3.0, 0.92)
+    goals = (shares, 0.0, refit._limits(loop, c), 3.0, 0.92)
     before, slopes = refit._rows(loop, goals, theta)
     for k in range(0, theta.size, 5):
         step = np.zeros(theta.size)
@@ -132,19 +128,15 @@ def test_a_loop_that_coarse_arithmetic_breaks_is_mended(case):
 def test_errors_of_rounding_cancel_where_they_count(case):
     """Against rounding one by one, by what each changes of the loop's polynomial."""
     loop, own = case
-    c = _widened(loop, own)
+    c = _widened(own)
     rounded = round_together(loop, c)
     assert rounded.dtype == np.float32
+    assert np.any(own == 0)
+    assert np.all(round_together(loop, own)[own == 0] == 0)
 
     def change(near):
-        gains = (1.0, loop.low, loop.high, *(s.sensor_gain for s in loop.scenarios))
+        gains = (1.0, loop.low, loop.high, *loop.gains)
         pairs = [[loop.polynomials(x, gain)[2] for x in (near.astype(float), c)] for gain in gains]
         return np.linalg.norm([after / before - 1 for after, before in pairs])
 
     assert change(rounded) < 0.1 * change(c.astype(np.float32))
-
-
-def test_coefficients_that_are_zero_stay(case):
-    loop, c = case
-    assert np.any(c == 0)
-    assert np.all(round_together(loop, c)[c == 0] == 0)

@@ -6,15 +6,13 @@ noise that enters with the command; its variance bounds that of the target's ord
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.design import Check, Design, ShapedDesign
-from lbt_synth.design.result import require_hardware
+from lbt_synth.design import Check, Design
 from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.design.shaping.objectives import leaves
@@ -29,8 +27,9 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
+from lbt_synth.loop.budget import plant_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
-from lbt_synth.models import ARModel, LoopHardware, TipTiltPlant
+from lbt_synth.models import ARModel, LoopHardware
 from lbt_synth.validation import BoolArray, FloatArray
 
 ROUNDOFF = {"double": 2.0**-53, "single": 2.0**-24}  # largest relative error of an operation
@@ -39,40 +38,57 @@ _SCENARIOS = (1.0, 0.7, 0.5, 0.358)  # sensor gains, where a design names none
 _STEP = 1.01  # ratio of neighbouring sensor gains
 _WIDEST = 10.0  # factor on the sensor gain, to either side
 _POLE, _NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
+EIGENVALUES = "eigenvalues of the monodromy, per frame"
 _ASKED = np.array([0.0031, 0.11, 0.37])  # parts of the frame rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rounding:
-    """Rounding of the arithmetic, as noise."""
+class Written:
+    """A controller as a target computes it: its numbers, the rounding of its sums, what it lacks.
 
-    # from the noise (r,) of the sums to the command; A and C are those of the controller
-    entry: Controller
-    # from the sensor gain and the rms of measurements (q,) and commands (m,) to that of the noise
-    variance: Callable[[float, FloatArray, FloatArray], FloatArray]
-    # rows (s, n) that read signals from the controller's state; their rms follow the measurements'
-    signals: FloatArray | None = None
-
-
-def matrix_rounding(
-    whole: FloatArray, entry: Controller, signals: FloatArray, roundoff: float
-) -> Rounding:
-    """Return the rounding of the products and the partial sums of each row, from left to right.
-
-    The columns of ``whole`` (r, c) belong to the signals, which rows (s, n) read from the
-    controller's state, then to measurements, then to commands, as far as there are columns;
-    ``entry`` leads from an error in each of the r sums to the command.
+    Attributes
+    ----------
+    controllers : mapping of frozenset to Controller
+        With the numbers of the file, for each set of sensors and channels that are not read.
+    entry : Controller, optional
+        From the noise (r,) of the sums to the command; A and C are those of the controller.
+    variance : callable, optional
+        From the sensor gain and the rms of measurements (q,) and commands (m,) to that of the
+        noise in the sums.
+    signals : (s, n) ndarray, optional
+        Rows that read signals from the controller's state; their rms follow the measurements'.
+    residual_change_nm, response_change : callable, optional
+        Bounds on what is left out: from the sensor gain to the change of the residual's rms [nm],
+        and to that of the sensitivities.
+    checks : tuple of Check
+        What has to hold besides, such as stability without the loop.
     """
-    count = len(signals)
+
+    controllers: Mapping[frozenset[str], Controller]
+    entry: Controller | None = None
+    variance: Callable[[float, FloatArray, FloatArray], FloatArray] | None = None
+    signals: FloatArray | None = None
+    residual_change_nm: Callable[[float], float] | None = None
+    response_change: Callable[[float], float] | None = None
+    checks: tuple[Check, ...] = ()
+
+
+def sums_variance(
+    whole: FloatArray, signals: int, roundoff: float
+) -> Callable[[float, FloatArray, FloatArray], FloatArray]:
+    """Return the variance of the rounding of each row's products and partial sums, left to right.
+
+    The columns of ``whole`` (r, c) belong to signals of the controller's state, then to commands,
+    then to measurements. A term that is zero rounds nothing.
+    """
 
     def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
-        q = measured.size - count
-        sizes = np.concatenate([measured[q:], measured[:q], commands])[: whole.shape[1]]
-        terms = np.abs(whole) * sizes
-        squares = terms**2 + np.cumsum(terms, axis=1) ** 2
-        return np.asarray(roundoff**2 / 3 * np.sum(squares, axis=1))
+        own = measured.size - signals
+        terms = np.abs(whole) * np.concatenate([measured[own:], commands, measured[:own]])
+        sums = np.where(terms > 0, np.cumsum(terms, axis=1), 0.0)
+        return np.asarray(roundoff**2 / 3 * np.sum(terms**2 + sums**2, axis=1))
 
-    return Rounding(entry=entry, variance=variance, signals=signals)
+    return variance
 
 
 def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> None:
@@ -87,52 +103,74 @@ def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> Non
             )
 
 
-class LeftOut(Protocol):
-    """What is written less than the controller, by bounds on what it changes."""
-
-    def residual_nm(self, gain: float) -> float:
-        """Bound the rms of the residual's change at a sensor gain [nm]."""
-
-    def response(self, gain: float) -> float:
-        """Bound the change of the sensitivities at a sensor gain."""
-
-
-def prove_written(
-    design: Design,
-    written: Controller,
-    rounding: Rounding | None = None,
-    left_out: LeftOut | None = None,
-) -> tuple[Check, ...]:
+def prove_written(design: Design, written: Written) -> tuple[Check, ...]:
     """Check the loop around a controller as it is written, against that of its design.
 
-    It is stable over the design's sensor gains; residual, arithmetic included, and modulus margin
-    are within 1 % of the design's, and so is each demand of a shaped design of its limit.
+    A design without a loop has no checks of one.
     """
-    hardware = require_hardware(design, "a check of what is written")
+    if design.hardware is None:
+        return written.checks
+    prove = _prove_sensors if len(written.controllers) > 1 else _prove_loop
+    return (*prove(design, design.hardware, written), *written.checks)
+
+
+def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
+    """Check the loops of all sensors and with some missing: stable, and the residual is kept."""
+    checks = []
+    for name, sets in (
+        ("all sensors", [frozenset[str]()]),
+        ("any sensors missing", [some for some in written.controllers if some]),
+    ):
+        radii, losses = [0.0], [0.0]
+        for some in sets:
+            loops = [
+                close_loop(hardware, of[some], blind=tuple(some))
+                for of in (written.controllers, design.controllers)
+            ]
+            radii.append(loops[0].system.radius_per_frame)
+            if not loops[0].is_stable:
+                losses.append(np.inf)
+                break
+            after, before = (plant_budget(loop, design.problem).rms_nm for loop in loops)
+            losses.append(after / before - 1)
+        name_of_loss = f"residual with {name}, loss"
+        checks += [
+            Check(f"spectral radius with {name}", max(radii), 1 - STABILITY_MARGIN, EIGENVALUES),
+            Check(name_of_loss, max(losses), _LOSS, "Lyapunov equations"),
+        ]
+    return checks
+
+
+def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
+    """Check the loop of one sensor over the sensor gains of its design.
+
+    It is stable; residual, arithmetic included, and modulus margin are within 1 % of the design's,
+    and so is each demand on a shaped design of its limit.
+    """
+    (controller,) = written.controllers.values()
     low, high = proved_gains(design, hardware)
     count = 2 + int(np.log(high / low) / np.log(_STEP))
     gains = np.append(np.geomspace(low, high, count), 1.0)
-    radius = float(np.max(radii_by_gain(hardware, written)(gains)))
+    radius = float(np.max(radii_by_gain(hardware, controller)(gains)))
     name = f"spectral radius at sensor gains {low:.4g} to {high:.4g}"
     checks = [Check(name, radius, 1 - STABILITY_MARGIN, f"eigenvalues at {gains.size} gains")]
     if not checks[0].passed:
-        return tuple(checks)
+        return checks
     inside = (gain for gain in scenario_gains(design) if low <= gain <= high)
-    checks += (_residual_check(design, written, rounding, left_out, gain) for gain in inside)
-    own, other = (close_loop(hardware, c) for c in (design.controller, written))
+    checks += (_residual_check(design, hardware, written, gain) for gain in inside)
+    own, other = (close_loop(hardware, c) for c in (design.controller, controller))
     before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (own, other))
-    after += left_out.response(1.0) if left_out else 0.0
+    change = written.response_change
+    after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, _LOSS, "level sets"))
-    if isinstance(design, ShapedDesign):
-        checks += _demand_checks(design, other, left_out)
-    return tuple(checks)
+    return checks + _demand_checks(design, other, change)
 
 
 def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
     """Return the sensor gains that are demanded, or 1 % less than the design holds."""
-    if isinstance(design, ShapedDesign):
-        demands = [d for spec in design.specifications for d in spec.demands]
-        ranges = [d for d in demands if isinstance(d, SensorGainRange)]
+    if specifications := design.mode_specifications:
+        demands = [demand for spec in specifications for demand in spec.demands]
+        ranges = [demand for demand in demands if isinstance(demand, SensorGainRange)]
         return min([1.0, *(r.low for r in ranges)]), max([1.0, *(r.high for r in ranges)])
     low, high = stable_sensor_gains(hardware, design.controller)
     return min(max(low * _STEP, 1 / _WIDEST), 1.0), max(min(high / _STEP, _WIDEST), 1.0)
@@ -140,38 +178,34 @@ def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
 
 def scenario_gains(design: Design) -> tuple[float, ...]:
     """Return the sensor gains at which the residual is compared."""
-    if not isinstance(design, ShapedDesign):
-        return _SCENARIOS
-    terms = [leaf for spec in design.specifications for leaf in leaves(spec.objective)]
-    return tuple(sorted({leaf.sensor_gain for leaf in terms}, reverse=True))
+    terms = [leaf for spec in design.mode_specifications for leaf in leaves(spec.objective)]
+    return tuple(sorted({leaf.sensor_gain for leaf in terms}, reverse=True)) or _SCENARIOS
 
 
-def _residual_check(
-    design: Design,
-    written: Controller,
-    rounding: Rounding | None,
-    left_out: LeftOut | None,
-    gain: float,
-) -> Check:
+def _residual_check(design: Design, hardware: LoopHardware, written: Written, gain: float) -> Check:
     """Compare the residual, with what the rounding of the arithmetic and what is left out add."""
-    hardware = require_hardware(design, "a check of what is written")
+    (controller,) = written.controllers.values()
     n, m = hardware.modes, hardware.n_commands
-    loops = [close_loop(hardware, c, sensor_gain=gain) for c in (design.controller, written)]
+    pair = design.controller, controller
+    loops = [close_loop(hardware, c, sensor_gain=gain) for c in pair]
     before = mode_variances(design, loops[0], slice(n))
-    how = "Lyapunov equations, level sets" + (", and what is left out" if left_out else "")
-    if rounding is None:
-        after, left = mode_variances(design, loops[1], slice(n)), np.zeros(n)
+    change, how = written.residual_change_nm, "Lyapunov equations, level sets"
+    how += ", and what is left out" if change else ""
+    rounding_nm2 = np.zeros(n)
+    if written.variance is None or written.entry is None:
+        after = mode_variances(design, loops[1], slice(n))
     else:
-        shown = _with_signals(loops[1], rounding.signals)
-        found = mode_variances(design, shown, slice(None))
-        sizes = np.sqrt(np.abs(found))  # where it is below zero, the size of its rounding
-        variance = rounding.variance(gain, sizes[n + m :], sizes[n : n + m])
-        after, left = found[:n], _rounding_left(hardware, written, rounding.entry, variance, gain)
+        shown = _with_signals(loops[1], written.signals)
+        outputs = mode_variances(design, shown, slice(None))
+        sizes = np.sqrt(np.abs(outputs))  # where it is below zero, the size of its rounding
+        variance = written.variance(gain, sizes[n + m :], sizes[n : n + m])
+        after = outputs[:n]
+        rounding_nm2 = _rounding_left(hardware, controller, written.entry, variance, gain)
     with np.errstate(invalid="ignore"):  # not a number: no accuracy, and the check fails
-        after_nm = np.sqrt(after + left) + (left_out.residual_nm(gain) if left_out else 0.0)
+        after_nm = np.sqrt(after + rounding_nm2) + (change(gain) if change else 0.0)
         loss = float(np.max(after_nm / np.sqrt(before))) - 1
-        share = float(np.sqrt(np.max(left / before)))
-    if rounding is not None:
+        share = float(np.sqrt(np.max(rounding_nm2 / before)))
+    if written.variance is not None:
         how += f"; rounding at most {share:.1e} of it"
     return Check(f"residual at sensor gain {gain:g}, loss", loss, _LOSS, how)
 
@@ -191,13 +225,12 @@ def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     s, rate = loop.system, loop.hardware.frame_rate_hz
     seen = replace(loop, system=replace(s, C=s.C[rows], D=s.D[rows]))
     n, q = loop.hardware.modes, loop.hardware.n_measurements
-    if isinstance(design, ShapedDesign):
+    if design.mode_specifications:
         return _shaped_variances(design, seen)
     drive = np.sqrt(1 - _POLE**2)
     slow = ARModel(coefficients=np.array([_POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
     sources, noise = [(slow, row) for row in np.eye(n)], _NOISE * np.eye(q)
-    if design.is_estimator and isinstance(design.problem, TipTiltPlant):
-        plant = design.problem
+    if (plant := design.model) is not None:
         sources = list(zip(plant.turbulence, np.eye(n), strict=True))
         sources += [(v.ar_model(rate), np.asarray(v.direction)) for v in plant.vibrations]
         noise = plant.D[:, -q:]
@@ -219,15 +252,15 @@ def _gaussian_variances(
     return output_variances(C, through, stationary_root(A, B))
 
 
-def _shaped_variances(design: ShapedDesign, loop: ClosedLoop) -> FloatArray:
+def _shaped_variances(design: Design, loop: ClosedLoop) -> FloatArray:
     """Variance of each output under the terms of a shaped design, mode by mode."""
-    found = np.zeros(len(loop.system.C))
-    for mode, spec in enumerate(design.specifications):
+    variances = np.zeros(len(loop.system.C))
+    for mode, spec in enumerate(design.mode_specifications):
         terms = [x for x in leaves(spec.objective) if x.sensor_gain == loop.sensor_gain]
         for row in np.flatnonzero(_reached(loop, mode)):
             one = _mode_of(loop, mode, slice(row, row + 1))
-            found[row] += sum(term.measured_nm2(one) for term in terms)
-    return found
+            variances[row] += sum(term.measured_nm2(one) for term in terms)
+    return variances
 
 
 def _reached(loop: ClosedLoop, mode: int) -> BoolArray:
@@ -266,8 +299,12 @@ def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:
     return SingleModeLoop(hardware=one, controller=loop.controller, _loops={loop.sensor_gain: own})
 
 
-def _demand_checks(design: ShapedDesign, loop: ClosedLoop, left_out: LeftOut | None) -> list[Check]:
-    """Check the demands of each mode in the loop as written; equal modes once."""
+def _demand_checks(
+    design: Design, loop: ClosedLoop, change: Callable[[float], float] | None
+) -> list[Check]:
+    """Check the demands on each mode in the loop as written; equal modes once."""
+    if not design.mode_specifications:
+        return []
     hardware, s = loop.hardware, loop.system
     n, m = hardware.modes, hardware.n_commands
     to_modes = np.zeros((3 * n, len(s.C)))
@@ -277,17 +314,17 @@ def _demand_checks(design: ShapedDesign, loop: ClosedLoop, left_out: LeftOut | N
     modal = replace(loop, system=replace(s, C=to_modes @ s.C, D=to_modes @ s.D))
     checks = []
     for mode in sorted(set(design.first_equal_modes)):
-        own = _mode_of(modal, mode, slice(mode, None, n))
-        for demand in design.specifications[mode].demands:
-            more = _demand_change(demand, left_out) if left_out else 0.0
-            for check in demand.checks(own):
+        mode_alone = _mode_of(modal, mode, slice(mode, None, n))
+        for demand in design.mode_specifications[mode].demands:
+            more = _demand_change(demand, change) if change else 0.0
+            for check in demand.checks(mode_alone):
                 name, value = f"mode {mode + 1}: {check.name}", check.value + more
                 limit = check.limit + _LOSS * abs(check.limit)
                 checks.append(replace(check, name=name, value=value, limit=limit))
     return checks
 
 
-def _demand_change(demand: Demand, left_out: LeftOut) -> float:
+def _demand_change(demand: Demand, change: Callable[[float], float]) -> float:
     """Bound how much what is left out moves the value of a demand."""
     if isinstance(demand, CommandRms | MovingSensorGain):  # no bound on a response
         raise ProblemError(
@@ -295,7 +332,7 @@ def _demand_change(demand: Demand, left_out: LeftOut) -> float:
             f"{demand.label}. Use a target with states, such as c or pyrtc."
         )
     if isinstance(demand, Attenuation):
-        return left_out.response(demand.sensor_gain)
+        return change(demand.sensor_gain)
     factor = demand.relative if isinstance(demand, MirrorUncertainty) else 1.0
     factor = 2.0 if isinstance(demand, DelayError) else factor  # the taps of two delays
-    return factor * left_out.response(1.0)
+    return factor * change(1.0)

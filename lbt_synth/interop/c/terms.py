@@ -1,0 +1,527 @@
+"""The terms of exported C source: made of a design, counted, stepped, proved, read from its text.
+
+In each frame the source predicts from its state and from the commands that were applied, and
+corrects by what each new reading differs from its prediction. A controller of one sensor is the
+case of one phase, in which every reading is new: its matrix B is the gain of the readings, whose
+prediction is none.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lbt_synth.design import Check, Design
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import ProblemError
+from lbt_synth.interop.modes import ModeDesign
+from lbt_synth.interop.proof import EIGENVALUES, ROUNDOFF, Written, sums_variance
+from lbt_synth.linear import Controller, StateSpace, estimator_form
+from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.storage.rows import column, table_row
+from lbt_synth.validation import BoolArray, FloatArray, set_fields
+
+_SMALL = 256  # up to so many entries of all matrices, every term is written out
+_LONGEST = 4096  # terms that are written out at most
+_LARGEST_SINGLE = float(np.finfo(np.float32).max)
+NONE = frozenset[str]()  # no sensor is missing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SourceTerms:
+    """The coefficients of a source.
+
+    With the states x (s,), of which the first n are corrected, and the commands a (m,) that were
+    applied in the last frame, a frame computes ``e = y + innovation [x, a]``,
+    ``x+ = transition [x, a] + gains e`` of the readings that are new, and ``u = command [x+, y]``.
+    """
+
+    transition: FloatArray  # (N, s, s + m)
+    innovation: FloatArray  # (N, q, s + m): minus what a reading is predicted to be
+    gains: Mapping[frozenset[str], FloatArray]  # (N, n, q) for each set that is missing
+    command: FloatArray  # (m, s + q)
+    read: BoolArray  # (N, q): which readings are due
+    rows: Mapping[str, slice]  # of each sensor or channel in y
+    dt_s: float
+    applied: bool  # whether the source is given the commands that were applied
+    single: bool = False  # whether its numbers are of single precision
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of states, of readings and of commands."""
+        m, columns = self.command.shape
+        q = self.read.shape[1]
+        return columns - q, q, m
+
+    @property
+    def masked(self) -> bool:
+        """Whether it is told which readings are new."""
+        return len(self.rows) > 1
+
+    @property
+    def whole(self) -> FloatArray:
+        """All matrices of one sensor: columns of states, applied commands and measurements."""
+        (s, _, m), gains = self.sizes, self.gains[NONE][0]
+        states, through = np.hsplit(self.command, [s])
+        return np.block([[self.transition[0], gains], [states, np.zeros((m, m)), through]])
+
+    @property
+    def dense(self) -> bool:
+        """Whether matrices are multiplied in loops: there are many terms, and few are zero."""
+        if self.masked:
+            return False
+        count, size = int(np.count_nonzero(self.whole)), _matrix_size(self)
+        return size > _SMALL and (2 * count > size or count > _LONGEST)
+
+    def rounded(self) -> SourceTerms:
+        """Return the terms in single precision; refuse numbers that do not fit."""
+        return replace(
+            self,
+            transition=_to_single(self.transition, "transition"),
+            innovation=_to_single(self.innovation, "innovation"),
+            gains={some: _to_single(K, "gains") for some, K in self.gains.items()},
+            command=_to_single(self.command, "command"),
+            single=True,
+        )
+
+    def controller(self, missing: frozenset[str] = NONE) -> Controller:
+        """Return the controller that the terms make where its own commands are applied."""
+        (s, *_), K = self.sizes, np.zeros((*self.transition.shape[:2], self.read.shape[1]))
+        K[:, : self.gains[missing].shape[1]] = self.gains[missing]
+        whole, (states, through) = self.transition + K @ self.innovation, _halves(self.command, s)
+        return Controller(
+            A=whole[:, :, :s] + whole[:, :, s:] @ states,
+            B=K,
+            C=states,
+            D=through,
+            dt_s=self.dt_s,
+        )
+
+
+def _halves(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
+    """Return the first columns of a matrix, and the others."""
+    return matrix[..., :columns], matrix[..., columns:]
+
+
+def _to_single(values: FloatArray, name: str) -> FloatArray:
+    largest = float(np.max(np.abs(values), initial=0.0))
+    if largest > _LARGEST_SINGLE:
+        raise ProblemError(
+            f"the coefficients must be below {_LARGEST_SINGLE:.3g} in single precision; got "
+            f"{largest:.3g} in {name}. Try double precision, or scale the states."
+        )
+    return values.astype(np.float32).astype(np.float64)
+
+
+def source_terms(design: Design, *, form: str = "plain") -> SourceTerms:
+    """Return the coefficients of a design, or of a filter of several sensors and its fall-backs."""
+    if design.other_sensors:
+        return _filter_terms(design)
+    if form == "plain":
+        return controller_terms(design.controller)
+    require_hardware(design, "the estimator form")  # a bare filter has no commands to be applied
+    own = estimator_form(design)
+    inputs = np.hstack([own.B, own.applied])
+    D = np.zeros((len(own.C), inputs.shape[1]))
+    return controller_terms(Controller(A=own.A, B=inputs, C=own.C, D=D, dt_s=own.dt_s), len(own.C))
+
+
+def controller_terms(controller: Controller, applied: int = 0) -> SourceTerms:
+    """Return the coefficients of a controller, whose last inputs are the applied commands."""
+    m, q = controller.D.shape[0], controller.D.shape[1] - applied
+    B, L = _halves(controller.B, q)
+    L = L if applied else np.zeros((len(B), m))
+    return SourceTerms(
+        transition=np.hstack([controller.A, L])[None],
+        innovation=np.zeros((1, q, len(B) + m)),
+        gains={NONE: B[None]},
+        command=np.hstack([controller.C, controller.D[:, :q]]),
+        read=np.ones((1, q), dtype=np.bool_),
+        rows={"measurements": slice(0, q)},
+        dt_s=controller.dt_s,
+        applied=applied > 0,
+    )
+
+
+def _filter_terms(design: Any) -> SourceTerms:
+    """Return the coefficients of a filter of several sensors and of its fall-backs."""
+    plant = design.problem
+    full = plant.full()
+    n, s, m = plant.n_states, full.n_states, plant.hardware.n_commands
+    A, _, C, _ = full.stacks()
+    transition = np.zeros((plant.period, s, s + m))
+    transition[:, :, :s], transition[:, :, s:] = A, full.B_known
+    predicted = np.zeros((plant.period, plant.n_measurements, s + m))
+    predicted[:, :, :s], predicted[:, :, s:] = C, full.D_known
+    filters = {(): design.gain_predictor} | {f.missing: f.gains for f in design.fallbacks}
+    states = design.controller.stacks()[2][0]
+    return SourceTerms(
+        transition=transition,
+        innovation=-predicted,
+        gains={
+            frozenset(missing): np.reshape(gains, (plant.period, n, plant.n_measurements))
+            for missing, gains in filters.items()
+        },
+        command=np.hstack([states, np.zeros((m, plant.n_measurements))]),
+        read=plant.read,
+        rows=plant.hardware.suite.rows(plant.hardware),
+        dt_s=plant.dt_s,
+        applied=True,
+    )
+
+
+class RunningSource:
+    """A source, stepped as it is written: term by term from left to right, each rounded."""
+
+    def __init__(self, terms: SourceTerms) -> None:
+        self._terms, self._dtype = terms, np.float32 if terms.single else np.float64
+        names = ("transition", "innovation", "command")
+        self._matrices = [getattr(terms, name).astype(self._dtype) for name in names]
+        self._gains = {some: gains.astype(self._dtype) for some, gains in terms.gains.items()}
+        self.reset()
+
+    def reset(self) -> None:
+        """Set states and last commands to zero; the next frame is the first of a period."""
+        s, _, m = self._terms.sizes
+        self._state: NDArray[Any] = np.zeros(s, dtype=self._dtype)
+        self._last: NDArray[Any] = np.zeros(m, dtype=self._dtype)
+        self._phase, self._missing = 0, NONE
+
+    def step(
+        self,
+        y: FloatArray,
+        fresh: Mapping[str, bool] | None = None,
+        applied: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Take y(k), what is new and the commands u(k-1) that were applied; return u(k).
+
+        By default all that is due is new, and its own commands were applied.
+        """
+        rows, read = self._terms.rows, self._terms.read[self._phase]
+        due = frozenset(unit for unit, own in rows.items() if read[own.start])
+        new = frozenset(
+            unit
+            for unit in due
+            if (fresh is None or fresh[unit]) and np.all(np.isfinite(y[rows[unit]]))
+        )
+        if not self._terms.masked and not new:
+            return np.asarray(self._last, dtype=np.float64)
+        self._missing = (self._missing - due) | (due - new)
+        used = np.concatenate([np.r_[rows[unit]] for unit in rows if unit in new] or [[]])
+        used = used.astype(np.intp)
+        transition, innovation = (matrix[self._phase] for matrix in self._matrices[:2])
+        given = self._last if applied is None else np.asarray(applied, dtype=self._dtype)
+        signals = np.concatenate([self._state, given])
+        measured: NDArray[Any] = np.zeros(len(read), dtype=self._dtype)
+        measured[used] = y[used]
+        errors = _added(np.hstack([measured[:, None], innovation * signals]))
+        gains = self._gains[self._missing][self._phase]
+        state = _added(transition * signals)
+        n = len(gains)
+        state[:n] = _added(np.hstack([state[:n, None], (gains * errors)[:, used]]))
+        self._state = state
+        self._last = _added(self._matrices[2] * np.concatenate([state, measured]))
+        self._phase = (self._phase + 1) % len(self._terms.read)
+        return np.asarray(self._last, dtype=np.float64)
+
+
+def _added(terms: NDArray[Any]) -> NDArray[Any]:
+    """Return the sums of rows, added one by one."""
+    return np.asarray(np.add.accumulate(terms, axis=1)[:, -1])
+
+
+_Places = list[list[tuple[NDArray[np.intp], NDArray[np.intp]]]]  # states and modes of each copy
+
+
+def _places(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign]) -> _Places:
+    """Return where each copy of each design has its states, and its modes."""
+    out, count = [], 0
+    for terms, part in zip(numbers, parts, strict=True):
+        copies = []
+        for modes in part.copies:
+            copies.append((np.arange(count, count + terms.sizes[0]), np.array(modes)))
+            count += terms.sizes[0]
+        out.append(copies)
+    return out
+
+
+def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int) -> SourceTerms:
+    """Put controllers side by side, each as often as it has modes."""
+    first, places = numbers[0], _places(numbers, parts)
+    if parts[0].copies == [tuple(range(count))]:
+        return first
+    s = places[-1][-1][0][-1] + 1
+    transition, gains = np.zeros((1, s, s + count)), np.zeros((1, s, count))
+    command = np.zeros((count, s + count))
+    for terms, copies in zip(numbers, places, strict=True):
+        for states, modes in copies:
+            signals = np.concatenate([states, s + modes])
+            transition[0][np.ix_(states, signals)] = terms.transition[0]
+            gains[0][np.ix_(states, modes)] = terms.gains[NONE][0]
+            command[np.ix_(modes, signals)] = terms.command
+    return replace(
+        first,
+        transition=transition,
+        innovation=np.zeros((1, count, s + count)),
+        gains={NONE: gains},
+        command=command,
+        read=np.ones((1, count), dtype=np.bool_),
+        rows={"measurements": slice(0, count)},
+    )
+
+
+def split(
+    whole: SourceTerms, parts: Sequence[ModeDesign], numbers: Sequence[SourceTerms]
+) -> list[list[SourceTerms]]:
+    """Return the terms of each copy of each design."""
+    if len(parts) == 1 and numbers[0].sizes == whole.sizes:
+        return [[whole]]
+    s, out = whole.sizes[0], []
+    for terms, copies in zip(numbers, _places(numbers, parts), strict=True):
+        held = []
+        for states, modes in copies:
+            signals = np.concatenate([states, s + modes])
+            held.append(
+                replace(
+                    terms,
+                    transition=whole.transition[0][np.ix_(states, signals)][None],
+                    gains={NONE: whole.gains[NONE][0][np.ix_(states, modes)][None]},
+                    command=whole.command[np.ix_(modes, signals)],
+                )
+            )
+        out.append(held)
+    return out
+
+
+def as_computed(design: Design, terms: SourceTerms) -> Written:
+    """Return the controllers that a source makes, and the rounding of one of one sensor.
+
+    The estimator form must be stable by itself. A rounded command is applied, and known to the
+    next frame: the last commands are further states.
+    """
+    (s, _, m), K = terms.sizes, terms.gains[NONE]
+    still = terms.transition[:, :, :s].copy()
+    still[:, : K.shape[1]] += K @ terms.innovation[:, :, :s]
+    checks: tuple[Check, ...] = ()
+    if terms.applied:
+        alone = StateSpace(A=still, B=np.zeros((s, 0)), C=np.zeros((0, s)), D=np.zeros((0, 0)))
+        radius, name = alone.radius_per_frame, "spectral radius of the estimator alone"
+        checks = (Check(name, radius, 1 - STABILITY_MARGIN, EIGENVALUES),)
+    if terms.masked:
+        controllers = {missing: terms.controller(missing) for missing in terms.gains}
+        return Written(controllers=controllers, checks=checks)
+    controller, rows, whole = terms.controller(), np.eye(s + m), terms.whole
+    entry, signals = replace(controller, B=rows[:s], D=rows[s:]), np.eye(s)
+    if terms.applied:
+        both = np.vstack([rows[:s, :s], controller.C])
+        controller = replace(
+            controller, A=both @ whole[:s, : s + m], B=both @ whole[:s, s + m :], C=rows[s:]
+        )
+        no_feed = np.zeros((m, s + m))
+        entry = replace(controller, B=np.hstack([both, rows[:, s:]]), D=no_feed)
+        signals = rows[:s]
+    roundoff = ROUNDOFF["single" if terms.single else "double"]
+    return Written(
+        controllers={NONE: controller},
+        entry=entry,
+        variance=sums_variance(whole, s, roundoff),
+        signals=signals,
+        checks=checks,
+    )
+
+
+_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
+_TABLE = re.compile(r"static const [\w ]+ (\w+)(?:\[\w+\])+ = \{([^;]*)\};")
+_NUMBER = re.compile(r"-?(?:0x[0-9a-f.]+p[+-]\d+|0\.0|\d+\b(?![.]))")
+_SUM = re.compile(r"(?:const \w+_real ([nu])\d+|error\[count\+\+\]) =([^;]*);")
+_TERM = re.compile(r"(-?)\s*(?:([cv])\[(\d+)\] \* )?([xnya])(\d+)")
+
+
+def read_source(text: str, like: SourceTerms) -> SourceTerms:
+    """Return the terms that the text of a source holds, of the sizes of others."""
+    code = _COMMENT.sub("", text)
+    code = re.sub(r"state->x\[(\d+)\](?! =)", r"n\1", code)
+    code = re.sub(r"\by\[(\d+)\]", r"y\1", code)
+    tables = {name: _numbers(body) for name, body in _TABLE.findall(code)}
+    (s, q, m), period = like.sizes, len(like.read)
+    if "transition" in tables:  # whole matrices, by columns
+        columns = tables["transition"].reshape(-1, s).T
+        transition = np.zeros((1, s, s + m))
+        transition[0, :, : columns.shape[1]] = columns
+        gains = {NONE: tables["gains"].reshape(q, s).T[None]}
+        command = tables["output"].reshape(-1, m).T
+        return replace(like, transition=transition, gains=gains, command=command)
+    factors = {"c": tables.get("c", np.zeros(0)), "v": np.zeros((period, 0))}
+    if "varying" in tables:
+        factors["v"] = tables["varying"].reshape(period, -1)
+    # rows of sums, with the columns of states, applied commands and readings
+    sums: dict[str, list[FloatArray]] = {"n": [], "u": [], "": []}
+    first = {"x": 0, "n": 0, "a": s, "y": s + m}
+    for name, body in _SUM.findall(code):
+        row = np.zeros((period, s + m + q))
+        for sign, kind, place, signal, number in _TERM.findall(body):
+            value = factors[kind][..., int(place)] if kind else 1.0
+            row[:, first[signal] + int(number)] += -value if sign else value
+        sums[name].append(row)
+    predicted, command = (np.stack(sums[name], axis=1) for name in "nu")
+    innovation = np.stack(sums[""], axis=1)[:, :, : s + m] if sums[""] else like.innovation
+    read = like.read
+    gains = {NONE: predicted[:, :, s + m :]}
+    if "first" in tables:
+        gains, read = _read_gains(tables, like)
+    return replace(
+        like,
+        transition=predicted[:, :, : s + m],
+        innovation=innovation,
+        gains=gains,
+        command=np.delete(command[0], np.s_[s : s + m], axis=1),
+        read=read,
+    )
+
+
+def _numbers(text: str) -> FloatArray:
+    found = _NUMBER.findall(text)
+    return np.array([float.fromhex(v) if "x" in v else float(v) for v in found])
+
+
+def _read_gains(
+    tables: Mapping[str, FloatArray], like: SourceTerms
+) -> tuple[dict[frozenset[str], FloatArray], BoolArray]:
+    """Return the gains for each set of sensors that is missing, and which readings are due."""
+    units, period = tuple(like.rows), len(like.read)
+    n, read = like.gains[NONE].shape[1], np.zeros_like(like.read)
+    due = tables["due"].astype(int)
+    for i, rows in enumerate(like.rows.values()):
+        read[:, rows] = (due >> i & 1 > 0)[:, None]
+    first = tables["first"].astype(int).reshape(period, -1)
+    out, whole = {}, replace(like, read=read)
+    for missing in like.gains:
+        mask = sum(1 << units.index(unit) for unit in missing)
+        gains, due_now = np.zeros((period, n, read.shape[1])), used_readings(whole, missing)
+        for phase in range(period):
+            used = due_now[phase]
+            start, count = first[phase, mask], n * int(np.count_nonzero(used))
+            gains[phase][:, used] = tables["gains"][start : start + count].reshape(-1, n).T
+        out[missing] = gains
+    return out, read
+
+
+@table_row
+class FrameCost:
+    """Arithmetic and memory of one frame of a controller, as exported and with whole matrices."""
+
+    form: str = column(
+        "form of the exported source",
+        help='"straight line" where each non-zero term is written out, "loops" where the source '
+        "multiplies by whole matrices",
+    )
+    multiplications: int = column(
+        "multiplications per frame",
+        help="Of the exported source; factors of 1 and -1 are no multiplications",
+    )
+    dense_multiplications: int = column("  with whole matrices", help="The same of A, B, C, D")
+    additions: int = column("additions per frame", help="Of the exported source")
+    dense_additions: int = column("  with whole matrices", help="The same of A, B, C, D")
+    coefficients: int = column(help="Numbers that the exported source stores")
+    states: int = column(help="Numbers that it keeps between frames: states and last commands")
+    coefficient_bytes_double: int = column("coefficients, double", unit="bytes", init=False)
+    coefficient_bytes_single: int = column("coefficients, single", unit="bytes", init=False)
+    dense_coefficients: int = column(
+        "  with whole matrices, double",
+        unit="bytes",
+        scale=8,
+        help="Numbers of the whole matrices",
+    )
+    state_bytes_double: int = column("state, double", unit="bytes", init=False)
+    state_bytes_single: int = column("state, single", unit="bytes", init=False)
+
+    def __post_init__(self) -> None:
+        set_fields(
+            self,
+            coefficient_bytes_double=8 * self.coefficients,
+            coefficient_bytes_single=4 * self.coefficients,
+            state_bytes_double=8 * self.states,
+            state_bytes_single=4 * self.states,
+        )
+
+
+def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
+    """Count the arithmetic and the memory of one frame.
+
+    Parameters
+    ----------
+    design : Design or Controller
+        The controller, or a design with one.
+
+    Returns
+    -------
+    FrameCost
+        Counts for the C source that :func:`export` writes, and for dense matrices.
+
+    Raises
+    ------
+    ProblemError
+        If it is neither.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> cost = lbt.interop.frame_cost(lag)
+    >>> cost.multiplications, cost.additions, cost.dense_multiplications
+    (1, 1, 4)
+    """
+    terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
+    (s, _, m), size = terms.sizes, _matrix_size(terms)
+    sums = [terms.transition, terms.innovation, terms.command[None]]
+    table, period = 0, len(terms.read)  # gains in a table, of a frame in which all is read
+    if terms.masked:
+        table = next(iter(terms.gains.values()))[0].size
+    else:
+        sums[0] = np.concatenate([terms.transition, terms.gains[NONE]], axis=2)
+    written = multiplied = stored = 0
+    for part in sums:
+        same, there = np.all(part == part[0], axis=0), part.any(axis=0)
+        factors = there & ~(same & (np.abs(part[0]) == 1))
+        written += int(np.sum(np.maximum(there.sum(axis=1) - (part is not terms.innovation), 0)))
+        multiplied += int(np.count_nonzero(factors))
+        stored += int(np.count_nonzero(factors & same))
+        stored += period * int(np.count_nonzero(factors & ~same))
+    return FrameCost(
+        form="loops" if terms.dense else "straight line",
+        multiplications=size if terms.dense else multiplied + table,
+        additions=size if terms.dense else written + table,
+        coefficients=size if terms.dense else stored + count_gains(terms),
+        states=s + m,
+        dense_multiplications=size,
+        dense_additions=size - s - m,
+        dense_coefficients=period * size,
+    )
+
+
+def _matrix_size(terms: SourceTerms) -> int:
+    """Return the entries of all matrices of a frame."""
+    s, q, m = terms.sizes
+    return (s + m) * (s + q + m * terms.applied)
+
+
+def used_readings(terms: SourceTerms, missing: frozenset[str]) -> BoolArray:
+    """Return which readings are due in each phase where some sensors are missing, (N, q)."""
+    used = terms.read.copy()
+    for unit in missing:
+        used[:, terms.rows[unit]] = False
+    return used
+
+
+def count_gains(terms: SourceTerms) -> int:
+    """Return how many gains stand in the table of a source, 0 where they are written out."""
+    if not terms.masked:
+        return 0
+    readings = sum(int(np.count_nonzero(used_readings(terms, some))) for some in terms.gains)
+    return readings * int(terms.gains[NONE].shape[1])

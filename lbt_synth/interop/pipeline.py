@@ -1,0 +1,571 @@
+"""The one export: a design in the form that another program loads, proved in its arithmetic.
+
+A target says how it rounds the numbers of a design, writes them, and reads them back. Everything
+else stands here: what is refused, the rehearsal beside the controller, the proof of what was read
+from the file, its certificate. A folder of this room whose ``export`` module has a ``TARGET`` is a
+target; nothing else lists them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import lbt_synth
+from lbt_synth.design import Check, Design
+from lbt_synth.design.modal.per_mode import name_modes
+from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
+from lbt_synth.interop.proof import Written, prove_written, require_proved
+from lbt_synth.linear.state_space import RunningController
+from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
+from lbt_synth.loop.simulation.run import SteppedController, step_loop
+from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
+from lbt_synth.storage.rows import column, json_record, table_row
+from lbt_synth.validation import FloatArray, choice
+
+if TYPE_CHECKING:
+    from lbt_synth.interop.c.terms import FrameCost
+
+CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
+FRAMES = 2000
+# without *, \ and ? no text ends a comment, splices lines or makes a trigraph
+_UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_POLE = 0.99  # of the random phase that disturbs the rehearsed loop
+_LARGEST_ERROR = 0.01  # of the largest command, where the proof knows nothing of rounded sums
+_SINGLE_SUFFICES = 1e-3  # of the largest command
+
+
+@table_row
+class Arithmetic:
+    """How the program that loads a file computes with it."""
+
+    program: str = column("program")
+    precision: str = column("precision")
+    sums: str = column("order of sums")
+    state: str = column("convention of the state")
+    clipping: str = column("clipping")
+    limits: str = column("limits")
+
+
+def _join_one(numbers: Sequence[Any], parts: Sequence[ModeDesign], count: int) -> Any:
+    """Return the numbers of the only design."""
+    return numbers[0]
+
+
+def _split_one(whole: Any, parts: Sequence[ModeDesign], numbers: Sequence[Any]) -> list[list[Any]]:
+    """Return the numbers of a file that holds one design."""
+    return [[whole]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Target:
+    """A program that runs our controllers.
+
+    Its functions hand on the *numbers* that a file holds, in a type of the target's own.
+
+    Attributes
+    ----------
+    arithmetic : Arithmetic
+        How it computes.
+    file : str
+        What is written, in words.
+    options : mapping
+        Options of :func:`export` that the target takes, each with its default.
+    round : callable
+        ``round(designs, **options)`` returns the numbers of each design, in the precision of the
+        target; it refuses what the target cannot hold.
+    write, read : callable
+        ``write(place, whole, design, origin, gain_digest=..., **options)`` returns the content of
+        each file, and ``read(files, whole)`` the numbers in it; ``whole`` has their sizes.
+    computed : callable
+        ``computed(design, numbers)`` returns the :class:`Written` that is proved.
+    start : callable
+        ``start(numbers, limit)`` returns a twin of the program, stepped in its arithmetic. One that
+        knows the limit of a command clips its commands itself.
+    single : callable, optional
+        The same numbers in single precision, which the target has or may have.
+    join, split : callable
+        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes, and
+        ``split(whole, parts, numbers)`` those of each copy of each design.
+    cost : callable, optional
+        ``cost(whole)`` counts the arithmetic of a frame.
+    facts : callable
+        ``facts(whole, **options)`` returns what else the certificate names.
+    remark : callable
+        ``remark(design, numbers)`` returns what a user is told of these numbers, or nothing.
+    hint : str
+        What to try where the proof fails.
+    endings, beside : tuple of str
+        Endings that a file may have, and those of what goes beside it other than the certificate.
+    contents : tuple of str
+        Names of the files, where the target writes a folder.
+    modal : bool or None
+        Whether measurements and commands must be the modes; None where it does for several designs.
+    reads_others : bool
+        Whether a design may read further sensors.
+    """
+
+    arithmetic: Arithmetic
+    file: str
+    round: Callable[..., list[Any]]
+    write: Callable[..., dict[Path, bytes]]
+    read: Callable[[Mapping[Path, bytes], Any], Any]
+    computed: Callable[[Design, Any], Written]
+    start: Callable[[Any, float], SteppedController]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    single: Callable[[Any], Any] | None = None
+    join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = _join_one
+    split: Callable[[Any, Sequence[ModeDesign], Sequence[Any]], list[list[Any]]] = _split_one
+    cost: Callable[[Any], FrameCost] | None = None
+    facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
+    remark: Callable[[Design, Any], str] = lambda *_: ""
+    hint: str
+    endings: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    contents: tuple[str, ...] = ()
+    modal: bool | None = True
+    mixed: bool = True
+    reads_others: bool = False
+
+    def path_in(self, folder: Path) -> Path:
+        """Return a path in a folder that can be written."""
+        return folder / "".join(["k", *self.endings[:1]])
+
+    def places(self, output: Path) -> list[Path]:
+        """Return what an export to a path writes."""
+        if self.contents:
+            return [output / name for name in self.contents] if output.is_dir() else [output]
+        beside = [output.with_suffix(ending) for ending in self.beside]
+        return [output, *beside, output.with_name(output.name + CERTIFICATE)]
+
+
+def target_names() -> tuple[str, ...]:
+    """Return the names of the targets, sorted, without loading them.
+
+    >>> from lbt_synth.interop.pipeline import target_names
+    >>> target_names()
+    ('c', 'cacao', 'dao', 'matlab', 'pyrtc')
+    """
+    exports = Path(__file__).parent.glob("*/export.py")
+    return tuple(sorted(path.parent.name for path in exports))
+
+
+def target_named(name: str) -> Target:
+    """Return one target.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`target_names`.
+
+    Returns
+    -------
+    Target
+        The target.
+
+    Raises
+    ------
+    ProblemError
+        If there is none of that name.
+
+    Examples
+    --------
+    >>> from lbt_synth.interop.pipeline import target_named
+    >>> target_named("dao").arithmetic.precision
+    'single'
+    """
+    module: Any = import_module(
+        f"lbt_synth.interop.{choice(name, 'target', target_names())}.export"
+    )
+    target: Target = module.TARGET
+    return target
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Exported:
+    """Files that were written, and how far they are from the controller.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        The files; the certificate is the last one.
+    error : float
+        Largest difference of the commands from those of the controller, over the largest command,
+        in the arithmetic of the file: in the closed loop where the design is of one, on white noise
+        elsewhere.
+    error_single : float or None
+        The same in single precision, inf where the loop is then unstable; None where the target
+        has no such arithmetic.
+    start : callable
+        ``start(limit)`` returns what was written, stepped in the arithmetic of the target.
+    checks : tuple of Check
+        The proof in the loop, with the numbers of the file.
+    cost : FrameCost or None
+        Arithmetic of a frame, if the target counts it.
+    notes : tuple of str
+        What a user should know of the export.
+    """
+
+    files: tuple[Path, ...]
+    error: float
+    error_single: float | None
+    start: Callable[[float], SteppedController]
+    checks: tuple[Check, ...]
+    cost: FrameCost | None
+    notes: tuple[str, ...]
+
+
+def export(
+    path: str | PathLike[str],
+    design: ModalDesign,
+    target: str,
+    *,
+    modes: int | None = None,
+    other_gain: float | None = None,
+    hardware: LoopHardware | None = None,
+    gain_digest: str | None = None,
+    **options: Any,
+) -> Exported:
+    """Write a controller in the form that another program loads, with a certificate beside it.
+
+    The numbers of the design are rounded to the precision of the target, and the file is read back
+    before it is written. The loop is closed around what was read, over the sensor gains of the
+    design, and the rounding of the sums counts as noise: residual and margins are kept within
+    1 %, and so are the demands on a robust design. The target's arithmetic runs beside the
+    controller, too. All files are written, or none; the same design gives the same bytes.
+
+    Units are those of the design: nm rms of wavefront for a loop whose sensor and influence
+    matrices are the identity. {doc}`export` says how each program computes and how its file is
+    used.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write: ``.c`` (the header goes beside it), ``.fits`` for cacao, ``.npy`` or
+        ``.fits`` for dao, ``.mat`` for MATLAB; for pyRTC a folder, whose parent is there. The
+        certificate has the name of the file and ``.certificate.json``.
+    design : Design, MixedController or ModalFilters
+        The design. Targets ``c``, ``cacao`` and ``dao`` also take a design with integrators for
+        the other modes, or a filter for each mode.
+    target : {"c", "cacao", "dao", "matlab", "pyrtc"}
+        The program that loads the file.
+    modes : int, optional
+        Modes of the program; by default those of the design, which come first. Further ones get
+        the command 0, without ``other_gain``. Not for ``matlab``.
+    other_gain : float, optional
+        Gain of an integrator for each further mode.
+    hardware : LoopHardware, optional
+        Loop of the integrators, where no filter says which.
+    gain_digest : str, optional
+        SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
+    **options
+        Of one target. For ``c``: form ("plain" assumes that commands were applied, "estimator" is
+        given those that were, :func:`~lbt_synth.linear.estimator_form`; a design of several sensors
+        has that form alone), precision ("double" or "single") and name (the prefix of the C names;
+        by default that of the file). For ``dao``: order (M of the RTC's configuration, 20). For
+        ``cacao``: steps (of the history; by default as many as the loss needs) and loss (of
+        residual, relative, at each sensor gain of the proof, at which the length is chosen; at
+        most 0.01, the limit of the proof).
+
+    Returns
+    -------
+    Exported
+        Files, errors, the checks in the arithmetic of the target, and notes.
+
+    Raises
+    ------
+    OutputError
+        If the ending is another one, or a file cannot be written.
+    ProblemError
+        If the target cannot hold the design, or an option is out of its range or of another target.
+    CertificateError
+        If the certificate that the design carries has a failed check.
+    NumericalError
+        If the commands overflow, or a check fails in the arithmetic of the target; ``residual``
+        holds its value.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, numpy as np, tempfile, pathlib
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     written = lbt.interop.export(pathlib.Path(folder) / "slow.c", slow, "c")
+    ...     [file.name for file in written.files]
+    ['slow.c', 'slow.h', 'slow.c.certificate.json']
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder) / "slow.npy"
+    ...     _ = lbt.interop.export(file, slow, "dao", order=1, modes=3)
+    ...     np.load(file).tolist()
+    [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
+    """
+    own = target_named(target)
+    given = {"modes": modes, "other_gain": other_gain}
+    options |= {name: value for name, value in given.items() if value is not None}
+    if unknown := options.keys() - own.options.keys():
+        raise ProblemError(f"{min(unknown)} is no option of target {target}. Leave it out.")
+    settings = {**own.options, **options}
+    place = require_ending(path, f"a file for {target}", own.endings) if own.endings else Path(path)
+    parts, count = mode_designs(
+        design,
+        target,
+        modes=modes,
+        other_gain=other_gain,
+        hardware=hardware,
+        modal=modes is not None if own.modal is None else own.modal,
+        mixed=own.mixed,
+        reads_others=own.reads_others,
+    )
+    first = parts[0].design
+    origin = provenance_lines(first, gain_digest)
+    numbers = own.round([part.design for part in parts], **settings)
+    whole = own.join(numbers, parts, count)
+    pairs = list(zip(parts, numbers, strict=True))
+    error = max(rehearsal_error(part.design, own.start(held, np.inf)) for part, held in pairs)
+    precision = settings.get("precision", own.arithmetic.precision)
+    single = settings.get("precision") == "single"
+    if single:  # in double precision the figure would depend on this machine's sums
+        origin.append(("precision", f"single: commands within {error:.1e} of the largest one"))
+    files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
+    again = own.read(files, whole)
+    checks = _proved(own, parts, numbers, again, error)
+    require_proved(checks, f"the arithmetic of {target} ({precision} precision)", own.hint)
+    _require_finite(error, precision, own.hint)
+    notes = [own.remark(part.design, held) for part, held in pairs]
+    if single and not error <= _SINGLE_SUFFICES:
+        notes.append(
+            f"in single precision commands are off by {error:.2g} of the largest one. Export with "
+            "precision double"
+        )
+    notes = list(dict.fromkeys(filter(None, notes)))
+    if own.contents:
+        make_directory(place, parents=False)
+    settings |= {"modes": count, "notes": notes, **own.facts(whole, **settings)}
+    kept = {name: settings[name] for name in sorted(settings) if settings[name] is not None}
+    certificate = _certificate(files, target, own.arithmetic, checks, gain_digest, kept)
+    return Exported(
+        files=write_together(dict((*files.items(), *certificate.items()))),
+        error=error,
+        error_single=_error_in_single(own, pairs, error),
+        start=lambda limit: own.start(again, limit),
+        checks=checks,
+        cost=own.cost(again) if own.cost else None,
+        notes=tuple(notes),
+    )
+
+
+def _require_finite(error: float, precision: str, hint: str) -> None:
+    """Refuse commands that grow beyond all numbers of a precision."""
+    if not np.isfinite(error):
+        raise NumericalError(
+            f"the commands must stay finite in {precision} precision; they grew beyond all "
+            f"numbers within {FRAMES} frames. {hint}",
+            status="arithmetic",
+            residual=error,
+        )
+
+
+def _error_in_single(
+    own: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
+) -> float | None:
+    """Return the largest error in single precision, inf where a number does not fit."""
+    if own.single is None:
+        return None
+    try:
+        singles = [own.single(held) for _, held in pairs]
+    except ProblemError:
+        return float("inf")
+    if all(single is held for single, (_, held) in zip(singles, pairs, strict=True)):
+        return error
+    return max(
+        rehearsal_error(part.design, own.start(single, np.inf))
+        for single, (part, _) in zip(singles, pairs, strict=True)
+    )
+
+
+def _proved(
+    own: Target, parts: Sequence[ModeDesign], numbers: Sequence[Any], whole: Any, error: float
+) -> tuple[Check, ...]:
+    """Check the loop of each design with the numbers of a file; equal copies once."""
+    checks: list[Check] = []
+    controlled = sum(len(part.modes) for part in parts)
+    for part, copies in zip(parts, own.split(whole, parts, numbers), strict=True):
+        seen: set[bytes] = set()
+        for held in copies:
+            key = pickle.dumps(held)
+            if key in seen:
+                continue
+            seen.add(key)
+            proof = list(prove_written(part.design, own.computed(part.design, held)))
+            if part.design.other_sensors:
+                how = "a run in which each sensor is missing for a while"
+                name = "commands in a rehearsal, difference"
+                proof.append(Check(name, error, _LARGEST_ERROR, how))
+            if len(part.modes) < controlled:
+                modes = name_modes(np.array(part.modes))
+                proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
+            checks += proof
+    return tuple(checks)
+
+
+def rehearsal_error(design: Design, other: Any) -> float:
+    """Largest difference of commands from the controller's, over the largest command.
+
+    Both close the loop of the design around the same disturbance (a process of the first
+    order) and noise; a controller alone may be unstable, so only its loop can be compared.
+    A design without a loop is fed white noise. One of several sensors is stable by itself: it gets
+    the readings and the commands of its loop, in which each sensor is missing for a while.
+    """
+    with np.errstate(all="ignore"):  # what overflows is found to be infinite
+        expected, readings = _own_commands(design)
+        try:
+            if readings is None:
+                commands = _rehearse(design, other)
+            else:
+                commands = _rehearse_sensors(design, other, expected, readings)
+        except ProblemError:
+            return float("inf")
+        size = float(np.max(np.abs(expected)))
+        error = float(np.max(np.abs(commands - expected)))
+    if not np.isfinite(error):
+        return float("inf")
+    return error / size if size > 0 else error
+
+
+@lru_cache(maxsize=8)
+def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
+    """Return the commands of the controller itself, and the readings of several sensors."""
+    if not design.other_sensors:
+        return _rehearse(design, design.controller.start()), None
+    plant, (starts, length) = design.problem, _absences(design)
+    rate = plant.hardware.frame_rate_hz
+    run = simulate_sensors(
+        design.controllers,
+        Truth(
+            turbulence=plant.turbulence,
+            vibrations=plant.vibrations,
+            motions=plant.motions,
+            noise_nm=np.linalg.norm(plant.own_noise_factor, axis=1),
+        ),
+        hardware=plant.hardware,
+        frames=(2 * len(starts) + 1) * length,
+        settle_frames=0,
+        drops=[
+            Drop(unit=unit, start_s=start / rate, end_s=(start + length) / rate)
+            for unit, start in starts.items()
+        ],
+    )
+    return run.commands[0], run.measurements[0]
+
+
+def _absences(design: Design) -> tuple[dict[str, int], int]:
+    """Return the first frame in which each sensor is missing, and for how many frames it is."""
+    hardware, period = design.problem.hardware, design.problem.period
+    units = tuple(hardware.suite.rows(hardware))
+    turns = 2 * len(units) + 1
+    length = period * int(np.ceil(FRAMES / turns / period))  # all are due at its begin
+    return {unit: (2 * i + 1) * length for i, unit in enumerate(units)}, length
+
+
+def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
+    """Return the commands (frames, m) of a controller that takes the place of a design's own."""
+    rng = np.random.default_rng(0)
+    hardware, q = design.hardware, design.controller.B.shape[1]
+    if hardware is None:
+        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
+    n, total = hardware.modes, rng.standard_normal((1, FRAMES, hardware.modes))
+    for k in range(1, FRAMES):
+        total[0, k] = _POLE * total[0, k - 1] + np.sqrt(1 - _POLE**2) * total[0, k]
+    noise = 0.1 * rng.standard_normal((1, FRAMES, q))
+    return step_loop(controller, 1.0, hardware, total, noise)[0, :, n : n + hardware.n_commands]
+
+
+def _rehearse_sensors(
+    design: Design, source: Any, expected: FloatArray, readings: FloatArray
+) -> FloatArray:
+    """Return the commands (frames, m) of a source that is told what is new in each frame."""
+    (starts, length), commands = _absences(design), np.empty_like(expected)
+    applied = np.zeros_like(expected[0])
+    for k, y in enumerate(readings):
+        fresh = {unit: not 0 <= k - start < length for unit, start in starts.items()}
+        commands[k] = source.step(y, fresh, applied)
+        applied = expected[k]
+    return commands
+
+
+def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:
+    """Join each label and its text."""
+    return [f"{label}: {text}" if label else text for label, text in lines]
+
+
+def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
+    """Return labelled lines on a file: version, method, gain file, loop, units, certificate."""
+    if gain_digest is not None and not _DIGEST.fullmatch(str(gain_digest)):
+        raise ProblemError(
+            "gain_digest must be the SHA-256 of a gain file, 64 hexadecimal digits; "
+            f"got {gain_digest!r}."
+        )
+    lines = [
+        ("written by", f"lbt_synth {lbt_synth.__version__}"),
+        ("method", f"{design.method} ({design.solver.route})"),
+        ("gain file", "not named" if gain_digest is None else f"SHA-256 {gain_digest}"),
+    ]
+    hardware = design.hardware
+    if hardware is None:
+        lines += [("sampling", f"{design.controller.dt_s!r} s"), ("units", "those of the problem")]
+    else:
+        lines += [
+            ("frame rate", f"{hardware.frame_rate_hz!r} Hz"),
+            ("delay", f"{hardware.delay_frames!r} frames in total"),
+            ("units", "y: nm rms wavefront where the sensor matrix is the identity;"),
+            ("", "u: nm rms wavefront where the influence matrix is"),
+        ]
+    if hardware is not None and design.other_sensors and hardware.suite.channels:
+        lines.append(("", "channels of accelerometers: metres per second squared"))
+    checks = design.certificate.checks
+    lines.append(("certificate", f"{len(checks)} checks passed"))
+    lines += [("", f"{c.name}: {c.value:.6g} (limit {c.limit:.6g})") for c in checks]
+    return [(label, comment_text(text)) for label, text in lines]
+
+
+def comment_text(text: str) -> str:
+    """Return text without what could end a comment of C."""
+    return _UNSAFE.sub("_", text)
+
+
+def _certificate(
+    files: Mapping[Path, bytes],
+    target: str,
+    arithmetic: Arithmetic,
+    checks: Sequence[Check],
+    gain_digest: str | None,
+    facts: Mapping[str, Any],
+) -> dict[Path, bytes]:
+    """Return the certificate of files, named after the first one; facts are what they depend on."""
+    digests = {path.name: hashlib.sha256(content).hexdigest() for path, content in files.items()}
+    first, *others = files
+    certificate = {
+        "target": target,
+        "file": first.name,
+        "file_sha256": digests[first.name],
+        **({"others_sha256": {o.name: digests[o.name] for o in others}} if others else {}),
+        "gain_sha256": gain_digest,
+        **facts,
+        "arithmetic": json_record(arithmetic),
+        "checks": [json_record(check) for check in checks],
+    }
+    text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
+    return {first.with_name(first.name + CERTIFICATE): text.encode()}

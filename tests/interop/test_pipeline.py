@@ -1,0 +1,180 @@
+"""The targets of an export."""
+
+import hashlib
+import json
+from dataclasses import astuple, replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from support.plants import ROOT
+from support.written_files import ORACLES, WITHOUT_ORACLE, is_schur, judge
+
+import lbt_synth as lbt
+from lbt_synth.interop.pipeline import target_names
+
+CHUNK = 100
+
+
+@pytest.mark.parametrize("name", target_names())
+def test_a_target_says_how_it_computes(name):
+    target = lbt.interop.target_named(name)
+    assert all(text and text.isascii() for text in astuple(target.arithmetic))
+
+
+def test_the_page_has_the_table_of_the_targets():
+    page = (ROOT / "docs" / "real_time_computer.md").read_text()
+    for name in target_names():
+        words = astuple(lbt.interop.target_named(name).arithmetic)
+        assert f"* - `{name}`\n" + "".join(f"  - {text}\n" for text in words) in page
+
+
+def test_each_folder_with_an_export_is_a_target_and_has_an_oracle():
+    assert {"c", "cacao", "dao", "matlab", "pyrtc"} <= set(target_names())
+    assert set(target_names()) <= set(ORACLES) | WITHOUT_ORACLE
+    assert not set(ORACLES) & WITHOUT_ORACLE
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
+    """Files of an integrator, judged in the loop of one that is too slow for it."""
+    quick = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.9)
+    late = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=3), gain=0.1)
+    options = {"precision": "double", "form": "plain"}
+    for name, oracle in ORACLES.items():
+        if name == "cacao":  # its configuration has the delay, so that this loop has none to miss
+            continue
+        target = lbt.interop.target_named(name)
+        files = lbt.interop.export(target.path_in(tmp_path), quick, name).files
+        assert oracle(files, quick, options)
+        assert not oracle(files, late, options)
+
+
+def test_polynomials_are_judged_exactly():
+    near = Fraction(2**60 - 1, 2**60)
+    assert is_schur([Fraction(1), -near])
+    assert not is_schur([Fraction(1), Fraction(-1)])
+    assert is_schur([Fraction(1), -2 * near, near**2, Fraction(0)])
+    assert not is_schur([Fraction(1), -2 * near, 1 + Fraction(1, 2**100)])
+
+
+def written_stable(folder, seeds):
+    """Require that no file of these gain files is unstable; return how many were written."""
+    written = dict.fromkeys(ORACLES, 0)
+    for seed in seeds:
+        for name, verdict in judge(folder, seed).items():
+            assert verdict is not False, (name, seed)
+            written[name] += verdict is not None
+    return written
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+def test_no_target_writes_an_unstable_file(tmp_path):
+    assert all(written_stable(tmp_path, [6]).values())
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("chunk", range(100))
+@pytest.mark.usefixtures("short_rehearsal")
+def test_no_target_writes_one_of_ten_thousand(tmp_path, chunk):
+    seeds = range(CHUNK * chunk, CHUNK * (chunk + 1))
+    assert all(written_stable(tmp_path, seeds).values())
+
+
+FILES = {"k.c": "c", "k.mat": "matlab", "k.npy": "dao"}
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+@pytest.mark.parametrize("file", FILES)
+def test_what_no_format_takes(tmp_path, designs, file):
+    target = tmp_path / file
+
+    def export(path, design, **options):
+        return lbt.interop.export(path, design, FILES[file], **options)
+
+    with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got int"):
+        export(target, 3)
+    failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, computed_by="guess")
+    with pytest.raises(lbt.errors.CertificateError, match="this one failed: rms") as caught:
+        export(
+            target,
+            replace(
+                designs["integrator"],
+                certificate=lbt.design.Certificate(
+                    checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0)
+                ),
+            ),
+        )
+    assert caught.value.failed == ("rms",)
+    for digest in ("abc", "AB" * 32, 3, "ab" * 32 + "\n"):
+        with pytest.raises(lbt.errors.ProblemError, match="64 hexadecimal digits"):
+            export(target, designs["integrator"], gain_digest=digest)
+    with pytest.raises(lbt.errors.OutputError, match="must end in"):
+        export(tmp_path / "k.txt", designs["integrator"])
+    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
+        export(tmp_path / "nowhere" / file, designs["integrator"])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+@pytest.mark.parametrize("name", target_names())
+def test_the_same_design_gives_the_same_files_and_a_certificate_of_them(tmp_path, designs, name):
+    own, seen = lbt.interop.target_named(name), []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        folder.mkdir()
+        written = lbt.interop.export(
+            own.path_in(folder), designs["hinf"], name, gain_digest="ab" * 32
+        )
+        *files, certificate = written.files
+        seen.append([path.read_bytes() for path in files])
+        beside = json.loads(certificate.read_text())
+        assert (beside["target"], beside["gain_sha256"]) == (name, "ab" * 32)
+        digests = {beside["file"]: beside["file_sha256"], **beside.get("others_sha256", {})}
+        found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+        assert digests == found
+        assert [check["name"] for check in beside["checks"]] == [c.name for c in written.checks]
+        assert all(check["passed"] for check in beside["checks"])
+        assert beside["arithmetic"]["program"] == own.arithmetic.program
+        assert 0 <= written.error < 1e-3
+    assert seen[0] == seen[1]
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+def test_an_option_goes_with_its_target(tmp_path, designs):
+    for target, option in (("dao", "form"), ("matlab", "modes"), ("c", "steps")):
+        with pytest.raises(lbt.errors.ProblemError, match=f"{option} is no option of target"):
+            lbt.interop.export(tmp_path / "k", designs["integrator"], target, **{option: 3})
+    with pytest.raises(lbt.errors.ProblemError, match="target must be one of c, cacao"):
+        lbt.interop.export(tmp_path / "k", designs["integrator"], "fpga")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("short_rehearsal")
+@pytest.mark.parametrize("name", target_names())
+def test_what_is_proved_is_what_was_read_from_the_file(tmp_path, designs, monkeypatch, name):
+    """Each file holds numbers; where one is another when it is read, the proof fails."""
+    own = lbt.interop.target_named(name)
+
+    def damaged(files, like):
+        return louder(own.read(files, like))
+
+    monkeypatch.setattr(f"lbt_synth.interop.{name}.export.TARGET", replace(own, read=damaged))
+    with pytest.raises(lbt.errors.NumericalError, match="must keep what its design promises"):
+        lbt.interop.export(own.path_in(tmp_path), designs["integrator"], name)
+    assert not list(tmp_path.iterdir())
+
+
+def louder(numbers):
+    """The numbers of a target, with a gain of 1.2 on what acts on measurements."""
+    if isinstance(numbers, np.ndarray):  # dao
+        return 1.2 * numbers * (np.arange(len(numbers)) <= len(numbers) // 2)[:, None] + (
+            numbers * (np.arange(len(numbers)) > len(numbers) // 2)[:, None]
+        )
+    if isinstance(numbers, tuple) and isinstance(numbers[0], np.ndarray):  # cacao
+        return 1.2 * numbers[0], numbers[1]
+    if isinstance(numbers, tuple):  # pyrtc
+        first = numbers[0]
+        return (replace(first, response=first.response / 1.2),)
+    if hasattr(numbers, "gains"):  # c
+        return replace(numbers, gains={some: 1.2 * K for some, K in numbers.gains.items()})
+    return replace(numbers, B=1.2 * numbers.B, D=1.2 * numbers.D)
