@@ -14,10 +14,9 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import design_report, write_report
-from lbt_synth.report.designs.assessment import DesignAssessment
-from lbt_synth.report.designs.report import count_steps
+from lbt_synth.report.designs.report import DesignAssessment, count_steps
 from lbt_synth.report.designs.tables import AssessmentRow, assessment_row, good_range, verdict
-from lbt_synth.report.page.page_files import require_page_names
+from lbt_synth.report.page.html import require_page_names
 from lbt_synth.report.provenance import require_letters, time_text
 from lbt_synth.report.sensors import write_sensors_report
 from lbt_synth.storage.rows import json_record, json_units, row_table

@@ -9,9 +9,9 @@ from pathlib import Path
 from lbt_synth.design import FilterDesign
 from lbt_synth.files import save_gain
 from lbt_synth.methods.registry import design_label
-from lbt_synth.report.figures.robustness import robustness_figure
-from lbt_synth.report.figures.sigma import sigma_figure
-from lbt_synth.report.figures.style import save_figure
+from lbt_synth.report.draw import save_figure
+from lbt_synth.report.figures.loops import sigma_figure
+from lbt_synth.report.figures.studies import robustness_figure
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import csv_rows

@@ -16,7 +16,7 @@ from lbt_synth.errors import FileError, ProblemError
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.rows import column, table_row
 
-_DISTRIBUTIONS = ("numpy", "scipy", "matplotlib", "bokeh")
+_DISTRIBUTIONS = ("numpy", "scipy", "matplotlib")
 _WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 
 

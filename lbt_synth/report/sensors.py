@@ -11,17 +11,18 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.loop.simulation.failing_sensors import Drop
 from lbt_synth.models.sensor_suite import OWN_SENSOR
-from lbt_synth.report.charts.description import Chart
-from lbt_synth.report.figures.simulation import sensor_failure_panels
-from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
-from lbt_synth.report.page.page_files import require_page_names, write_page
-from lbt_synth.report.page.source_section import source_section
-from lbt_synth.report.page.words import chart
-from lbt_synth.report.provenance import (
-    creation_time,
-    read_source,
-    time_text,
+from lbt_synth.report.figures.records import sensor_failure_figure
+from lbt_synth.report.page.blocks import (
+    Block,
+    Chart,
+    Notice,
+    Page,
+    Section,
+    chart,
+    source_section,
 )
+from lbt_synth.report.page.html import require_page_names, write_page
+from lbt_synth.report.provenance import creation_time, read_source, time_text
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import listing_text
@@ -84,12 +85,12 @@ def _summary_section(
         if found.limit is not None:
             least = nm_text(found.limit.rms_nm, ".1f", unit="nm rms")
             text += f"; no controller of the own sensor alone leaves less than {least}"
-        blocks.append(Paragraph(text=f"{text}."))
+        blocks.append(f"{text}.")
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
     hidden = ("worst_nm", "above_band_limit_percent", "phase_margin_deg")
     blocks.append(row_table(caption, found.rows, without=hidden))
     blocks += [Notice(text=note) for note in found.notes]
-    return Section(key="summary", title="Summary", blocks=tuple(blocks))
+    return Section(key="summary", title="Summary", blocks=blocks)
 
 
 def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:
@@ -109,8 +110,8 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
     ]
     return chart(
         key,
-        sensor_failure_panels(run.simulation, run.segments, run.exact_nm),
-        words="sensor-failures",
+        sensor_failure_figure(run.simulation, run.segments, run.exact_nm),
+        group="sensor-failures",
         name=name,
         away=f"{_AWAY_S:g}",
         residuals=listing_text(left),

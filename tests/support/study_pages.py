@@ -5,8 +5,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.report.study.page import study_page
-from lbt_synth.report.study.sections import StudyInfo
+from lbt_synth.report.study import StudyInfo, study_page
 
 PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")
 

@@ -1,31 +1,64 @@
-"""A report of designs as a page, and the files that it becomes."""
+"""The page of a report of designs: its sections, charts and words, and its files."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.loop import close_loop
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.report.designs.charts import (
-    pole_and_step_charts,
-    robustness_charts,
-    simulation_charts,
-    transfer_charts,
-)
-from lbt_synth.report.designs.report import DesignReport
+from lbt_synth.report.designs.report import DesignAssessment, DesignReport
+from lbt_synth.report.designs.simulation import DesignSimulation
 from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table, verdict
-from lbt_synth.report.number_text import number_text
-from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
-from lbt_synth.report.page.page_files import require_page_names, write_page
-from lbt_synth.report.page.source_section import source_section
-from lbt_synth.report.page.words import paragraph
+from lbt_synth.report.draw import (
+    PANEL_IN,
+    Figure,
+    Panel,
+    count_columns,
+    drawing,
+    square_in,
+)
+from lbt_synth.report.figures.loops import (
+    FREQUENCY,
+    break_loops,
+    draw_bode,
+    draw_design,
+    draw_loop_norms,
+    draw_steps,
+    draw_transfer,
+)
+from lbt_synth.report.figures.records import SPECTRUM, TIME
+from lbt_synth.report.figures.studies import (
+    FREQUENCY_ERROR,
+    draw_limits,
+    draw_maps,
+    strehl_axis,
+    strehl_ends,
+)
+from lbt_synth.report.number_text import fixed_text, number_text, signed_text
+from lbt_synth.report.page.blocks import (
+    Block,
+    Chart,
+    Notice,
+    Page,
+    Section,
+    chart,
+    paragraph,
+    source_section,
+)
+from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.report.provenance import require_letters, time_text
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.words import count_text, listing_text
+
+_PANELS = 6  # of one figure that has a panel per design: they fit a sheet
+_STEP_NM = 100.0
 
 
 def write_report(
@@ -84,14 +117,12 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     count = len(report.assessments)
     names = listing_text([one.name for one in report.assessments])
     sections = [
-        Section(key="summary", title="Summary", blocks=tuple(_summary_blocks(report))),
-        Section(key="transfer", title="Transfer functions", blocks=tuple(_transfer_blocks(report))),
-        Section(key="errors", title="Robustness", blocks=tuple(robustness_charts(report))),
-        Section(key="dynamics", title="Dynamics", blocks=tuple(pole_and_step_charts(report))),
-        Section(key="simulation", title="Simulation", blocks=tuple(_simulation_blocks(report))),
-        Section(
-            key="certificates", title="Certificates", blocks=tuple(_certificate_blocks(report))
-        ),
+        Section(key="summary", title="Summary", blocks=_summary_blocks(report)),
+        Section(key="transfer", title="Transfer functions", blocks=_transfer_blocks(report)),
+        Section(key="errors", title="Robustness", blocks=_robustness_charts(report)),
+        Section(key="dynamics", title="Dynamics", blocks=_dynamics_charts(report)),
+        Section(key="simulation", title="Simulation", blocks=_simulation_blocks(report)),
+        Section(key="certificates", title="Certificates", blocks=_certificate_blocks(report)),
         source_section(report.files, versions=report.versions, texts={source: report.config_text}),
     ]
     return Page(
@@ -121,7 +152,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             blocks.append(Notice(text=f"The certificate of {one.name} fails: {why}", tone="bad"))
     return [
         *blocks,
-        Paragraph(text=verdict(report)),
+        verdict(report),
         summary_table(report),
         truth_table(report),
         *(
@@ -130,7 +161,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             for text in report.truth.warnings[one.name]
         ),
         *(Notice(text=note) for note in report.truth.notes),
-        Paragraph(text=_situation_text(report)),
+        _situation_text(report),
         *(
             Notice(text=f"{one.name} was {note}")
             for one in report.assessments
@@ -161,32 +192,227 @@ def _situation_text(report: DesignReport) -> str:
     )
 
 
-def _transfer_blocks(report: DesignReport) -> list[Block]:
-    """Return the charts of transfer functions, and say so if no loop is stable."""
-    charts: list[Block] = [*transfer_charts(report)]
-    if report.stable:
-        return charts
-    return [
-        Paragraph(text="No loop is stable, so none has a rejection or a noise transfer."),
-        *charts,
-    ]
-
-
-def _simulation_blocks(report: DesignReport) -> list[Block]:
-    settings = report.config.settings.simulation
-    charts = simulation_charts(report)
-    if not charts:
-        return [Paragraph(text="No loop is stable, so none was simulated.")]
-    frames = next(iter(report.simulations.values())).frames
-    text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
-    return [Paragraph(text=text), *charts]
-
-
 def _certificate_blocks(report: DesignReport) -> list[Block]:
-    blocks: list[Block] = [Paragraph(text=paragraph("certificates"))]
+    blocks: list[Block] = [paragraph("certificates")]
     for one in report.assessments:
         missing = f"{one.name}: not computed: {one.certificate_error}"
         blocks.append(
             Notice(text=missing, tone="bad") if one.certificate_error else certificate_table(one)
         )
     return blocks
+
+
+def _transfer_blocks(report: DesignReport) -> list[Block]:
+    """Return singular values of the estimation error and of the closed loops, and their margins."""
+    blocks: list[Block] = []
+    names, f = report.names, report.frequency_hz
+    lines_hz = report.config.truth.lines_hz
+    line = {"line": "true vibration" if len(lines_hz) == 1 else "true vibrations"}
+    errors = {a.name: a.error_norms for a in report.assessments if a.error_norms is not None}
+    if not report.stable:
+        blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
+    if errors:
+        with drawing([PANEL_IN]) as (panel,):
+            norms = {name: (f, values) for name, values in errors.items()}
+            draw_transfer(panel, "disturbances to error", "nm", norms, names, lines_hz, **line)
+        peaks = [f"{name} {nm_text(float(np.max(norm)))}" for name, norm in errors.items()]
+        blocks.append(chart("sigma", panel.figure, peaks=listing_text(peaks)))
+    if not report.stable:
+        return blocks
+    rejections = {one.name: (f, one.rejection) for one in report.assessments}
+    noises = {one.name: (f, one.noise_transfer) for one in report.assessments}
+    with drawing([PANEL_IN, PANEL_IN]) as panels:
+        draw_loop_norms(panels, rejections, noises, names, lines_hz, **line)
+    gain = number_text(report.real_gain)
+    largest = {
+        what: listing_text(
+            [
+                f"{name} {number_text(float(np.max(norm)), 3)}"
+                for name, (_, norm) in norms.items()
+                if norm is not None
+            ]
+        )
+        for what, norms in (("rejection", rejections), ("noise", noises))
+    }
+    blocks.append(chart("loop", panels[0].figure, gain=gain, **largest))
+    hardware, real_gain = report.config.hardware, report.config.truth.sensor_gain
+    loops = break_loops(
+        {
+            one.name: close_loop(hardware, one.design.controller, sensor_gain=real_gain)
+            for one in report.assessments
+        }
+    )
+    margins = listing_text([f"{loop.name} {loop.margins}" for loop in loops])
+    blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
+    return blocks
+
+
+def _robustness_charts(report: DesignReport) -> list[Chart]:
+    """Strehl ratio and residual over the frequency error, and maps with the sensor gain."""
+    if report.errors_hz.size == 1:
+        return [_sensor_gain_chart(report)]
+    charts = [_strehl_chart(report), _residual_chart(report)] if report.stable else []
+    ends = strehl_ends([one.map for one in report.assessments])
+    for number, batch in _sheets(report.assessments):
+        maps = {one.name: one.map for one in batch}
+        figure = draw_maps(maps, real_gain=report.real_gain, ends=ends)
+        charts.append(chart(f"map{number}", figure, ranges=_map_texts(batch)))
+    return charts
+
+
+def _sheets(items: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
+    """Yield the items of figures that each fit a sheet of paper, and the end of their keys."""
+    for start in range(0, len(items), _PANELS):
+        number = f"-{start // _PANELS + 1}" if start else ""
+        yield number, items[start : start + _PANELS]
+
+
+def _strehl_chart(report: DesignReport) -> Chart:
+    worst = {one.name: one.curve.strehl[0, 0] for one in report.stable}
+    ends = [
+        f"{name} falls to {fixed_text(100 * float(np.min(strehl)), 1)} % at "
+        f"{signed_text(float(report.errors_hz[np.argmin(strehl)]))} Hz"
+        for name, strehl in worst.items()
+    ]
+    with drawing([2.5]) as (panel,):
+        values = np.concatenate([100 * strehl for strehl in worst.values()])
+        panel.set_axes(FREQUENCY_ERROR, strehl_axis(values))
+        for one in report.assessments:
+            percents = 100 * one.curve.strehl[0, 0] if one.stable else None
+            draw_design(panel, report.names, one.name, one.curve.errors_hz, percents)
+    gain = number_text(report.real_gain)
+    return chart("robustness", panel.figure, gain=gain, ends=listing_text(ends))
+
+
+def _residual_chart(report: DesignReport) -> Chart:
+    study = report.limits
+    figure = draw_limits(study, report.names, FREQUENCY_ERROR)
+    limits = [
+        f"{name} {nm_text(limit.rms_nm, '.1f')}"
+        for name, limit in (
+            ("limit, frequency known", study.limit),
+            ("limit, frequency anywhere in this range", study.band),
+        )
+        if limit is not None and limit.rms_nm > 0
+    ]
+    worst = [f"{row.design} {nm_text(row.worst_nm, '.1f')}" for row in study.rows if row.stable]
+    said = f" Limits: {listing_text(limits)}." if limits else ""
+    return chart("limits", figure, worst=listing_text(worst), limits=said)
+
+
+def _map_texts(assessments: Sequence[DesignAssessment]) -> str:
+    """Say of each design how far its Strehl ratio ranges over its map."""
+    texts = []
+    for one in assessments:
+        values = 100 * one.map.strehl[np.isfinite(one.map.strehl)]
+        if not values.size:
+            texts.append(f"{one.name}: unstable everywhere.")
+            continue
+        texts.append(
+            f"{one.name}: {fixed_text(float(values.min()), 1)} to "
+            f"{fixed_text(float(values.max()), 1)} %, stable at {int(one.map.stable.sum())} of "
+            f"{one.map.stable.size} sensor gains."
+        )
+    return " ".join(texts)
+
+
+def _sensor_gain_chart(report: DesignReport) -> Chart:
+    """Strehl ratio over the sensor gain, drawn for a truth without vibrations."""
+    with drawing([2.5]) as (panel,):
+        y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0.0}
+        panel.set_axes({"label": "sensor gain", "unit": "-"}, y_axis)
+        for one in report.assessments:
+            percents = 100 * one.map.strehl[0, :, 0]
+            draw_design(panel, report.names, one.name, one.map.sensor_gains, percents)
+        panel.rule("real sensor gain", report.real_gain, dash=3)
+    return chart("sensor-gain", panel.figure, ranges=_map_texts(report.assessments))
+
+
+def _dynamics_charts(report: DesignReport) -> list[Chart]:
+    """Poles, and step responses."""
+    poles = [np.append(one.loop_poles, one.controller_poles) for one in report.assessments]
+    reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for values in poles))
+    radii = [f"{one.name} {number_text(one.spectral_radius, 6)}" for one in report.assessments]
+    charts = [
+        chart(f"poles{number}", _draw_poles(batch, reach), radii=listing_text(radii))
+        for number, batch in _sheets(report.assessments)
+    ]
+    if not report.stable:
+        return charts
+    steps = {one.name: (report.simulations[one.name].step,) for one in report.stable}
+    peaks = [
+        f"{name} {nm_text(_STEP_NM * float(np.max(np.abs(step.residual[5:]))), '.0f')}"
+        for name, (step,) in steps.items()
+    ]
+    facts = {
+        "step": nm_text(_STEP_NM, ".4g"),
+        "frame": number_text(1e3 / report.config.hardware.frame_rate_hz),
+        "peaks": listing_text(peaks),
+    }
+    return [*charts, chart("step", draw_steps(steps, height_nm=_STEP_NM), **facts)]
+
+
+def _draw_poles(assessments: Sequence[DesignAssessment], reach: float) -> Figure:
+    """Draw the poles of closed loops and of controllers in the complex plane."""
+    columns = count_columns(len(assessments))
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
+    real, imaginary = (
+        {"label": f"{part} part", "unit": "-", "low": -reach, "high": reach}
+        for part in ("real", "imaginary")
+    )
+    with drawing([square_in(columns)] * len(assessments), columns=columns) as panels:
+        for panel, one in zip(panels, assessments, strict=True):
+            title = one.name if one.stable else f"{one.name}: unstable"
+            panel.set_axes(real, imaginary, title=title, equal=True)
+            panel.curve("unit circle", turn.real, turn.imag, look=None, width=1.0, numbers=False)
+            for name, values, marker, look in (
+                ("controller alone", one.controller_poles, "o", 1),
+                ("closed loop", one.loop_poles, "x", 0),
+            ):
+                style: dict[str, Any] = {"marker": marker, "look": look, "filled": False}
+                panel.curve(name, values.real, values.imag, line=False, size=6.0, **style)
+    return panels[0].figure
+
+
+def _simulation_blocks(report: DesignReport) -> list[Block]:
+    """Return series and spectra of the simulated loops."""
+    settings = report.config.settings.simulation
+    runs = [(name, report.simulations[name]) for name in report.simulations]
+    if not runs:
+        return ["No loop is stable, so none was simulated."]
+    first = runs[0][1]
+    residuals = [f"{name} {nm_text(run.residual_nm, '.1f', unit='nm rms')}" for name, run in runs]
+    facts = {
+        "duration": fixed_text(float(first.time_s[-1]), 2),
+        "residuals": listing_text(residuals),
+    }
+    reach = 1.05 * max(float(np.max(np.abs(run.series_nm[:, 0]))) for _, run in runs)
+    text = f"{count_text(settings.cases, 'run')} of {first.frames} frames each, seed "
+    blocks: list[Block] = [f"{text}{settings.seed}."]
+    for number, batch in _sheets(runs):
+        with drawing([0.95] * len(batch)) as panels:
+            for panel, (name, run) in zip(panels, batch, strict=True):
+                _draw_series(panel, name, run, report.names.index(name), reach)
+        blocks.append(chart(f"series{number}", panels[0].figure, **facts))
+    for number, batch in _sheets(runs):
+        columns = count_columns(len(batch))
+        with drawing([2.2] * len(batch), columns=columns) as panels:
+            for panel, (name, run) in zip(panels, batch, strict=True):
+                _draw_spectra(panel, name, run)
+        blocks.append(chart(f"spectra{number}", panels[0].figure))
+    return blocks
+
+
+def _draw_series(panel: Panel, name: str, run: DesignSimulation, look: int, reach: float) -> None:
+    y_axis = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
+    panel.set_axes(TIME, y_axis, title=name)
+    y = run.series_nm[:, 0]
+    panel.curve("residual", run.time_s, y, look=look, width=0.9, dash=0, quiet=True)
+
+
+def _draw_spectra(panel: Panel, name: str, run: DesignSimulation) -> None:
+    panel.set_axes(FREQUENCY, SPECTRUM, title=name)
+    f = run.frequency_hz
+    panel.curve("before the correction", f, run.open_nm2_hz, look=None, width=0.8)
+    panel.curve("residual, simulated", f, run.residual_nm2_hz, look=5, dash=0)
+    panel.curve("residual, exact", f, run.exact_nm2_hz, look=1, width=1.4)

@@ -10,11 +10,11 @@ from scipy.signal import welch
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.loop import ClosedLoop, close_loop, simulate, step_response
+from lbt_synth.loop.simulation.run import LoopStep
 from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy
 
-STEP_NM = 100.0
 _MOST_FRAMES = 8192  # of a run
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
 _EXCERPT = 400  # frames that are drawn
@@ -36,10 +36,7 @@ class DesignSimulation:
     residual_nm2_hz: FloatArray  # after it
     # (f,): residual's spectrum by the transfer functions, with the window's image of each sinusoid
     exact_nm2_hz: FloatArray
-    step_time_s: FloatArray  # (s,): times after a step of the disturbance [s]
-    # (s,): response of the first axis to a step of ``STEP_NM`` without other disturbances
-    step_residual_nm: FloatArray
-    step_command_nm: FloatArray
+    step: LoopStep  # of the first axis, without other disturbances
 
 
 def simulate_design(design: Design, config: Config, *, settle_frames: int) -> DesignSimulation:
@@ -63,7 +60,6 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
         spectra.append(density.mean(axis=0).sum(axis=-1))
     strehls = run.strehl(config.imaging)
     shown = min(frames, _EXCERPT)
-    step = step_response(loop)
     return DesignSimulation(
         strehl=float(np.mean(strehls)),
         residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
@@ -75,9 +71,7 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
         open_nm2_hz=frozen_copy(spectra[0][1:]),
         residual_nm2_hz=frozen_copy(spectra[1][1:]),
         exact_nm2_hz=frozen_copy(exact_spectrum(loop, truth, frequency, length)[1:]),
-        step_time_s=step.time_s,
-        step_residual_nm=STEP_NM * step.residual,
-        step_command_nm=STEP_NM * step.command,
+        step=step_response(loop),
     )
 
 

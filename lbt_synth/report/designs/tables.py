@@ -10,8 +10,7 @@ import numpy as np
 
 from lbt_synth.loop.least_residuals.band_limit import BandLimit
 from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
-from lbt_synth.report.designs.assessment import DesignAssessment
-from lbt_synth.report.designs.report import DesignReport
+from lbt_synth.report.designs.report import DesignAssessment, DesignReport
 from lbt_synth.report.number_text import (
     DASH,
     MINUS,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.design import Certificate, Check
 from lbt_synth.report.designs.report import count_steps, frequency_errors
 
 
@@ -57,3 +58,19 @@ def test_steps_are_counted(few, designs):
     done = []
     lbt.report.design_report(few, designs, advance=done.append)
     assert sum(done) == count_steps(3) - 1  # the unstable one is not simulated
+
+
+def test_a_design_that_was_tampered_with_fails(config, designs):
+    kalman = designs["kalman"]
+    wrong = replace(
+        kalman,
+        gain_predictor=1.1 * np.asarray(kalman.gain_predictor),
+        certificate=Certificate(
+            checks=(Check(name="believe me", value=0, limit=1, computed_by="none"),),
+            gamma=1.0,
+            rms_per_output=np.ones(2),
+        ),
+    )
+    one = lbt.report.design_report(config, {"wrong": wrong}).assessments[0]
+    assert not one.certified
+    assert "believe me" not in [check.name for check in one.checks]

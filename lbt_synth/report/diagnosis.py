@@ -5,108 +5,90 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.channels import AXES
 from lbt_synth.identification.diagnosis.running_loop import command_row, law_row
 from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
-from lbt_synth.linear import Controller
 from lbt_synth.report import provenance
-from lbt_synth.report.charts.description import Axis, Bars, Chart, Curve, Mark, Panel
-from lbt_synth.report.figures.identification import identification_panels
+from lbt_synth.report.draw import Figure, drawing
+from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.number_text import number_text, print_text
-from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
-from lbt_synth.report.page.page_files import require_page_names, write_page
-from lbt_synth.report.page.source_section import source_section
-from lbt_synth.report.page.words import chart, paragraph
+from lbt_synth.report.page.blocks import (
+    Block,
+    Chart,
+    Notice,
+    Page,
+    Section,
+    chart,
+    paragraph,
+    source_section,
+)
+from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import cell_text, fact_table, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, listing_text
 
-_POINTS = 400  # bands of a curve on a page, each with its least and its largest value
-_RESIDUAL = Axis(label="residual", unit="nm rms", low=0)
 _ROW_IN = 0.42  # height of a category
 _SIGMAS = 2.0
 
 
-def residual_charts(found: Diagnosis) -> list[Chart]:
+def _residual_charts(found: Diagnosis) -> list[Chart]:
     """Return bars of the residuals on unseen data, and of the parts of the disturbance."""
     charts = []
     if rows := found.residuals:
         values = np.array([row.replayed_nm for row in rows])
         errors = _SIGMAS * np.array([row.replayed_error_nm for row in rows])
-        bars: tuple[Bars, ...] = (
-            Bars(name="data", values=values, low=values - errors, high=values + errors),
-            Bars(name="model", values=np.array([row.model_nm for row in rows]), look=1),
-        )
+        promised = np.array([row.model_nm for row in rows])
         names = [row.name for row in rows]
-        shown = np.where(np.isfinite(values), values, [row.model_nm for row in rows])
+        intervals = {"data": (values - errors, values + errors)}
+        figure = _draw_bars(names, {"data": values, "model": promised}, intervals)
+        shown = np.where(np.isfinite(values), values, promised)
         pairs = zip(names, shown.tolist(), strict=True)  # the limit has no data
         said = [f"{name} {nm_text(value_nm, '.1f')}" for name, value_nm in pairs]
-        charts.append(chart("residuals", [_bar_panel(bars, names)], values=listing_text(said)))
+        charts.append(chart("residuals", figure, values=listing_text(said)))
     if costs := found.costs:
         columns = {"loop that ran": "running_nm", "best design": "best_nm"}
-        bars = tuple(
-            Bars(name=name, values=np.array([getattr(row, field) for row in costs]), look=look)
-            for look, (name, field) in enumerate(columns.items())
-        )
+        bars = {
+            name: np.array([getattr(row, field) for row in costs])
+            for name, field in columns.items()
+        }
         said = [
             f"{row.part} {nm_text(row.running_nm, '.1f')} and {nm_text(row.best_nm, '.1f')}"
             for row in costs
         ]
-        panel = _bar_panel(bars, [row.part for row in costs])
+        figure = _draw_bars([row.part for row in costs], bars, {})
         best = found.best or "none"
-        charts.append(chart("costs", [panel], values=listing_text(said), best=best))
+        charts.append(chart("costs", figure, values=listing_text(said), best=best))
     return charts
 
 
-def _bar_panel(bars: tuple[Bars, ...], names: list[str]) -> Panel:
-    return Panel(
-        x=_RESIDUAL,
-        y=Axis(label=""),
-        marks=bars,
-        categories=tuple(names),
-        height_in=_ROW_IN * max(len(names), 2),
-    )
+def _draw_bars(
+    names: Sequence[str],
+    bars: Mapping[str, ArrayLike],
+    intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
+) -> Figure:
+    with drawing([_ROW_IN * max(len(names), 2)]) as (panel,):
+        panel.set_axes({"label": "residual", "unit": "nm rms", "low": 0}, {})
+        panel.bars(names, bars, intervals)
+    return panel.figure
 
 
-def spectrum_charts(found: Diagnosis) -> list[Chart]:
+def _spectrum_charts(found: Diagnosis) -> list[Chart]:
     """Return the chart of the identified model."""
-    model = found.model
-    if model is None:
+    if found.model is None:
         return []
-    designs: Mapping[str, Controller | Design] = {}
-    if found.best_design is not None:
-        designs = {found.best: found.best_design}
-    panels = [
-        replace(panel, marks=tuple(map(_thin_curve, panel.marks)))
-        for panel in identification_panels(model, designs)
-    ]
+    designs = {} if found.best_design is None else {found.best: found.best_design}
     lines = [f"{number_text(line.row.frequency_hz)} Hz" for line in found.lines]
-    words = listing_text(lines) or "none"
-    return [chart("identification", panels, columns=len(model.axes), lines=words)]
-
-
-def _thin_curve(mark: Mark) -> Mark:
-    """Return a curve of many points with the least and the largest value of each band."""
-    if not isinstance(mark, Curve) or mark.x.size <= 4 * _POINTS:
-        return mark
-    edges = np.searchsorted(mark.x, np.geomspace(mark.x[0], mark.x[-1], _POINTS))
-    kept = {0, mark.x.size - 1}
-    for start, stop in pairwise(edges.tolist()):
-        if stop > start:
-            band = mark.y[start:stop]
-            kept |= {start + int(np.argmin(band)), start + int(np.argmax(band))}
-    where = np.array(sorted(kept))
-    return replace(mark, x=mark.x[where], y=mark.y[where])
+    figure = identification_figure(found.model, designs=designs)
+    return [chart("identification", figure, lines=listing_text(lines) or "none")]
 
 
 def diagnosis_tables(found: Diagnosis) -> tuple[Table, ...]:
@@ -197,28 +179,28 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
     ]
     name = read[0].name if read else found.record.source or "a record"
     record = found.record
-    sections = [
-        Section(key="verdict", title="Verdict", blocks=tuple(_verdict_blocks(found))),
-        Section(key="record", title="Record", blocks=tuple(_print_tables(record_tables(found)))),
+    sections = (
+        Section(key="verdict", title="Verdict", blocks=_verdict_blocks(found)),
+        Section(key="record", title="Record", blocks=_print_tables(record_tables(found))),
         Section(
             key="loop",
             title="Loop that ran",
-            blocks=(Paragraph(text=paragraph("law")), *_print_tables(loop_tables(found))),
+            blocks=(paragraph("law"), *_print_tables(loop_tables(found))),
         ),
         Section(
             key="disturbance",
             title="Disturbance",
-            blocks=(*_print_tables(line_tables(found)), *spectrum_charts(found))
-            or (Paragraph(text="No model was identified."),),
+            blocks=(*_print_tables(line_tables(found)), *_spectrum_charts(found))
+            or ("No model was identified.",),
         ),
         source_section(read),
-    ]
+    )
     return Page(
         title=f"Diagnosis of {name}",
         subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "
         f"{count_text(record.axes, 'axis', 'axes')}. Made "
         f"{provenance.time_text(provenance.creation_time())}.",
-        sections=tuple(section for section in sections if section.blocks),
+        sections=sections,
     )
 
 
@@ -243,8 +225,8 @@ def _verdict_blocks(found: Diagnosis) -> list[Block]:
     tone = "bad" if wrong else "note" if doubtful else "good"
     return [
         Notice(text=print_text(state), tone=tone),
-        Paragraph(text=print_text(" ".join(rest))),
+        print_text(" ".join(rest)),
         *_print_tables(residual_tables(found)),
-        *residual_charts(found),
+        *_residual_charts(found),
         *(Notice(text=print_text(f"{note[0].upper()}{note[1:]}")) for note in found.notes),
     ]
