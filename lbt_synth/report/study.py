@@ -8,8 +8,6 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -62,69 +60,6 @@ _EVALUATION = {
     "simulation": "each simulated in the time domain",
 }
 Names = Mapping[str, str]  # what each parameter is called
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StudyInfo:
-    """What the page of a study says besides its results."""
-
-    name: str  # Name of the study's file
-    samples: int  # How many samples it is to have
-    sampling: str  # How they are drawn
-    evaluation: str  # How they are evaluated
-    parameters: dict[str, str]  # Distribution of each parameter, in words
-    controllers: dict[str, str]  # Origin of each controller, in words
-    # SHA-256 of the matrices of each controller that is the same for all samples
-    digests: dict[str, str]
-    digest: str  # Digest of the study
-    failures: tuple[Failure, ...]  # Evaluations that failed
-    files: tuple[provenance.SourceFile, ...]  # Files that it was read from
-    texts: dict[str, str]  # The study file and the configuration, by their names
-    versions: tuple[tuple[str, str], ...]  # Programs and their versions
-    made: datetime  # When the page was made
-    computing_s: float | None  # Time of all its batches, of all processes together [s]
-    replay: str  # Command that replays a sample, with ``{row}`` for its number
-
-
-def study_info(
-    study: Study,
-    *,
-    directory: str | os.PathLike[str],
-    failures: Sequence[Failure] = (),
-    computing_s: float | None = None,
-) -> StudyInfo:
-    """Collect what a page says of a study."""
-    settings = study.settings
-    roles = ["study", "configuration"]
-    files, texts = [], {}
-    for place, path in enumerate(study.inputs):
-        role = roles[place] if place < len(roles) else "gain file"
-        source, content = provenance.read_source(path, role)
-        files.append(source)
-        if place < len(roles):
-            texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8-sig", "replace")
-    return StudyInfo(
-        name=study.source.name,
-        samples=study.samples,
-        sampling=f"{_SAMPLING[settings.sampling]}, seed {settings.seed}",
-        evaluation=_EVALUATION[settings.evaluation],
-        parameters={each.name: each.distribution.text for each in study.parameters},
-        controllers={each.name: each.origin for each in study.controllers},
-        digests={
-            each.name: digest({name: getattr(each.design.controller, name) for name in "ABCD"}, {})
-            for each in study.controllers
-            if each.design is not None
-        },
-        digest=study.digest,
-        failures=tuple(failures),
-        files=tuple(files),
-        texts=texts,
-        versions=provenance.program_versions(),
-        made=provenance.creation_time(),
-        computing_s=computing_s,
-        replay=shlex.join(["lbt-synth", "study", os.fspath(study.source)])
-        + f" -o {shlex.quote(os.fspath(directory))} --row {{row}}",
-    )
 
 
 def write_study_page(
@@ -186,14 +121,25 @@ def write_study_page(
     if statistics is None:
         names = [each.name for each in study.controllers]
         statistics = study_statistics(columns, study.parameter_names, names)
-    info = study_info(
-        study, directory=Path(path).parent, failures=failures, computing_s=computing_s
+    page = study_page(
+        study,
+        statistics,
+        columns,
+        folder=Path(path).parent,
+        failures=failures,
+        computing_s=computing_s,
     )
-    return write_page(study_page(info, statistics, columns), path, pdf)
+    return write_page(page, path, pdf)
 
 
 def study_page(
-    info: StudyInfo, statistics: StudyStatistics, columns: Mapping[str, ArrayLike]
+    study: Study,
+    statistics: StudyStatistics,
+    columns: Mapping[str, ArrayLike],
+    *,
+    folder: Path,
+    failures: Sequence[Failure] = (),
+    computing_s: float | None = None,
 ) -> Page:
     """Return the page of a study's results; columns (n,) have one value per sample."""
     samples = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
@@ -208,35 +154,35 @@ def study_page(
     names = summary.short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
     reading = [paragraph(name) for name in ("intervals", "indices")]
+    made = provenance.time_text(provenance.creation_time())
     return Page(
-        title=f"Robustness study {info.name}",
+        title=f"Robustness study {study.source.name}",
         subtitle=(
             f"{statistics.samples} samples of {varying} parameters, "
-            f"{count_text(len(statistics.controllers), 'controller')}. Made "
-            f"{provenance.time_text(info.made)}."
+            f"{count_text(len(statistics.controllers), 'controller')}. Made {made}."
         ),
         sections=(
-            _summary_section(info, statistics, samples),
-            _samples_section(info, values, names),
-            _controllers_section(info, statistics),
+            _summary_section(study, statistics, samples),
+            _samples_section(study, values, names),
+            _controllers_section(study, statistics, failures),
             _comparison_section(statistics, samples),
             _dependence_section(statistics, samples, values, names),
-            _worst_section(info, statistics, names),
+            _worst_section(study, statistics, names, folder),
             Section(key="reading", title="How to read the figures", blocks=reading),
-            _origin_section(info, statistics),
+            _origin_section(study, statistics, computing_s),
         ),
     )
 
 
 def _summary_section(
-    info: StudyInfo, statistics: StudyStatistics, samples: Sequence[ControllerSamples]
+    study: Study, statistics: StudyStatistics, samples: Sequence[ControllerSamples]
 ) -> Section:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
     unstable = [each for each in statistics.controllers if each.unstable.count]
     failed = [each for each in statistics.controllers if each.failed]
     warnings = []
-    if statistics.samples < info.samples:
-        warnings.append(paragraph("incomplete", done=statistics.samples, samples=info.samples))
+    if statistics.samples < study.samples:
+        warnings.append(paragraph("incomplete", done=statistics.samples, samples=study.samples))
     if unstable:
         parts = ", ".join(
             f"{each.controller} in {each.unstable.count} of {each.samples} "
@@ -281,13 +227,14 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     return f"{text} {paragraph('regret', name=least.controller, loss=summary.percent(loss))}"
 
 
-def _samples_section(info: StudyInfo, values: Mapping[str, FloatArray], names: Names) -> Section:
+def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Names) -> Section:
     """Show the parameters and their histograms."""
+    distributions = {each.name: each.distribution.text for each in study.parameters}
     rows = tuple(
         (
             names[name],
             name,
-            info.parameters.get(name, ""),
+            distributions.get(name, ""),
             *_rounded_texts(np.percentile(column, (0, 50, 100))),
         )
         for name, column in values.items()
@@ -299,7 +246,11 @@ def _samples_section(info: StudyInfo, values: Mapping[str, FloatArray], names: N
         rows=rows,
         words=(1, 2),
     )
-    opening = f"{info.samples} samples, {info.sampling}; {info.evaluation}."
+    settings = study.settings
+    opening = (
+        f"{study.samples} samples, {_SAMPLING[settings.sampling]}, seed {settings.seed}; "
+        f"{_EVALUATION[settings.evaluation]}."
+    )
     blocks = (
         opening,
         table,
@@ -315,37 +266,38 @@ def _rounded_texts(values: FloatArray) -> list[str]:
     return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
 
 
-def _controllers_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
-    """List the controllers, and evaluations that failed."""
-    blocks: list[Block] = [
-        Table(
-            caption="Controllers",
-            headings=("controller", "origin", "digest", "evaluated", "unstable", "failed"),
-            rows=tuple(
-                (
-                    each.controller,
-                    info.controllers.get(each.controller, ""),
-                    info.digests.get(each.controller, "-")[:16],
-                    str(each.samples),
-                    _count_cell(each.unstable.count),
-                    _count_cell(each.failed),
-                )
-                for each in statistics.controllers
-            ),
-            words=(1, 2),
+def _controllers_section(
+    study: Study, statistics: StudyStatistics, failures: Sequence[Failure]
+) -> Section:
+    """List the controllers, with digests of what is the same for all samples, and failures."""
+    origins = {each.name: each.origin for each in study.controllers}
+    digests = {
+        each.name: digest({name: getattr(each.design.controller, name) for name in "ABCD"}, {})
+        for each in study.controllers
+        if each.design is not None
+    }
+    rows = tuple(
+        (
+            each.controller,
+            origins.get(each.controller, ""),
+            digests.get(each.controller, "-")[:16],
+            str(each.samples),
+            _count_cell(each.unstable.count),
+            _count_cell(each.failed),
         )
-    ]
-    if info.failures:
-        more = len(info.failures) - _MOST_FAILURES
+        for each in statistics.controllers
+    )
+    headings = ("controller", "origin", "digest", "evaluated", "unstable", "failed")
+    blocks: list[Block] = [Table(caption="Controllers", headings=headings, rows=rows, words=(1, 2))]
+    if failures:
+        more = len(failures) - _MOST_FAILURES
+        caption = f": the first {_MOST_FAILURES}, and {more} more" if more > 0 else ""
+        listed = tuple((str(f.row), f.controller, f.error) for f in failures[:_MOST_FAILURES])
         blocks.append(
             Table(
-                caption="Evaluations that failed"
-                + (f": the first {_MOST_FAILURES}, and {more} more" if more > 0 else ""),
+                caption=f"Evaluations that failed{caption}",
                 headings=("row", "controller", "error"),
-                rows=tuple(
-                    (str(each.row), each.controller, each.error)
-                    for each in info.failures[:_MOST_FAILURES]
-                ),
+                rows=listed,
                 words=(1, 2),
             )
         )
@@ -389,9 +341,12 @@ def _dependence_section(
     return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)
 
 
-def _worst_section(info: StudyInfo, statistics: StudyStatistics, names: Names) -> Section:
+def _worst_section(
+    study: Study, statistics: StudyStatistics, names: Names, folder: Path
+) -> Section:
     """List the worst samples, and the commands that replay them."""
     blocks: list[Block] = []
+    words = ["lbt-synth", "study", os.fspath(study.source), "-o", os.fspath(folder), "--row"]
     commands = []
     most = 0
     for each, one in zip(statistics.controllers, statistics.sensitivities, strict=True):
@@ -401,7 +356,7 @@ def _worst_section(info: StudyInfo, statistics: StudyStatistics, names: Names) -
             shown = (ranked or others)[:_PARAMETERS]
             most = max(most, len(ranked) - len(shown))
             blocks.append(summary.worst_table(each, shown, names=names))
-            commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
+            commands.append(shlex.join([*words, str(each.worst[0].row)]))
     if most:
         blocks.insert(0, paragraph("worst", count=_PARAMETERS))
     if commands:
@@ -410,16 +365,25 @@ def _worst_section(info: StudyInfo, statistics: StudyStatistics, names: Names) -
     return Section(key="worst", title="Worst samples", blocks=blocks)
 
 
-def _origin_section(info: StudyInfo, statistics: StudyStatistics) -> Section:
+def _origin_section(
+    study: Study, statistics: StudyStatistics, computing_s: float | None
+) -> Section:
     """Name the files and programs that the page was made from."""
-    rows: list[tuple[str, str]] = [
-        ("samples with results", f"{statistics.samples} of {info.samples}"),
-        ("digest of the study", info.digest),
+    rows = [
+        ("samples with results", f"{statistics.samples} of {study.samples}"),
+        ("digest of the study", study.digest),
     ]
-    if info.computing_s is not None:
-        rows.append(("computing time, of all processes together", duration_text(info.computing_s)))
+    if computing_s is not None:
+        rows.append(("computing time, of all processes together", duration_text(computing_s)))
     about = Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,))
-    return source_section(info.files, versions=info.versions, texts=info.texts, about=about)
+    roles, sources, texts = ["study", "configuration"], [], {}
+    for place, path in enumerate(study.inputs):
+        role = roles[place] if place < len(roles) else "gain file"
+        source, content = provenance.read_source(path, role)
+        sources.append(source)
+        if place < len(roles):
+            texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8-sig", "replace")
+    return source_section(sources, texts=texts, about=about)
 
 
 def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
@@ -496,11 +460,8 @@ def _histogram_chart(parameters: Mapping[str, FloatArray], names: Names) -> list
                 y = np.concatenate(([0.0], np.repeat(100 * share, 2), [0.0]))
                 panel.area("", x, np.zeros_like(y), y)
                 panel.curve("samples [%]", x, y, dash=0, quiet=True)
-    return [chart("parameters", panels[0].figure, names=_listed(list(varying), names))]
-
-
-def _listed(parameters: Sequence[str], names: Names) -> str:
-    return listing_text([names[name] for name in parameters])
+    listed_names = listing_text([names[name] for name in varying])
+    return [chart("parameters", panels[0].figure, names=listed_names)]
 
 
 def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
@@ -557,7 +518,9 @@ def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart
                 label, y = f"{controller}, 10th percentile", 100 * curve.low
                 panel.curve(label, curve.parameter, y, look=look, width=0.9, quiet=True)
             panel.curve("10th percentile (thin)", [], [], look=None, width=0.9)
-    charts = [chart("curves", panels[0].figure, names=_listed(list(curves), names))]
+    charts = [
+        chart("curves", panels[0].figure, names=listing_text([names[name] for name in curves]))
+    ]
     unstable = {
         name: [(look, controller, curve) for look, controller, curve in own if curve.unstable.any()]
         for name, own in curves.items()
@@ -575,7 +538,10 @@ def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart
             panel.set_axes({"label": names[name]}, {"label": "unstable", "unit": "%", "low": 0})
             for look, controller, curve in unstable[name]:
                 panel.curve(controller, curve.parameter, 100 * curve.unstable, look=look, **style)
-    return [*charts, chart("unstable", panels[0].figure, names=_listed(most, names))]
+    return [
+        *charts,
+        chart("unstable", panels[0].figure, names=listing_text([names[name] for name in most])),
+    ]
 
 
 def _map_charts(

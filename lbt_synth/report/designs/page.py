@@ -15,7 +15,7 @@ from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport
 from lbt_synth.report.designs.simulation import DesignSimulation
-from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table, verdict
+from lbt_synth.report.designs.tables import summary_table, truth_table, verdict
 from lbt_synth.report.draw import (
     PANEL_IN,
     Figure,
@@ -55,6 +55,7 @@ from lbt_synth.report.page.blocks import (
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.report.provenance import require_letters, time_text
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.words import count_text, listing_text
 
 _PANELS = 6  # of one figure that has a panel per design: they fit a sheet
@@ -197,7 +198,9 @@ def _certificate_blocks(report: DesignReport) -> list[Block]:
     for one in report.assessments:
         missing = f"{one.name}: not computed: {one.certificate_error}"
         blocks.append(
-            Notice(text=missing, tone="bad") if one.certificate_error else certificate_table(one)
+            Notice(text=missing, tone="bad")
+            if one.certificate_error
+            else row_table(f"Certificate of {one.name}", one.checks)
         )
     return blocks
 

@@ -14,7 +14,8 @@ from functools import partial
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from threading import Condition, Thread
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any
 
 from bokeh.core.properties import String
@@ -51,33 +52,28 @@ class Lane:
     """
 
     def __init__(self) -> None:
-        self._waiting: Callable[[], None] | None = None
-        self._open, self._changed = True, Condition()
+        self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._thread = Thread(target=copy_context().run, args=(self._run,), daemon=True)
         self._thread.start()
 
     def submit(self, work: Callable[[], None]) -> None:
         """Run a piece of work, instead of any that waits."""
-        with self._changed:
-            self._waiting = work
-            self._changed.notify()
+        self._queue.put(work)
 
     @property
     def is_waiting(self) -> bool:
         """Whether newer work waits for the one that runs."""
-        return self._waiting is not None
+        return not self._queue.empty()
 
     def close(self) -> None:
         """Drop what waits, and end after what runs."""
-        with self._changed:
-            self._waiting, self._open = None, False
-            self._changed.notify()
+        self._queue.put(None)
 
     def _run(self) -> None:
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting is not None or not self._open)
-                work, self._waiting = self._waiting, None
+            work = self._queue.get()
+            while not self._queue.empty():
+                work = self._queue.get()
             if work is None:
                 return
             work()
@@ -96,7 +92,13 @@ def save_view(
         if not any((folder / (stem + ending)).exists() for ending in _ENDINGS)
     )
     config, gain, script = (folder / (stem + ending) for ending in _ENDINGS)
-    commands = list_commands(view, stem)
+    request = view.request
+    options = [f"--{name.replace('_', '-')} {value}" for name, value in request.given.items()]
+    design = ["lbt-synth design", config.name, "--method", request.method.name, *options]
+    commands = (
+        " ".join((*design, "-o", gain.name)),
+        f"lbt-synth report {config.name} {gain.name} -o {stem}.html",
+    )
     moves = describe_moves(exploration, view.wish) or "nothing moved"
     head = f"{exploration.config.source.name!a} with {moves}; {creator_name()}"
     lines = ["#!/bin/sh", f"# {head}", "set -e", 'cd "$(dirname "$0")"', *commands, ""]
@@ -104,17 +106,6 @@ def save_view(
     write_together({config: text.encode(), script: "\n".join(lines).encode()})
     save_gain(gain, view.design)
     return [config, gain, script], commands
-
-
-def list_commands(view: View, stem: str) -> tuple[str, ...]:
-    """Return the commands that make the files of a name, and a report of them."""
-    request = view.request
-    options = [f"--{name.replace('_', '-')} {value}" for name, value in request.given.items()]
-    design = ["lbt-synth design", f"{stem}.yaml --method {request.method.name}", *options]
-    return (
-        " ".join((*design, f"-o {stem}.fits")),
-        f"lbt-synth report {stem}.yaml {stem}.fits -o {stem}.html",
-    )
 
 
 _QUICK_S = 0.3  # a design that takes longer is made when a slider is released, in its own lane
