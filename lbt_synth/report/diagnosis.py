@@ -16,7 +16,6 @@ from lbt_synth.identification.diagnosis.running_loop import command_row, law_row
 from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
-from lbt_synth.report import provenance
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.number_text import number_text, print_text
@@ -27,8 +26,11 @@ from lbt_synth.report.page.blocks import (
     Page,
     Section,
     chart,
+    creation_time,
     paragraph,
+    read_source,
     source_section,
+    time_text,
 )
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.display_unit import nm_text
@@ -173,10 +175,7 @@ def write_diagnosis(
 def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = ()) -> Page:
     """Return the page of a diagnosis."""
     roles = ("record", "gain file")
-    read = [
-        provenance.read_source(Path(file), role)[0]
-        for file, role in zip(files, roles, strict=False)
-    ]
+    read = [read_source(Path(file), role)[0] for file, role in zip(files, roles, strict=False)]
     name = read[0].name if read else found.record.source or "a record"
     record = found.record
     sections = (
@@ -199,7 +198,7 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
         title=f"Diagnosis of {name}",
         subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "
         f"{count_text(record.axes, 'axis', 'axes')}. Made "
-        f"{provenance.time_text(provenance.creation_time())}.",
+        f"{time_text(creation_time())}.",
         sections=sections,
     )
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report import provenance
 from lbt_synth.report.draw import PANEL_IN, Panel, drawing
 from lbt_synth.report.page.blocks import (
     Block,
@@ -25,8 +24,11 @@ from lbt_synth.report.page.blocks import (
     Page,
     Section,
     chart,
+    creation_time,
     paragraph,
+    read_source,
     source_section,
+    time_text,
 )
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.array_file import digest
@@ -154,7 +156,7 @@ def study_page(
     names = summary.short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
     reading = [paragraph(name) for name in ("intervals", "indices")]
-    made = provenance.time_text(provenance.creation_time())
+    made = time_text(creation_time())
     return Page(
         title=f"Robustness study {study.source.name}",
         subtitle=(
@@ -379,7 +381,7 @@ def _origin_section(
     roles, sources, texts = ["study", "configuration"], [], {}
     for place, path in enumerate(study.inputs):
         role = roles[place] if place < len(roles) else "gain file"
-        source, content = provenance.read_source(path, role)
+        source, content = read_source(path, role)
         sources.append(source)
         if place < len(roles):
             texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8-sig", "replace")

@@ -1,17 +1,23 @@
-"""The page of a report of designs: its sections, charts and words, and its files."""
+"""Pages of designs: their sections, charts and words, and their files."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from lbt_synth.config import Config
+from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop import close_loop
+from lbt_synth.linear import largest_singular_values
+from lbt_synth.linear.norms import spectral_norms
+from lbt_synth.loop.simulation.failing_sensors import Drop
 from lbt_synth.models import SinusoidalVibration
+from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport
 from lbt_synth.report.designs.simulation import DesignSimulation
@@ -32,8 +38,9 @@ from lbt_synth.report.figures.loops import (
     draw_loop_norms,
     draw_steps,
     draw_transfer,
+    frequency_grid,
 )
-from lbt_synth.report.figures.records import SPECTRUM, TIME
+from lbt_synth.report.figures.records import SPECTRUM, TIME, sensor_failure_figure
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
     draw_limits,
@@ -49,14 +56,20 @@ from lbt_synth.report.page.blocks import (
     Page,
     Section,
     chart,
+    creation_time,
     paragraph,
+    read_source,
+    require_letters,
     source_section,
+    time_text,
 )
 from lbt_synth.report.page.html import require_page_names, write_page
-from lbt_synth.report.provenance import require_letters, time_text
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import row_table
+from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
+from lbt_synth.studies import compare_in_truth
+from lbt_synth.studies.sensor_failures import run_failures
+from lbt_synth.studies.truth_comparison import TruthComparison
 
 _PANELS = 6  # of one figure that has a panel per design: they fit a sheet
 _STEP_NM = 100.0
@@ -140,7 +153,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             text = paragraph(
                 "unstable",
                 name=one.name,
-                radius=number_text(one.spectral_radius, 6),
+                radius=number_text(one.loop.spectral_radius, 6),
                 gain=number_text(report.real_gain),
             )
             blocks.append(Notice(text=text, tone="bad"))
@@ -208,10 +221,14 @@ def _certificate_blocks(report: DesignReport) -> list[Block]:
 def _transfer_blocks(report: DesignReport) -> list[Block]:
     """Return singular values of the estimation error and of the closed loops, and their margins."""
     blocks: list[Block] = []
-    names, f = report.names, report.frequency_hz
-    lines_hz = report.config.truth.lines_hz
+    names, lines_hz = report.names, report.config.truth.lines_hz
+    f = frequency_grid(report.config.hardware.frame_rate_hz, lines_hz)
     line = {"line": "true vibration" if len(lines_hz) == 1 else "true vibrations"}
-    errors = {a.name: a.error_norms for a in report.assessments if a.error_norms is not None}
+    errors = {
+        one.name: largest_singular_values(one.design.error_system(), f)
+        for one in report.assessments
+        if one.design.is_estimator
+    }
     if not report.stable:
         blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
     if errors:
@@ -222,8 +239,13 @@ def _transfer_blocks(report: DesignReport) -> list[Block]:
         blocks.append(chart("sigma", panel.figure, peaks=listing_text(peaks)))
     if not report.stable:
         return blocks
-    rejections = {one.name: (f, one.rejection) for one in report.assessments}
-    noises = {one.name: (f, one.noise_transfer) for one in report.assessments}
+    rejections, noises = (
+        {
+            one.name: (f, spectral_norms(getattr(one.loop, name)(f)) if one.stable else None)
+            for one in report.assessments
+        }
+        for name in ("sensitivity", "noise_transfer")
+    )
     with drawing([PANEL_IN, PANEL_IN]) as panels:
         draw_loop_norms(panels, rejections, noises, names, lines_hz, **line)
     gain = number_text(report.real_gain)
@@ -238,13 +260,7 @@ def _transfer_blocks(report: DesignReport) -> list[Block]:
         for what, norms in (("rejection", rejections), ("noise", noises))
     }
     blocks.append(chart("loop", panels[0].figure, gain=gain, **largest))
-    hardware, real_gain = report.config.hardware, report.config.truth.sensor_gain
-    loops = break_loops(
-        {
-            one.name: close_loop(hardware, one.design.controller, sensor_gain=real_gain)
-            for one in report.assessments
-        }
-    )
+    loops = break_loops({one.name: one.loop for one in report.assessments})
     margins = listing_text([f"{loop.name} {loop.margins}" for loop in loops])
     blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
     return blocks
@@ -333,12 +349,15 @@ def _sensor_gain_chart(report: DesignReport) -> Chart:
 
 def _dynamics_charts(report: DesignReport) -> list[Chart]:
     """Poles, and step responses."""
-    poles = [np.append(one.loop_poles, one.controller_poles) for one in report.assessments]
-    reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for values in poles))
-    radii = [f"{one.name} {number_text(one.spectral_radius, 6)}" for one in report.assessments]
+    poles = [
+        (one.loop.system.poles, np.linalg.eigvals(one.design.controller.A))
+        for one in report.assessments
+    ]
+    reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for pair in poles for values in pair))
+    radii = [f"{one.name} {number_text(one.loop.spectral_radius, 6)}" for one in report.assessments]
     charts = [
         chart(f"poles{number}", _draw_poles(batch, reach), radii=listing_text(radii))
-        for number, batch in _sheets(report.assessments)
+        for number, batch in _sheets(list(zip(report.assessments, poles, strict=True)))
     ]
     if not report.stable:
         return charts
@@ -355,25 +374,23 @@ def _dynamics_charts(report: DesignReport) -> list[Chart]:
     return [*charts, chart("step", draw_steps(steps, height_nm=_STEP_NM), **facts)]
 
 
-def _draw_poles(assessments: Sequence[DesignAssessment], reach: float) -> Figure:
-    """Draw the poles of closed loops and of controllers in the complex plane."""
-    columns = count_columns(len(assessments))
+def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
+    """Draw the poles of the closed loop and of the controller of each design."""
+    columns = count_columns(len(designs))
     turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
     real, imaginary = (
         {"label": f"{part} part", "unit": "-", "low": -reach, "high": reach}
         for part in ("real", "imaginary")
     )
-    with drawing([square_in(columns)] * len(assessments), columns=columns) as panels:
-        for panel, one in zip(panels, assessments, strict=True):
+    with drawing([square_in(columns)] * len(designs), columns=columns) as panels:
+        for panel, (one, (loop, controller)) in zip(panels, designs, strict=True):
             title = one.name if one.stable else f"{one.name}: unstable"
             panel.set_axes(real, imaginary, title=title, equal=True)
             panel.curve("unit circle", turn.real, turn.imag, look=None, width=1.0, numbers=False)
-            for name, values, marker, look in (
-                ("controller alone", one.controller_poles, "o", 1),
-                ("closed loop", one.loop_poles, "x", 0),
-            ):
-                style: dict[str, Any] = {"marker": marker, "look": look, "filled": False}
-                panel.curve(name, values.real, values.imag, line=False, size=6.0, **style)
+            points: dict[str, Any] = {"line": False, "filled": False, "size": 6.0}
+            own = {"look": 1, "marker": "o", **points}
+            panel.curve("controller alone", controller.real, controller.imag, **own)
+            panel.curve("closed loop", loop.real, loop.imag, look=0, marker="x", **points)
     return panels[0].figure
 
 
@@ -419,3 +436,91 @@ def _draw_spectra(panel: Panel, name: str, run: DesignSimulation) -> None:
     panel.curve("before the correction", f, run.open_nm2_hz, look=None, width=0.8)
     panel.curve("residual, simulated", f, run.residual_nm2_hz, look=5, dash=0)
     panel.curve("residual, exact", f, run.exact_nm2_hz, look=1, width=1.4)
+
+
+_AWAY_S = 1.0  # that each sensor is missing, and that all are there again
+
+
+def write_sensors_report(
+    config: Config,
+    designs: Mapping[str, Design],
+    path: str | os.PathLike[str],
+    *,
+    gain_files: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
+    pdf: str | os.PathLike[str] | None = None,
+    title: str | None = None,
+) -> tuple[tuple[Path, ...], TruthComparison]:
+    """Write the page of designs of several sensors, and as a PDF if that is wanted.
+
+    The truth of the configuration must be stationary. The page gives the digests of the files that
+    designs came from.
+    """
+    require_page_names(path, pdf)
+    source, content = read_source(config.source, "configuration")
+    text = content.decode("utf-8-sig", errors="replace")
+    gains = [read_source(file, f"gain file of {name}")[0] for name, file in gain_files.items()]
+    files = [source, *gains]
+    found = compare_in_truth(designs, config)
+    sections = [_sensors_section(config, designs, found)]
+    for number, (name, design) in enumerate(designs.items(), start=1):
+        failures = design.tables()[0]
+        blocks: tuple[Block, ...] = (
+            fact_table(name, design.facts()),
+            row_table(failures.title, failures.rows),
+            _failure_chart(config, name, design, f"failures-{number}"),
+            row_table("Certificate, computed again", design.recertify().checks),
+        )
+        sections.append(Section(key=f"design-{number}", title=name, blocks=blocks))
+    sections.append(source_section(files, texts={source.name: text}))
+    page = Page(
+        title=title or f"Several sensors for {config.source.name}",
+        subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
+        sections=tuple(sections),
+    )
+    return write_page(page, path, pdf), found
+
+
+def _sensors_section(
+    config: Config, designs: Mapping[str, Design], found: TruthComparison
+) -> Section:
+    """Open with what each design leaves in the truth, beside references."""
+    blocks: list[Block] = []
+    for name, design in designs.items():
+        own = next(row for row in found.rows if row.design == name)
+        others = listing_text(list(design.other_sensors))
+        text = f"{name} reads {others} beside the loop's own sensor, and leaves "
+        text += nm_text(own.residual_nm, ".1f", unit="nm rms")
+        if found.limit is not None:
+            least = nm_text(found.limit.rms_nm, ".1f", unit="nm rms")
+            text += f"; no controller of the own sensor alone leaves less than {least}"
+        blocks.append(f"{text}.")
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    hidden = ("worst_nm", "above_band_limit_percent", "phase_margin_deg")
+    blocks.append(row_table(caption, found.rows, without=hidden))
+    blocks += [Notice(text=note) for note in found.notes]
+    return Section(key="summary", title="Summary", blocks=blocks)
+
+
+def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:
+    """Draw a run in which each sensor and channel is missing in turn."""
+    units = (OWN_SENSOR, *design.other_sensors)
+    drops = [
+        Drop(unit=unit, start_s=(2 * i + 1) * _AWAY_S, end_s=(2 * i + 2) * _AWAY_S)
+        for i, unit in enumerate(units)
+    ]
+    seconds = (2 * len(units) + 1) * _AWAY_S
+    frames, seed = int(seconds * config.hardware.frame_rate_hz), config.settings.simulation.seed
+    run = run_failures(design, config, config.truth, drops, frames=frames, cases=1, seed=seed)
+    left = [
+        f"without {segment.text} {nm_text(exact, '.1f', unit='nm rms')}"
+        for segment, exact in zip(run.segments, run.exact_nm, strict=True)
+        if segment.text
+    ]
+    return chart(
+        key,
+        sensor_failure_figure(run.simulation, run.segments, run.exact_nm),
+        group="sensor-failures",
+        name=name,
+        away=f"{_AWAY_S:g}",
+        residuals=listing_text(left),
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
@@ -17,8 +17,7 @@ from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.interop import frame_cost
 from lbt_synth.interop.arithmetic_cost import FrameCost
-from lbt_synth.linear import Controller, largest_singular_values
-from lbt_synth.linear.norms import spectral_norms
+from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,
     LoopMargins,
@@ -35,13 +34,18 @@ from lbt_synth.loop.moving_gain import MovingGain
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report import provenance
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
-from lbt_synth.report.figures.loops import frequency_grid
+from lbt_synth.report.page.blocks import (
+    SourceFile,
+    creation_time,
+    program_versions,
+    read_source,
+    require_letters,
+)
 from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.truth_comparison import TruthComparison
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
+from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")
 _MOST_DESIGNS = 36  # more lines cannot be distinguished
@@ -53,36 +57,28 @@ class DesignAssessment:
     """What is known exactly of one design in the loop of a configuration."""
 
     name: str  # its name in the report
-    design: Design  # the design
+    design: Design
+    loop: ClosedLoop  # with the real sensor gain
     notes: tuple[str, ...]  # how the loop that it was made for differs from this one
-    stable: bool  # whether the loop is stable at the real sensor gain
-    spectral_radius: float  # largest modulus of the closed loop's poles
-    # (n,): poles of the closed loop, and of the controller alone
-    loop_poles: ComplexArray
-    controller_poles: ComplexArray
-    # norm and standard deviation of the estimation error in its own model; nan for a design that
-    # estimates nothing
-    gamma: float
-    estimation_rms: float
-    budget: ResidualBudget | None  # exact residual; None where the loop is unstable
+    # None where the loop is unstable: the exact residual, the margins at the real sensor gain, and
+    # the intervals around it of a gain that moves
+    budget: ResidualBudget | None
+    margins: LoopMargins | None
+    moving: MovingGain | None
     strehl: float  # Strehl ratio in [0, 1]; nan where the loop is unstable
-    margins: LoopMargins | None  # margins at the real sensor gain; None where the loop is unstable
     # intervals of real sensor gains for which the loop is stable, relative to the sensor matrix of
     # the configuration; searched for between 0.01 and 100 times the assumed one
     sensor_gains: tuple[tuple[float, float], ...]
-    # intervals of a sensor gain that moves, around the real one; None where the loop is unstable
-    moving: MovingGain | None
     checks: tuple[Check, ...]  # the certificate, recomputed
     certificate_error: str  # why it could not be; empty if it could
     cost: FrameCost  # arithmetic of one frame, as exported to C
-    # (f,): largest singular values of the estimation error at the frequencies of the report
-    error_norms: FloatArray | None
-    # (f,): those of the loop, from phase to residual and from noise to residual; None where the
-    # loop is unstable
-    rejection: FloatArray | None
-    noise_transfer: FloatArray | None
     curve: RobustnessMap  # Strehl ratio over the frequency error at the real sensor gain
     map: RobustnessMap  # the same over frequency error and real sensor gain
+
+    @property
+    def stable(self) -> bool:
+        """Whether the loop is stable at the real sensor gain."""
+        return self.loop.is_stable
 
     @property
     def certified(self) -> bool:
@@ -96,53 +92,37 @@ class DesignAssessment:
 
 
 def assess_design(
-    name: str, design: Design, config: Config, *, frequency_hz: FloatArray, errors_hz: FloatArray
+    name: str, design: Design, config: Config, errors_hz: FloatArray
 ) -> DesignAssessment:
-    """Assess a design; its transfer functions are taken at frequency_hz (f,)."""
+    """Assess a design in the loop of a configuration, over frequency errors (e,)."""
     hardware, truth, assumed_gain = config.hardware, config.truth, config.sensor_gain
     sensor_gains = np.unique(config.settings.robustness.sensor_gains)
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    budget = residual_budget(loop, truth) if loop.is_stable else None
-    margins = loop_margins(loop) if loop.is_stable else None
-    rejection, noise_transfer = (
-        frozen_copy(spectral_norms(response(frequency_hz))) if loop.is_stable else None
-        for response in (loop.sensitivity, loop.noise_transfer)
-    )
+    stable = loop.is_stable
+    budget = residual_budget(loop, truth) if stable else None
+    margins = loop_margins(loop) if stable else None
     checks, complaint = _recertify(design)
-    own = design.hardware
     mapped = partial(robustness_map, design, truth, config.imaging, hardware=hardware)
-    curve, found = (
+    curve, grid = (
         mapped(errors_hz=errors_hz, sensor_gains=gains)
         for gains in ([truth.sensor_gain], sensor_gains / assumed_gain)
     )
+    intervals = stable_intervals(loop, design.controller, margins)
     return DesignAssessment(
         name=name,
         design=design,
-        notes=() if own is None else tuple(loop_differences(own, hardware)),
-        stable=loop.is_stable,
-        spectral_radius=loop.spectral_radius,
-        loop_poles=loop.system.poles,
-        controller_poles=np.linalg.eigvals(design.controller.A).astype(np.complex128),
-        gamma=design.gamma,
-        estimation_rms=design.rms,
+        loop=loop,
+        notes=() if design.hardware is None else tuple(loop_differences(design.hardware, hardware)),
         budget=budget,
-        strehl=float("nan") if budget is None else strehl(budget, config.imaging),
         margins=margins,
-        sensor_gains=tuple(
-            (low * assumed_gain, high * assumed_gain)
-            for low, high in stable_intervals(loop, design.controller, margins)
-        ),
-        moving=moving_gain(loop) if loop.is_stable else None,
+        moving=moving_gain(loop) if stable else None,
+        strehl=float("nan") if budget is None else strehl(budget, config.imaging),
+        sensor_gains=tuple((low * assumed_gain, high * assumed_gain) for low, high in intervals),
         checks=checks,
         certificate_error=complaint,
         cost=frame_cost(design),
-        error_norms=largest_singular_values(design.error_system(), frequency_hz)
-        if design.is_estimator
-        else None,
-        rejection=rejection,
-        noise_transfer=noise_transfer,
         curve=curve,
-        map=replace(found, sensor_gains=frozen_copy(sensor_gains)),  # the real ones again
+        map=replace(grid, sensor_gains=frozen_copy(sensor_gains)),  # the real ones again
     )
 
 
@@ -212,10 +192,9 @@ class DesignReport:
     # residuals over the frequency error, and what no linear controller goes below
     limits: LimitStudy
     truth: TruthComparison  # the designs beside reference designs, and what they were not made for
-    frequency_hz: FloatArray  # (f,): frequencies of the transfer functions [Hz]
     # (e,): frequency errors, truth less design [Hz]; only 0 where the truth has no vibration
     errors_hz: FloatArray
-    files: tuple[provenance.SourceFile, ...]  # digests of the files that were read
+    files: tuple[SourceFile, ...]  # digests of the files that were read
     versions: tuple[tuple[str, str], ...]  # programs and libraries
     made: datetime  # when
 
@@ -245,7 +224,6 @@ def design_report(
     designs: Mapping[str, Design],
     *,
     gain_files: Mapping[str, str | os.PathLike[str]] | None = None,
-    advance: Callable[[int], object] | None = None,
 ) -> DesignReport:
     """Examine designs in the loop of a configuration.
 
@@ -260,8 +238,6 @@ def design_report(
         Designs by name.
     gain_files : mapping of str to path-like, optional
         Files that designs came from, whose digests the report gives.
-    advance : callable, optional
-        Called with a number of steps whenever they are done; there are :func:`count_steps` of them.
 
     Returns
     -------
@@ -291,50 +267,34 @@ def design_report(
         raise ProblemError(f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}.")
     for name, design in designs.items():
         require_instance(design, Design)
-        provenance.require_letters(name, "name of a design")
+        require_letters(name, "name of a design")
         require_compatible(name, design, config.hardware)
-    made = provenance.creation_time()
-    source, content = provenance.read_source(config.source, "configuration")
+    made = creation_time()
+    source, content = read_source(config.source, "configuration")
     files = [source]
     for name, path in (gain_files or {}).items():
-        files.append(provenance.read_source(Path(path), f"gain file of {name}")[0])
-    count = advance or (lambda _: None)
-    truth, hardware = config.truth, config.hardware
-    errors = frequency_errors(config)
-    grid = frozen_copy(frequency_grid(hardware.frame_rate_hz, truth.lines_hz))
-    assessments = []
-    for name, design in designs.items():
-        assessments.append(assess_design(name, design, config, frequency_hz=grid, errors_hz=errors))
-        count(1)
-    limits = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
-    count(1)
-    compared = studies.compare_in_truth(designs, config)
-    count(1)
+        files.append(read_source(Path(path), f"gain file of {name}")[0])
+    truth, hardware, errors = config.truth, config.hardware, frequency_errors(config)
+    assessments = tuple(assess_design(n, design, config, errors) for n, design in designs.items())
     stable = [one for one in assessments if one.stable]
-    settle = [settling_frames(one.spectral_radius) for one in stable]
-    simulations = {}
-    for one in stable:  # all settle as the slowest, so that one seed is the same weather for all
-        simulations[one.name] = simulate_design(one.design, config, settle_frames=max(settle))
-        count(1)
+    # all settle as the slowest, so that one seed is the same weather for all
+    settle = max((settling_frames(one.loop.spectral_radius) for one in stable), default=0)
     solved = any(design.solver.route in _CONVEX_ROUTES for design in designs.values())
     return DesignReport(
         config=config,
         config_text=content.decode("utf-8-sig", errors="replace"),
-        assessments=tuple(assessments),
-        simulations=simulations,
-        limits=limits,
-        truth=compared,
-        frequency_hz=grid,
+        assessments=assessments,
+        simulations={
+            one.name: simulate_design(one.design, one.loop, config, settle_frames=settle)
+            for one in stable
+        },
+        limits=studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors)),
+        truth=studies.compare_in_truth(designs, config),
         errors_hz=errors,
         files=tuple(files),
-        versions=provenance.program_versions(("cvxpy", "clarabel") if solved else ()),
+        versions=program_versions(("cvxpy", "clarabel") if solved else ()),
         made=made,
     )
-
-
-def count_steps(designs: int) -> int:
-    """Return the number of steps that a report of so many designs takes at most."""
-    return 2 * designs + 2
 
 
 def frequency_errors(config: Config) -> FloatArray:

@@ -9,7 +9,7 @@ from scipy.signal import welch
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.loop import ClosedLoop, close_loop, simulate, step_response
+from lbt_synth.loop import ClosedLoop, simulate, step_response
 from lbt_synth.loop.simulation.run import LoopStep
 from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
@@ -39,7 +39,9 @@ class DesignSimulation:
     step: LoopStep  # of the first axis, without other disturbances
 
 
-def simulate_design(design: Design, config: Config, *, settle_frames: int) -> DesignSimulation:
+def simulate_design(
+    design: Design, loop: ClosedLoop, config: Config, *, settle_frames: int
+) -> DesignSimulation:
     """Run a design in the loop of a configuration, which settles for at least so many frames."""
     settings, hardware, truth = config.settings.simulation, config.hardware, config.truth
     frames = min(settings.frames, _MOST_FRAMES)
@@ -52,7 +54,6 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
         seed=settings.seed,
         settle_frames=max(settings.settle_frames, settle_frames),
     )
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     rate, length = hardware.frame_rate_hz, min(frames, _SEGMENT)
     spectra = []
     for series in (run.total_nm, run.residual_nm):

@@ -85,8 +85,9 @@ def assessment_row(report: DesignReport, one: DesignAssessment, limits: LimitRow
     simulation = report.simulations.get(one.name)
     return fill_row(
         AssessmentRow,
-        *(one, one.budget, one.margins, one.cost, limits, one.design, one.design.solver),
+        *(one, one.loop, one.budget, one.margins, one.cost, limits, one.design, one.design.solver),
         design=one.name,
+        estimation_rms=one.design.rms,
         n_states=one.design.controller.n_states,
         strehl_simulated=None if simulation is None else simulation.strehl,
         worst_strehl=float(one.curve.strehl.min()) if one.stable else float("nan"),

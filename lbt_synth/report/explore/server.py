@@ -38,8 +38,7 @@ from lbt_synth.report.explore.exploration import (
     whole_view,
 )
 from lbt_synth.report.explore.panels import LivePanel, explore_numbers
-from lbt_synth.report.page.blocks import words
-from lbt_synth.report.provenance import creator_name
+from lbt_synth.report.page.blocks import creator_name, words
 from lbt_synth.storage.atomic_files import write_together
 from lbt_synth.storage.rows import row_table
 

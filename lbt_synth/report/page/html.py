@@ -17,8 +17,7 @@ import numpy as np
 from lbt_synth.errors import MissingExtraError
 from lbt_synth.report.draw import Figure, Series, figure_series, house_style
 from lbt_synth.report.number_text import number_text, print_text, unbroken_text
-from lbt_synth.report.page.blocks import Chart, Page
-from lbt_synth.report.provenance import creator_name
+from lbt_synth.report.page.blocks import Chart, Page, creator_name
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_together
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.warning_filters import ignore_warnings
