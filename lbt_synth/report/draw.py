@@ -13,7 +13,6 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -73,17 +72,14 @@ def colour(look: int | None) -> str:
 
 def dashes(look: int | None) -> tuple[float, ...]:
     """Strokes and gaps of a look [widths of the line]; () is solid."""
-    return () if look is None else _DASHES[_turned(look)]
+    # where the colours repeat, dashes and markers are others
+    return () if look is None else _DASHES[(look + look // len(_COLOURS)) % len(_DASHES)]
 
 
 def marker_of(look: int | None) -> str:
     """Matplotlib's name of the marker of a look."""
-    return _MARKERS[0 if look is None else _turned(look)]
-
-
-def _turned(look: int) -> int:
-    """Return the number of dashes or marker; where the colours repeat, it differs."""
-    return (look + look // len(_COLOURS)) % len(_DASHES)
+    number = 0 if look is None else look
+    return _MARKERS[(number + number // len(_COLOURS)) % len(_MARKERS)]
 
 
 @contextmanager
@@ -91,17 +87,10 @@ def house_style() -> Iterator[None]:
     """Matplotlib settings of this package, for the time of the block."""
     import matplotlib as mpl
 
+    style = files("lbt_synth.report") / "house.mplstyle"
     # a name in a script that the font does not have stays a name
-    with mpl.rc_context(_style()), ignore_warnings(message=r"Glyph .* missing"):
+    with mpl.rc_context(fname=str(style)), ignore_warnings(message=r"Glyph .* missing"):
         yield
-
-
-@cache
-def _style() -> dict[str, Any]:
-    import matplotlib as mpl
-
-    path = str(files("lbt_synth.report") / "house.mplstyle")
-    return dict(mpl.rc_params_from_file(path, use_default_template=False))
 
 
 def require_figure_name(path: str | os.PathLike[str]) -> Path:
@@ -231,12 +220,11 @@ def _draw_own_legend(panel: Panel) -> None:
     entries = _legend_entries([panel])
     if not entries:
         return
-    style: dict[str, Any] = {"handlelength": 3.2}
-    legend = panel.axes.legend(list(entries.values()), list(entries), loc="best", **style)
+    legend = panel.axes.legend(list(entries.values()), list(entries), handlelength=3.2)
     covered, whole = legend.get_window_extent(), panel.axes.get_window_extent()
     if covered.width * covered.height > _MOST_OF_A_PANEL * whole.width * whole.height:
-        beside = {"loc": "upper left", "bbox_to_anchor": (1.02, 1.0), "borderaxespad": 0.0}
-        panel.axes.legend(list(entries.values()), list(entries), **beside, **style)
+        legend.set_loc("upper left")
+        legend.set_bbox_to_anchor((1.02, 1.0), transform=panel.axes.transAxes)
 
 
 def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:

@@ -20,12 +20,10 @@ from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport
-from lbt_synth.report.designs.simulation import DesignSimulation
 from lbt_synth.report.designs.tables import summary_table, truth_table, verdict
 from lbt_synth.report.draw import (
     PANEL_IN,
     Figure,
-    Panel,
     count_columns,
     drawing,
     square_in,
@@ -73,6 +71,7 @@ from lbt_synth.studies.truth_comparison import TruthComparison
 
 _PANELS = 6  # of one figure that has a panel per design: they fit a sheet
 _STEP_NM = 100.0
+_EXCERPT = 400  # frames of a simulated series
 
 
 def write_report(
@@ -400,42 +399,33 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
     runs = [(name, report.simulations[name]) for name in report.simulations]
     if not runs:
         return ["No loop is stable, so none was simulated."]
-    first = runs[0][1]
-    residuals = [f"{name} {nm_text(run.residual_nm, '.1f', unit='nm rms')}" for name, run in runs]
-    facts = {
-        "duration": fixed_text(float(first.time_s[-1]), 2),
-        "residuals": listing_text(residuals),
-    }
-    reach = 1.05 * max(float(np.max(np.abs(run.series_nm[:, 0]))) for _, run in runs)
-    text = f"{count_text(settings.cases, 'run')} of {first.frames} frames each, seed "
-    blocks: list[Block] = [f"{text}{settings.seed}."]
+    _, frames, _ = runs[0][1].run.residual_nm.shape
+    residuals = [f"{name} {nm_text(one.residual_nm, '.1f', unit='nm rms')}" for name, one in runs]
+    series = {name: one.run.residual_nm[0, :_EXCERPT, 0] for name, one in runs}
+    time_s = np.arange(min(frames, _EXCERPT)) / report.config.hardware.frame_rate_hz
+    facts = {"duration": fixed_text(float(time_s[-1]), 2), "residuals": listing_text(residuals)}
+    reach = 1.05 * max(float(np.max(np.abs(y))) for y in series.values())
+    residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
+    text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
+    blocks: list[Block] = [text]
     for number, batch in _sheets(runs):
         with drawing([0.95] * len(batch)) as panels:
-            for panel, (name, run) in zip(panels, batch, strict=True):
-                _draw_series(panel, name, run, report.names.index(name), reach)
+            for panel, (name, _) in zip(panels, batch, strict=True):
+                panel.set_axes(TIME, residual, title=name)
+                own: dict[str, Any] = {"look": report.names.index(name), "width": 0.9, "dash": 0}
+                panel.curve("residual", time_s, series[name], quiet=True, **own)
         blocks.append(chart(f"series{number}", panels[0].figure, **facts))
     for number, batch in _sheets(runs):
         columns = count_columns(len(batch))
         with drawing([2.2] * len(batch), columns=columns) as panels:
-            for panel, (name, run) in zip(panels, batch, strict=True):
-                _draw_spectra(panel, name, run)
+            for panel, (name, one) in zip(panels, batch, strict=True):
+                panel.set_axes(FREQUENCY, SPECTRUM, title=name)
+                f = one.frequency_hz
+                panel.curve("before the correction", f, one.open_nm2_hz, look=None, width=0.8)
+                panel.curve("residual, simulated", f, one.residual_nm2_hz, look=5, dash=0)
+                panel.curve("residual, exact", f, one.exact_nm2_hz, look=1, width=1.4)
         blocks.append(chart(f"spectra{number}", panels[0].figure))
     return blocks
-
-
-def _draw_series(panel: Panel, name: str, run: DesignSimulation, look: int, reach: float) -> None:
-    y_axis = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
-    panel.set_axes(TIME, y_axis, title=name)
-    y = run.series_nm[:, 0]
-    panel.curve("residual", run.time_s, y, look=look, width=0.9, dash=0, quiet=True)
-
-
-def _draw_spectra(panel: Panel, name: str, run: DesignSimulation) -> None:
-    panel.set_axes(FREQUENCY, SPECTRUM, title=name)
-    f = run.frequency_hz
-    panel.curve("before the correction", f, run.open_nm2_hz, look=None, width=0.8)
-    panel.curve("residual, simulated", f, run.residual_nm2_hz, look=5, dash=0)
-    panel.curve("residual, exact", f, run.exact_nm2_hz, look=1, width=1.4)
 
 
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again

@@ -9,7 +9,7 @@ from scipy.signal import welch
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.loop import ClosedLoop, simulate, step_response
+from lbt_synth.loop import ClosedLoop, Simulation, simulate, step_response
 from lbt_synth.loop.simulation.run import LoopStep
 from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
@@ -17,23 +17,20 @@ from lbt_synth.validation import FloatArray, frozen_copy
 
 _MOST_FRAMES = 8192  # of a run
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
-_EXCERPT = 400  # frames that are drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DesignSimulation:
     """One design in a simulated loop."""
 
-    strehl: float  # Mean Strehl ratio of the runs
-    residual_nm: float  # Residual over all runs [nm rms]
-    scatter: float  # Standard deviation of the Strehl ratio between runs; nan for a single one
-    frames: int  # Frames of a run
-    time_s: FloatArray  # (t,): times of the excerpt, from its first frame [s]
-    series_nm: FloatArray  # (t, n): residual of the first run
+    run: Simulation
+    strehl: float  # mean Strehl ratio of the runs
+    scatter: float  # standard deviation of the Strehl ratio between runs; nan for a single one
+    residual_nm: float  # residual over all runs [nm rms]
     frequency_hz: FloatArray  # (f,): frequencies of the spectra
-    # (f,): spectra by Welch's method, sums over the axes
-    open_nm2_hz: FloatArray  # before the correction
-    residual_nm2_hz: FloatArray  # after it
+    # (f,): spectra by Welch's method, sums over the axes, before the correction and after it
+    open_nm2_hz: FloatArray
+    residual_nm2_hz: FloatArray
     # (f,): residual's spectrum by the transfer functions, with the window's image of each sinusoid
     exact_nm2_hz: FloatArray
     step: LoopStep  # of the first axis, without other disturbances
@@ -60,14 +57,11 @@ def simulate_design(
         frequency, density = welch(series, rate, nperseg=length, detrend=False, axis=1)
         spectra.append(density.mean(axis=0).sum(axis=-1))
     strehls = run.strehl(config.imaging)
-    shown = min(frames, _EXCERPT)
     return DesignSimulation(
+        run=run,
         strehl=float(np.mean(strehls)),
-        residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
         scatter=float(np.std(strehls, ddof=1)) if settings.cases > 1 else float("nan"),
-        frames=frames,
-        time_s=frozen_copy(np.arange(shown) / rate),
-        series_nm=frozen_copy(run.residual_nm[0, :shown]),
+        residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
         frequency_hz=frozen_copy(frequency[1:]),
         open_nm2_hz=frozen_copy(spectra[0][1:]),
         residual_nm2_hz=frozen_copy(spectra[1][1:]),
