@@ -22,7 +22,6 @@ from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport
 from lbt_synth.report.designs.tables import summary_table, truth_table, verdict
 from lbt_synth.report.draw import (
-    PANEL_IN,
     Figure,
     count_columns,
     drawing,
@@ -33,9 +32,8 @@ from lbt_synth.report.figures.loops import (
     break_loops,
     draw_bode,
     draw_design,
-    draw_loop_norms,
+    draw_sigma,
     draw_steps,
-    draw_transfer,
     frequency_grid,
 )
 from lbt_synth.report.figures.records import SPECTRUM, TIME, sensor_failure_figure
@@ -62,7 +60,7 @@ from lbt_synth.report.page.blocks import (
     time_text,
 )
 from lbt_synth.report.page.html import require_page_names, write_page
-from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import compare_in_truth
@@ -219,49 +217,48 @@ def _certificate_blocks(report: DesignReport) -> list[Block]:
 
 def _transfer_blocks(report: DesignReport) -> list[Block]:
     """Return singular values of the estimation error and of the closed loops, and their margins."""
-    blocks: list[Block] = []
     names, lines_hz = report.names, report.config.truth.lines_hz
     f = frequency_grid(report.config.hardware.frame_rate_hz, lines_hz)
-    line = {"line": "true vibration" if len(lines_hz) == 1 else "true vibrations"}
     errors = {
-        one.name: largest_singular_values(one.design.error_system(), f)
+        one.name: (f, largest_singular_values(one.design.error_system(), f))
         for one in report.assessments
         if one.design.is_estimator
     }
-    if not report.stable:
-        blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
-    if errors:
-        with drawing([PANEL_IN]) as (panel,):
-            norms = {name: (f, values) for name, values in errors.items()}
-            draw_transfer(panel, "disturbances to error", "nm", norms, names, lines_hz, **line)
-        peaks = [f"{name} {nm_text(float(np.max(norm)))}" for name, norm in errors.items()]
-        blocks.append(chart("sigma", panel.figure, peaks=listing_text(peaks)))
-    if not report.stable:
-        return blocks
     rejections, noises = (
         {
             one.name: (f, spectral_norms(getattr(one.loop, name)(f)) if one.stable else None)
             for one in report.assessments
+            if report.stable
         }
         for name in ("sensitivity", "noise_transfer")
     )
-    with drawing([PANEL_IN, PANEL_IN]) as panels:
-        draw_loop_norms(panels, rejections, noises, names, lines_hz, **line)
     gain = number_text(report.real_gain)
-    largest = {
-        what: listing_text(
-            [
-                f"{name} {number_text(float(np.max(norm)), 3)}"
-                for name, (_, norm) in norms.items()
-                if norm is not None
-            ]
-        )
-        for what, norms in (("rejection", rejections), ("noise", noises))
-    }
-    blocks.append(chart("loop", panels[0].figure, gain=gain, **largest))
-    loops = break_loops({one.name: one.loop for one in report.assessments})
-    margins = listing_text([f"{loop.name} {loop.margins}" for loop in loops])
-    blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
+    blocks: list[Block] = []
+    if not report.stable:
+        blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
+    if errors or report.stable:
+        line = "true vibration" if len(lines_hz) == 1 else "true vibrations"
+        figure = draw_sigma(errors, rejections, noises, names, lines_hz, line=line)
+        largest = {
+            what: listing_text(
+                [
+                    f"{name} {number_text(factor * float(np.max(norm)), 3)}{unit and f' {unit}'}"
+                    for name, (_, norm) in norms.items()
+                    if norm is not None
+                ]
+            )
+            or "none"
+            for what, norms, (unit, factor) in (
+                ("peaks", errors, shown_unit("nm")),
+                ("rejection", rejections, ("", 1.0)),
+                ("noise", noises, ("", 1.0)),
+            )
+        }
+        blocks.append(chart("sigma", figure, gain=gain, **largest))
+    if report.stable:
+        loops = break_loops({one.name: one.loop for one in report.assessments})
+        margins = listing_text([f"{loop.name} {loop.margins}" for loop in loops])
+        blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
     return blocks
 
 

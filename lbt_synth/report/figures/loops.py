@@ -94,19 +94,34 @@ def draw_transfer(
         panel.rule(line, line_hz, dash=3)
 
 
-def draw_loop_norms(
-    panels: Sequence[Panel],
+def draw_sigma(
+    errors: Mapping[str, Norms],
     rejections: Mapping[str, Norms],
     noises: Mapping[str, Norms],
     names: Sequence[str],
     lines_hz: Sequence[float],
-    **more: str,
-) -> None:
-    """Draw rejection and noise transfer of closed loops on two panels."""
-    draw_transfer(panels[0], "phase to residual", "-", rejections, names, lines_hz, **more)
-    panels[0].rule("", 1.0, "y")
-    line = {key: value for key, value in more.items() if key == "line"}
-    draw_transfer(panels[1], "noise to residual", "-", noises, names, lines_hz, **line)
+    *,
+    unit: str = "nm",
+    title: str = "",
+    line: str = "vibration",
+    axes: OwnAxes = None,
+) -> Figure:
+    """Draw estimation errors, and rejection and noise transfer of loops; a panel for what is there.
+
+    The title is that of the loops.
+    """
+    parts = [
+        ("disturbances to error", unit, errors, ""),
+        ("phase to residual", "-", rejections, title),
+        ("noise to residual", "-", noises, ""),
+    ]
+    parts = [part for part in parts if part[2]]
+    with drawing([PANEL_IN] * len(parts), axes=axes) as panels:
+        for panel, (label, of, norms, words) in zip(panels, parts, strict=True):
+            draw_transfer(panel, label, of, norms, names, lines_hz, title=words, line=line)
+            if norms is rejections:
+                panel.rule("", 1.0, "y")
+    return panels[0].figure
 
 
 def sigma_figure(
@@ -157,19 +172,15 @@ def sigma_figure(
     names, lines_hz = list(designs), _vibration_frequencies(designs.values())
     norms = sigma_curves(designs, sensor_gain=sensor_gain, unit_weights=unit_weights)
     errors = {name: (f, error) for name, (f, error, *_) in norms.items() if error is not None}
-    loops = {name: norms[name] for name in names if designs[name].hardware is not None}
-    with drawing([PANEL_IN] * (bool(errors) + 2 * bool(loops)), axes=axes) as panels:
-        if errors:
-            physical = all(designs[name].hardware is not None for name in errors)
-            unit = "nm" if physical and not unit_weights else "-"
-            draw_transfer(panels[0], "disturbances to error", unit, errors, names, lines_hz)
-        if loops:
-            rejections, noises = (
-                {name: (norm[0], norm[i]) for name, norm in loops.items()} for i in (2, 3)
-            )
-            title = f"closed loops at sensor gain {sensor_gain:g}"
-            draw_loop_norms(panels[-2:], rejections, noises, names, lines_hz, title=title)
-    return panels[0].figure
+    rejections, noises = (
+        {name: (norms[name][0], norms[name][i]) for name in names if designs[name].hardware}
+        for i in (2, 3)
+    )
+    physical = all(designs[name].hardware is not None for name in errors)
+    unit = "nm" if physical and not unit_weights else "-"
+    title = f"closed loops at sensor gain {sensor_gain:g}"
+    more: dict[str, Any] = {"unit": unit, "title": title, "axes": axes}
+    return draw_sigma(errors, rejections, noises, names, lines_hz, **more)
 
 
 def sigma_curves(

@@ -61,7 +61,7 @@ def test_the_page_is_complete(text, report, config):
     titles = " ".join(reader.texts["h2"] + reader.texts["h3"])
     for word in (
         "Summary",
-        "Rejection and noise",
+        "Estimation error, rejection and noise",
         "Loop gain and margins",
         "Strehl ratio over the frequency error",
         "Poles",
