@@ -50,7 +50,7 @@ def run(arguments: Namespace) -> Report:
     report = Report(
         data={"source": str(arguments.file), "verdict": verdict, **_diagnosis_data(found)},
         opening=list(verdict),
-        tables=list(diagnosis_tables(found)),
+        tables=[table for own in diagnosis_tables(found).values() for table in own],
         notes=[loop_records.marked_note(note) for note in found.notes],
     )
     if arguments.output is not None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.number_text import number_text, print_text
+from lbt_synth.report.number_text import number_text
 from lbt_synth.report.page.blocks import (
     Block,
     Chart,
@@ -93,66 +92,41 @@ def _spectrum_charts(found: Diagnosis) -> list[Chart]:
     return [chart("identification", figure, lines=listing_text(lines) or "none")]
 
 
-def diagnosis_tables(found: Diagnosis) -> tuple[Table, ...]:
-    """Return the tables of a diagnosis, without those of which nothing is known."""
-    tables = [*record_tables(found), *loop_tables(found), *line_tables(found)]
-    return (*tables, *residual_tables(found))
-
-
-def record_tables(found: Diagnosis) -> list[Table]:
-    """Return the tables of the record: channels, and frames that are lost."""
+def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
+    """Return the tables of a diagnosis by their sections, without those of what is not known."""
     record, health = found.record, found.record.health
     text = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
     if health.jitter_frames is not None:
         text += f", clock jitter {health.jitter_frames:.2g} frames rms"
-    tables = [row_table(f"Record: {text}. {health.summary()}", found.channels)]
-    rows = [
-        (kind, series, "-" if axis is None else AXES[axis], *rest)
+    channels = [row_table(f"Record: {text}. {health.summary()}", found.channels)]
+    faults = tuple(
+        tuple(map(cell_text, (kind, series, "-" if axis is None else AXES[axis], *rest)))
         for kind, series, axis, *rest in health.rows()
         if kind != NOT_KNOWN  # a consequence of other faults, and of the beginning
-    ]
-    if rows:
-        cells = tuple(tuple(map(cell_text, row)) for row in rows)
-        tables.append(Table(caption="Faults", headings=HEADINGS, rows=cells, words=(1, 2, 6)))
-    return tables
-
-
-def loop_tables(found: Diagnosis) -> list[Table]:
-    """Return the tables of the loop that ran."""
-    tables = []
-    if found.commands is not None:
-        caption = "How the commands reach the measurements"
-        tables.append(row_table(caption, [command_row(found.commands)]))
-    if found.law is not None:
-        tables.append(row_table("Control law in use, from y to u", [law_row(found.law)]))
-    if found.loop is not None:
-        tables.append(row_table("Loop", [found.loop]))
-    return tables
-
-
-def line_tables(found: Diagnosis) -> list[Table]:
-    """Return the table of vibrations."""
-    rows = [line.row for line in found.lines]
-    return [row_table("Vibrations, and where they come from", rows)] if rows else []
-
-
-def residual_tables(found: Diagnosis) -> list[Table]:
-    """Return the tables of costs, of residuals on unseen data, and of a given design."""
-    tables = []
-    if found.costs:
-        caption = "What each part leaves by the model of the whole record"
-        if found.best:
-            caption += f" (best design: {found.best})"
-        tables.append(row_table(caption, found.costs))
-    if found.residuals:
-        caption = (
-            "Residual on the second half of the record, by models of the first; "
-            f"{found.imaging.label}"
-        )
-        tables.append(row_table(caption, found.residuals))
-    if found.given is not None:
-        tables.append(fact_table("The gain file on this record", found.given))
-    return tables
+    )
+    if faults:
+        channels.append(Table(caption="Faults", headings=HEADINGS, rows=faults, words=(1, 2, 6)))
+    commands, law = found.commands, found.law
+    loop = {
+        "How the commands reach the measurements": commands and [command_row(commands)],
+        "Control law in use, from y to u": law and [law_row(law)],
+        "Loop": found.loop and [found.loop],
+    }
+    best = f" (best design: {found.best})" if found.best else ""
+    unseen = "Residual on the second half of the record, by models of the first"
+    residuals = {
+        f"What each part leaves by the model of the whole record{best}": found.costs,
+        f"{unseen}; {found.imaging.label}": found.residuals,
+    }
+    given = found.given
+    lines = {"Vibrations, and where they come from": [line.row for line in found.lines]}
+    return {
+        "record": channels,
+        "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],
+        "disturbance": [row_table(caption, rows) for caption, rows in lines.items() if rows],
+        "verdict": [row_table(caption, rows) for caption, rows in residuals.items() if rows]
+        + ([] if given is None else [fact_table("The gain file on this record", given)]),
+    }
 
 
 def write_diagnosis(
@@ -177,20 +151,16 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
     roles = ("record", "gain file")
     read = [read_source(Path(file), role)[0] for file, role in zip(files, roles, strict=False)]
     name = read[0].name if read else found.record.source or "a record"
-    record = found.record
+    record, tables = found.record, diagnosis_tables(found)
+    disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(found)]
     sections = (
-        Section(key="verdict", title="Verdict", blocks=_verdict_blocks(found)),
-        Section(key="record", title="Record", blocks=_print_tables(record_tables(found))),
-        Section(
-            key="loop",
-            title="Loop that ran",
-            blocks=(paragraph("law"), *_print_tables(loop_tables(found))),
-        ),
+        Section(key="verdict", title="Verdict", blocks=_verdict_blocks(found, tables["verdict"])),
+        Section(key="record", title="Record", blocks=tables["record"]),
+        Section(key="loop", title="Loop that ran", blocks=(paragraph("law"), *tables["loop"])),
         Section(
             key="disturbance",
             title="Disturbance",
-            blocks=(*_print_tables(line_tables(found)), *_spectrum_charts(found))
-            or ("No model was identified.",),
+            blocks=disturbance or ["No model was identified."],
         ),
         source_section(read),
     )
@@ -203,29 +173,14 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
     )
 
 
-def _print_tables(tables: Iterable[Table]) -> list[Table]:
-    """Return tables with the signs of print in their words, too."""
-    return [
-        replace(
-            table,
-            rows=tuple(
-                tuple(print_text(cell) if isinstance(cell, str) else cell for cell in row)
-                for row in table.rows
-            ),
-        )
-        for table in tables
-    ]
-
-
-def _verdict_blocks(found: Diagnosis) -> list[Block]:
+def _verdict_blocks(found: Diagnosis, tables: Sequence[Table]) -> list[Block]:
     state, *rest = diagnosis_verdict(found)
     wrong = found.doubt or any(row.serious for row in found.channels)
     doubtful = found.loop is None or found.loop.modulus < NARROW
-    tone = "bad" if wrong else "note" if doubtful else "good"
     return [
-        Notice(text=print_text(state), tone=tone),
-        print_text(" ".join(rest)),
-        *_print_tables(residual_tables(found)),
+        Notice(text=state, tone="bad" if wrong else "note" if doubtful else "good"),
+        " ".join(rest),
+        *tables,
         *_residual_charts(found),
-        *(Notice(text=print_text(f"{note[0].upper()}{note[1:]}")) for note in found.notes),
+        *(Notice(text=f"{note[0].upper()}{note[1:]}") for note in found.notes),
     ]

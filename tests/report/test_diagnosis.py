@@ -11,7 +11,7 @@ from support.pages import Reader
 import lbt_synth as lbt
 from lbt_synth.report.diagnosis import diagnosis_page, write_diagnosis
 from lbt_synth.report.draw import figure_series
-from lbt_synth.storage.tables import Table
+from lbt_synth.report.page.html import page_html
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +39,9 @@ def test_sections_and_charts(page):
 
 
 def test_words_have_the_signs_of_print(page):
-    tables = [block for s in page.sections for block in s.blocks if isinstance(block, Table)]
-    words = [str(cell) for table in tables for row in table.rows for cell in row]
+    reader = Reader(page_html(page).decode())
+    words = [word for tag in ("p", "td", "th", "caption") for word in reader.texts[tag]]
+    assert any("±" in word for word in words)
     assert not [word for word in words if "+-" in word]
 
 

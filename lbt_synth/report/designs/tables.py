@@ -13,7 +13,6 @@ from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport
 from lbt_synth.report.number_text import (
     DASH,
-    MINUS,
     NO_BREAK,
     fixed_text,
     interval_text,
@@ -22,7 +21,6 @@ from lbt_synth.report.number_text import (
 )
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import (
-    Column,
     column,
     columns,
     fill_row,
@@ -225,7 +223,8 @@ def summary_table(report: DesignReport) -> Table:
             if each is not None:
                 title = f"{each.help} [{each.shown_unit}]" if each.unit else each.help
             cells = (
-                own[name] if name in own else _text(printed[name], row) for row, own in designs
+                own[name] if name in own else replace(printed[name], missing=DASH).text(row)
+                for row, own in designs
             )
             lines.append((titles.get(name, title), *cells))
     return Table(
@@ -241,12 +240,6 @@ def truth_table(report: DesignReport) -> Table:
     caption = f"In the truth of {report.config.source.name}; {report.config.imaging.label}"
     without = ("worst_nm", "above_band_limit_percent", "method", "stable")
     return row_table(caption, report.truth.rows, without=without)
-
-
-def _text(each: Column, row: AssessmentRow) -> str:
-    """Return a number of a row with the signs of print."""
-    text = replace(each, missing=DASH).text(row)
-    return text if isinstance(getattr(row, each.name), str) else text.replace("-", MINUS)
 
 
 def _limit_title(name: str, limit: ResidualLimit | BandLimit | None, where: str) -> dict[str, str]:
