@@ -189,38 +189,33 @@ def _own_places(axes: OwnAxes, count: int) -> list[Axes]:
     return places
 
 
-def _legend_entries(panels: Sequence[Panel]) -> dict[str, Any]:
-    """Return the entries of a legend, each name with the first mark that has it."""
+def _legend_entries(panels: Sequence[Panel]) -> tuple[list[Any], list[str]]:
+    """Return marks and texts of a legend, each name with the first mark that has it."""
     entries: dict[str, Any] = {}
     for panel in panels:
         for mark, name in zip(*panel.axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(scales.shorten(name, _LONGEST["name"]), mark)
-    return entries
+            entries.setdefault(name, mark)
+    return list(entries.values()), [scales.shorten(name, _LONGEST["name"]) for name in entries]
 
 
 def _draw_legend(figure: Figure, panels: Sequence[Panel], height: float) -> None:
     """Draw the legend above the panels, and give the figure its height without it [inch]."""
-    entries = _legend_entries(panels)
-    if entries:
-        widest = 0.55 + _LETTER_IN * max(map(len, entries))
-        columns = int(max(1, min(len(entries), (_WIDTH_IN - 0.2) // widest)))
-        figure.legend(
-            list(entries.values()),
-            list(entries),
-            loc="outside upper center",
-            ncols=columns,
-            handlelength=3.2,
-        )
-        height += 0.12 + 0.165 * -(-len(entries) // columns)
+    marks, names = _legend_entries(panels)
+    if names:
+        widest = 0.55 + _LETTER_IN * max(map(len, names))
+        columns = int(max(1, min(len(names), (_WIDTH_IN - 0.2) // widest)))
+        place: dict[str, Any] = {"loc": "outside upper center", "ncols": columns}
+        figure.legend(marks, names, handlelength=3.2, **place)
+        height += 0.12 + 0.165 * -(-len(names) // columns)
     figure.set_size_inches(_WIDTH_IN, height)
 
 
 def _draw_own_legend(panel: Panel) -> None:
     """Draw the legend of the user's axes: in them, or beside them if it would cover too much."""
-    entries = _legend_entries([panel])
-    if not entries:
+    marks, names = _legend_entries([panel])
+    if not names:
         return
-    legend = panel.axes.legend(list(entries.values()), list(entries), handlelength=3.2)
+    legend = panel.axes.legend(marks, names, handlelength=3.2)
     covered, whole = legend.get_window_extent(), panel.axes.get_window_extent()
     if covered.width * covered.height > _MOST_OF_A_PANEL * whole.width * whole.height:
         legend.set_loc("upper left")
@@ -500,7 +495,8 @@ class Panel:
         width_in = self.axes.get_window_extent().width / self.axes.figure.dpi
         if self._flags is not None:
             self._draw_flags(width_in)
-        lines = textwrap.wrap(self._title, max(12, int(width_in / _LETTER_IN)), max_lines=4)
+        letters = max(12, int(width_in / _LETTER_IN))
+        lines = textwrap.wrap(scales.shorten(self._title, 3 * letters), letters)
         self.title_lines = len(lines)
         self.axes.set_title("\n".join(lines), loc="left", parse_math=False)
 

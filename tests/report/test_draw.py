@@ -77,6 +77,13 @@ def test_a_legend_names_what_is_seen():
     assert set(legend(panels[1].axes)) == {*seen, "line beyond", "band beyond"}
 
 
+def test_names_that_are_shortened_alike_stay_two():
+    with drawing([2.0]) as (panel,):
+        for middle in "ab":
+            panel.curve(50 * "x" + middle + 50 * "x", [0.0, 1.0], [0.0, 1.0])
+    assert len(panel.figure.legends[0].get_texts()) == 2
+
+
 @pytest.mark.parametrize("count", [2, 9])
 def test_a_legend_on_own_axes_does_not_cover_them(count):
     axes = Figure(figsize=(4, 2.5), layout="constrained").subplots()
