@@ -18,13 +18,14 @@ import time
 from pathlib import Path
 from statistics import median, quantiles
 
+
 import lbt_synth as lbt
-from lbt_synth.report.explore.evaluation import loop_curves
 from lbt_synth.report.explore.exploration import (
     Wish,
     explore,
     fulfil,
     judge,
+    loop_curves,
     quick_view,
     whole_view,
 )

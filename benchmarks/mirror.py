@@ -11,8 +11,8 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import mirror_figure
-from lbt_synth.report.figures.style import save_figure
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
 SHELL = {"natural_frequency_hz": 20.0, "damping": 0.5}

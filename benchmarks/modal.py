@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 
 import lbt_synth as lbt
 from lbt_synth.models.turbulence.zernike import noll_orders
-from lbt_synth.report.figures.style import save_figure
+from lbt_synth.report.draw import save_figure
 
 MODES, RATE_HZ, FRAMES = 672, 800.0, 4000
 

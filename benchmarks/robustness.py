@@ -14,7 +14,7 @@ from rich.table import Table
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
-from lbt_synth.report.figures.style import house_style
+from lbt_synth.report.draw import house_style
 from lbt_synth.studies.paper import parameters as paper
 from lbt_synth.studies.paper.tables import paper_filters
 

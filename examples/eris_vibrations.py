@@ -23,9 +23,7 @@ from typing import Any
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.report.charts.description import Axis, Curve, Panel, Rule
-from lbt_synth.report.charts.matplotlib_charts import draw_figure
-from lbt_synth.report.figures.style import save_figure
+from lbt_synth.report.draw import drawing, save_figure
 
 FILE = Path(__file__).parent / "data" / "eris_vibrations_psd.fits"
 BACKGROUND_NM2_HZ = 4e4  # at 1 Hz, falling with the square of the frequency; see docs/eris.md
@@ -246,27 +244,29 @@ def figure(
     f = np.union1d(np.geomspace(0.5, 499.0, 1500), seen.frequency_hz)
     whole = met.whole.turbulence_per_mode(seen.axes)
     noise = 2 * NOISE_NM**2 / FRAME_RATE_HZ
-    x = Axis(label="frequency", unit="Hz", log=True, low=0.5, high=499.0)
-    spectra, rejections, totals = [], [], []
-    for i in range(seen.axes):
-        density = whole[i].psd(f)
-        y = Axis(label="density", unit="nm²/Hz", log=True, low=0.1, high=1e6)
-        spectrum = Curve(name="disturbance", x=f, y=density, look=None, width=0.7)
-        level = Rule(name="noise", at=noise, axis="y", dash=3)
-        spectra.append(Panel(title=("tip", "tilt")[i], x=x, y=y, marks=(spectrum, level)))
-        rejection: list[Curve | Rule] = [Rule(name="", at=1.0, axis="y")]
-        total = []
-        for look, (name, loop) in enumerate(loops.items()):
-            rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
-            passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
-            left = accumulated(f, rejected * density + passed * noise)
-            rejection.append(Curve(name=name, x=f, y=np.sqrt(rejected), look=look, width=0.9))
-            total.append(Curve(name=name, x=f, y=np.sqrt(left), look=look))
-        y = Axis(label="rejection", unit="-", log=True, low=5e-3, high=5.0)
-        rejections.append(Panel(x=x, y=y, marks=tuple(rejection)))
-        y = Axis(label="residual up to the frequency", unit="nm rms", low=0.0)
-        totals.append(Panel(x=x, y=y, marks=tuple(total), height_in=2.6))
-    return draw_figure([*spectra, *rejections, *totals], columns=seen.axes)
+    frequency = {"label": "frequency", "unit": "Hz", "log": True, "low": 0.5, "high": 499.0}
+    axes = (
+        {"label": "density", "unit": "nm²/Hz", "log": True, "low": 0.1, "high": 1e6},
+        {"label": "rejection", "unit": "-", "log": True, "low": 5e-3, "high": 5.0},
+        {"label": "residual up to the frequency", "unit": "nm rms", "low": 0.0},
+    )
+    heights = [height for height in (2.1, 2.1, 2.6) for _ in range(seen.axes)]
+    with drawing(heights, columns=seen.axes) as panels:
+        for i in range(seen.axes):
+            density, column = whole[i].psd(f), panels[i :: seen.axes]
+            for panel, axis, title in zip(column, axes, (("tip", "tilt")[i], "", ""), strict=True):
+                panel.set_axes(frequency, axis, title=title)
+            spectrum, rejection, total = column
+            spectrum.curve("disturbance", f, density, look=None, width=0.7)
+            spectrum.rule("noise", noise, "y", dash=3)
+            rejection.rule("", 1.0, "y")
+            for look, (name, loop) in enumerate(loops.items()):
+                rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
+                passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
+                left = accumulated(f, rejected * density + passed * noise)
+                rejection.curve(name, f, np.sqrt(rejected), look=look, width=0.9)
+                total.curve(name, f, np.sqrt(left), look=look)
+    return panels[0].figure
 
 
 def accumulated(f: np.ndarray, density: np.ndarray) -> np.ndarray:

@@ -18,8 +18,8 @@ from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.diagnosis.channels import live_axes
 from lbt_synth.identification.diagnosis.running_loop import command_row
 from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
-from lbt_synth.report.diagnosis.page import diagnosis_tables, write_diagnosis
-from lbt_synth.report.page.page_files import require_page_names
+from lbt_synth.report.diagnosis import diagnosis_tables, write_diagnosis
+from lbt_synth.report.page.html import require_page_names
 from lbt_synth.storage.rows import json_record
 
 _STEPS = 4
@@ -50,7 +50,7 @@ def run(arguments: Namespace) -> Report:
     report = Report(
         data={"source": str(arguments.file), "verdict": verdict, **_diagnosis_data(found)},
         opening=list(verdict),
-        tables=list(diagnosis_tables(found)),
+        tables=[table for own in diagnosis_tables(found).values() for table in own],
         notes=[loop_records.marked_note(note) for note in found.notes],
     )
     if arguments.output is not None:

@@ -21,8 +21,8 @@ from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.calibration import Calibration
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.interop.specula.simulation import unread_sensors
-from lbt_synth.report.figures.end_to_end import end_to_end_figure, end_to_end_table_figure
-from lbt_synth.report.figures.style import save_figure
+from lbt_synth.report.draw import save_figure
+from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table_figure
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import (

@@ -11,7 +11,7 @@ from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.explore.exploration import explore, first_wish, quick_view, whole_view
+from lbt_synth.report.explore.exploration import Wish, explore, quick_view, whole_view
 from lbt_synth.storage.atomic_files import require_writable
 
 _MOST_PORTS = 65535
@@ -31,11 +31,11 @@ def run(arguments: Namespace) -> Report:
     require_writable(folder / "explored-1.yaml")
     config = load_shown(arguments)
     exploration = explore(config, load_designs(arguments.gains))
-    first = whole_view(exploration, quick_view(exploration, first_wish()))
+    first = whole_view(exploration, quick_view(exploration, Wish()))
 
-    from lbt_synth.report.explore.server import Site, serve  # bokeh's server, slow to import
+    from lbt_synth.report.explore.server import serve  # bokeh's server, slow to import
 
-    site, served = Site(exploration=exploration, first=first, folder=folder), []
+    served = []
 
     def announce(url: str) -> None:
         stream = sys.stderr if arguments.json else sys.stdout
@@ -49,9 +49,15 @@ def run(arguments: Namespace) -> Report:
             )
         served.append(url)
 
-    serve(
-        site, host=arguments.host, port=arguments.port, origins=arguments.origin, announce=announce
+    saved = serve(
+        exploration,
+        first,
+        folder,
+        host=arguments.host,
+        port=arguments.port,
+        origins=arguments.origin,
+        announce=announce,
     )
     report = Report(data={"url": served[0]})
-    report.note_files(site.saved)
+    report.note_files(saved)
     return report

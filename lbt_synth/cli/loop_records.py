@@ -34,8 +34,8 @@ from lbt_synth.identification.fit.identified_model import axis_names, model_tabl
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import LEAST_SECONDS
 from lbt_synth.loop import Imaging
+from lbt_synth.report.draw import require_figure_name, save_figure
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.figures.style import require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import number

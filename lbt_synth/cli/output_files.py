@@ -11,7 +11,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.files.telemetry.aot import lost_fields
 from lbt_synth.files.telemetry.store import require_telemetry_name
-from lbt_synth.report.figures.style import FIGURE_ENDINGS, require_figure_name, save_figure
+from lbt_synth.report.draw import FIGURE_ENDINGS, require_figure_name, save_figure
 from lbt_synth.storage.atomic_files import require_writable, write_atomically
 from lbt_synth.storage.rows import csv_rows
 

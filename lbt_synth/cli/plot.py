@@ -24,9 +24,7 @@ from lbt_synth.report.figures import (
     sigma_figure,
     step_figure,
 )
-from lbt_synth.report.figures.open_loops import axes_name, open_loops
-from lbt_synth.report.figures.sigma import sigma_curves
-from lbt_synth.report.figures.step import design_steps
+from lbt_synth.report.figures.loops import axes_name, design_steps, open_loops, sigma_curves
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import column, columns, fact, facts, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray

@@ -24,8 +24,8 @@ from lbt_synth.loop import Imaging, series_strehl
 from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report.figures.simulation import simulation_figure
-from lbt_synth.report.figures.style import save_figure
+from lbt_synth.report.draw import save_figure
+from lbt_synth.report.figures.records import simulation_figure
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.validation import FloatArray, integer
 

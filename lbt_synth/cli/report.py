@@ -9,17 +9,16 @@ from typing import Any
 from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import load_designs, named_difference_notes
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import count_progress, show_spinner
+from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import design_report, write_report
-from lbt_synth.report.designs.assessment import DesignAssessment
-from lbt_synth.report.designs.report import count_steps
+from lbt_synth.report.designs.page import write_sensors_report
+from lbt_synth.report.designs.report import DesignAssessment
 from lbt_synth.report.designs.tables import AssessmentRow, assessment_row, good_range, verdict
-from lbt_synth.report.page.page_files import require_page_names
-from lbt_synth.report.provenance import require_letters, time_text
-from lbt_synth.report.sensors import write_sensors_report
+from lbt_synth.report.page.blocks import require_letters, time_text
+from lbt_synth.report.page.html import require_page_names
 from lbt_synth.storage.rows import json_record, json_units, row_table
 
 _IN_MARGINS = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz")
@@ -38,11 +37,9 @@ def run(arguments: Namespace) -> Report:
     files = dict(zip(designs, arguments.gains, strict=True))
     if several:
         return _report_sensors(arguments, config, designs, several, files)
-    total = count_steps(len(designs)) + 1
-    with count_progress(total=total, what="report", quiet=arguments.json) as count:
-        found = design_report(config, designs, gain_files=files, advance=count)
+    with show_spinner("report", quiet=arguments.json):
+        found = design_report(config, designs, gain_files=files)
         written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
-        count(1)
     rows = [assessment_row(found, one, limits) for one, limits in found.rows]
     report = Report(
         data={

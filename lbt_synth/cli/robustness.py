@@ -21,8 +21,7 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, stable_sensor_gains
-from lbt_synth.report.designs.assessment import require_compatible
-from lbt_synth.report.designs.report import refine_values
+from lbt_synth.report.designs.report import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, percent_column, row_table, table_row

@@ -35,8 +35,8 @@ from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_o
 from lbt_synth.loop.simulation.failing_sensors import READINGS, Drop
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import Truth
-from lbt_synth.report.figures.simulation import sensor_failure_figure, simulation_figure
-from lbt_synth.report.figures.style import save_figure
+from lbt_synth.report.draw import save_figure
+from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.input_files import file_sha256

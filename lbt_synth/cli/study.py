@@ -13,7 +13,7 @@ from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import write_study_page
-from lbt_synth.report.page.page_files import require_weasyprint
+from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import fact, facts
 from lbt_synth.storage.words import count_text, duration_text

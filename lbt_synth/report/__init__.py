@@ -1,7 +1,7 @@
 """Figures and pages that people read.
 
-Figures are drawn by matplotlib for papers.
-Pages are single HTML files with interactive charts, and PDF on request.
+Matplotlib draws every figure, for files, for your own axes and for pages.
+Pages are single HTML files without scripts, and PDF on request.
 Every number on a page comes from a study or a design, never from the page.
 """
 

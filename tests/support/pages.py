@@ -6,19 +6,8 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from lbt_synth.report.charts.description import (
-    Area,
-    Axis,
-    Bars,
-    Chart,
-    Curve,
-    Flags,
-    Map,
-    Panel,
-    Rule,
-    Span,
-)
-from lbt_synth.report.page.blocks import Listing, Notice, Page, Paragraph, Section
+from lbt_synth.report.draw import PANEL_IN, drawing, square_in
+from lbt_synth.report.page.blocks import Chart, Listing, Notice, Page, Section
 from lbt_synth.storage.tables import Cell, Table
 
 HOSTILE = "</script><script>alert(1)</script><b>&\"'$x$ $$y$$ _z"
@@ -62,103 +51,47 @@ class Reader(HTMLParser):
 def every_mark(name: str = "first") -> tuple[Chart, ...]:
     """Charts with every kind of mark."""
     f = np.geomspace(0.1, 400, 50)
-    frequency = Axis(label="frequency", unit="Hz", log=True)
-    lines = Chart(
-        key="lines",
-        title=f"Lines of {name}",
-        caption="Lines, areas, rules and spans.",
-        alt="Two curves that fall.",
-        panels=(
-            Panel(
-                x=frequency,
-                y=Axis(label="size", unit="-", log=True),
-                marks=(
-                    Span(name="band", low=10, high=20),
-                    Area(name="spread", x=f, low=0.5 / f, high=2 / f, look=2),
-                    Area(name="", x=f[:9], low=1e-4 / f[:9], high=2e-4 / f[:9], look=2, solid=True),
-                    Rule(name="line at 20 Hz", at=20.0, dash=3),
-                    Curve(name=name, x=f, y=1 / f, look=0),
-                    Curve(name="second", x=f, y=np.where(f < 5, np.nan, 1 / f**2), look=1),
-                    Curve(
-                        name="dots",
-                        x=f[::5],
-                        y=1 / f[::5],
-                        error=0.5 / f[::5],
-                        line=False,
-                        marker="own",
-                        look=3,
-                    ),
-                    Flags(x=[2.0, 3.0], y=[0.5, 0.3], texts=(name, "flag")),
-                    Curve(name="only named", x=[], y=[], look=4),
-                ),
-            ),
-            Panel(
-                x=frequency,
-                y=Axis(label="steps", unit="nm"),
-                marks=(
-                    Span(name="range", axis="y", low=0.1, high=0.2, look=5),
-                    Rule(name="level", at=0.3, axis="y"),
-                    Curve(name=name, x=f, y=1 / f, step="after", look=0),
-                ),
-            ),
-        ),
-    )
+    frequency = {"label": "frequency", "unit": "Hz", "log": True}
+    with drawing([PANEL_IN, PANEL_IN]) as (above, below):
+        above.set_axes(frequency, {"label": "size", "unit": "-", "log": True})
+        above.span("band", 10, 20)
+        above.area("spread", f, 0.5 / f, 2 / f, look=2)
+        above.area("", f[:9], 1e-4 / f[:9], 2e-4 / f[:9], look=2, solid=True)
+        above.rule("line at 20 Hz", 20.0, dash=3)
+        above.curve(name, f, 1 / f)
+        above.curve("second", f, np.where(f < 5, np.nan, 1 / f**2), look=1)
+        dots = {"line": False, "marker": "own", "look": 3}
+        above.curve("dots", f[::5], 1 / f[::5], error=0.5 / f[::5], **dots)
+        above.flags([2.0, 3.0], [0.5, 0.3], (name, "flag"))
+        above.curve("only named", [], [], look=4)
+        below.set_axes(frequency, {"label": "steps", "unit": "nm"})
+        below.span("range", 0.1, 0.2, "y", look=5)
+        below.rule("level", 0.3, "y")
+        below.curve(name, f, 1 / f, step="steps-post")
+    words = {"caption": "Lines, areas, rules and spans.", "alt": "Two curves that fall."}
+    lines = Chart(key="lines", title=f"Lines of {name}", figure=above.figure, **words)
     values = np.arange(30.0).reshape(5, 6)
     values[0] = np.nan
     values[3, 2] = np.nan
-    maps = Chart(
-        key="maps",
-        title="Maps",
-        caption="Two maps.",
-        alt="Values rise to the upper right.",
-        columns=2,
-        panels=tuple(
-            Panel(
-                title=title,
-                x=Axis(label="error", unit="Hz"),
-                y=Axis(label="gain", unit="-"),
-                marks=(
-                    Map(
-                        x=np.arange(6.0),
-                        y=[0.2, 0.4, 0.7, 1.0, 1.4],
-                        values=values,
-                        low=1 if title == "other" else 0,
-                        high=30,
-                        label="ratio",
-                        unit="%",
-                        log=title == "other",
-                        levels=(10, 20),
-                        blank="unstable",
-                    ),
-                ),
+    with drawing([PANEL_IN, PANEL_IN], columns=2) as panels:
+        for panel, title in zip(panels, (name, "other"), strict=True):
+            panel.set_axes(
+                {"label": "error", "unit": "Hz"}, {"label": "gain", "unit": "-"}, title=title
             )
-            for title in (name, "other")
-        ),
-    )
+            ends, gains = (float(title == "other"), 30.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4])
+            more = {"log": title == "other", "levels": (10, 20), "blank": "unstable"}
+            panel.map(np.arange(6.0), gains, values, "ratio", "%", ends=ends, **more)
+    words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
+    maps = Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
     turn = np.linspace(0, 2 * np.pi, 61)
-    rest = Chart(
-        key="rest",
-        title="Bars and a plane",
-        caption="Bars and a plane.",
-        alt="Three bars, one circle.",
-        panels=(
-            Panel(
-                x=Axis(label="share", unit="%", low=0),
-                y=Axis(label="parameter"),
-                categories=("a.b", name, "c"),
-                marks=(
-                    Bars(name="first order", values=[1, 2, 3], low=[0.5, 1, 2], high=[2, 3, 4]),
-                    Bars(name="total", values=[2, np.nan, 4], look=1),
-                ),
-            ),
-            Panel(
-                x=Axis(label="real"),
-                y=Axis(label="imaginary"),
-                equal=True,
-                marks=(Curve(name="", x=np.cos(turn), y=np.sin(turn), look=None),),
-            ),
-        ),
-    )
+    with drawing([1.0, square_in(1)]) as (bars, plane):
+        bars.set_axes({"label": "share", "unit": "%", "low": 0}, {})
+        lengths = {"first order": [1, 2, 3], "total": [2, np.nan, 4]}
+        bars.bars(("a.b", name, "c"), lengths, {"first order": ([0.5, 1, 2], [2, 3, 4])})
+        plane.set_axes({"label": "real"}, {"label": "imaginary"}, equal=True)
+        plane.curve("", np.cos(turn), np.sin(turn), look=None)
+    words = {"caption": "Bars and a plane.", "alt": "Three bars, one circle."}
+    rest = Chart(key="rest", title="Bars and a plane", figure=bars.figure, **words)
     return lines, maps, rest
 
 
@@ -183,7 +116,7 @@ def whole_page(name: str = "first") -> Page:
                 key="summary",
                 title=f"Summary of {name}",
                 blocks=(
-                    Paragraph(text=f"Words of {name}. " * 20),
+                    f"Words of {name}. " * 20,
                     Notice(text=f"{name} is bad", tone="bad"),
                     Notice(text="note", tone="note"),
                     table,
@@ -197,15 +130,4 @@ def whole_page(name: str = "first") -> Page:
                 blocks=(Listing(caption=name, text=f"a: 1\n\tb: {name}\n" + 200 * "x"),),
             ),
         ),
-    )
-
-
-def many_panels(count, title="p", columns=2):
-    """A chart of so many equal panels."""
-    x = np.linspace(0, 1, 5)
-    panel = Panel(
-        title=title, x=Axis(label="x"), y=Axis(label="y"), marks=(Curve(name="a", x=x, y=x),)
-    )
-    return Chart(
-        key="many", title="Many", caption="c", alt="a", panels=count * (panel,), columns=columns
     )

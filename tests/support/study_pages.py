@@ -1,12 +1,14 @@
 """A study with all that can go wrong in one, and its page."""
 
-from datetime import UTC, datetime
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
+from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.report.study.page import study_page
-from lbt_synth.report.study.sections import StudyInfo
+from lbt_synth.report.study import study_page
 
 PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")
 
@@ -40,28 +42,21 @@ def results(n=300, seed=0):
 
 
 CONTROLLERS = ("steady", "sharp", "frail")
-INFO = StudyInfo(
-    name="night.yaml",
-    samples=300,
-    sampling="points of a scrambled Sobol sequence, seed 1",
-    evaluation="each evaluated exactly",
-    parameters={"truth.sensor_gain": "uniform from 0.4 to 1.1"},
-    controllers={"steady": "kalman for the configuration"},
-    digests={"steady": "0123456789abcdef" * 4},
-    digest="fedcba98" * 8,
-    failures=tuple(
-        lbt.studies.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
-        for row in range(0, 300, 20)
-    ),
-    files=(),
-    texts={"Study night.yaml": "samples: 300 # & <script>"},
-    versions=(("numpy", "2.4"),),
-    made=datetime(2026, 11, 21, tzinfo=UTC),
-    computing_s=75.0,
-    replay="lbt-synth study night.yaml -o out --row {row}",
-)
+FAILURES = [
+    lbt.studies.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
+    for row in range(0, 300, 20)
+]
 
 
-def page_of(columns, controllers=CONTROLLERS, parameters=PARAMETERS, info=INFO):
+@cache
+def night():
+    """A study of 300 samples, read from night.yaml."""
+    study = lbt.studies.load_study(ROOT / "examples" / "study.yaml")
+    settings = study.settings.model_copy(update={"samples": 300})
+    return replace(study, settings=settings, source=Path("night.yaml"))
+
+
+def page_of(columns, controllers=CONTROLLERS, parameters=PARAMETERS, study=None):
     statistics = lbt.studies.study_statistics(columns, parameters, controllers)
-    return study_page(info, statistics, columns)
+    more = {"folder": Path("out"), "failures": FAILURES, "computing_s": 75.0}
+    return study_page(study or night(), statistics, columns, **more)

@@ -1,31 +1,75 @@
-"""A report of designs as a page, and the files that it becomes."""
+"""Pages of designs: their sections, charts and words, and their files."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
+from lbt_synth.config import Config
+from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
+from lbt_synth.linear import largest_singular_values
+from lbt_synth.linear.norms import spectral_norms
+from lbt_synth.loop.simulation.failing_sensors import Drop
 from lbt_synth.models import SinusoidalVibration
+from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.report.designs.charts import (
-    pole_and_step_charts,
-    robustness_charts,
-    simulation_charts,
-    transfer_charts,
+from lbt_synth.report.designs.report import DesignAssessment, DesignReport
+from lbt_synth.report.designs.tables import summary_table, truth_table, verdict
+from lbt_synth.report.draw import (
+    Figure,
+    count_columns,
+    drawing,
+    square_in,
 )
-from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.designs.tables import certificate_table, summary_table, truth_table, verdict
-from lbt_synth.report.number_text import number_text
-from lbt_synth.report.page.blocks import Block, Notice, Page, Paragraph, Section
-from lbt_synth.report.page.page_files import require_page_names, write_page
-from lbt_synth.report.page.source_section import source_section
-from lbt_synth.report.page.words import paragraph
-from lbt_synth.report.provenance import require_letters, time_text
-from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.report.figures.loops import (
+    FREQUENCY,
+    break_loops,
+    draw_bode,
+    draw_design,
+    draw_sigma,
+    draw_steps,
+    frequency_grid,
+)
+from lbt_synth.report.figures.records import SPECTRUM, TIME, sensor_failure_figure
+from lbt_synth.report.figures.studies import (
+    FREQUENCY_ERROR,
+    draw_limits,
+    draw_maps,
+    strehl_axis,
+    strehl_ends,
+)
+from lbt_synth.report.number_text import fixed_text, number_text, signed_text
+from lbt_synth.report.page.blocks import (
+    Block,
+    Chart,
+    Notice,
+    Page,
+    Section,
+    chart,
+    creation_time,
+    paragraph,
+    read_source,
+    require_letters,
+    source_section,
+    time_text,
+)
+from lbt_synth.report.page.html import require_page_names, write_page
+from lbt_synth.storage.display_unit import nm_text, shown_unit
+from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
+from lbt_synth.studies import compare_in_truth
+from lbt_synth.studies.sensor_failures import run_failures
+from lbt_synth.studies.truth_comparison import TruthComparison
+
+_PANELS = 6  # of one figure that has a panel per design: they fit a sheet
+_STEP_NM = 100.0
+_EXCERPT = 400  # frames of a simulated series
 
 
 def write_report(
@@ -84,14 +128,12 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     count = len(report.assessments)
     names = listing_text([one.name for one in report.assessments])
     sections = [
-        Section(key="summary", title="Summary", blocks=tuple(_summary_blocks(report))),
-        Section(key="transfer", title="Transfer functions", blocks=tuple(_transfer_blocks(report))),
-        Section(key="errors", title="Robustness", blocks=tuple(robustness_charts(report))),
-        Section(key="dynamics", title="Dynamics", blocks=tuple(pole_and_step_charts(report))),
-        Section(key="simulation", title="Simulation", blocks=tuple(_simulation_blocks(report))),
-        Section(
-            key="certificates", title="Certificates", blocks=tuple(_certificate_blocks(report))
-        ),
+        Section(key="summary", title="Summary", blocks=_summary_blocks(report)),
+        Section(key="transfer", title="Transfer functions", blocks=_transfer_blocks(report)),
+        Section(key="errors", title="Robustness", blocks=_robustness_charts(report)),
+        Section(key="dynamics", title="Dynamics", blocks=_dynamics_charts(report)),
+        Section(key="simulation", title="Simulation", blocks=_simulation_blocks(report)),
+        Section(key="certificates", title="Certificates", blocks=_certificate_blocks(report)),
         source_section(report.files, versions=report.versions, texts={source: report.config_text}),
     ]
     return Page(
@@ -108,7 +150,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             text = paragraph(
                 "unstable",
                 name=one.name,
-                radius=number_text(one.spectral_radius, 6),
+                radius=number_text(one.loop.spectral_radius, 6),
                 gain=number_text(report.real_gain),
             )
             blocks.append(Notice(text=text, tone="bad"))
@@ -121,7 +163,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             blocks.append(Notice(text=f"The certificate of {one.name} fails: {why}", tone="bad"))
     return [
         *blocks,
-        Paragraph(text=verdict(report)),
+        verdict(report),
         summary_table(report),
         truth_table(report),
         *(
@@ -130,7 +172,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             for text in report.truth.warnings[one.name]
         ),
         *(Notice(text=note) for note in report.truth.notes),
-        Paragraph(text=_situation_text(report)),
+        _situation_text(report),
         *(
             Notice(text=f"{one.name} was {note}")
             for one in report.assessments
@@ -161,32 +203,311 @@ def _situation_text(report: DesignReport) -> str:
     )
 
 
-def _transfer_blocks(report: DesignReport) -> list[Block]:
-    """Return the charts of transfer functions, and say so if no loop is stable."""
-    charts: list[Block] = [*transfer_charts(report)]
-    if report.stable:
-        return charts
-    return [
-        Paragraph(text="No loop is stable, so none has a rejection or a noise transfer."),
-        *charts,
-    ]
-
-
-def _simulation_blocks(report: DesignReport) -> list[Block]:
-    settings = report.config.settings.simulation
-    charts = simulation_charts(report)
-    if not charts:
-        return [Paragraph(text="No loop is stable, so none was simulated.")]
-    frames = next(iter(report.simulations.values())).frames
-    text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
-    return [Paragraph(text=text), *charts]
-
-
 def _certificate_blocks(report: DesignReport) -> list[Block]:
-    blocks: list[Block] = [Paragraph(text=paragraph("certificates"))]
+    blocks: list[Block] = [paragraph("certificates")]
     for one in report.assessments:
         missing = f"{one.name}: not computed: {one.certificate_error}"
         blocks.append(
-            Notice(text=missing, tone="bad") if one.certificate_error else certificate_table(one)
+            Notice(text=missing, tone="bad")
+            if one.certificate_error
+            else row_table(f"Certificate of {one.name}", one.checks)
         )
     return blocks
+
+
+def _transfer_blocks(report: DesignReport) -> list[Block]:
+    """Return singular values of the estimation error and of the closed loops, and their margins."""
+    names, lines_hz = report.names, report.config.truth.lines_hz
+    f = frequency_grid(report.config.hardware.frame_rate_hz, lines_hz)
+    errors = {
+        one.name: (f, largest_singular_values(one.design.error_system(), f))
+        for one in report.assessments
+        if one.design.is_estimator
+    }
+    rejections, noises = (
+        {
+            one.name: (f, spectral_norms(getattr(one.loop, name)(f)) if one.stable else None)
+            for one in report.assessments
+            if report.stable
+        }
+        for name in ("sensitivity", "noise_transfer")
+    )
+    gain = number_text(report.real_gain)
+    blocks: list[Block] = []
+    if not report.stable:
+        blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
+    if errors or report.stable:
+        line = "true vibration" if len(lines_hz) == 1 else "true vibrations"
+        figure = draw_sigma(errors, rejections, noises, names, lines_hz, line=line)
+        largest = {
+            what: listing_text(
+                [
+                    f"{name} {number_text(factor * float(np.max(norm)), 3)}{unit and f' {unit}'}"
+                    for name, (_, norm) in norms.items()
+                    if norm is not None
+                ]
+            )
+            or "none"
+            for what, norms, (unit, factor) in (
+                ("peaks", errors, shown_unit("nm")),
+                ("rejection", rejections, ("", 1.0)),
+                ("noise", noises, ("", 1.0)),
+            )
+        }
+        blocks.append(chart("sigma", figure, gain=gain, **largest))
+    if report.stable:
+        loops = break_loops({one.name: one.loop for one in report.assessments})
+        margins = listing_text([f"{loop.name} {loop.margins}" for loop in loops])
+        blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
+    return blocks
+
+
+def _robustness_charts(report: DesignReport) -> list[Chart]:
+    """Strehl ratio and residual over the frequency error, and maps with the sensor gain."""
+    if report.errors_hz.size == 1:
+        return [_sensor_gain_chart(report)]
+    charts = [_strehl_chart(report), _residual_chart(report)] if report.stable else []
+    ends = strehl_ends([one.map for one in report.assessments])
+    for number, batch in _sheets(report.assessments):
+        maps = {one.name: one.map for one in batch}
+        figure = draw_maps(maps, real_gain=report.real_gain, ends=ends)
+        charts.append(chart(f"map{number}", figure, ranges=_map_texts(batch)))
+    return charts
+
+
+def _sheets(items: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
+    """Yield the items of figures that each fit a sheet of paper, and the end of their keys."""
+    for start in range(0, len(items), _PANELS):
+        number = f"-{start // _PANELS + 1}" if start else ""
+        yield number, items[start : start + _PANELS]
+
+
+def _strehl_chart(report: DesignReport) -> Chart:
+    worst = {one.name: one.curve.strehl[0, 0] for one in report.stable}
+    ends = [
+        f"{name} falls to {fixed_text(100 * float(np.min(strehl)), 1)} % at "
+        f"{signed_text(float(report.errors_hz[np.argmin(strehl)]))} Hz"
+        for name, strehl in worst.items()
+    ]
+    with drawing([2.5]) as (panel,):
+        values = np.concatenate([100 * strehl for strehl in worst.values()])
+        panel.set_axes(FREQUENCY_ERROR, strehl_axis(values))
+        for one in report.assessments:
+            percents = 100 * one.curve.strehl[0, 0] if one.stable else None
+            draw_design(panel, report.names, one.name, one.curve.errors_hz, percents)
+    gain = number_text(report.real_gain)
+    return chart("robustness", panel.figure, gain=gain, ends=listing_text(ends))
+
+
+def _residual_chart(report: DesignReport) -> Chart:
+    study = report.limits
+    figure = draw_limits(study, report.names, FREQUENCY_ERROR)
+    limits = [
+        f"{name} {nm_text(limit.rms_nm, '.1f')}"
+        for name, limit in (
+            ("limit, frequency known", study.limit),
+            ("limit, frequency anywhere in this range", study.band),
+        )
+        if limit is not None and limit.rms_nm > 0
+    ]
+    worst = [f"{row.design} {nm_text(row.worst_nm, '.1f')}" for row in study.rows if row.stable]
+    said = f" Limits: {listing_text(limits)}." if limits else ""
+    return chart("limits", figure, worst=listing_text(worst), limits=said)
+
+
+def _map_texts(assessments: Sequence[DesignAssessment]) -> str:
+    """Say of each design how far its Strehl ratio ranges over its map."""
+    texts = []
+    for one in assessments:
+        values = 100 * one.map.strehl[np.isfinite(one.map.strehl)]
+        if not values.size:
+            texts.append(f"{one.name}: unstable everywhere.")
+            continue
+        texts.append(
+            f"{one.name}: {fixed_text(float(values.min()), 1)} to "
+            f"{fixed_text(float(values.max()), 1)} %, stable at {int(one.map.stable.sum())} of "
+            f"{one.map.stable.size} sensor gains."
+        )
+    return " ".join(texts)
+
+
+def _sensor_gain_chart(report: DesignReport) -> Chart:
+    """Strehl ratio over the sensor gain, drawn for a truth without vibrations."""
+    with drawing([2.5]) as (panel,):
+        y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0.0}
+        panel.set_axes({"label": "sensor gain", "unit": "-"}, y_axis)
+        for one in report.assessments:
+            percents = 100 * one.map.strehl[0, :, 0]
+            draw_design(panel, report.names, one.name, one.map.sensor_gains, percents)
+        panel.rule("real sensor gain", report.real_gain, dash=3)
+    return chart("sensor-gain", panel.figure, ranges=_map_texts(report.assessments))
+
+
+def _dynamics_charts(report: DesignReport) -> list[Chart]:
+    """Poles, and step responses."""
+    poles = [
+        (one.loop.system.poles, np.linalg.eigvals(one.design.controller.A))
+        for one in report.assessments
+    ]
+    reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for pair in poles for values in pair))
+    radii = [f"{one.name} {number_text(one.loop.spectral_radius, 6)}" for one in report.assessments]
+    charts = [
+        chart(f"poles{number}", _draw_poles(batch, reach), radii=listing_text(radii))
+        for number, batch in _sheets(list(zip(report.assessments, poles, strict=True)))
+    ]
+    if not report.stable:
+        return charts
+    steps = {one.name: (report.simulations[one.name].step,) for one in report.stable}
+    peaks = [
+        f"{name} {nm_text(_STEP_NM * float(np.max(np.abs(step.residual[5:]))), '.0f')}"
+        for name, (step,) in steps.items()
+    ]
+    facts = {
+        "step": nm_text(_STEP_NM, ".4g"),
+        "frame": number_text(1e3 / report.config.hardware.frame_rate_hz),
+        "peaks": listing_text(peaks),
+    }
+    return [*charts, chart("step", draw_steps(steps, height_nm=_STEP_NM), **facts)]
+
+
+def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
+    """Draw the poles of the closed loop and of the controller of each design."""
+    columns = count_columns(len(designs))
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
+    real, imaginary = (
+        {"label": f"{part} part", "unit": "-", "low": -reach, "high": reach}
+        for part in ("real", "imaginary")
+    )
+    with drawing([square_in(columns)] * len(designs), columns=columns) as panels:
+        for panel, (one, (loop, controller)) in zip(panels, designs, strict=True):
+            title = one.name if one.stable else f"{one.name}: unstable"
+            panel.set_axes(real, imaginary, title=title, equal=True)
+            panel.curve("unit circle", turn.real, turn.imag, look=None, width=1.0, numbers=False)
+            points: dict[str, Any] = {"line": False, "filled": False, "size": 6.0}
+            own = {"look": 1, "marker": "o", **points}
+            panel.curve("controller alone", controller.real, controller.imag, **own)
+            panel.curve("closed loop", loop.real, loop.imag, look=0, marker="x", **points)
+    return panels[0].figure
+
+
+def _simulation_blocks(report: DesignReport) -> list[Block]:
+    """Return series and spectra of the simulated loops."""
+    settings = report.config.settings.simulation
+    runs = [(name, report.simulations[name]) for name in report.simulations]
+    if not runs:
+        return ["No loop is stable, so none was simulated."]
+    _, frames, _ = runs[0][1].run.residual_nm.shape
+    residuals = [f"{name} {nm_text(one.residual_nm, '.1f', unit='nm rms')}" for name, one in runs]
+    series = {name: one.run.residual_nm[0, :_EXCERPT, 0] for name, one in runs}
+    time_s = np.arange(min(frames, _EXCERPT)) / report.config.hardware.frame_rate_hz
+    facts = {"duration": fixed_text(float(time_s[-1]), 2), "residuals": listing_text(residuals)}
+    reach = 1.05 * max(float(np.max(np.abs(y))) for y in series.values())
+    residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
+    text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
+    blocks: list[Block] = [text]
+    for number, batch in _sheets(runs):
+        with drawing([0.95] * len(batch)) as panels:
+            for panel, (name, _) in zip(panels, batch, strict=True):
+                panel.set_axes(TIME, residual, title=name)
+                own: dict[str, Any] = {"look": report.names.index(name), "width": 0.9, "dash": 0}
+                panel.curve("residual", time_s, series[name], quiet=True, **own)
+        blocks.append(chart(f"series{number}", panels[0].figure, **facts))
+    for number, batch in _sheets(runs):
+        columns = count_columns(len(batch))
+        with drawing([2.2] * len(batch), columns=columns) as panels:
+            for panel, (name, one) in zip(panels, batch, strict=True):
+                panel.set_axes(FREQUENCY, SPECTRUM, title=name)
+                f = one.frequency_hz
+                panel.curve("before the correction", f, one.open_nm2_hz, look=None, width=0.8)
+                panel.curve("residual, simulated", f, one.residual_nm2_hz, look=5, dash=0)
+                panel.curve("residual, exact", f, one.exact_nm2_hz, look=1, width=1.4)
+        blocks.append(chart(f"spectra{number}", panels[0].figure))
+    return blocks
+
+
+_AWAY_S = 1.0  # that each sensor is missing, and that all are there again
+
+
+def write_sensors_report(
+    config: Config,
+    designs: Mapping[str, Design],
+    path: str | os.PathLike[str],
+    *,
+    gain_files: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
+    pdf: str | os.PathLike[str] | None = None,
+    title: str | None = None,
+) -> tuple[tuple[Path, ...], TruthComparison]:
+    """Write the page of designs of several sensors, and as a PDF if that is wanted.
+
+    The truth of the configuration must be stationary. The page gives the digests of the files that
+    designs came from.
+    """
+    require_page_names(path, pdf)
+    source, content = read_source(config.source, "configuration")
+    text = content.decode("utf-8-sig", errors="replace")
+    gains = [read_source(file, f"gain file of {name}")[0] for name, file in gain_files.items()]
+    files = [source, *gains]
+    found = compare_in_truth(designs, config)
+    sections = [_sensors_section(config, designs, found)]
+    for number, (name, design) in enumerate(designs.items(), start=1):
+        failures = design.tables()[0]
+        blocks: tuple[Block, ...] = (
+            fact_table(name, design.facts()),
+            row_table(failures.title, failures.rows),
+            _failure_chart(config, name, design, f"failures-{number}"),
+            row_table("Certificate, computed again", design.recertify().checks),
+        )
+        sections.append(Section(key=f"design-{number}", title=name, blocks=blocks))
+    sections.append(source_section(files, texts={source.name: text}))
+    page = Page(
+        title=title or f"Several sensors for {config.source.name}",
+        subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
+        sections=tuple(sections),
+    )
+    return write_page(page, path, pdf), found
+
+
+def _sensors_section(
+    config: Config, designs: Mapping[str, Design], found: TruthComparison
+) -> Section:
+    """Open with what each design leaves in the truth, beside references."""
+    blocks: list[Block] = []
+    for name, design in designs.items():
+        own = next(row for row in found.rows if row.design == name)
+        others = listing_text(list(design.other_sensors))
+        text = f"{name} reads {others} beside the loop's own sensor, and leaves "
+        text += nm_text(own.residual_nm, ".1f", unit="nm rms")
+        if found.limit is not None:
+            least = nm_text(found.limit.rms_nm, ".1f", unit="nm rms")
+            text += f"; no controller of the own sensor alone leaves less than {least}"
+        blocks.append(f"{text}.")
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    hidden = ("worst_nm", "above_band_limit_percent", "phase_margin_deg")
+    blocks.append(row_table(caption, found.rows, without=hidden))
+    blocks += [Notice(text=note) for note in found.notes]
+    return Section(key="summary", title="Summary", blocks=blocks)
+
+
+def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:
+    """Draw a run in which each sensor and channel is missing in turn."""
+    units = (OWN_SENSOR, *design.other_sensors)
+    drops = [
+        Drop(unit=unit, start_s=(2 * i + 1) * _AWAY_S, end_s=(2 * i + 2) * _AWAY_S)
+        for i, unit in enumerate(units)
+    ]
+    seconds = (2 * len(units) + 1) * _AWAY_S
+    frames, seed = int(seconds * config.hardware.frame_rate_hz), config.settings.simulation.seed
+    run = run_failures(design, config, config.truth, drops, frames=frames, cases=1, seed=seed)
+    left = [
+        f"without {segment.text} {nm_text(exact, '.1f', unit='nm rms')}"
+        for segment, exact in zip(run.segments, run.exact_nm, strict=True)
+        if segment.text
+    ]
+    return chart(
+        key,
+        sensor_failure_figure(run.simulation, run.segments, run.exact_nm),
+        group="sensor-failures",
+        name=name,
+        away=f"{_AWAY_S:g}",
+        residuals=listing_text(left),
+    )

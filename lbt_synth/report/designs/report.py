@@ -3,29 +3,182 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lbt_synth import studies
 from lbt_synth.config import Config
-from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
+from lbt_synth.design import Check, Design
+from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.interop import frame_cost
+from lbt_synth.interop.arithmetic_cost import FrameCost
+from lbt_synth.linear import Controller
+from lbt_synth.loop import (
+    ClosedLoop,
+    LoopMargins,
+    ResidualBudget,
+    close_loop,
+    loop_margins,
+    moving_gain,
+    residual_budget,
+    stable_sensor_gains,
+    strehl,
+)
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
+from lbt_synth.loop.moving_gain import MovingGain
 from lbt_synth.loop.simulation.run import settling_frames
-from lbt_synth.report import provenance
-from lbt_synth.report.designs.assessment import DesignAssessment, assess_design, require_compatible
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
-from lbt_synth.report.figures.loop import frequency_grid
-from lbt_synth.studies import LimitRow
+from lbt_synth.report.page.blocks import (
+    SourceFile,
+    creation_time,
+    program_versions,
+    read_source,
+    require_letters,
+)
+from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.truth_comparison import TruthComparison
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")
 _MOST_DESIGNS = 36  # more lines cannot be distinguished
+_GAINS = np.geomspace(0.01, 100.0, 400)  # where stable intervals are looked for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DesignAssessment:
+    """What is known exactly of one design in the loop of a configuration."""
+
+    name: str  # its name in the report
+    design: Design
+    loop: ClosedLoop  # with the real sensor gain
+    notes: tuple[str, ...]  # how the loop that it was made for differs from this one
+    # None where the loop is unstable: the exact residual, the margins at the real sensor gain, and
+    # the intervals around it of a gain that moves
+    budget: ResidualBudget | None
+    margins: LoopMargins | None
+    moving: MovingGain | None
+    strehl: float  # Strehl ratio in [0, 1]; nan where the loop is unstable
+    # intervals of real sensor gains for which the loop is stable, relative to the sensor matrix of
+    # the configuration; searched for between 0.01 and 100 times the assumed one
+    sensor_gains: tuple[tuple[float, float], ...]
+    checks: tuple[Check, ...]  # the certificate, recomputed
+    certificate_error: str  # why it could not be; empty if it could
+    cost: FrameCost  # arithmetic of one frame, as exported to C
+    curve: RobustnessMap  # Strehl ratio over the frequency error at the real sensor gain
+    map: RobustnessMap  # the same over frequency error and real sensor gain
+
+    @property
+    def stable(self) -> bool:
+        """Whether the loop is stable at the real sensor gain."""
+        return self.loop.is_stable
+
+    @property
+    def certified(self) -> bool:
+        """Whether the certificate could be recomputed, and every check passed."""
+        return not self.certificate_error and all(check.passed for check in self.checks)
+
+    @property
+    def residual_nm(self) -> float:
+        """Exact residual [nm rms]; nan where the loop is unstable."""
+        return float("nan") if self.budget is None else self.budget.rms_nm
+
+
+def assess_design(
+    name: str, design: Design, config: Config, errors_hz: FloatArray
+) -> DesignAssessment:
+    """Assess a design in the loop of a configuration, over frequency errors (e,)."""
+    hardware, truth, assumed_gain = config.hardware, config.truth, config.sensor_gain
+    sensor_gains = np.unique(config.settings.robustness.sensor_gains)
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    stable = loop.is_stable
+    budget = residual_budget(loop, truth) if stable else None
+    margins = loop_margins(loop) if stable else None
+    checks, complaint = _recertify(design)
+    mapped = partial(robustness_map, design, truth, config.imaging, hardware=hardware)
+    curve, grid = (
+        mapped(errors_hz=errors_hz, sensor_gains=gains)
+        for gains in ([truth.sensor_gain], sensor_gains / assumed_gain)
+    )
+    intervals = stable_intervals(loop, design.controller, margins)
+    return DesignAssessment(
+        name=name,
+        design=design,
+        loop=loop,
+        notes=() if design.hardware is None else tuple(loop_differences(design.hardware, hardware)),
+        budget=budget,
+        margins=margins,
+        moving=moving_gain(loop) if stable else None,
+        strehl=float("nan") if budget is None else strehl(budget, config.imaging),
+        sensor_gains=tuple((low * assumed_gain, high * assumed_gain) for low, high in intervals),
+        checks=checks,
+        certificate_error=complaint,
+        cost=frame_cost(design),
+        curve=curve,
+        map=replace(grid, sensor_gains=frozen_copy(sensor_gains)),  # the real ones again
+    )
+
+
+def require_compatible(name: str, design: Design, hardware: LoopHardware) -> None:
+    """Refuse a design that cannot be run in a loop."""
+    own = design.hardware
+    if own is None:
+        raise ProblemError(
+            f"{name} is a filter of a bare estimation problem; expected a design for a loop. "
+            "Design it for the plant of a configuration."
+        )
+    for what, mine, theirs in (
+        ("axes", own.modes, hardware.modes),
+        ("measurements", own.n_measurements, hardware.n_measurements),
+        ("commands", own.n_commands, hardware.n_commands),
+    ):
+        if mine != theirs:
+            raise ProblemError(
+                f"{name} must be for the configuration's {theirs} {what}; got a design for {mine}. "
+                "Design it for this configuration."
+            )
+    if not np.isclose(own.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
+        raise ProblemError(
+            f"{name} must run at the configuration's {hardware.frame_rate_hz:g} Hz; got a design "
+            f"for {own.frame_rate_hz:g} Hz. Design it for this frame rate."
+        )
+
+
+def stable_intervals(
+    loop: ClosedLoop, controller: Controller, margins: LoopMargins | None
+) -> list[tuple[float, float]]:
+    """Intervals of sensor gains for which a loop is stable, in increasing order.
+
+    The interval around the loop's own gain comes from its margins; others are looked for at 400
+    gains from 0.01 to 100.
+    """
+    found = []
+    if margins is not None:
+        found.append((margins.gain_low * loop.sensor_gain, margins.gain_high * loop.sensor_gain))
+    radii = radii_by_gain(loop.hardware, controller)(_GAINS)
+    inside = np.nonzero(radii < 1 - STABILITY_MARGIN)[0]
+    for run in np.split(inside, np.nonzero(np.diff(inside) > 1)[0] + 1):
+        if not run.size:
+            continue
+        nominal = float(_GAINS[run[np.argmin(radii[run])]])
+        if not any(low < nominal < high for low, high in found):
+            found.append(stable_sensor_gains(loop.hardware, controller, nominal=nominal))
+    return sorted(found)
+
+
+def _recertify(design: Design) -> tuple[tuple[Check, ...], str]:
+    """Return the checks of the recomputed certificate, or why that failed."""
+    try:
+        return design.recertify().checks, ""
+    except (LbtSynthError, ArithmeticError) as error:
+        return (), str(error)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,10 +192,9 @@ class DesignReport:
     # residuals over the frequency error, and what no linear controller goes below
     limits: LimitStudy
     truth: TruthComparison  # the designs beside reference designs, and what they were not made for
-    frequency_hz: FloatArray  # (f,): frequencies of the transfer functions [Hz]
     # (e,): frequency errors, truth less design [Hz]; only 0 where the truth has no vibration
     errors_hz: FloatArray
-    files: tuple[provenance.SourceFile, ...]  # digests of the files that were read
+    files: tuple[SourceFile, ...]  # digests of the files that were read
     versions: tuple[tuple[str, str], ...]  # programs and libraries
     made: datetime  # when
 
@@ -72,7 +224,6 @@ def design_report(
     designs: Mapping[str, Design],
     *,
     gain_files: Mapping[str, str | os.PathLike[str]] | None = None,
-    advance: Callable[[int], object] | None = None,
 ) -> DesignReport:
     """Examine designs in the loop of a configuration.
 
@@ -87,8 +238,6 @@ def design_report(
         Designs by name.
     gain_files : mapping of str to path-like, optional
         Files that designs came from, whose digests the report gives.
-    advance : callable, optional
-        Called with a number of steps whenever they are done; there are :func:`count_steps` of them.
 
     Returns
     -------
@@ -118,50 +267,34 @@ def design_report(
         raise ProblemError(f"a report needs 1 to {_MOST_DESIGNS} designs; got {len(designs)}.")
     for name, design in designs.items():
         require_instance(design, Design)
-        provenance.require_letters(name, "name of a design")
+        require_letters(name, "name of a design")
         require_compatible(name, design, config.hardware)
-    made = provenance.creation_time()
-    source, content = provenance.read_source(config.source, "configuration")
+    made = creation_time()
+    source, content = read_source(config.source, "configuration")
     files = [source]
     for name, path in (gain_files or {}).items():
-        files.append(provenance.read_source(Path(path), f"gain file of {name}")[0])
-    count = advance or (lambda _: None)
-    truth, hardware = config.truth, config.hardware
-    errors = frequency_errors(config)
-    grid = frozen_copy(frequency_grid(hardware.frame_rate_hz, truth.lines_hz))
-    assessments = []
-    for name, design in designs.items():
-        assessments.append(assess_design(name, design, config, frequency_hz=grid, errors_hz=errors))
-        count(1)
-    limits = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
-    count(1)
-    compared = studies.compare_in_truth(designs, config)
-    count(1)
+        files.append(read_source(Path(path), f"gain file of {name}")[0])
+    truth, hardware, errors = config.truth, config.hardware, frequency_errors(config)
+    assessments = tuple(assess_design(n, design, config, errors) for n, design in designs.items())
     stable = [one for one in assessments if one.stable]
-    settle = [settling_frames(one.spectral_radius) for one in stable]
-    simulations = {}
-    for one in stable:  # all settle as the slowest, so that one seed is the same weather for all
-        simulations[one.name] = simulate_design(one.design, config, settle_frames=max(settle))
-        count(1)
+    # all settle as the slowest, so that one seed is the same weather for all
+    settle = max((settling_frames(one.loop.spectral_radius) for one in stable), default=0)
     solved = any(design.solver.route in _CONVEX_ROUTES for design in designs.values())
     return DesignReport(
         config=config,
         config_text=content.decode("utf-8-sig", errors="replace"),
-        assessments=tuple(assessments),
-        simulations=simulations,
-        limits=limits,
-        truth=compared,
-        frequency_hz=grid,
+        assessments=assessments,
+        simulations={
+            one.name: simulate_design(one.design, one.loop, config, settle_frames=settle)
+            for one in stable
+        },
+        limits=studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors)),
+        truth=studies.compare_in_truth(designs, config),
         errors_hz=errors,
         files=tuple(files),
-        versions=provenance.program_versions(("cvxpy", "clarabel") if solved else ()),
+        versions=program_versions(("cvxpy", "clarabel") if solved else ()),
         made=made,
     )
-
-
-def count_steps(designs: int) -> int:
-    """Return the number of steps that a report of so many designs takes at most."""
-    return 2 * designs + 2
 
 
 def frequency_errors(config: Config) -> FloatArray:

@@ -9,40 +9,36 @@ from scipy.signal import welch
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.loop import ClosedLoop, close_loop, simulate, step_response
+from lbt_synth.loop import ClosedLoop, Simulation, simulate, step_response
+from lbt_synth.loop.simulation.run import LoopStep
 from lbt_synth.models import Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy
 
-STEP_NM = 100.0
 _MOST_FRAMES = 8192  # of a run
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
-_EXCERPT = 400  # frames that are drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DesignSimulation:
     """One design in a simulated loop."""
 
-    strehl: float  # Mean Strehl ratio of the runs
-    residual_nm: float  # Residual over all runs [nm rms]
-    scatter: float  # Standard deviation of the Strehl ratio between runs; nan for a single one
-    frames: int  # Frames of a run
-    time_s: FloatArray  # (t,): times of the excerpt, from its first frame [s]
-    series_nm: FloatArray  # (t, n): residual of the first run
+    run: Simulation
+    strehl: float  # mean Strehl ratio of the runs
+    scatter: float  # standard deviation of the Strehl ratio between runs; nan for a single one
+    residual_nm: float  # residual over all runs [nm rms]
     frequency_hz: FloatArray  # (f,): frequencies of the spectra
-    # (f,): spectra by Welch's method, sums over the axes
-    open_nm2_hz: FloatArray  # before the correction
-    residual_nm2_hz: FloatArray  # after it
+    # (f,): spectra by Welch's method, sums over the axes, before the correction and after it
+    open_nm2_hz: FloatArray
+    residual_nm2_hz: FloatArray
     # (f,): residual's spectrum by the transfer functions, with the window's image of each sinusoid
     exact_nm2_hz: FloatArray
-    step_time_s: FloatArray  # (s,): times after a step of the disturbance [s]
-    # (s,): response of the first axis to a step of ``STEP_NM`` without other disturbances
-    step_residual_nm: FloatArray
-    step_command_nm: FloatArray
+    step: LoopStep  # of the first axis, without other disturbances
 
 
-def simulate_design(design: Design, config: Config, *, settle_frames: int) -> DesignSimulation:
+def simulate_design(
+    design: Design, loop: ClosedLoop, config: Config, *, settle_frames: int
+) -> DesignSimulation:
     """Run a design in the loop of a configuration, which settles for at least so many frames."""
     settings, hardware, truth = config.settings.simulation, config.hardware, config.truth
     frames = min(settings.frames, _MOST_FRAMES)
@@ -55,29 +51,22 @@ def simulate_design(design: Design, config: Config, *, settle_frames: int) -> De
         seed=settings.seed,
         settle_frames=max(settings.settle_frames, settle_frames),
     )
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     rate, length = hardware.frame_rate_hz, min(frames, _SEGMENT)
     spectra = []
     for series in (run.total_nm, run.residual_nm):
         frequency, density = welch(series, rate, nperseg=length, detrend=False, axis=1)
         spectra.append(density.mean(axis=0).sum(axis=-1))
     strehls = run.strehl(config.imaging)
-    shown = min(frames, _EXCERPT)
-    step = step_response(loop)
     return DesignSimulation(
+        run=run,
         strehl=float(np.mean(strehls)),
-        residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
         scatter=float(np.std(strehls, ddof=1)) if settings.cases > 1 else float("nan"),
-        frames=frames,
-        time_s=frozen_copy(np.arange(shown) / rate),
-        series_nm=frozen_copy(run.residual_nm[0, :shown]),
+        residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
         frequency_hz=frozen_copy(frequency[1:]),
         open_nm2_hz=frozen_copy(spectra[0][1:]),
         residual_nm2_hz=frozen_copy(spectra[1][1:]),
         exact_nm2_hz=frozen_copy(exact_spectrum(loop, truth, frequency, length)[1:]),
-        step_time_s=step.time_s,
-        step_residual_nm=STEP_NM * step.residual,
-        step_command_nm=STEP_NM * step.command,
+        step=step_response(loop),
     )
 
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from lbt_synth.loop.least_residuals.band_limit import BandLimit
 from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
-from lbt_synth.report.designs.assessment import DesignAssessment
-from lbt_synth.report.designs.report import DesignReport
+from lbt_synth.report.designs.report import DesignAssessment, DesignReport
 from lbt_synth.report.number_text import (
     DASH,
-    MINUS,
     NO_BREAK,
     fixed_text,
     interval_text,
@@ -23,7 +21,6 @@ from lbt_synth.report.number_text import (
 )
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import (
-    Column,
     column,
     columns,
     fill_row,
@@ -86,8 +83,9 @@ def assessment_row(report: DesignReport, one: DesignAssessment, limits: LimitRow
     simulation = report.simulations.get(one.name)
     return fill_row(
         AssessmentRow,
-        *(one, one.budget, one.margins, one.cost, limits, one.design, one.design.solver),
+        *(one, one.loop, one.budget, one.margins, one.cost, limits, one.design, one.design.solver),
         design=one.name,
+        estimation_rms=one.design.rms,
         n_states=one.design.controller.n_states,
         strehl_simulated=None if simulation is None else simulation.strehl,
         worst_strehl=float(one.curve.strehl.min()) if one.stable else float("nan"),
@@ -183,28 +181,15 @@ def _certificate_sentence(report: DesignReport) -> str:
     return f"{sentence if unstable else sentence[0].upper() + sentence[1:]}."
 
 
-# titles of what is an interval, not a column of the row
-_GOOD = "within 10 % of its best Strehl ratio [Hz]"
-_GAIN_MARGIN, _STABLE_GAINS = "gain margin, factors", "stable real sensor gains"
-_MOVING_GAINS = "proved while the gain moves at any speed"
-_OWN_CELLS: dict[str, Callable[[DesignReport, DesignAssessment], str | Cell]] = {
-    "certified": lambda _, one: _certificate_cell(one),
-    "stable": lambda _, one: _stability_cell(one),
-    "strehl_simulated": lambda report, one: _simulated_text(report, one),
-    _GOOD: lambda _, one: _good_text(one),
-    _GAIN_MARGIN: lambda _, one: _gain_margin_text(one),
-    _STABLE_GAINS: lambda _, one: _stable_gains_text(one),
-    _MOVING_GAINS: lambda report, one: _moving_text(report, one),
-}
 _DESIGN = ("method", "route", "n_states", "multiplications", "gamma", "estimation_rms", "certified")
 _LOOP = (
     *("stable", "spectral_radius", "residual_nm", "turbulence_nm", "vibration_nm", "noise_nm"),
     *("strehl", "strehl_simulated"),
 )
-_RANGE = ("worst_nm", "worst_strehl", _GOOD)
+_GOOD = "within 10 % of its best Strehl ratio [Hz]"
 _MARGINS = (
-    *("modulus", _GAIN_MARGIN, "phase_deg", "delay_frames", "crossover_hz", _STABLE_GAINS),
-    _MOVING_GAINS,
+    *("modulus", "gain margin, factors", "phase_deg", "delay_frames", "crossover_hz"),
+    *("stable real sensor gains", "proved while the gain moves at any speed"),
 )
 
 
@@ -222,18 +207,26 @@ def summary_table(report: DesignReport) -> Table:
         ends = interval_text(float(report.errors_hz[0]), float(report.errors_hz[-1]))
         band = _limit_title("above_band_limit_percent", limits.band, " for this range")
         titles |= band
-        groups.append((f"Over frequency errors of {ends} Hz", [*_RANGE, *band]))
+        over = ("worst_nm", "worst_strehl", _GOOD, *band)
+        groups.append((f"Over frequency errors of {ends} Hz", over))
     groups.append(("Margins at the real sensor gain", _MARGINS))
     printed = {each.name: each for each in columns(AssessmentRow)}
-    found = [(one, assessment_row(report, one, row)) for one, row in report.rows]
+    designs = [
+        (assessment_row(report, one, row), _own_cells(report, one)) for one, row in report.rows
+    ]
     lines: list[tuple[str | Cell, ...]] = []
     for group, names in groups:
         lines.append((group,))
         for name in names:
-            each, own = printed.get(name), _OWN_CELLS.get(name)
-            title = titles.get(name) or (name if each is None else _title(each))
-            cells = (_text(each, row) if own is None else own(report, one) for one, row in found)
-            lines.append((title, *cells))
+            each = printed.get(name)
+            title = name
+            if each is not None:
+                title = f"{each.help} [{each.shown_unit}]" if each.unit else each.help
+            cells = (
+                own[name] if name in own else replace(printed[name], missing=DASH).text(row)
+                for row, own in designs
+            )
+            lines.append((titles.get(name, title), *cells))
     return Table(
         caption=f"Summary at a real sensor gain of {number_text(report.real_gain)}; "
         f"{report.config.imaging.label}",
@@ -249,17 +242,6 @@ def truth_table(report: DesignReport) -> Table:
     return row_table(caption, report.truth.rows, without=without)
 
 
-def _title(each: Column) -> str:
-    return f"{each.help} [{each.shown_unit}]" if each.unit else each.help
-
-
-def _text(each: Column | None, row: AssessmentRow) -> str:
-    """Return a number of a row with the signs of print."""
-    assert each is not None  # a cell that is no column has its own function
-    text = replace(each, missing=DASH).text(row)
-    return text if isinstance(getattr(row, each.name), str) else text.replace("-", MINUS)
-
-
 def _limit_title(name: str, limit: ResidualLimit | BandLimit | None, where: str) -> dict[str, str]:
     """Return the title of percents above a limit, or none where the limit says nothing."""
     if limit is None or not limit.rms_nm > 0:
@@ -267,75 +249,34 @@ def _limit_title(name: str, limit: ResidualLimit | BandLimit | None, where: str)
     return {name: f"above the limit of {nm_text(limit.rms_nm, '.1f')}{where} [%]"}
 
 
-def certificate_table(one: DesignAssessment) -> Table:
-    """Return the checks of one design."""
-    return Table(
-        caption=f"Certificate of {one.name}",
-        headings=("check", "value", "must stay below", "result", "computed by"),
-        rows=tuple(
-            (
-                check.name,
-                _measured_text(check.value),
-                _measured_text(check.limit)
-                if not 0.999 < check.limit < 1
-                else f"1 {MINUS} 1e{MINUS}9",
-                Cell(text="passed", tone="good")
-                if check.passed
-                else Cell(text="FAILED", tone="bad"),
-                check.computed_by,
-            )
-            for check in one.checks
-        ),
-        words=(4,),
-    )
-
-
-def _measured_text(value: float) -> str:
-    """Return six digits of a number, or three if it is close to 0."""
-    return number_text(value, 6 if abs(value) >= 1e-4 else 3)
-
-
-def _certificate_cell(one: DesignAssessment) -> Cell:
+def _own_cells(report: DesignReport, one: DesignAssessment) -> dict[str, str | Cell]:
+    """Return the cells of a design that are not a number of its row: words and intervals."""
+    margins, run, good = one.margins, report.simulations.get(one.name), good_range(one)
     if one.certified:
-        return Cell(text=f"passed, {count_text(len(one.checks), 'check')}", tone="good")
-    failed = sum(not check.passed for check in one.checks)
-    text = "NOT COMPUTED" if one.certificate_error else f"FAILED, {failed} of {len(one.checks)}"
-    return Cell(text=text, tone="bad")
-
-
-def _stability_cell(one: DesignAssessment) -> Cell:
-    return Cell(text="stable", tone="good") if one.stable else Cell(text="UNSTABLE", tone="bad")
-
-
-def _simulated_text(report: DesignReport, one: DesignAssessment) -> str:
-    run = report.simulations.get(one.name)
-    if run is None:
-        return DASH
-    scatter = "" if np.isnan(run.scatter) else f" ± {fixed_text(100 * run.scatter, 2)}"
-    return f"{fixed_text(100 * run.strehl, 2)}{scatter}"
-
-
-def _good_text(one: DesignAssessment) -> str:
-    found = good_range(one)
-    return DASH if found is None else " to ".join(map(signed_text, found))
-
-
-def _gain_margin_text(one: DesignAssessment) -> str:
-    if one.margins is None:
-        return DASH
-    return interval_text(one.margins.gain_low, one.margins.gain_high, 3)
-
-
-def _stable_gains_text(one: DesignAssessment) -> str | Cell:
-    if not one.sensor_gains:
-        return Cell(text="none found", tone="bad")
-    return ", ".join(interval_text(low, high, 4) for low, high in one.sensor_gains)
-
-
-def _moving_text(report: DesignReport, one: DesignAssessment) -> str:
-    """Return the interval of a gain that moves, in real sensor gains as those above it."""
-    if one.moving is None:
-        return DASH
-    gain = report.config.sensor_gain
-    low, high = gain * one.moving.moving_low, gain * one.moving.moving_high
-    return DASH if np.isnan(low) else interval_text(low, high, 4)
+        certified = Cell(text=f"passed, {count_text(len(one.checks), 'check')}", tone="good")
+    else:
+        failed = sum(not check.passed for check in one.checks)
+        text = "NOT COMPUTED" if one.certificate_error else f"FAILED, {failed} of {len(one.checks)}"
+        certified = Cell(text=text, tone="bad")
+    simulated = DASH
+    if run is not None:
+        scatter = "" if np.isnan(run.scatter) else f" ± {fixed_text(100 * run.scatter, 2)}"
+        simulated = f"{fixed_text(100 * run.strehl, 2)}{scatter}"
+    gains: str | Cell = ", ".join(interval_text(*ends, 4) for ends in one.sensor_gains)
+    moving, gain = one.moving, report.config.sensor_gain
+    return {
+        "certified": certified,
+        "stable": Cell(text="stable", tone="good")
+        if one.stable
+        else Cell(text="UNSTABLE", tone="bad"),
+        "strehl_simulated": simulated,
+        _GOOD: DASH if good is None else " to ".join(map(signed_text, good)),
+        "gain margin, factors": DASH
+        if margins is None
+        else interval_text(margins.gain_low, margins.gain_high, 3),
+        "stable real sensor gains": gains or Cell(text="none found", tone="bad"),
+        # in real sensor gains, as those above it
+        "proved while the gain moves at any speed": DASH
+        if moving is None or np.isnan(moving.moving_low)
+        else interval_text(gain * moving.moving_low, gain * moving.moving_high, 4),
+    }

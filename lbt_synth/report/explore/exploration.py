@@ -5,29 +5,44 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from lbt_synth.config import Config
 from lbt_synth.config.load import build_config, validate_sections
 from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
-from lbt_synth.design.certificate import Certificate
+from lbt_synth.linear import hinf_norm, largest_singular_values
+from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import default_method, design_title, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
-from lbt_synth.report.designs.assessment import require_compatible
-from lbt_synth.report.explore.edits import section_content, section_of
-from lbt_synth.report.explore.evaluation import loop_curves, performance
-from lbt_synth.report.explore.knobs import SHIFT, Knob, list_knobs
-from lbt_synth.report.explore.panels import Shown
+from lbt_synth.report.designs.report import require_compatible
+from lbt_synth.report.designs.simulation import exact_spectrum
+from lbt_synth.report.explore.knobs import (
+    SHIFT,
+    Knob,
+    list_knobs,
+    section_content,
+    section_of,
+    shift_range_hz,
+)
+from lbt_synth.report.figures.loops import frequency_grid
 from lbt_synth.report.number_text import fixed_text, number_text
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.studies import compare_in_truth
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.studies import compare_in_truth, robustness_map
+from lbt_synth.validation import ComplexArray, FloatArray
+
+_POINTS, _NEAR_A_LINE = 240, 28  # frequencies of a curve: in all, and on each side of a line
+_SHIFTS = 15
+_SEGMENT = 2048  # frames of a segment of the spectrum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wish:
     """A method of synthesis, and the values of the knobs that were moved, by their keys."""
 
-    method: str
+    method: str = field(default_factory=default_method)
     values: Mapping[str, float] = field(default_factory=dict)
 
     def move(self, knobs: Sequence[Knob]) -> dict[Knob, float]:
@@ -43,23 +58,30 @@ class Wish:
         return next((v for knob, v in self.move(knobs).items() if knob.key == SHIFT), 0.0)
 
 
-def fulfil(wish: Wish, knobs: Sequence[Knob], config: Config) -> tuple[Config, DesignRequest]:
-    """Return the configuration and the request of a wish; ConfigError where they do not fit."""
-    method, moved = method_named(wish.method), wish.move(knobs)
-    content = config.settings.model_dump(exclude_unset=True)
-    if method.section is not None and section_of(method, config) is not None:
-        section_content(method, config, content)
-    for knob, value in moved.items():
-        if knob.edit is not None:
-            knob.edit(config, content, value)
-    settings = validate_sections(FileSection, content, config.source)
-    options = {
-        knob.option: moved.get(knob, knob.value)
-        for knob in knobs
-        if knob.option and wish.method in (knob.methods or ())
-    }
-    request = design_request(wish.method, {**method.reference_options, **options})
-    return build_config(settings, config.source), request
+@table_row
+class ExploredRow:
+    """A design in the loop that the sliders make; what an unstable loop does not have is nan."""
+
+    design: str = column("design")
+    residual_nm: float = nm_column("residual", format=".1f", missing="unstable")
+    strehl: float = percent_column("Strehl ratio")
+    modulus: float = column("modulus margin", format=".3f")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shown:
+    """A design on the page: first its curves, then what it leaves; nan in an unstable loop."""
+
+    frequency_hz: FloatArray  # (f,)
+    error_nm: FloatArray | None  # (f,): norm of the estimation error; None without an estimate
+    rejection: FloatArray  # (f,): norm from phase to residual
+    noise_transfer: FloatArray  # (f,): norm from noise to residual
+    spectrum_nm2_hz: FloatArray  # (f,): of the residual, sum over the axes
+    broken: ComplexArray  # (q, f): loop gain of each measurement, the others closed
+    poles: ComplexArray  # of the closed loop
+    row: ExploredRow | None = None  # what it leaves where the true lines are now
+    shift_hz: FloatArray | None = None  # (s,): by which the true lines are moved from the start
+    strehls: FloatArray | None = None  # (s,): Strehl ratio there, in [0, 1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,17 +103,12 @@ class View:
     shift_hz: float  # of the true lines
     design: Design
     shown: Mapping[str, Shown]
-    is_whole: bool = False  # Whether what the designs leave is that of this view
+    is_whole: bool = False  # whether what the designs leave is that of this view
 
     @property
     def name(self) -> str:
         """Name of the design."""
         return next(iter(self.shown))
-
-    @property
-    def lines_hz(self) -> list[float]:
-        """Frequencies of the true lines [Hz]."""
-        return self.config.truth.lines_hz
 
 
 def explore(config: Config, designs: Mapping[str, Design]) -> Exploration:
@@ -101,9 +118,23 @@ def explore(config: Config, designs: Mapping[str, Design]) -> Exploration:
     return Exploration(config=config, designs=designs, knobs=list_knobs(config))
 
 
-def first_wish() -> Wish:
-    """Return the wish that a page opens with."""
-    return Wish(method=default_method())
+def fulfil(wish: Wish, knobs: Sequence[Knob], config: Config) -> tuple[Config, DesignRequest]:
+    """Return the configuration and the request of a wish; ConfigError where they do not fit."""
+    method, moved = method_named(wish.method), wish.move(knobs)
+    content = config.settings.model_dump(exclude_unset=True)
+    if method.section is not None and section_of(method, config) is not None:
+        section_content(method, config, content)
+    for knob, value in moved.items():
+        if knob.edit is not None:
+            knob.edit(config, content, value)
+    settings = validate_sections(FileSection, content, config.source)
+    options = {
+        knob.option: moved.get(knob, knob.value)
+        for knob in knobs
+        if knob.option and wish.method in (knob.methods or ())
+    }
+    request = design_request(wish.method, {**method.reference_options, **options})
+    return build_config(settings, config.source), request
 
 
 def quick_view(exploration: Exploration, wish: Wish, before: View | None = None) -> View:
@@ -112,13 +143,14 @@ def quick_view(exploration: Exploration, wish: Wish, before: View | None = None)
     design = config.design(request)
     label = request.method.label
     own = f"{label} by the sliders" if label in exploration.designs else label
-    lent = [one.performance for one in before.shown.values()] if before else []
     shown = {
-        name: Shown(
-            curves=loop_curves(one, config), performance=lent[place] if place < len(lent) else None
-        )
-        for place, (name, one) in enumerate({own: design, **exploration.designs}.items())
+        name: loop_curves(one, config) for name, one in {own: design, **exploration.designs}.items()
     }
+    if before is not None:
+        shown = {
+            name: replace(one, row=last.row, shift_hz=last.shift_hz, strehls=last.strehls)
+            for (name, one), last in zip(shown.items(), before.shown.values(), strict=True)
+        }
     return View(
         wish=wish,
         config=config,
@@ -129,17 +161,62 @@ def quick_view(exploration: Exploration, wish: Wish, before: View | None = None)
     )
 
 
+def loop_curves(design: Design, config: Config) -> Shown:
+    """Return the curves of a design in the loop of a configuration."""
+    hardware, truth = config.hardware, config.truth
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    density = {"points": _POINTS, "near": _NEAR_A_LINE}
+    grid = frequency_grid(hardware.frame_rate_hz, truth.lines_hz, **density)
+    n, m = hardware.modes, hardware.n_commands
+    response = loop.system.frequency_response(grid)
+    returned = response[:, n + m :, n:].diagonal(axis1=1, axis2=2).T
+    stable, nothing = loop.is_stable, np.full(grid.size, np.nan)
+    return Shown(
+        frequency_hz=grid,
+        error_nm=largest_singular_values(design.error_system(), grid)
+        if design.is_estimator
+        else None,
+        rejection=spectral_norms(response[:, :n, :n]) if stable else nothing,
+        noise_transfer=spectral_norms(response[:, :n, n:]) if stable else nothing,
+        spectrum_nm2_hz=exact_spectrum(loop, truth, grid, _SEGMENT) if stable else nothing,
+        broken=1 / returned - 1,
+        poles=loop.system.poles,
+    )
+
+
 def whole_view(exploration: Exploration, view: View) -> View:
     """Return a view with what its designs leave."""
     designs = (view.design, *exploration.designs.values())
     shown = {
-        name: replace(
-            one,
-            performance=performance(name, design, view.config, exploration.config, view.shift_hz),
-        )
+        name: complete(one, name, design, view, exploration.config)
         for (name, one), design in zip(view.shown.items(), designs, strict=True)
     }
     return replace(view, shown=shown, is_whole=True)
+
+
+def complete(one: Shown, name: str, design: Design, view: View, start: Config) -> Shown:
+    """Return a design with what it leaves if the true lines move from where they are at start."""
+    hardware, config = view.config.hardware, view.config
+    lines = {n: getattr(start.truth, n) for n in ("vibrations", "frequency_errors_hz")}
+    truth = replace(config.truth, **lines)
+    shifts = np.unique(np.append(np.linspace(*shift_range_hz(start), _SHIFTS), view.shift_hz))
+    grid = robustness_map(
+        design,
+        truth,
+        config.imaging,
+        hardware=hardware,
+        errors_hz=shifts,
+        sensor_gains=[truth.sensor_gain],
+    )
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    now = int(np.searchsorted(shifts, view.shift_hz))
+    row = ExploredRow(
+        design=name,
+        residual_nm=float(grid.residual_nm[0, 0, now]),
+        strehl=float(grid.strehl[0, 0, now]),
+        modulus=1 / float(hinf_norm(loop.output_sensitivity())) if loop.is_stable else np.nan,
+    )
+    return replace(one, row=row, shift_hz=shifts, strehls=grid.strehl[0, 0])
 
 
 def describe_moves(exploration: Exploration, wish: Wish) -> str:
@@ -152,39 +229,27 @@ def describe_moves(exploration: Exploration, wish: Wish) -> str:
 
 def judge(view: View) -> str:
     """Return the verdict on the design of a view, in sentences."""
-    found = compare_in_truth({view.name: view.design}, view.config)
-    own, *others = found.rows
-    passed = _certificate_text(view.design.certificate)
+    compared = compare_in_truth({view.name: view.design}, view.config)
+    own, *others = compared.rows
+    passed = f"All {len(view.design.certificate.checks)} checks of its certificate passed."
     if not own.stable:
         return f"{view.name} is UNSTABLE in this loop. {passed}"
-    loop = close_loop(
-        view.config.hardware, view.design.controller, sensor_gain=view.config.truth.sensor_gain
-    )
-    margins = loop_margins(loop)
-    parts = [
-        f"{view.name} leaves {nm_text(own.residual_nm, '.1f', unit='nm rms')}, Strehl ratio "
-        f"{fixed_text(100 * own.strehl, 1)} %"
-    ]
-    if found.limit is not None:
-        parts.append(
-            f"{fixed_text(own.above_limit_percent, 1)} % above the least of any linear controller"
-        )
-    sentences = [", ".join(parts)]
-    better = [row for row in others if row.residual_nm < own.residual_nm]
-    if better:
-        best = min(better, key=lambda row: row.residual_nm)
-        sentences.append(
-            f"the {design_title(best.method)} leaves {nm_text(best.residual_nm, '.1f')} here"
-        )
+    hardware, gain = view.config.hardware, view.config.truth.sensor_gain
+    margins = loop_margins(close_loop(hardware, view.design.controller, sensor_gain=gain))
+    residual, strehl = nm_text(own.residual_nm, ".1f", unit="nm rms"), 100 * own.strehl
+    sentences = [f"{view.name} leaves {residual}, Strehl ratio {fixed_text(strehl, 1)} %"]
+    if compared.limit is not None:
+        above = fixed_text(own.above_limit_percent, 1)
+        sentences[0] += f", {above} % above the least of any linear controller"
+    best = min(others, key=lambda row: row.residual_nm, default=own)
+    if best.residual_nm < own.residual_nm:
+        least = nm_text(best.residual_nm, ".1f")
+        sentences.append(f"the {design_title(best.method)} leaves {least} here")
     sentences.append(
         f"Margins: modulus {number_text(margins.modulus, 3)}, phase "
         f"{number_text(margins.phase_deg, 3)} degrees, delay "
         f"{number_text(margins.delay_frames, 3)} frames, sensor gain times "
         f"{number_text(margins.gain_low, 3)} to {number_text(margins.gain_high, 3)}"
     )
-    sentences += found.warnings[view.name]
+    sentences += compared.warnings[view.name]
     return ". ".join(text[0].upper() + text[1:] for text in sentences) + f". {passed}"
-
-
-def _certificate_text(certificate: Certificate) -> str:
-    return f"All {len(certificate.checks)} checks of its certificate passed."

@@ -1,127 +1,206 @@
-"""The charts of the page of sliders; their scales move in steps, so that curves move in them."""
+"""The figures of the page of sliders; their scales move in steps, so that curves move in them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
+from bokeh.models import ColumnDataSource, FixedTicker, GridBox, HoverTool, PlainText, Range1d
+from bokeh.plotting import figure as new_figure
 
-from lbt_synth.report.charts.description import Axis, Chart, Curve, Mark, Panel, Rule
-from lbt_synth.report.explore.evaluation import LoopCurves, Performance
-from lbt_synth.report.figures.loop import frequency_panel, vibration_rules
-from lbt_synth.report.figures.robustness import SHORT_FREQUENCY_ERROR, strehl_axis
-from lbt_synth.report.figures.simulation import spectra_panel
-from lbt_synth.report.page.words import chart
+from lbt_synth.report.draw import colour, dashes
+from lbt_synth.report.explore.exploration import Shown
+from lbt_synth.report.figures.studies import strehl_axis
+from lbt_synth.report.scales import log_tick_texts, log_ticks
+from lbt_synth.storage.display_unit import shown_unit
+from lbt_synth.validation import FloatArray
 
+Ends: TypeAlias = tuple[tuple[float, float], tuple[float, float]]  # of the scales of x and y
+# curves by the names of designs, abscissae of rules, and the scales
+Numbers: TypeAlias = tuple[dict[str, tuple[FloatArray, FloatArray]], Sequence[float], Ends]
 _REACH = 3.0  # of the plane of a loop gain, to each side of -1
+_FAR = 9.0  # outside that plane; a canvas takes no larger numbers
 _ROOM = 0.05  # decades above the highest curve
+_GREY = "#404040"
+# of each figure: what is on its axes, and which of them are logarithmic
+_AXES = {
+    "explore-rejection": ("frequency [Hz]", "\u03c3\u0304, phase to residual [-]", "xy"),
+    "explore-noise": ("frequency [Hz]", "\u03c3\u0304, noise to residual [-]", "xy"),
+    "explore-nyquist": ("real part [-]", "imaginary part [-]", ""),
+    "explore-spectrum": ("frequency [Hz]", "power spectrum [{nm²/Hz}]", "xy"),
+    "explore-strehl": ("frequency error [Hz]", "Strehl ratio [%]", ""),
+    "explore-poles": ("real part [-]", "imaginary part [-]", ""),
+    "explore-sigma": ("frequency [Hz]", "\u03c3\u0304, disturbances to error [{nm}]", "xy"),
+}
+_STYLE = {
+    "axis_label_text_font_size": "13px",
+    "axis_label_text_font_style": "normal",
+    "major_label_text_font_size": "12px",
+    "axis_line_color": "#808080",
+    "minor_tick_line_color": None,
+}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Shown:
-    """A design on the page: its curves, and what it leaves once that is known."""
-
-    curves: LoopCurves
-    performance: Performance | None
-
-
-def explore_charts(
+def explore_numbers(
     shown: Mapping[str, Shown], lines_hz: Sequence[float], shift_hz: float
-) -> tuple[Chart, ...]:
-    """Return the charts of designs by name, the lines of the truth and their shift marked."""
-    rules = vibration_rules(lines_hz, "true line")
-    found = {name: one.curves for name, one in shown.items()}
-    left = {name: one.performance for name, one in shown.items() if one.performance is not None}
-    looks = {name: look for look, name in enumerate(shown)}
-
-    def curves(field: str) -> list[Mark]:
-        return [
-            Curve(name=name, x=one.frequency_hz, y=getattr(one, field), look=looks[name])
-            for name, one in found.items()
+) -> dict[str, Numbers]:
+    """Return what each figure shows of designs, with true lines and where the slider stands."""
+    density, error = shown_unit("nm²/Hz")[1], shown_unit("nm")[1]
+    numbers: dict[str, Numbers] = {}
+    for key, field, factor, decades in (
+        ("explore-rejection", "rejection", 1.0, 4),
+        ("explore-noise", "noise_transfer", 1.0, 2),
+        ("explore-spectrum", "spectrum_nm2_hz", density, 4),
+        ("explore-sigma", "error_nm", error, 2),
+    ):
+        curves = {
+            name: (one.frequency_hz, factor * getattr(one, field))
+            for name, one in shown.items()
             if getattr(one, field) is not None
-        ]
-
-    unity = Rule(name="", at=1.0, axis="y")
-    panels = {
-        "explore-rejection": _in_decades(
-            frequency_panel("phase to residual", "-", [*curves("rejection"), unity], rules), 4
-        ),
-        "explore-noise": _in_decades(
-            frequency_panel("noise to residual", "-", curves("noise_transfer"), rules), 2
-        ),
-        "explore-nyquist": _nyquist_panel(found, looks),
-        "explore-spectrum": _in_decades(spectra_panel([*curves("spectrum_nm2_hz"), *rules]), 4),
-        "explore-strehl": _strehl_panel(left, looks, shift_hz),
-        "explore-poles": _pole_panel(found, looks),
-        "explore-sigma": _in_decades(
-            frequency_panel("disturbances to error", "nm", curves("error_nm"), rules), 2
-        ),
+        }
+        values = np.concatenate([np.ones(1), *(y for _, y in curves.values())])
+        high = float(10.0 ** np.ceil(np.log10(np.nanmax(values)) + _ROOM))
+        grid = next(iter(shown.values())).frequency_hz
+        ends = (float(grid[0]), float(grid[-1])), (high / 10**decades, high)
+        numbers[key] = curves, lines_hz, ends
+    numbers["explore-nyquist"] = (
+        {name: _loop_gains(one) for name, one in shown.items()},
+        (),
+        ((-1.0 - _REACH, -1.0 + _REACH), (-_REACH, _REACH)),
+    )
+    poles = {name: (one.poles.real, one.poles.imag) for name, one in shown.items()}
+    numbers["explore-poles"] = poles, (), ((-1.2, 1.2), (-1.2, 1.2))
+    strehls = {
+        name: (one.shift_hz, 100 * one.strehls)
+        for name, one in shown.items()
+        if one.shift_hz is not None and one.strehls is not None
     }
-    return tuple(chart(key, [panel]) for key, panel in panels.items())
+    percents = np.concatenate([np.zeros(0), *(y for _, y in strehls.values())])
+    low = strehl_axis(percents)["low"]
+    high = np.nanmax(percents) if np.isfinite(percents).any() else 100.0
+    shifts = np.concatenate([np.array([shift_hz]), *(x for x, _ in strehls.values())])
+    across = float(np.min(shifts)) - 1e-9, float(np.max(shifts)) + 1e-9
+    numbers["explore-strehl"] = strehls, [shift_hz], (across, (low, high + 0.04 * (high - low)))
+    return {key: numbers[key] for key in _AXES}
 
 
-def _in_decades(panel: Panel, decades: int) -> Panel:
-    """Return a panel whose scale of y ends at the decade above its curves, and so far below."""
-    values = np.concatenate([np.ones(1), *(curve.y for curve in panel.select(Curve))])
-    high = 10.0 ** np.ceil(np.log10(np.nanmax(values)) + _ROOM)
-    return replace(panel, y=replace(panel.y, low=high / 10**decades, high=high), height_in=2.1)
+def _loop_gains(one: Shown) -> tuple[FloatArray, FloatArray]:
+    """Return the loop gains of all measurements, each broken in turn, with gaps between them."""
+    near = np.clip(one.broken.real, -_FAR, _FAR) + 1j * np.clip(one.broken.imag, -_FAR, _FAR)
+    line = np.pad(near, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+    return line.real, line.imag
 
 
-def _strehl_panel(left: Mapping[str, Performance], looks: Mapping[str, int], now: float) -> Panel:
-    marks = [
-        Curve(name=name, x=one.shift_hz, y=100 * one.strehls, look=looks[name])
-        for name, one in left.items()
-    ]
-    return Panel(
-        x=SHORT_FREQUENCY_ERROR,
-        y=strehl_axis(marks),
-        marks=(*marks, Rule(name="now", at=now, dash=1)),
-        height_in=2.1,
-    )
+class LivePanel:
+    """A place for a figure, which is made anew only where its designs are others."""
 
+    def __init__(self, key: str) -> None:
+        self.root = GridBox(name=key, sizing_mode="stretch_width")
+        self._key = key
+        self._texts = [
+            text.format_map({unit: shown_unit(unit)[0] for unit in ("nm", "nm²/Hz")})
+            for text in _AXES[key][:2]
+        ]
+        self._log = _AXES[key][2]
+        self._designs: object = None
+        self._ends: Ends | None = None
+        self._sources: list[ColumnDataSource] = []
 
-def _nyquist_panel(found: Mapping[str, LoopCurves], looks: Mapping[str, int]) -> Panel:
-    """Return the loop gains of all measurements, each broken in turn, around the point -1."""
-    marks = []
-    for name, one in found.items():
-        # far outside the panel a canvas takes no more numbers; a gap parts the measurements
-        near = np.clip(one.broken.real, -9.0, 9.0) + 1j * np.clip(one.broken.imag, -9.0, 9.0)
-        line = np.pad(near, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
-        marks.append(Curve(name=name, x=line.real, y=line.imag, look=looks[name], hover=False))
-    critical = Curve(
-        name="-1",
-        x=np.full(1, -1.0),
-        y=np.zeros(1),
-        line=False,
-        marker="plus",
-        look=None,
-        hover=False,
-        size=8.0,
-    )
-    across, up = (
-        Axis(label=f"{part} part", unit="-", low=middle - _REACH, high=middle + _REACH)
-        for part, middle in (("real", -1.0), ("imaginary", 0.0))
-    )
-    return Panel(x=across, y=up, marks=(*marks, critical), equal=True)
+    def show(self, numbers: Numbers, looks: Mapping[str, int]) -> None:
+        """Show curves in the looks of their designs."""
+        curves, rules, ends = numbers
+        groups: dict[bytes, list[str]] = {}  # curves of the same abscissae are sent together
+        for name, (x, _) in curves.items():
+            groups.setdefault(x.tobytes(), []).append(name)
+        columns = [{"at": np.array(rules)}] if len(rules) else []
+        for names in groups.values():
+            ordinates = {f"y{i}": self._drawn(curves[name][1]) for i, name in enumerate(names)}
+            columns.append({"x": curves[names[0]][0], **ordinates})
+        designs = [[(name, looks[name]) for name in names] for names in groups.values()]
+        if [bool(rules), *designs] != self._designs:
+            self._designs, self._ends = [bool(rules), *designs], None
+            self._sources = [ColumnDataSource(one) for one in columns]
+            self.root.children = [(self._new_figure(designs, bool(rules)), 0, 0)]
+        else:
+            for source, new in zip(self._sources, columns, strict=True):
+                old = source.data
+                if not all(np.array_equal(old[n], new[n], equal_nan=True) for n in new):
+                    source.data = new
+        if ends != self._ends:
+            self._ends = ends
+            self._set_scales(self.root.children[0][0], ends)
 
+    def _drawn(self, y: FloatArray) -> FloatArray:
+        return np.where(y > 0, y, np.nan) if "y" in self._log else y
 
-def _pole_panel(found: Mapping[str, LoopCurves], looks: Mapping[str, int]) -> Panel:
-    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 181))
-    circle = Curve(name="", x=turn.real, y=turn.imag, look=None, width=1.0, hover=False)
-    poles = [
-        Curve(
-            name=name,
-            x=one.poles.real,
-            y=one.poles.imag,
-            look=looks[name],
-            line=False,
-            marker="own",
-            filled=False,
+    def _new_figure(self, designs: Sequence[Sequence[tuple[str, int]]], ruled: bool) -> Any:
+        square = self._key in ("explore-nyquist", "explore-poles")
+        size = {"aspect_ratio": 1.0, "max_width": 460} if square else {"height": 300}
+        figure = new_figure(
+            **{f"{n}_axis_type": "log" if n in self._log else "linear" for n in "xy"},
+            x_range=Range1d(),
+            y_range=Range1d(),
+            sizing_mode="stretch_width",
+            tools="box_zoom,pan,wheel_zoom,reset",
+            toolbar_location="above",
+            min_border_left=64,  # figures above each other are in line
+            min_border_right=12,
+            **size,
         )
-        for name, one in found.items()
-    ]
-    x, y = (
-        Axis(label=f"{part} part", unit="-", low=-1.2, high=1.2) for part in ("real", "imaginary")
-    )
-    return Panel(x=x, y=y, marks=(circle, *poles), equal=True)
+        # a finger scrolls the page
+        figure.toolbar.update(logo=None, active_drag=None, active_scroll=None)
+        figure.grid.grid_line_color = "#e0e0e0"
+        figure.outline_line_color = None
+        for axis, text, name in zip(
+            (figure.xaxis[0], figure.yaxis[0]), self._texts, "xy", strict=True
+        ):
+            axis.update(axis_label=PlainText(text=text), **_STYLE)
+            if name in self._log:
+                axis.ticker = FixedTicker()
+        remaining = iter(self._sources)
+        if ruled:
+            dash = "6 3" if self._key == "explore-strehl" else "4 5"
+            style = {"line_color": _GREY, "line_width": 1.2, "line_dash": dash}
+            figure.vspan(x="at", source=next(remaining), **style)
+        curves = []
+        for group, source in zip(designs, remaining, strict=True):
+            for i, (name, look) in enumerate(group):
+                curves.append(self._new_curve(figure, source, f"y{i}", look))
+                curves[-1].name = f"design {name}"
+        self._draw_guides(figure)
+        tips = [("", "$name")]
+        tips += [(t, f"$snap_{n}{{%.4g}}") for t, n in zip(self._texts, "xy", strict=True)]
+        formats = {f"$snap_{n}": "printf" for n in "xy"}
+        figure.add_tools(HoverTool(renderers=curves, tooltips=tips, formatters=formats))
+        return figure
+
+    def _new_curve(self, figure: Any, source: ColumnDataSource, y: str, look: int) -> Any:
+        shade, place = colour(look), {"x": "x", "y": y, "source": source}
+        if self._key == "explore-poles":
+            markers = ("circle", "square", "triangle", "diamond", "cross", "x")
+            style = {"size": 8, "line_width": 1.5, "fill_color": None, "line_color": shade}
+            return figure.scatter(**place, marker=markers[look % len(markers)], **style)
+        strokes = [max(1, round(2.4 * stroke)) for stroke in dashes(look)]
+        return figure.line(**place, line_color=shade, line_width=2, line_dash=strokes)
+
+    def _draw_guides(self, figure: Any) -> None:
+        """Draw what the curves are compared with."""
+        thin = {"line_color": _GREY, "line_width": 1.2}
+        if self._key == "explore-rejection":
+            figure.hspan(y=[1.0], **thin)
+        elif self._key == "explore-nyquist":
+            figure.scatter([-1.0], [0.0], marker="cross", size=13, line_color=_GREY)
+        elif self._key == "explore-poles":
+            turn = np.linspace(0, 2 * np.pi, 181)
+            figure.line(np.cos(turn), np.sin(turn), **thin)
+
+    def _set_scales(self, figure: Any, ends: Ends) -> None:
+        scales = (figure.xaxis[0], figure.x_range), (figure.yaxis[0], figure.y_range)
+        for (axis, scale), (start, end), name in zip(scales, ends, "xy", strict=True):
+            scale.update(start=start, end=end)
+            if name in self._log:
+                ticks = log_ticks(start, end)
+                axis.ticker.ticks = ticks
+                texts = log_tick_texts(ticks)
+                axis.major_label_overrides = dict(zip(ticks, texts, strict=True))

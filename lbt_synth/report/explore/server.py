@@ -9,12 +9,13 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import copy_context
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from threading import Condition, Thread
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any
 
 from bokeh.core.properties import String
@@ -25,10 +26,10 @@ from lbt_synth.config.write import config_text
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.methods.registry import all_methods
-from lbt_synth.report.charts.bokeh_charts import LivePanel
-from lbt_synth.report.charts.description import colour, dashes
+from lbt_synth.report.draw import colour, dashes
 from lbt_synth.report.explore.exploration import (
     Exploration,
+    Shown,
     View,
     Wish,
     describe_moves,
@@ -36,8 +37,8 @@ from lbt_synth.report.explore.exploration import (
     quick_view,
     whole_view,
 )
-from lbt_synth.report.explore.panels import Shown, explore_charts
-from lbt_synth.report.provenance import creator_name
+from lbt_synth.report.explore.panels import LivePanel, explore_numbers
+from lbt_synth.report.page.blocks import creator_name, words
 from lbt_synth.storage.atomic_files import write_together
 from lbt_synth.storage.rows import row_table
 
@@ -50,33 +51,28 @@ class Lane:
     """
 
     def __init__(self) -> None:
-        self._waiting: Callable[[], None] | None = None
-        self._open, self._changed = True, Condition()
+        self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._thread = Thread(target=copy_context().run, args=(self._run,), daemon=True)
         self._thread.start()
 
     def submit(self, work: Callable[[], None]) -> None:
         """Run a piece of work, instead of any that waits."""
-        with self._changed:
-            self._waiting = work
-            self._changed.notify()
+        self._queue.put(work)
 
     @property
     def is_waiting(self) -> bool:
         """Whether newer work waits for the one that runs."""
-        return self._waiting is not None
+        return not self._queue.empty()
 
     def close(self) -> None:
         """Drop what waits, and end after what runs."""
-        with self._changed:
-            self._waiting, self._open = None, False
-            self._changed.notify()
+        self._queue.put(None)
 
     def _run(self) -> None:
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting is not None or not self._open)
-                work, self._waiting = self._waiting, None
+            work = self._queue.get()
+            while not self._queue.empty():
+                work = self._queue.get()
             if work is None:
                 return
             work()
@@ -85,41 +81,30 @@ class Lane:
 _ENDINGS = (".yaml", ".fits", ".sh")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Saved:
-    """What was written."""
-
-    files: tuple[Path, ...]
-    commands: tuple[str, ...]
-
-
-def save_view(exploration: Exploration, view: View, folder: Path) -> Saved:
-    """Write a view into a folder under names that are free; OutputError if that fails."""
+def save_view(
+    exploration: Exploration, view: View, folder: Path
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Write a view into a folder under names that are free; return the files and their commands."""
     stem = next(
         stem
         for stem in (f"explored-{number}" for number in count(1))
         if not any((folder / (stem + ending)).exists() for ending in _ENDINGS)
     )
     config, gain, script = (folder / (stem + ending) for ending in _ENDINGS)
-    commands = list_commands(view, stem)
+    request = view.request
+    options = [f"--{name.replace('_', '-')} {value}" for name, value in request.given.items()]
+    design = ["lbt-synth design", config.name, "--method", request.method.name, *options]
+    commands = (
+        " ".join((*design, "-o", gain.name)),
+        f"lbt-synth report {config.name} {gain.name} -o {stem}.html",
+    )
     moves = describe_moves(exploration, view.wish) or "nothing moved"
     head = f"{exploration.config.source.name!a} with {moves}; {creator_name()}"
     lines = ["#!/bin/sh", f"# {head}", "set -e", 'cd "$(dirname "$0")"', *commands, ""]
     text = config_text(view.config.settings, {"": "\n".join((head, *commands))})
     write_together({config: text.encode(), script: "\n".join(lines).encode()})
     save_gain(gain, view.design)
-    return Saved(files=(config, gain, script), commands=commands)
-
-
-def list_commands(view: View, stem: str) -> tuple[str, ...]:
-    """Return the commands that make the files of a name, and a report of them."""
-    request = view.request
-    options = [f"--{name.replace('_', '-')} {value}" for name, value in request.given.items()]
-    design = ["lbt-synth design", f"{stem}.yaml --method {request.method.name}", *options]
-    return (
-        " ".join((*design, f"-o {stem}.fits")),
-        f"lbt-synth report {stem}.yaml {stem}.fits -o {stem}.html",
-    )
+    return [config, gain, script], commands
 
 
 _QUICK_S = 0.3  # a design that takes longer is made when a slider is released, in its own lane
@@ -137,49 +122,45 @@ class Exchange(DataModel):  # type: ignore[misc]  # bokeh has no types
     saved = String("")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Site:
-    """What all pages of a server share."""
-
-    exploration: Exploration
-    first: View
-    folder: Path
-    saved: list[Path] = field(default_factory=list)  # files that its pages wrote
-
-
 class Session:
     """One open page."""
 
-    def __init__(self, document: Any, site: Site) -> None:
-        self._document, self._site, self._view = document, site, site.first
+    def __init__(
+        self, document: Any, exploration: Exploration, first: View, folder: Path, saved: list[Path]
+    ) -> None:
+        self._document, self._exploration, self._view = document, exploration, first
+        self._folder, self._saved = folder, saved  # the files that all pages wrote
         self._number = 0
         self._seconds: dict[str, float] = {}  # of the processor for the last design of a method
         self._kept: dict[str, Shown] = {}
         self._quick, self._slow, self._third = Lane(), Lane(), Lane()
         self._exchange = Exchange(name="exchange")
-        charts = explore_charts(site.first.shown, site.first.lines_hz, site.first.shift_hz)
-        self._panels = {one.key: LivePanel(one.key) for one in charts}
+        keys = explore_numbers(first.shown, (), 0.0)
+        self._panels = {key: LivePanel(key) for key in keys}
         for panel in self._panels.values():
             document.add_root(panel.root)
         next(iter(self._panels.values())).root.tags = [self._exchange]
-        self._show_view(0, site.first)
+        self._show_view(0, first)
         self._exchange.on_change("wish", lambda _, __, new: self._hear(json.loads(new)))
-        self._third.submit(partial(self._form_verdict, 0, site.first))
+        self._third.submit(partial(self._form_verdict, 0, first))
         document.on_session_destroyed(self._close)
         here = files("lbt_synth.report")
-        document.template = (here / "explore/page.html.jinja").read_text(encoding="utf-8")
-        document.title = f"Explore {site.exploration.config.source.name}"
+        style, script, template = (
+            (here / name).read_text(encoding="utf-8")
+            for name in ("explore/page.css", "explore/page.js", "explore/page.html.jinja")
+        )
+        document.template = template
+        document.title = f"Explore {exploration.config.source.name}"
         document.template_variables.update(
             {
                 "heading": document.title,
-                "charts": charts,
-                "knobs": site.exploration.knobs,
+                "charts": [{"key": key, **words()[key]} for key in keys],
+                "knobs": exploration.knobs,
                 "methods": {m.name: m.title for m in all_methods().values()},
-                "method": site.first.wish.method,
-                "folder": str(site.folder),
-                "style": (here / "page/page.css").read_text(encoding="utf-8")
-                + (here / "explore/page.css").read_text(encoding="utf-8"),
-                "script": (here / "explore/page.js").read_text(encoding="utf-8"),
+                "method": first.wish.method,
+                "folder": str(folder),
+                "style": (here / "page/page.css").read_text(encoding="utf-8") + style,
+                "script": script,
             }
         )
 
@@ -202,7 +183,7 @@ class Session:
 
     def _work(self, lane: Lane, number: int, wish: Wish, final: bool) -> None:
         """Design in a thread: show the curves first, then what they leave, then the verdict."""
-        exploration, start = self._site.exploration, time.thread_time()
+        exploration, start = self._exploration, time.thread_time()
         try:
             view = quick_view(exploration, wish, self._view)
             self._seconds[wish.method] = time.thread_time() - start
@@ -234,13 +215,11 @@ class Session:
             return
         self._number, self._view = number, view
         shown = {**view.shown, **self._kept}
-        for chart in explore_charts(shown, view.lines_hz, view.shift_hz):
-            self._panels[chart.key].show(chart.panels[0])
-        rows = [
-            replace(one.performance.row, design=name)
-            for name, one in shown.items()
-            if one.performance is not None
-        ]
+        looks = {name: look for look, name in enumerate(shown)}
+        lines_hz = view.config.truth.lines_hz
+        for key, numbers in explore_numbers(shown, lines_hz, view.shift_hz).items():
+            self._panels[key].show(numbers, looks)
+        rows = [replace(one.row, design=name) for name, one in shown.items() if one.row is not None]
         table = row_table("", rows)
         self._answer(
             number=number,
@@ -278,7 +257,7 @@ class Session:
 
     def _keep(self) -> None:
         """Keep the curves of the design that is shown."""
-        exploration = self._site.exploration
+        exploration = self._exploration
         view = self._view if self._view.is_whole else whole_view(exploration, self._view)
         moves = describe_moves(exploration, view.wish)
         name = f"{view.name}, {moves}" if moves else f"{view.name}, kept"
@@ -290,12 +269,12 @@ class Session:
 
     def _save(self) -> None:
         try:
-            saved = save_view(self._site.exploration, self._view, self._site.folder)
+            paths, commands = save_view(self._exploration, self._view, self._folder)
         except LbtSynthError as error:
             self._exchange.saved = json.dumps({"time": time.time(), "error": str(error)})
             return
-        self._site.saved.extend(saved.files)
-        names, commands = [str(path) for path in saved.files], saved.commands
+        self._saved.extend(paths)
+        names = [str(path) for path in paths]
         self._exchange.saved = json.dumps(
             {"time": time.time(), "files": names, "commands": commands}
         )
@@ -306,15 +285,24 @@ class Session:
 
 
 def serve(
-    site: Site, *, host: str, port: int, origins: Sequence[str], announce: Callable[[str], None]
-) -> None:
-    """Serve the page until it is interrupted; ProblemError if there is no such place to serve.
+    exploration: Exploration,
+    first: View,
+    folder: Path,
+    *,
+    host: str,
+    port: int,
+    origins: Sequence[str],
+    announce: Callable[[str], None],
+) -> list[Path]:
+    """Serve the page until it is interrupted, and return the files that its users saved.
 
     ``origins`` are further addresses, as host:port, under which browsers may reach the page.
+    ProblemError if there is no such place to serve.
     """
+    saved: list[Path] = []
 
     def open_page(document: Any) -> None:
-        Session(document, site)
+        Session(document, exploration, first, folder, saved)
 
     place = _require_free(host, port)
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
@@ -336,6 +324,7 @@ def serve(
         pass
     finally:
         server.stop()
+    return saved
 
 
 def _require_free(host: str, port: int) -> int:

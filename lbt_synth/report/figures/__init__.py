@@ -1,7 +1,7 @@
 """Figures of designs, loops and studies, drawn by matplotlib.
 
 Each function returns a matplotlib figure.
-Each builds the panels that pages use as well, and draws them on a new figure or on your own axes.
+Each draws on a new figure, or on your own axes. Pages show the same figures.
 Curves differ in colour, dash and marker, so that a reader can distinguish them in grey.
 Axes carry units.
 """

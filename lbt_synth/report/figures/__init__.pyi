@@ -1,9 +1,9 @@
-from .identification import identification_figure as identification_figure
-from .open_loops import bode_figure as bode_figure
-from .open_loops import nichols_figure as nichols_figure
-from .open_loops import nyquist_figure as nyquist_figure
-from .robustness import robustness_figure as robustness_figure
-from .robustness import robustness_map_figure as robustness_map_figure
-from .sigma import sigma_figure as sigma_figure
-from .step import step_figure as step_figure
+from .loops import bode_figure as bode_figure
+from .loops import nichols_figure as nichols_figure
+from .loops import nyquist_figure as nyquist_figure
+from .loops import sigma_figure as sigma_figure
+from .loops import step_figure as step_figure
+from .records import identification_figure as identification_figure
 from .studies import modal_figure as modal_figure
+from .studies import robustness_figure as robustness_figure
+from .studies import robustness_map_figure as robustness_map_figure

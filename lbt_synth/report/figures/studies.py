@@ -1,8 +1,8 @@
-"""The figures of limits, trade-offs, modes and the mirror."""
+"""Figures of studies: robustness, maps, limits, trade-offs, modes, the mirror, end to end."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,15 +10,210 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.interop import EndToEndRun
 from lbt_synth.methods.registry import design_label
 from lbt_synth.models import LoopHardware
-from lbt_synth.report.charts.description import Area, Axis, Curve, Mark, Panel, Rule, Span
-from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
-from lbt_synth.report.figures.loop import stable_curve
-from lbt_synth.studies import TradeoffPoint
+from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, count_columns, drawing
+from lbt_synth.report.figures.loops import draw_design
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.words import listing_text
+from lbt_synth.studies import EndToEndEntry, RobustnessMap, RobustnessRow, TradeoffPoint
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.tradeoff import FAMILIES
 from lbt_synth.validation import FloatArray, real_array, require_instance
+
+FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
+SHORT_FREQUENCY_ERROR = {"label": "frequency error", "unit": "Hz"}  # of narrow panels
+STREHL_LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
+_POINTS: dict[str, Any] = {"marker": "own", "size": 4.0}
+_RINGS: dict[str, Any] = {"line": False, "marker": "own", "filled": False, "size": 9.0}
+
+
+def robustness_figure(
+    rows: Sequence[RobustnessRow],
+    published: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    *,
+    axes: OwnAxes = None,
+) -> Figure:
+    """Strehl ratio over the error of the model's vibration frequency.
+
+    Parameters
+    ----------
+    rows : sequence of RobustnessRow
+        Rows of :func:`lbt_synth.studies.robustness`.
+    published : mapping, optional
+        For each method, pairs (error [Hz], Strehl ratio [%]) drawn as open markers.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One panel; unstable rows are left out of the line and marked at the bottom.
+
+    Raises
+    ------
+    ProblemError
+        If there are no rows,
+        or ``axes`` are not one per panel.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> row = lbt.studies.RobustnessRow(
+    ...     error_hz=0.0,
+    ...     method="kalman",
+    ...     strehl=0.8,
+    ...     residual_nm=40.0,
+    ...     vibration_nm=10.0,
+    ...     turbulence_nm=20.0,
+    ...     noise_nm=30.0,
+    ...     stable=True,
+    ...     gamma=190.0,
+    ... )
+    >>> len(lbt.report.figures.robustness_figure([row]).axes)
+    1
+    """
+    if not rows:
+        raise ProblemError("a robustness figure needs at least one row; got none.")
+    strehls = [100 * row.strehl if row.stable else 0.0 for row in rows]
+    papers = [strehl for points in (published or {}).values() for _, strehl in points]
+    with drawing([2.5], axes=axes) as (panel,):
+        panel.set_axes(FREQUENCY_ERROR, strehl_axis([*strehls, *papers]))
+        for look, method in enumerate(dict.fromkeys(row.method for row in rows)):
+            own = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
+            label, errors = design_label(method), np.array([r.error_hz for r in own])
+            stable = np.array([r.stable for r in own])
+            if stable.any():
+                y = np.where(stable, [100 * r.strehl for r in own], np.nan)
+                panel.curve(label, errors, y, look=look, **_POINTS)
+            if not stable.all():
+                x = errors[~stable]
+                zeros = np.zeros(x.size)
+                panel.curve(f"{label}: unstable", x, zeros, look=look, line=False, marker="x")
+            if published is not None and method in published:
+                x, y = np.array(published[method], dtype=float).T
+                panel.curve(f"{label}, paper", x, y, look=look, **_RINGS | {"size": 7.0})
+    return panel.figure
+
+
+def strehl_axis(percents: ArrayLike) -> dict[str, Any]:
+    """Return the axis of Strehl ratios, from a multiple of 10 % or 1 % below the least on."""
+    values = np.asarray(percents, dtype=np.float64)
+    values = values[np.isfinite(values)]
+    least, most = (values.min(), values.max()) if values.size else (0.0, 100.0)
+    step = 10.0 if most - least > 10 else 1.0  # of the lower end
+    low = max(0.0, step * np.floor(least / step - 0.5))
+    return {"label": "Strehl ratio", "unit": "%", "low": low}
+
+
+def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = None) -> Figure:
+    """Draw the Strehl ratio of designs over frequency error and sensor gain.
+
+    Parameters
+    ----------
+    maps : mapping of str to RobustnessMap
+        Maps of :func:`robustness_map` by the names of their designs.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One panel per delay error and design, up to three side by side, with one colour bar for
+        all. Sensor gains at which the loop is unstable are hatched.
+
+    Raises
+    ------
+    ProblemError
+        If there is no map, or the maps have different delay errors,
+        or ``axes`` are not one per panel.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> found = lbt.studies.robustness_map(
+    ...     lbt.integrator(path, gain=0.5),
+    ...     lbt.Truth(turbulence=None),
+    ...     lbt.Imaging(diameter_m=8.22),
+    ...     errors_hz=[0],
+    ...     sensor_gains=[1, 3],
+    ... )
+    >>> len(
+    ...     lbt.report.figures.robustness_map_figure({"integrator": found}).axes
+    ... )  # one panel and the colour bar
+    2
+    """
+    if not maps:
+        raise ProblemError("a map figure needs at least one map; got none.")
+    delays = next(iter(maps.values())).delay_errors_frames
+    for name, grid in maps.items():
+        if not np.array_equal(grid.delay_errors_frames, delays):
+            raise ProblemError(
+                f"the maps must have the same delay errors {delays.tolist()}; got "
+                f"{grid.delay_errors_frames.tolist()} for {name}."
+            )
+    return draw_maps(maps, axes=axes)
+
+
+def draw_maps(
+    maps: Mapping[str, RobustnessMap],
+    *,
+    real_gain: float | None = None,
+    ends: tuple[float, float] | None = None,
+    axes: OwnAxes = None,
+) -> Figure:
+    """Draw a map per delay error and design, the real sensor gain marked.
+
+    ``ends`` are those of the one scale of colours [%], by default those of the maps.
+    """
+    ends = ends or strehl_ends(maps.values())
+    delays = next(iter(maps.values())).delay_errors_frames
+    columns = min(len(maps), 3) if len(delays) > 1 else count_columns(len(maps))
+    # the long name of the axis does not fit three columns
+    x_axis = FREQUENCY_ERROR if columns < 3 else SHORT_FREQUENCY_ERROR
+    heights = [2.3] * (len(delays) * len(maps))
+    with drawing(heights, columns=columns, axes=axes) as panels:
+        remaining = iter(panels)
+        for row, delay in enumerate(delays):
+            late = f", delay error {delay:+g} frames" if len(delays) > 1 or delay != 0 else ""
+            for name, grid in maps.items():
+                panel = next(remaining)
+                y_axis = {"label": "sensor gain", "unit": "-"}
+                panel.set_axes(x_axis, y_axis, title=f"{name}{late}")
+                _draw_map(panel, grid, row, ends, real_gain)
+    return panels[0].figure
+
+
+def _draw_map(
+    panel: Panel,
+    grid: RobustnessMap,
+    row: int,
+    ends: tuple[float, float],
+    real_gain: float | None,
+) -> None:
+    """Draw the map of a design at one delay error, with the real gain and the design's band."""
+    across, up = np.argsort(grid.errors_hz), np.argsort(grid.sensor_gains)
+    errors_hz, gains = grid.errors_hz[across], grid.sensor_gains[up]
+    values = 100 * grid.strehl[row][np.ix_(up, across)]
+    scale: dict[str, Any] = {"ends": ends, "levels": STREHL_LEVELS, "blank": "unstable loop"}
+    panel.map(errors_hz, gains, values, "Strehl ratio", "%", **scale)
+    if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
+        panel.rule("real sensor gain", real_gain, "y", dash=1)
+    for edge in grid.band_hz or ():
+        if errors_hz[0] < edge < errors_hz[-1]:
+            panel.rule("edge of the design's band", edge, dash=2)
+
+
+def strehl_ends(maps: Sequence[RobustnessMap] | Any) -> tuple[float, float]:
+    """Return the ends [%] of one colour scale for several maps of Strehl ratios."""
+    values = 100 * np.concatenate([grid.strehl.ravel() for grid in maps])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return 0.0, 100.0
+    low, high = float(values.min()), float(values.max())
+    return (low, high) if high - low > 1 else (low - 0.5, high + 0.5)
 
 
 def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
@@ -33,41 +228,66 @@ def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
             "a single error. Give truth.vibrations and robustness.errors_hz."
         )
     single = study.frequency_hz is not None
-    word = "frequency of the true vibration" if single else "shift of the true vibrations"
-    x = Axis(label=word, unit="Hz")
-    shifted = study.shift_hz + (study.frequency_hz or 0.0)
-    return draw_figure([limits_panel(study, x, shifted, design_label)], axes=axes)
+    shift = "shift of the vibration that moves most, the others in proportion"
+    x_axis = {"label": "frequency of the true vibration" if single else shift, "unit": "Hz"}
+    names = [design_label(row.design) for row in study.rows]
+    return draw_limits(study, names, x_axis, study.frequency_hz or 0.0, axes=axes)
 
 
-def limits_panel(
-    study: LimitStudy, x: Axis, places: FloatArray, label: Callable[[str], str]
-) -> Panel:
-    """Return the residual of each design, and the limits, over places on an axis."""
-    names = [label(row.design) for row in study.rows]
-    order = np.argsort(places)
-    marks: list[Curve | Rule] = [
-        stable_curve(name, names, places[order], curve[order] if row.stable else None)
-        for name, row, curve in zip(names, study.rows, study.residual_nm, strict=True)
-    ]
-    if study.limit is not None and study.limit.rms_nm > 0:
-        marks.append(Rule(name="limit, frequency known", at=study.limit.rms_nm, axis="y", dash=3))
-    if study.band is not None:
-        name = "limit, frequency anywhere in this range"
-        marks.append(Rule(name=name, at=study.band.rms_nm, axis="y", dash=1))
-    y = Axis(label="residual", unit="nm rms", log=True)
-    return Panel(x=x, y=y, marks=tuple(marks), height_in=2.5)
+def draw_limits(
+    study: LimitStudy,
+    names: Sequence[str],
+    x_axis: Mapping[str, Any],
+    start_hz: float = 0.0,
+    *,
+    axes: OwnAxes = None,
+) -> Figure:
+    """Draw the residual of designs, and the limits, over an axis that begins at start_hz.
+
+    Designs of the same residual are one curve with all their names.
+    """
+    order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
+    with drawing([2.5], axes=axes) as (panel,):
+        panel.set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})
+        groups: list[tuple[int, FloatArray | None, list[str]]] = []
+        for look, (name, row) in enumerate(zip(names, study.rows, strict=True)):
+            curve = study.residual_nm[look][order] if row.stable else None
+            equal = [
+                group
+                for _, residual, group in groups
+                if curve is not None
+                and residual is not None
+                and np.allclose(curve, residual, rtol=1e-6, atol=0)
+            ]
+            if equal:
+                equal[0].append(name)
+            else:
+                groups.append((look, curve, [name]))
+        for look, curve, group in groups:
+            name = listing_text(list(dict.fromkeys(group)))
+            if curve is None:
+                panel.curve(f"{name}: unstable", [], [], look=look)
+            else:
+                panel.curve(name, places, curve, look=look)
+        if study.limit is not None and study.limit.rms_nm > 0:
+            panel.rule("limit, frequency known", study.limit.rms_nm, "y", dash=3)
+        if study.band is not None:
+            panel.rule("limit, frequency anywhere in this range", study.band.rms_nm, "y", dash=1)
+    return panel.figure
 
 
 _NAMES = dict(
     zip(FAMILIES, ("least variance at this norm", "central H∞ filter of this norm"), strict=True)
 )
+_GAINS = (1e-2, 1e2)  # sensor gains that a trade-off shows
 
 
 def tradeoff_figure(points: Sequence[TradeoffPoint], *, axes: OwnAxes = None) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
     Above, the standard deviation; below, if there are loops, the interval of sensor gains for which
-    each is stable. Norms that no filter reaches are shaded.
+    each is stable. An end of it that is 0, or beyond what is shown, has no line: the shaded area
+    goes on to the edge. Norms that no filter reaches are shaded.
     """
     if not points:
         raise ProblemError("a trade-off figure needs at least one point; got none.")
@@ -76,31 +296,33 @@ def tradeoff_figure(points: Sequence[TradeoffPoint], *, axes: OwnAxes = None) ->
     norms = [point.gamma for point in points]
     margin = 0.06 * (max(norms) - min(norms)) or 0.01 * max(norms)
     low, high = min(norms) - margin, max(norms) + margin
-    x = Axis(label="H∞ norm of the estimation error", unit=unit, low=low, high=high)
-    unreached = Span(name="no filter", low=low, high=min(norms))
-    errors: list[Mark] = []
-    gains: list[Mark] = []
-    for look, family in enumerate(dict.fromkeys(point.family for point in points)):
-        own = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
-        gamma = np.array([p.gamma for p in own])
-        style: dict[str, Any] = {"x": gamma, "look": look, "marker": "own", "size": 4.0}
-        name = _NAMES.get(family, family)
-        errors.append(Curve(name=name, y=np.array([p.rms for p in own]), **style))
-        # an open end is drawn at the border of what is shown
-        least = np.array([max(p.gain_low, 1e-2) for p in own])
-        most = np.array([min(p.gain_high, 1e2) for p in own])
-        gains.append(Area(name="", x=gamma, low=least, high=most, look=look))
-        gains += [Curve(name=name, y=ends, **style) for ends in (least, most)]
-    kalman: dict[str, Any] = {"line": False, "marker": "circle", "filled": False, "size": 9.0}
-    least_rms = np.array([min(p.rms for p in points)])
-    errors.append(Curve(name="Kalman", x=np.array([max(norms)]), y=least_rms, look=None, **kalman))
-    y = Axis(label="estimation error, rms", unit=unit)
-    panels = [Panel(x=x, y=y, marks=(*errors, unreached), height_in=2.3)]
-    if loops:
-        gains.append(Rule(name="nominal sensor gain", at=1.0, axis="y", dash=1))
-        y = Axis(label="sensor gains with a stable loop", unit="-", log=True)
-        panels.append(Panel(x=x, y=y, marks=(*gains, unreached), height_in=2.3))
-    return draw_figure(panels, axes=axes)
+    x_axis = {"label": "H∞ norm of the estimation error", "unit": unit, "low": low, "high": high}
+    shown_gains = {"label": "sensor gains with a stable loop", "unit": "-", "log": True}
+    with drawing([2.3] * (1 + loops), axes=axes) as panels:
+        panels[0].set_axes(x_axis, {"label": "estimation error, rms", "unit": unit})
+        ends = [end for p in points for end in (p.gain_low, p.gain_high)]
+        drawn = [end for end in ends if _GAINS[0] < end < _GAINS[1]]
+        edges = min([1.0, *drawn]) / 2, 2 * max([1.0, *drawn])
+        if loops:
+            panels[1].set_axes(x_axis, shown_gains | {"low": edges[0], "high": edges[1]})
+        for look, family in enumerate(dict.fromkeys(point.family for point in points)):
+            own = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
+            gamma, name = np.array([p.gamma for p in own]), _NAMES.get(family, family)
+            panels[0].curve(name, gamma, [p.rms for p in own], look=look, **_POINTS)
+            if not loops:
+                continue
+            interval = np.array([(p.gain_low, p.gain_high) for p in own]).T
+            panels[1].area("", gamma, *np.clip(interval, *edges), look=look)
+            for gains in interval:
+                inside = np.where((gains > _GAINS[0]) & (gains < _GAINS[1]), gains, np.nan)
+                panels[1].curve(name, gamma, inside, look=look, **_POINTS)
+        least = min(point.rms for point in points)
+        panels[0].curve("Kalman", [max(norms)], [least], look=None, **_RINGS)
+        if loops:
+            panels[1].rule("nominal sensor gain", 1.0, "y", dash=1)
+        for panel in panels:
+            panel.span("no filter", low, min(norms))
+    return panels[0].figure
 
 
 def modal_figure(
@@ -142,10 +364,10 @@ def modal_figure(
     """
     if not residuals_nm:
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
-    given = {"turbulence_nm": turbulence_nm, "gains": gains}
+    others = {"turbulence_nm": turbulence_nm, "gains": gains}
     curves = {
         name: _require_modes(values, name)
-        for name, values in (*residuals_nm.items(), *given.items())
+        for name, values in (*residuals_nm.items(), *others.items())
         if values is not None
     }
     count = curves[next(iter(residuals_nm))].size
@@ -155,27 +377,22 @@ def modal_figure(
                 f"{name} must have {count} modes like the others; got {values.size}."
             )
     modes = np.arange(1.0, count + 1)
-    x = Axis(label="mode, in Noll's order from tip on", log=True, low=1, high=max(count, 2))
-    panels = []
-    if gains is not None:
-        look = len(residuals_nm)  # of none of the residuals, nor of the turbulence
-        above = Curve(name="", x=modes, y=curves["gains"], look=look, dash=0, step="center")
-        y = Axis(label="integrator gain", low=0)
-        panels.append(Panel(x=x, y=y, marks=(above,), height_in=1.7))
-    # modes are counted, there is nothing between them
-    marks = [
-        Curve(name=name, x=modes, y=curves[name], look=look, step="center")
-        for look, name in enumerate(residuals_nm)
-    ]
-    if turbulence_nm is not None:
-        y_turbulence = curves["turbulence_nm"]
-        marks.insert(
-            0,
-            Curve(name="turbulence", x=modes, y=y_turbulence, look=None, width=1.0, step="center"),
-        )
-    y = Axis(label="residual", unit="nm rms", log=True)
-    panels.append(Panel(x=x, y=y, marks=tuple(marks), height_in=2.6))
-    return draw_figure(panels, axes=axes)
+    label = "mode, in Noll's order from tip on"
+    x_axis = {"label": label, "log": True, "low": 1, "high": max(count, 2)}
+    step = "steps-mid"  # modes are counted, there is nothing between them
+    with drawing([1.7] * (gains is not None) + [2.6], axes=axes) as panels:
+        if gains is not None:
+            look = len(residuals_nm)  # of none of the residuals, nor of the turbulence
+            panels[0].set_axes(x_axis, {"label": "integrator gain", "low": 0})
+            y = curves["gains"]
+            panels[0].curve("integrator gain", modes, y, look=look, dash=0, step=step, quiet=True)
+        panels[-1].set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})
+        if turbulence_nm is not None:
+            y = curves["turbulence_nm"]
+            panels[-1].curve("turbulence", modes, y, look=None, width=1.0, step=step)
+        for name in residuals_nm:
+            draw_design(panels[-1], list(residuals_nm), name, modes, curves[name], step=step)
+    return panels[0].figure
 
 
 def _require_modes(values: ArrayLike, name: str) -> FloatArray:
@@ -191,7 +408,7 @@ def _require_modes(values: ArrayLike, name: str) -> FloatArray:
 
 
 _MOST_POINTS = 4000
-_SHOWN = 5e-3  # taps after the last one of this size are not drawn
+_SHOWN_TAP = 5e-3  # taps after the last one of this size are not drawn
 
 
 def mirror_figure(
@@ -218,39 +435,87 @@ def mirror_figure(
     position = np.append(step.position, 1.0)[: time_ms.size]
     shown = np.flatnonzero(time_ms <= end_ms)
     shown = shown[:: max(1, shown.size // _MOST_POINTS)]
-    settled = f"settled to {100 * tolerance:g} %: {settling_ms:.2f} ms"
-    response = Panel(
-        x=Axis(label="time since the command arrived", unit="ms", low=0, high=end_ms),
-        y=Axis(label="position / final position"),
-        marks=(
-            Span(name="", axis="y", low=1 - tolerance, high=1 + tolerance),
-            Curve(name="this mirror", x=time_ms[shown], y=position[shown]),
-            *(
-                Rule(name="frames", at=k * frame_ms, dash=3)
-                for k in range(1, int(end_ms / frame_ms) + 1)
-            ),
-            Rule(name=settled, at=settling_ms, dash=1),
-        ),
-        height_in=2.4,
-    )
     taps = hardware.mirror_taps
     ideal = replace(hardware, mirror=None).mirror_taps
-    count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN)[-1]) + 1, ideal.size)
-    weights = Panel(
-        x=Axis(label="frames after the command", low=-0.6, high=count - 0.4),
-        y=Axis(label="weight in the exposure"),
-        marks=(
-            _columns("this mirror", taps[:count], 0.0, look=0),
-            _columns("settled at once", ideal[:count], -0.4, look=None),
-        ),
-        height_in=2.4,
-    )
-    return draw_figure((response, weights), columns=2, axes=axes)
+    count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN_TAP)[-1]) + 1, ideal.size)
+    label = "time since the command arrived"
+    with drawing([2.4, 2.4], columns=2, axes=axes) as (response, weights):
+        x_axis = {"label": label, "unit": "ms", "low": 0, "high": end_ms}
+        response.set_axes(x_axis, {"label": "position / final position"})
+        response.span("", 1 - tolerance, 1 + tolerance, "y")
+        response.curve("this mirror", time_ms[shown], position[shown])
+        for k in range(1, int(end_ms / frame_ms) + 1):
+            response.rule("frames", k * frame_ms, dash=3)
+        settled = f"settled to {100 * tolerance:g} %: {settling_ms:.2f} ms"
+        response.rule(settled, settling_ms, dash=1)
+        x_axis = {"label": "frames after the command", "low": -0.6, "high": count - 0.4}
+        weights.set_axes(x_axis, {"label": "weight in the exposure"})
+        _draw_columns(weights, "this mirror", taps[:count], 0.0, look=0)
+        _draw_columns(weights, "settled at once", ideal[:count], -0.4, look=None)
+    return response.figure
 
 
-def _columns(name: str, heights: FloatArray, offset: float, *, look: int | None) -> Area:
-    """Return upright bars of width 0.4 that begin at an offset from 0, 1 and so on."""
+def _draw_columns(
+    panel: Panel, name: str, heights: FloatArray, offset: float, *, look: int | None
+) -> None:
+    """Draw upright bars of width 0.4 that begin at an offset from 0, 1 and so on."""
     left = np.arange(heights.size) + offset
     x = np.column_stack((left, left, left + 0.4, left + 0.4)).ravel()
     high = np.column_stack((0 * heights, heights, heights, 0 * heights)).ravel()
-    return Area(name=name, x=x, low=np.zeros(x.size), high=high, look=look, solid=look is not None)
+    panel.area(name, x, np.zeros(x.size), high, look=look, solid=look is not None)
+
+
+_SHOWN_MAS = 700.0  # from the centre of the image to its edges
+_FAINTEST = 1e-5  # of the peak
+
+
+def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
+    """Image, tip and tilt over time, and residual of each mode of an end-to-end run."""
+    size = run.psf.shape[0]
+    position_mas = (np.arange(size) - size // 2) * run.psf_pixel_mas
+    reach_mas = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
+    seconds = np.arange(run.frames) / run.system.frame_rate_hz
+    x_axis, y_axis = (
+        {"label": name, "unit": "mas", "low": -reach_mas, "high": reach_mas} for name in "xy"
+    )
+    with drawing([2.4, 2.4, PANEL_IN], columns=2, axes=axes) as (image, modes, series):
+        title = f"{run.system.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
+        image.set_axes(x_axis, y_axis, title=title, equal=True)
+        values = np.maximum(run.psf / run.psf.max(), _FAINTEST)
+        ends = (_FAINTEST, 1.0)
+        image.map(position_mas, position_mas, values, "intensity / peak", ends=ends, log=True)
+        x_axis = {"label": "mode (1 tip, 2 tilt)", "log": True}
+        y_axis = {"label": "residual", "unit": "nm rms", "log": True}
+        modes.set_axes(x_axis, y_axis, title="all modes")
+        numbers = np.arange(1.0, run.system.modes + 1)
+        modes.curve("residual", numbers, run.rms_nm, width=0.8, quiet=True)
+        y_axis = {"label": "residual", "unit": "nm rms wavefront"}
+        series.set_axes({"label": "time", "unit": "s"}, y_axis, title="tip and tilt")
+        for axis, name in enumerate(("tip", "tilt")):
+            label = f"{name}, {nm_text(run.rms_nm[axis], '.0f', unit='nm rms')}"
+            series.curve(label, seconds, run.residual_nm[:, axis], look=axis, width=0.8, dash=0)
+    return image.figure
+
+
+def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
+    """Strehl ratios of Table III by end-to-end simulation, the modal analysis and the paper."""
+    rows = [e for e in entries if e.table == "III" and e.error_hz is not None]
+    methods = list(dict.fromkeys(e.method for e in rows))
+    x_axis = FREQUENCY_ERROR if len(methods) < 3 else SHORT_FREQUENCY_ERROR
+    y_axis = {"label": "Strehl ratio at 2.2 µm", "unit": "%", "low": 0, "high": 100}
+    with drawing([2.3] * len(methods), columns=len(methods)) as panels:
+        for panel, method in zip(panels, methods, strict=True):
+            panel.set_axes(x_axis, y_axis, title=design_label(method))
+            _draw_method(panel, [e for e in rows if e.method == method])
+    return panels[0].figure
+
+
+def _draw_method(panel: Panel, entries: Sequence[EndToEndEntry]) -> None:
+    """Draw the curves of one method; the paper's is left out where it published none."""
+    error, paper, modal, strehl, scatter = np.array(
+        [(e.error_hz, e.paper, e.modal, e.strehl, e.scatter) for e in entries], dtype=float
+    ).T
+    if not np.isnan(paper[0]):
+        panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
+    panel.curve("modal, measured optical gain", error, modal, look=1)
+    panel.curve("end to end", error, strehl, error=scatter, look=0, **_POINTS)

@@ -1,22 +1,38 @@
-"""What a page is made of: paragraphs, notices, tables, listings and charts, in sections."""
+"""What a page is made of: sections of paragraphs, notices, tables, listings and charts.
+
+The words of charts and paragraphs are data, in ``words.toml``. A page says from which files it was
+made, by which programs, and when.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import os
+import platform
+import re
+import tomllib
+import unicodedata
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
 from typing import TypeAlias
 
-from lbt_synth.errors import ProblemError
-from lbt_synth.report.charts.description import Chart, require_key
+import lbt_synth
+from lbt_synth.errors import FileError, ProblemError
+from lbt_synth.report.draw import Figure
+from lbt_synth.storage.input_files import read_bytes
+from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import TONES, Table
 from lbt_synth.validation import choice
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Paragraph:
-    """A paragraph of plain text."""
-
-    text: str
+_DISTRIBUTIONS = ("numpy", "scipy", "matplotlib")
+_WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+_KEY = re.compile(r"[a-z][a-z0-9-]*")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +55,24 @@ class Listing:
     text: str
 
 
-Block: TypeAlias = Paragraph | Notice | Listing | Table | Chart
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Chart:
+    """A figure with its words; the page has its numbers, too."""
+
+    key: str  # Its anchor in the page: small letters, digits and hyphens; unique in the page
+    title: str  # A short heading
+    caption: str  # What is seen and how to read it
+    alt: str  # The same for those who do not see it: what is drawn, and what it shows
+    figure: Figure
+
+    def __post_init__(self) -> None:
+        _require_key(self.key)
+        for name in ("title", "caption", "alt"):
+            if not getattr(self, name).strip():
+                raise ProblemError(f"a chart must have words for its {name}; got none.")
+
+
+Block: TypeAlias = str | Notice | Listing | Table | Chart  # a text is a paragraph
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,29 +81,157 @@ class Section:
 
     key: str  # Its anchor: small letters, digits and hyphens; unique in the page
     title: str  # Its heading
-    blocks: tuple[Block, ...]  # What is in it
+    blocks: Sequence[Block]  # What is in it
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "blocks", tuple(self.blocks))
-        require_key(self.key)
+        _require_key(self.key)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Page:
-    """A whole page, for the screen or for paper."""
+    """A whole page, for the screen or for paper; a section without blocks is left out."""
 
     title: str  # Its heading
     subtitle: str  # A line below, such as what it is about and when it was made
-    sections: tuple[Section, ...]  # Its sections; the first one stands on the title page
+    sections: tuple[Section, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sections", tuple(self.sections))
+        kept = tuple(section for section in self.sections if section.blocks)
+        object.__setattr__(self, "sections", kept)
         keys = [section.key for section in self.sections] + [c.key for c in self.charts]
         repeated = sorted({key for key in keys if keys.count(key) > 1})
         if repeated:
             raise ProblemError(f"keys of a page must be unique; got {', '.join(repeated)} twice.")
 
     @property
-    def charts(self) -> Sequence[Chart]:
+    def charts(self) -> list[Chart]:
         """All charts, in their order."""
         return [b for section in self.sections for b in section.blocks if isinstance(b, Chart)]
+
+
+def _require_key(key: str) -> None:
+    """Refuse what cannot be an anchor."""
+    if not _KEY.fullmatch(key):
+        raise ProblemError(
+            f"a key must be of small letters, digits and hyphens, and start with a letter; "
+            f"got {key!r}."
+        )
+
+
+@cache
+def words() -> dict[str, dict[str, str]]:
+    """Return the texts of ``words.toml`` by group and name, each on one line."""
+    path = files("lbt_synth.report.page") / "words.toml"
+    texts: dict[str, dict[str, str]] = tomllib.loads(path.read_text(encoding="utf-8"))
+    return {
+        group: {name: " ".join(text.split()) for name, text in own.items()}
+        for group, own in texts.items()
+    }
+
+
+def chart(key: str, figure: Figure, *, group: str = "", **facts: object) -> Chart:
+    """Return a chart with the words of its key, or of another group, and facts filled in.
+
+    A key that ends in a number is that of a continuation, with the words of the first one.
+    """
+    name, _, number = key.rpartition("-")
+    own = words().get(group or key) or words()[name]
+    texts = {name: text.format(**facts) for name, text in own.items()}
+    if not group and number.isdigit():
+        texts["title"] += " (continued)"
+    return Chart(key=key, figure=figure, **texts)
+
+
+def paragraph(name: str, /, **facts: object) -> str:
+    """Return the text of a paragraph with facts filled in."""
+    return words()["paragraphs"][name].format(**facts)
+
+
+@table_row
+class SourceFile:
+    """A file that a page was made from."""
+
+    name: str = column("file", help="Its name, without directories")
+    role: str = column("what it is", help="What it is")
+    sha256: str = column("SHA-256", help="SHA-256 of its bytes, 64 hexadecimal digits")
+
+
+def read_source(path: str | os.PathLike[str], role: str) -> tuple[SourceFile, bytes]:
+    """Read a file, and return its name and digest with its bytes."""
+    source = Path(path)
+    require_letters(source.name, f"name of the {role}")
+    content = read_bytes(source, FileError)
+    digest = hashlib.sha256(content).hexdigest()
+    return SourceFile(name=source.name, role=role, sha256=digest), content
+
+
+def require_letters(text: str, what: str) -> str:
+    """Refuse a text that no page can show as it is."""
+    for letter in text:
+        if (
+            unicodedata.category(letter) in ("Cc", "Cs")
+            or unicodedata.bidirectional(letter) in _WRITING_DIRECTIONS
+            or letter in "\ufffe\uffff"
+        ):
+            raise ProblemError(
+                f"{what} must be of letters that a page can show; got {text!a}. Choose another."
+            )
+    return text
+
+
+def creation_time() -> datetime:
+    """Return the time, in UTC: that of SOURCE_DATE_EPOCH if it is set, else now."""
+    given = os.environ.get("SOURCE_DATE_EPOCH")
+    if given is None:
+        return datetime.now(UTC).replace(microsecond=0)
+    try:
+        return datetime.fromtimestamp(int(given), UTC)
+    except (ValueError, OverflowError, OSError) as error:
+        raise ProblemError(
+            f"SOURCE_DATE_EPOCH must be a number of seconds since 1970; got {given!r}."
+        ) from error
+
+
+def time_text(moment: datetime) -> str:
+    """Return a time as a text: 2026-11-21 17:05:09 UTC."""
+    return moment.strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def creator_name() -> str:
+    """Return the name and version of this program."""
+    return f"lbt_synth {lbt_synth.__version__}"
+
+
+def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
+    """Return name and version of the programs that make a page, and of ``extra`` ones."""
+    found = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
+    for name in (*_DISTRIBUTIONS, *extra):
+        try:
+            found.append((name, version(name)))
+        except PackageNotFoundError:
+            found.append((name, "not installed"))
+    return tuple(found)
+
+
+def source_section(
+    sources: Sequence[SourceFile] = (),
+    *,
+    versions: Sequence[tuple[str, str]] | None = None,
+    texts: Mapping[str, str] = MappingProxyType({}),
+    about: Table | None = None,
+) -> Section:
+    """Return the last section of a page: what it was made from, and by which programs.
+
+    Texts are listed under their captions.
+    """
+    made_with = tuple(program_versions() if versions is None else versions)
+    return Section(
+        key="sources",
+        title="Files and versions",
+        blocks=(
+            *([] if about is None else [about]),
+            *([row_table("Files that were read", sources)] if sources else []),
+            Table(caption="Made with", headings=("program", "version"), rows=made_with, words=(1,)),
+            *(Listing(caption=caption, text=text) for caption, text in texts.items()),
+        ),
+    )

@@ -1,36 +1,38 @@
-"""A page as one HTML file that needs nothing else."""
+"""A page as one HTML file that needs nothing else, and as a PDF."""
 
 from __future__ import annotations
 
-import json
+import io
+import os
+import re
+from collections.abc import Iterator
+from html import escape
 from importlib.resources import files
+from itertools import groupby
+from pathlib import Path
 from typing import Any
 
-from lbt_synth.report.charts.bokeh_charts import bokeh_script, embed_charts
-from lbt_synth.report.charts.description import PALE, SHADE, colour, dashes, marker_name
-from lbt_synth.report.charts.matplotlib_charts import chart_svg
-from lbt_synth.report.charts.scales import legend_entries
-from lbt_synth.report.number_text import print_text, unbroken_text
-from lbt_synth.report.page.blocks import Page
-from lbt_synth.report.provenance import creator_name
+import numpy as np
 
-# in a box of 34 times 14, around its middle
-_MARKER_PATHS = {
-    "circle": "M13 7A4 4 0 1 0 21 7A4 4 0 1 0 13 7Z",
-    "square": "M13 3H21V11H13Z",
-    "triangle": "M17 2.5L21.5 11H12.5Z",
-    "diamond": "M17 2L22 7L17 12L12 7Z",
-    "cross": "M13 3L21 11M21 3L13 11",
-    "plus": "M17 2V12M12 7H22",
-}
+from lbt_synth.errors import MissingExtraError
+from lbt_synth.report.draw import Figure, Series, figure_series, house_style
+from lbt_synth.report.number_text import number_text, print_text, unbroken_text
+from lbt_synth.report.page.blocks import Chart, Page, creator_name
+from lbt_synth.storage.atomic_files import require_ending, require_writable, write_together
+from lbt_synth.storage.tables import Table
+from lbt_synth.storage.warning_filters import ignore_warnings
+
 _COLUMNS = 6  # that fit a sheet of paper beside the first one of a table
+_MOST_ROWS = 120  # of a table of numbers behind a figure
+_DETAILS = re.compile(r"<details>.*?</details>", re.DOTALL)
+_DIGITS = 5  # of such a number
 
 
 def page_html(page: Page) -> bytes:
     """Return a page as one HTML file, UTF-8.
 
-    Every text is escaped. Charts are there twice: as drawings, for paper and for browsers
-    without JavaScript, and as data that the script in the page draws for the pointer.
+    Every text is escaped. Charts are drawings with their numbers in tables behind them; the page
+    has no script.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -41,38 +43,131 @@ def page_html(page: Page) -> bytes:
     environment.globals |= {
         "kind_of": lambda block: type(block).__name__.lower(),
         "parts_of": lambda table: list(table.by_columns(_COLUMNS)),
-        "colour": colour,
-        "strokes": lambda look: " ".join(f"{2 * stroke:g}" for stroke in dashes(look)) or "none",
-        "marker_path": lambda curve: _MARKER_PATHS[marker_name(curve.marker, curve.look)],
         "printed": print_text,
         "unbroken": unbroken_text,
-        "shade": SHADE,
-        "pale": PALE,
+        "drawing_of": chart_svg,
+        "numbers_of": lambda chart: list(number_tables(chart.figure)),
+        "rows_of": lambda chart: count_rows(figure_series(chart.figure)),
     }
-    embedding, lines = embed_charts(page.charts)
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
-    text = template.render(
-        page=page,
-        creator=creator_name(),
-        style=(here / "page.css").read_text(encoding="utf-8"),
-        script=(here / "page.js").read_text(encoding="utf-8"),
-        library=bokeh_script() if page.charts else "",
-        data=_script_json(embedding),
-        legends={
-            chart.key: [
-                (name, mark, " ".join(lines[chart.key].get(name, ())))
-                for name, mark in legend_entries(chart.panels).items()
-            ]
-            for chart in page.charts
-        },
-        drawings={chart.key: chart_svg(chart) for chart in page.charts},
-    )
-    return text.encode()
+    style = (here / "page.css").read_text(encoding="utf-8")
+    return template.render(page=page, creator=creator_name(), style=style).encode()
 
 
-def _script_json(value: Any) -> str:
-    """Return JSON that cannot close the script element around it."""
-    text = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
-    for character in "<>&\u2028\u2029":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text
+def chart_svg(chart: Chart) -> str:
+    """Return a chart as an SVG element to be set into a page, whose size follows its place."""
+    import matplotlib as mpl
+
+    buffer = io.BytesIO()
+    # texts stay texts; the salt makes the identifiers of each chart its own
+    with house_style(), mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": chart.key}):
+        chart.figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    svg = buffer.getvalue().decode()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    attributes = f' role="img" aria-label="{escape(chart.alt)}"'
+    svg = re.sub(r' width="[^"]*" height="[^"]*"', lambda _: attributes, svg, count=1)
+    svg = svg.replace('<g id="', f'<g id="{chart.key}_')  # the same in every chart
+    seen: set[str] = set()
+
+    def name_once(element: re.Match[str]) -> str:
+        repeated = element[2] in seen  # the same path, defined again
+        seen.add(element[2])
+        return element[1] if repeated else element[0]
+
+    return re.sub(r'(<(?:path|image|pattern|clipPath)\b[^>]*?) id="([^"]*)"', name_once, svg)
+
+
+def number_tables(figure: Figure) -> Iterator[Table]:
+    """Yield the numbers that a figure draws: a table for the curves of the same abscissae.
+
+    Of long curves it has rows at equal steps, and the least and the largest value of bands.
+    """
+    for group in _shared_abscissae(figure_series(figure)):
+        rows, x = _kept_rows(group), group[0].x
+        cells = [
+            [x[i] if isinstance(x, tuple) else number_text(float(x[i]), _DIGITS) for i in rows],
+            *([number_text(float(one.y[i]), _DIGITS) for i in rows] for one in group),
+        ]
+        yield Table(
+            caption=group[0].panel,
+            headings=(group[0].heading, *(one.name for one in group)),
+            rows=tuple(zip(*cells, strict=True)),
+        )
+
+
+def count_rows(series: tuple[Series, ...]) -> tuple[int, int]:
+    """Return how many rows the tables of numbers have, and how many there would be of all."""
+    groups = _shared_abscissae(series)
+    return sum(len(_kept_rows(group)) for group in groups), sum(len(g[0].x) for g in groups)
+
+
+def _shared_abscissae(series: tuple[Series, ...]) -> list[list[Series]]:
+    """Return series, those that follow each other with the same abscissae together."""
+
+    def abscissae(one: Series) -> object:
+        x = one.x if isinstance(one.x, tuple) else one.x.tobytes()
+        return one.panel, one.heading, x
+
+    return [list(group) for _, group in groupby(series, abscissae)]
+
+
+def _kept_rows(group: list[Series]) -> list[int]:
+    """Return the rows of a table of curves: all, or even ones and the extremes of bands."""
+    count = len(group[0].x)
+    if count <= _MOST_ROWS:
+        return list(range(count))
+    kept = {round(place) for place in np.linspace(0, count - 1, _MOST_ROWS // 2)}
+    for band in np.array_split(np.arange(count), max(1, _MOST_ROWS // (4 * len(group)))):
+        for one in group:
+            values = one.y[band]
+            if np.any(np.isfinite(values)):
+                kept |= {int(band[np.nanargmin(values)]), int(band[np.nanargmax(values)])}
+    return sorted(kept)
+
+
+def require_page_names(
+    path: str | os.PathLike[str],
+    pdf: str | os.PathLike[str] | None = None,
+    *,
+    inputs: tuple[str | os.PathLike[str], ...] = (),
+) -> None:
+    """Refuse names of pages that cannot be written, or would replace an input."""
+    pages: list[tuple[str | os.PathLike[str], str]] = [(path, ".html")]
+    if pdf is not None:
+        pages.append((pdf, ".pdf"))
+    for name, ending in pages:
+        require_ending(name, "a page", (ending,))
+    require_writable(*(name for name, _ in pages), inputs=inputs)
+    if pdf is not None:
+        require_weasyprint()
+
+
+def write_page(
+    page: Page, path: str | os.PathLike[str], pdf: str | os.PathLike[str] | None = None
+) -> tuple[Path, ...]:
+    """Write a page as HTML, and as PDF if that is named; all files are written, or none."""
+    contents: dict[str | os.PathLike[str], bytes] = {path: page_html(page)}
+    if pdf is not None:
+        contents[pdf] = print_html(contents[path])
+    return write_together(contents)
+
+
+def print_html(html: bytes) -> bytes:
+    """Return a page of HTML on sheets of A4, as PDF, without the numbers behind its figures."""
+    text = _DETAILS.sub("", html.decode())
+    content: bytes = require_weasyprint().HTML(string=text).write_pdf()
+    return content
+
+
+def require_weasyprint() -> Any:
+    """Return the module that prints HTML."""
+    try:
+        with ignore_warnings(DeprecationWarning):  # of a library that it will need later
+            import weasyprint
+    except (ImportError, OSError) as error:  # OSError: without the library Pango
+        raise MissingExtraError(
+            'a page as PDF needs WeasyPrint and Pango: pip install "lbt-synth[pdf]", and on Debian '
+            "apt-get install libpango-1.0-0 libpangoft2-1.0-0.",
+            extra="pdf",
+        ) from error
+    return weasyprint

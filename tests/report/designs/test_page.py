@@ -5,12 +5,13 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from support.commands import run
 from support.design_reports import SMALL, words_of
 from support.pages import Reader
+from support.several_sensors import write_config
 
 import lbt_synth as lbt
-from lbt_synth.report.charts.description import Curve
-from lbt_synth.report.designs.page import design_page
+from lbt_synth.report.designs.page import design_page, write_sensors_report
 from lbt_synth.report.designs.tables import verdict
 from lbt_synth.report.number_text import fixed_text
 from lbt_synth.storage.tables import Table
@@ -19,7 +20,7 @@ from lbt_synth.storage.tables import Table
 def test_an_unstable_loop_is_named_loudly(report, text):
     wild = report.assessments[2]
     assert not wild.stable
-    assert wild.spectral_radius > 1
+    assert wild.loop.spectral_radius > 1
     assert wild.budget is None
     assert wild.margins is None
     assert "wild" not in report.simulations
@@ -43,8 +44,7 @@ def test_the_loop_gain_has_the_margins_of_the_table(report):
     (found,) = [each for each in design_page(report).charts if each.key == "bode"]
     for one in report.stable:
         assert f"{one.name} {one.margins.phase_deg:.1f}° at" in found.alt
-    marked = {curve.name for curve in found.panels[1].select(Curve)}
-    assert "phase margin" in marked
+    assert "phase margin" in {line.get_label() for line in found.figure.axes[1].get_lines()}
     assert "wild unstable" in found.alt
 
 
@@ -61,7 +61,7 @@ def test_the_page_is_complete(text, report, config):
     titles = " ".join(reader.texts["h2"] + reader.texts["h3"])
     for word in (
         "Summary",
-        "Rejection and noise",
+        "Estimation error, rejection and noise",
         "Loop gain and margins",
         "Strehl ratio over the frequency error",
         "Poles",
@@ -152,9 +152,9 @@ def test_a_certificate_that_cannot_be_computed(few, monkeypatch):
 
 def test_both_files_or_none(report, tmp_path, monkeypatch):
     (tmp_path / "a.html").write_text("old")
-    monkeypatch.setattr("lbt_synth.report.page.page_files.page_html", lambda page: b"new")
-    monkeypatch.setattr("lbt_synth.report.page.page_files.print_html", lambda html: 1 / 0)
-    monkeypatch.setattr("lbt_synth.report.page.page_files.require_weasyprint", lambda: None)
+    monkeypatch.setattr("lbt_synth.report.page.html.page_html", lambda page: b"new")
+    monkeypatch.setattr("lbt_synth.report.page.html.print_html", lambda html: 1 / 0)
+    monkeypatch.setattr("lbt_synth.report.page.html.require_weasyprint", lambda: None)
     with pytest.raises(ZeroDivisionError):
         lbt.report.write_report(report, tmp_path / "a.html", pdf=tmp_path / "a.pdf")
     assert (tmp_path / "a.html").read_text() == "old"
@@ -182,3 +182,40 @@ def test_refused_in_the_library(report, config, designs, tmp_path):
     ):
         with pytest.raises(error, match=words):
             call()
+
+
+def test_a_page_has_the_table_of_failures_and_a_run(
+    sensors_design, sensors_file, sensors_config, tmp_path
+):
+    files, found = write_sensors_report(
+        sensors_config,
+        {"both": sensors_design},
+        tmp_path / "page.html",
+        gain_files={"both": sensors_file},
+    )
+    text = files[0].read_text(encoding="utf-8")
+    assert "When sensors fail" in text
+    for source in (sensors_file, sensors_config.source):
+        assert hashlib.sha256(source.read_bytes()).hexdigest() in text
+    assert "each sensor missing in turn" in text
+    assert found.rows[0].design == "both"
+    limit = found.limit.rms_nm
+    assert found.rows[0].residual_nm < limit  # of the own sensor alone
+    assert f"alone leaves less than {limit:.1f}" in text
+
+
+def test_the_command_takes_them_alone(sensors_file, gains, tmp_path, capsys):
+    config, page = write_config(tmp_path), tmp_path / "page.html"
+    status, text, _ = run(capsys, "report", config, sensors_file, "-o", page)
+    assert (status, page.exists()) == (0, True)
+    assert "above the limit" in text
+    page.unlink()
+    status, _, error = run(capsys, "report", config, sensors_file, gains["kalman"], "-o", page)
+    assert (status, page.exists()) == (2, False)
+    assert "lbt-synth limits takes both" in error
+
+
+@pytest.fixture
+def gains(tmp_path_factory, config):
+    design = lbt.integrator(config.hardware, gain=0.5)
+    return {"kalman": lbt.save_gain(tmp_path_factory.mktemp("own") / "own.fits", design)}

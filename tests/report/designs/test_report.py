@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.report.designs.report import count_steps, frequency_errors
+from lbt_synth.design import Certificate, Check
+from lbt_synth.report.designs.page import design_page
+from lbt_synth.report.designs.report import frequency_errors
+from lbt_synth.report.designs.tables import assessment_row
+from lbt_synth.report.draw import figure_series
 
 
 def test_the_numbers_are_those_of_the_library(report, config, designs):
@@ -17,6 +21,7 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         config.imaging,
         errors_hz=config.settings.robustness.errors_hz,
     )
+    (rejections,) = (c.figure for c in design_page(report).charts if c.key == "sigma")
     for (one, row), limits in zip(report.rows, study.rows, strict=True):
         assert row.residual_nm == pytest.approx(limits.residual_nm, rel=1e-9, nan_ok=True)
         assert row.above_limit_percent == pytest.approx(limits.above_limit_percent, nan_ok=True)
@@ -36,10 +41,14 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         gains = [int(np.flatnonzero(one.map.sensor_gains == g)[0]) for g in (0.5, 1.0)]
         assert one.map.strehl[0][np.ix_(gains, at)] == pytest.approx(found.strehl[0], rel=1e-9)
         assert one.curve.strehl[0, 0, at] == pytest.approx(found.strehl[0, 1], rel=1e-9)
-        peak = np.linalg.norm(loop.sensitivity(report.frequency_hz), 2, axis=(1, 2))
-        assert one.rejection == pytest.approx(peak, rel=1e-9)
+        series = next(
+            s for s in figure_series(rejections) if (s.name, "phase" in s.panel) == (one.name, True)
+        )
+        peak = np.linalg.norm(loop.sensitivity(series.x), 2, axis=(1, 2))
+        assert series.y == pytest.approx(peak, rel=1e-9)
     kalman = report.assessments[0]
-    assert (kalman.gamma, kalman.estimation_rms) == (kalman.design.gamma, kalman.design.rms)
+    row = assessment_row(report, *report.rows[0])
+    assert (row.gamma, row.estimation_rms) == (kalman.design.gamma, kalman.design.rms)
     assert kalman.checks == designs["kalman"].recertify().checks
 
 
@@ -53,7 +62,17 @@ def test_errors_that_would_leave_the_band_are_left_out(config):
     assert frequency_errors(config)[[0, -1]].tolist() == [-3.5, 3.5]
 
 
-def test_steps_are_counted(few, designs):
-    done = []
-    lbt.report.design_report(few, designs, advance=done.append)
-    assert sum(done) == count_steps(3) - 1  # the unstable one is not simulated
+def test_a_design_that_was_tampered_with_fails(config, designs):
+    kalman = designs["kalman"]
+    wrong = replace(
+        kalman,
+        gain_predictor=1.1 * np.asarray(kalman.gain_predictor),
+        certificate=Certificate(
+            checks=(Check(name="believe me", value=0, limit=1, computed_by="none"),),
+            gamma=1.0,
+            rms_per_output=np.ones(2),
+        ),
+    )
+    one = lbt.report.design_report(config, {"wrong": wrong}).assessments[0]
+    assert not one.certified
+    assert "believe me" not in [check.name for check in one.checks]

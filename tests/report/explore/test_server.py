@@ -3,7 +3,6 @@
 import json
 import re
 import time
-from dataclasses import replace
 from pathlib import Path
 from queue import Queue
 from threading import Event
@@ -19,8 +18,8 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.report.explore import server
-from lbt_synth.report.explore.exploration import Wish, explore, first_wish, quick_view, whole_view
-from lbt_synth.report.explore.server import Lane, Session, Site, save_view
+from lbt_synth.report.explore.exploration import Wish, explore, quick_view, whole_view
+from lbt_synth.report.explore.server import Lane, Session, save_view
 from lbt_synth.storage.display_unit import DisplayUnit, nm_text, own_display_unit, show_in
 
 # numbers of all sources, by the chart that draws them
@@ -38,10 +37,10 @@ return numbers;
 class Page:
     """A document whose callbacks run when the test says so."""
 
-    def __init__(self, site):
+    def __init__(self, *arguments):
         self.document, self._later = Document(), Queue()
         self.document.add_next_tick_callback = self._later.put
-        self.session = Session(self.document, site)
+        self.session = Session(self.document, *arguments, [])
         self.exchange = self.document.get_model_by_name("exchange")
 
     def ask(self, **message):
@@ -64,12 +63,12 @@ def exploration():
 
 @pytest.fixture(scope="module")
 def first(exploration):
-    return whole_view(exploration, quick_view(exploration, first_wish()))
+    return whole_view(exploration, quick_view(exploration, Wish()))
 
 
 @pytest.fixture
 def own(exploration, first, tmp_path):
-    page = Page(Site(exploration=exploration, first=first, folder=tmp_path))
+    page = Page(exploration, first, tmp_path)
     yield page
     page.close()
 
@@ -128,8 +127,8 @@ def test_a_save_that_fails_is_said(own, tmp_path):
     own.ask(do="save")
     saved = json.loads(own.exchange.saved)
     assert Path(saved["files"][0]).name == "explored-1.yaml"
-    assert len(own.session._site.saved) == 3
-    own.session._site = replace(own.session._site, folder=tmp_path / "nowhere")
+    assert len(own.session._saved) == 3
+    own.session._folder = tmp_path / "nowhere"
     own.ask(do="save", again=1)
     assert "cannot write" in json.loads(own.exchange.saved)["error"]
 
@@ -392,16 +391,15 @@ def test_work_is_shown_in_the_unit_of_the_page():
 def test_the_commands_make_the_files(exploration, tmp_path, monkeypatch, capsys, method):
     wish = Wish(method=method, values={"delay": 2.5, "shift": 0.7, f"{method}-gamma_ratio": 1.4})
     view = quick_view(exploration, wish)
-    saved = save_view(exploration, view, tmp_path)
-    config, gain, script = saved.files
+    (config, gain, script), commands = save_view(exploration, view, tmp_path)
     assert lbt.load_config(config).text == view.config.text
     kept = lbt.load_gain(gain)
     np.testing.assert_array_equal(kept.gain_predictor, view.design.gain_predictor)
     gain.unlink()
     monkeypatch.chdir(tmp_path)
-    words = saved.commands[0].split()
+    words = commands[0].split()
     assert words[0] == "lbt-synth"
-    assert saved.commands[0] in script.read_text().splitlines()
+    assert commands[0] in script.read_text().splitlines()
     status, _, error = run(capsys, *words[1:])
     assert (status, error) == (0, "")
     made = lbt.load_gain(gain)
@@ -413,19 +411,15 @@ def test_nothing_is_overwritten(exploration, tmp_path):
     first = save_view(exploration, view, tmp_path)
     (tmp_path / "explored-2.sh").write_text("mine")
     third = save_view(exploration, view, tmp_path)
-    assert [path.name for path in first.files] == [
-        f"explored-1.{e}" for e in ("yaml", "fits", "sh")
-    ]
-    assert [path.name for path in third.files] == [
-        f"explored-3.{e}" for e in ("yaml", "fits", "sh")
-    ]
+    assert [path.name for path in first[0]] == [f"explored-1.{e}" for e in ("yaml", "fits", "sh")]
+    assert [path.name for path in third[0]] == [f"explored-3.{e}" for e in ("yaml", "fits", "sh")]
     assert (tmp_path / "explored-2.sh").read_text() == "mine"
     assert len(list(tmp_path.iterdir())) == 7
 
 
 def test_the_head_says_what_was_moved(exploration, tmp_path):
     view = quick_view(exploration, Wish(method="kalman", values={"gain": 0.5}))
-    config = save_view(exploration, view, tmp_path).files[0]
+    config = save_view(exploration, view, tmp_path)[0][0]
     head = config.read_text().splitlines()[:2]
     assert head[0].startswith("# 'lbt.yaml' with real sensor gain 0.5; lbt_synth ")
     assert head[1] == "# lbt-synth design explored-1.yaml --method kalman -o explored-1.fits"

@@ -1,8 +1,121 @@
-"""The figures of studies: of a set of modes."""
+"""Figures of studies: robustness, maps, limits, trade-offs, modes, and end-to-end tables."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
+from support.end_to_end import make_table
+from support.figures import legend
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
+from lbt_synth.report.figures.studies import (
+    end_to_end_figure,
+    end_to_end_table_figure,
+    limits_figure,
+    tradeoff_figure,
+)
+from lbt_synth.studies import robustness, robustness_map
+
+
+def test_robustness_figure_draws_the_paper_beside(config):
+    rows = list(robustness(config.plant, config.truth, config.imaging, errors_hz=[-1, 0, 1]))
+    (axis,) = lbt.report.figures.robustness_figure(rows, {"kalman": [(0.0, 80.4)]}).axes
+    assert legend(axis) == ["Kalman", "Kalman, paper", "H∞"]
+    assert "[%]" in axis.get_ylabel()
+    assert 50 < axis.get_ylim()[0] < 80  # the scale is that of what is there
+    assert "[Hz]" in axis.get_xlabel()
+    (better,) = lbt.report.figures.robustness_figure(
+        [replace(row, strehl=0.99 + row.strehl / 1000) for row in rows]
+    ).axes
+    assert 97.9 < better.get_ylim()[0] < 99
+
+
+def test_robustness_figure_of_an_unstable_method(config):
+    truth = replace(config.truth, sensor_gain=0.3)
+    rows = list(
+        robustness(config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05)
+    )
+    (axis,) = lbt.report.figures.robustness_figure(rows).axes
+    assert legend(axis) == ["Kalman", "H∞: unstable"]
+
+
+@pytest.fixture(scope="module")
+def settings():
+    return lbt.load_config(LBT_YAML)
+
+
+@pytest.fixture(scope="module")
+def kalman(settings):
+    return lbt.kalman(settings.plant)
+
+
+@pytest.fixture(scope="module")
+def robust(settings):
+    return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
+
+
+@pytest.fixture(scope="module")
+def maps(kalman, robust, settings):
+    axes = {"errors_hz": [2, 0, -2, 1], "sensor_gains": [1.5, 0.3, 0.8, 3.0]}
+    return {
+        name: robustness_map(design, settings.truth, settings.imaging, **axes)
+        for name, design in (("Kalman", kalman), ("H-infinity", robust))
+    }
+
+
+def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
+    figure = lbt.report.figures.robustness_map_figure(maps)
+    left, right, bar = figure.axes
+    assert [panel.get_title(loc="left") for panel in (left, right)] == ["Kalman", "H-infinity"]
+    assert bar.get_xlabel() == "Strehl ratio [%]"
+    assert left.get_ylabel() == "sensor gain [-]"
+    assert left.get_xlabel() == "frequency error, truth less design [Hz]"
+    assert "unstable loop" in [text.get_text() for text in figure.legends[0].get_texts()]
+    unstable = [[c.get_hatch() for c in p.collections].count("////") for p in (left, right)]
+    assert unstable == [1, 2]  # the Kalman filter at 3, the other at 0.3 as well
+    assert left.collections[0].get_clim() == right.collections[0].get_clim()
+    figure.savefig(tmp_path / "map.png")
+
+
+def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
+    def mapped(design, gains, delays):
+        return robustness_map(
+            design,
+            settings.truth,
+            settings.imaging,
+            errors_hz=[0],
+            sensor_gains=gains,
+            delay_errors_frames=delays,
+        )
+
+    figure = lbt.report.figures.robustness_map_figure(
+        {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
+    )
+    assert len(figure.axes) == 5
+    assert figure.axes[2].get_title(loc="left") == "a, delay error +0.1 frames"
+    assert figure.axes[2].get_ylabel() == "sensor gain [-]"
+    figure.savefig(tmp_path / "a.png")
+    nowhere = lbt.report.figures.robustness_map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
+    nowhere.savefig(tmp_path / "b.pdf")
+
+
+def test_map_figures_that_are_refused(maps, kalman, settings):
+    with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
+        lbt.report.figures.robustness_map_figure({})
+    late = robustness_map(
+        kalman,
+        settings.truth,
+        settings.imaging,
+        errors_hz=[0],
+        sensor_gains=[1],
+        delay_errors_frames=[0.1],
+    )
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"
+    ):
+        lbt.report.figures.robustness_map_figure({**maps, "late": late})
 
 
 def test_modal_figure_has_labels_units_and_all_modes():
@@ -31,3 +144,61 @@ def test_bad_modal_figures_are_refused():
     ):
         with pytest.raises(error, match=words):
             lbt.report.figures.modal_figure(*arguments)
+
+
+def test_the_table_of_the_paper_has_a_panel_a_controller():
+    figure = end_to_end_table_figure(make_table())
+    assert [axis.get_title(loc="left") for axis in figure.axes] == ["Kalman", "H∞", "slow"]
+    assert figure.axes[0].lines[0].get_label() == "Agapito et al. 2008"
+
+
+def test_a_run_has_three_panels_and_a_colour_bar():
+    rng = np.random.default_rng(0)
+    run = lbt.interop.EndToEndRun(
+        system=lbt.load_config(LBT_YAML).end_to_end.system,
+        strehl_series=np.full(40, 0.8),
+        other_modes_series=np.full(40, 0.9),
+        **{
+            name: rng.normal(size=(40, 672)) for name in ("measurements", "commands", "residual_nm")
+        },
+        psf=np.eye(60),
+        psf_pixel_mas=18.4,
+        seed=0,
+        settle_frames=400,
+        seconds=1.0,
+    )
+    assert len(end_to_end_figure(run).axes) == 4
+
+
+def test_a_sensor_gain_of_zero_has_no_line():
+    """The interval goes on to the edge of the panel, where it has no end."""
+    points = [
+        SimpleNamespace(
+            family="mixed", gamma=gamma, rms=1.0, design=loop, gain_low=low, gain_high=3
+        )
+        for gamma, low in ((1.0, 0.5), (2.0, 0.1), (3.0, 0.0))
+        for loop in [SimpleNamespace(hardware=True)]
+    ]
+    axes = tradeoff_figure(points).axes[1]
+    low, high = (line.get_ydata() for line in axes.get_lines()[:2])
+    np.testing.assert_array_equal(low, [0.5, 0.1, np.nan])
+    np.testing.assert_array_equal(high, [3, 3, 3])
+    (shade,) = axes.collections
+    assert shade.get_paths()[0].vertices[:, 1].min() == pytest.approx(axes.get_ylim()[0])
+    assert axes.get_ylim()[0] > 0.01
+
+
+def test_limits_name_equal_designs_once_and_what_moves(config):
+    kalman = lbt.kalman(config.plant)
+    designs = {
+        "kalman": kalman,
+        "by hand": kalman,
+        "slow": lbt.integrator(config.hardware, gain=0.3),
+    }
+    parts = config.hardware, config.truth, config.imaging
+    study = lbt.studies.limits(designs, *parts, errors_hz=[-1, 1])
+    (axes,) = limits_figure(study).axes
+    assert legend(axes)[:2] == ["Kalman and by hand", "slow"]
+    assert axes.get_xlabel() == "frequency of the true vibration [Hz]"
+    several = limits_figure(replace(study, frequency_hz=None)).axes[0].get_xlabel()
+    assert several == "shift of the vibration that moves most, the others in proportion [Hz]"

@@ -1,45 +1,28 @@
-"""What blocks, charts and tables refuse."""
+"""What blocks, charts and tables refuse, and the time at which a page was made."""
 
 import re
+from datetime import UTC, datetime
 
 import pytest
+from matplotlib.figure import Figure
 
 import lbt_synth as lbt
-from lbt_synth.report.charts.description import Axis, Bars, Chart, Curve, Map, Panel
-from lbt_synth.report.page.blocks import Page, Section
+from lbt_synth.report.page.blocks import Chart, Page, Section, creation_time
 from lbt_synth.storage.tables import Cell, Table
 
-X, Y = Axis(label="x"), Axis(label="y")
-DOT = Curve(name="a", x=[1.0], y=[1.0])
+WORDS = {"title": "t", "caption": "c", "alt": "a", "figure": Figure()}
+TWICE = (Section(key="a", title="a", blocks=("words",)),) * 2
 
 
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: Curve(name="a", x=[1, 2], y=[1]), "same length"),
-        (lambda: Curve(name="a", x=[1], y=[1], line=False), "a line or a marker"),
-        (lambda: Curve(name="a", x=[1], y=[1], marker="star"), "marker must be one of"),
-        (lambda: Map(x=[1, 2], y=[1], values=[[1]], label="v"), "a column for each of 2 x"),
-        (lambda: Map(x=[2, 1], y=[1], values=[[1, 2]], label="v"), "x of a map must increase"),
-        (lambda: Map(x=[1], y=[1], values=[[1]], label="v", low=1), "low must be below high"),
-        (
-            lambda: Panel(x=X, y=Y, marks=(Bars(name="a", values=[1]),)),
-            "a value for each of 0 categories",
-        ),
-        (
-            lambda: Chart(key="A b", title="t", caption="c", alt="a", panels=()),
-            "a key must be of small letters",
-        ),
-        (lambda: Chart(key="a", title="t", caption="c", alt=" ", panels=()), "words for its alt"),
-        (lambda: Chart(key="a", title="t", caption="c", alt="a", panels=()), "one panel"),
+        (lambda: Chart(key="A b", **WORDS), "a key must be of small letters"),
+        (lambda: Chart(key="a", **WORDS | {"alt": " "}), "words for its alt"),
         (lambda: Table(caption="t", headings=("a", "b", "c"), rows=(("1", "2"),)), "1 or 3 cells"),
         (lambda: Cell(text="a", tone="loud"), "tone must be one of"),
         (
-            lambda: Page(
-                title="t",
-                subtitle="s",
-                sections=tuple(Section(key="a", title="a", blocks=()) for _ in range(2)),
-            ),
+            lambda: Page(title="t", subtitle="s", sections=TWICE),
             "keys of a page must be unique; got a twice",
         ),
     ],
@@ -47,3 +30,19 @@ DOT = Curve(name="a", x=[1.0], y=[1.0])
 def test_mistakes_are_refused(make, text):
     with pytest.raises(lbt.errors.ProblemError, match=re.escape(text)):
         make()
+
+
+def test_a_section_without_blocks_is_left_out():
+    sections = (Section(key="a", title="a", blocks=()), TWICE[0])
+    assert Page(title="t", subtitle="s", sections=sections).sections == TWICE[:1]
+
+
+def test_the_creation_time(monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert creation_time() == datetime(1970, 1, 2, tzinfo=UTC)
+    for wrong in ("tomorrow", "1e400", str(10**30)):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", wrong)
+        with pytest.raises(lbt.errors.ProblemError, match="SOURCE_DATE_EPOCH must be a number"):
+            creation_time()
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    assert abs((datetime.now(UTC) - creation_time()).total_seconds()) < 60

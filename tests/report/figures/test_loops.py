@@ -1,10 +1,12 @@
-"""Bode, Nyquist and Nichols plots: curves of closed forms, margins where they are."""
+"""Figures of loops: curves of closed forms, margins where they are, loops that are unstable."""
 
 import numpy as np
 import pytest
 from support.figures import legend
 
 import lbt_synth as lbt
+from lbt_synth.report.draw import drawing
+from lbt_synth.report.figures.loops import draw_transfer, frequency_grid
 
 FIGURES = lbt.report.figures
 PATH = lbt.LoopHardware(frame_rate_hz=800)
@@ -111,3 +113,63 @@ def test_designs_without_a_loop_are_refused():
             draw({"walk": lbt.kalman(walk)})
         with pytest.raises(lbt.errors.ProblemError, match="at least one design"):
             draw({})
+
+
+def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
+    error, rejection, noise = lbt.report.figures.sigma_figure(designs).axes
+    assert legend(error) == ["Kalman", "H-infinity", "vibration"]
+    assert legend(rejection) == ["Kalman", "H-infinity", "integrator", "vibration"]
+    assert "[nm]" in error.get_ylabel()
+    assert noise.get_xlabel() == "frequency [Hz]"
+    marks = [line for line in error.get_lines() if line.get_label() == "vibration"]
+    assert marks[0].get_xdata()[0] == 20
+    # the curve is the achieved norm at its highest point
+    curve = error.get_lines()[0].get_ydata()
+    assert curve.max() == pytest.approx(designs["Kalman"].gamma, rel=1e-3)
+
+
+def test_curves_differ_in_grey(designs):
+    lines = lbt.report.figures.sigma_figure(designs).axes[1].get_lines()[:3]
+    assert len({str(line._dash_pattern) for line in lines}) == 3
+    assert len({line.get_color() for line in lines}) == 3
+
+
+def test_a_sigma_plot_names_an_unstable_loop(designs):
+    _, rejection, noise = lbt.report.figures.sigma_figure(designs, sensor_gain=0.4).axes
+    assert "sensor gain 0.4" in rejection.get_title(loc="left")
+    for axis in (rejection, noise):
+        assert "H-infinity: unstable" in legend(axis)
+        curves = {line.get_label(): len(line.get_xdata()) for line in axis.get_lines()}
+        assert curves["H-infinity: unstable"] == 0
+        assert curves["Kalman"] > 100
+
+
+def test_empty_figures_are_refused():
+    for empty in (
+        lambda: lbt.report.figures.sigma_figure({}),
+        lambda: lbt.report.figures.robustness_figure([]),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match="at least one"):
+            empty()
+
+
+def test_a_zero_at_the_nyquist_frequency_is_no_scale():
+    f = np.geomspace(1, 400, 50)
+    zero = np.abs(1 - f / 400) + 1e-17
+    for y, lowest in ((zero, 1e-5 * zero.max()), (f, 400**-0.04)):
+        with drawing([2.0]) as (panel,):
+            draw_transfer(panel, "noise to residual", "-", {"a": (f, y)}, ["a"], [])
+        assert panel.axes.get_ylim()[0] == pytest.approx(lowest)
+
+
+@pytest.mark.parametrize("near", [28, 60])
+def test_a_grid_is_fine_around_lines_and_below_nyquist(near):
+    grid = frequency_grid(800, (20.0, 390.0), points=240, near=near)
+    assert np.all(np.diff(grid) > 0)
+    assert (grid[0], grid[-1]) == (pytest.approx(400 / 10**3.6), 400)
+    assert 20.0 in grid
+    for centre in (20.0, 390.0, 400.0):
+        distances = np.sort(np.abs(grid / centre - 1))
+        assert distances[0] == 0
+        assert distances[1] == pytest.approx(1e-4, rel=1e-6)
+        assert np.max(np.diff(distances[distances < 0.1])) < 0.035

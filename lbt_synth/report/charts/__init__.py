@@ -1,1 +1,0 @@
-"""Figures described once, drawn by matplotlib for files and by Bokeh for pages."""

@@ -1,0 +1,186 @@
+"""The page of a diagnosis, its charts and its tables."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.identification import Diagnosis
+from lbt_synth.identification.diagnosis.channels import AXES
+from lbt_synth.identification.diagnosis.running_loop import command_row, law_row
+from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
+from lbt_synth.identification.records.faults import HEADINGS
+from lbt_synth.identification.records.record import NOT_KNOWN
+from lbt_synth.report.draw import Figure, drawing
+from lbt_synth.report.figures import identification_figure
+from lbt_synth.report.number_text import number_text
+from lbt_synth.report.page.blocks import (
+    Block,
+    Chart,
+    Notice,
+    Page,
+    Section,
+    chart,
+    creation_time,
+    paragraph,
+    read_source,
+    source_section,
+    time_text,
+)
+from lbt_synth.report.page.html import require_page_names, write_page
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import cell_text, fact_table, row_table
+from lbt_synth.storage.tables import Table
+from lbt_synth.storage.words import count_text, listing_text
+
+_ROW_IN = 0.42  # height of a category
+_SIGMAS = 2.0
+
+
+def _residual_charts(found: Diagnosis) -> list[Chart]:
+    """Return bars of the residuals on unseen data, and of the parts of the disturbance."""
+    charts = []
+    if rows := found.residuals:
+        values = np.array([row.replayed_nm for row in rows])
+        errors = _SIGMAS * np.array([row.replayed_error_nm for row in rows])
+        promised = np.array([row.model_nm for row in rows])
+        names = [row.name for row in rows]
+        intervals = {"data": (values - errors, values + errors)}
+        figure = _draw_bars(names, {"data": values, "model": promised}, intervals)
+        shown = np.where(np.isfinite(values), values, promised)
+        pairs = zip(names, shown.tolist(), strict=True)  # the limit has no data
+        said = [f"{name} {nm_text(value_nm, '.1f')}" for name, value_nm in pairs]
+        charts.append(chart("residuals", figure, values=listing_text(said)))
+    if costs := found.costs:
+        columns = {"loop that ran": "running_nm", "best design": "best_nm"}
+        bars = {
+            name: np.array([getattr(row, field) for row in costs])
+            for name, field in columns.items()
+        }
+        said = [
+            f"{row.part} {nm_text(row.running_nm, '.1f')} and {nm_text(row.best_nm, '.1f')}"
+            for row in costs
+        ]
+        figure = _draw_bars([row.part for row in costs], bars, {})
+        best = found.best or "none"
+        charts.append(chart("costs", figure, values=listing_text(said), best=best))
+    return charts
+
+
+def _draw_bars(
+    names: Sequence[str],
+    bars: Mapping[str, ArrayLike],
+    intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
+) -> Figure:
+    with drawing([_ROW_IN * max(len(names), 2)]) as (panel,):
+        panel.set_axes({"label": "residual", "unit": "nm rms", "low": 0}, {})
+        panel.bars(names, bars, intervals)
+    return panel.figure
+
+
+def _spectrum_charts(found: Diagnosis) -> list[Chart]:
+    """Return the chart of the identified model."""
+    if found.model is None:
+        return []
+    designs = {} if found.best_design is None else {found.best: found.best_design}
+    lines = [f"{number_text(line.row.frequency_hz)} Hz" for line in found.lines]
+    figure = identification_figure(found.model, designs=designs)
+    return [chart("identification", figure, lines=listing_text(lines) or "none")]
+
+
+def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
+    """Return the tables of a diagnosis by their sections, without those of what is not known."""
+    record, health = found.record, found.record.health
+    text = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
+    if health.jitter_frames is not None:
+        text += f", clock jitter {health.jitter_frames:.2g} frames rms"
+    channels = [row_table(f"Record: {text}. {health.summary()}", found.channels)]
+    faults = tuple(
+        tuple(map(cell_text, (kind, series, "-" if axis is None else AXES[axis], *rest)))
+        for kind, series, axis, *rest in health.rows()
+        if kind != NOT_KNOWN  # a consequence of other faults, and of the beginning
+    )
+    if faults:
+        channels.append(Table(caption="Faults", headings=HEADINGS, rows=faults, words=(1, 2, 6)))
+    commands, law = found.commands, found.law
+    loop = {
+        "How the commands reach the measurements": commands and [command_row(commands)],
+        "Control law in use, from y to u": law and [law_row(law)],
+        "Loop": found.loop and [found.loop],
+    }
+    best = f" (best design: {found.best})" if found.best else ""
+    unseen = "Residual on the second half of the record, by models of the first"
+    residuals = {
+        f"What each part leaves by the model of the whole record{best}": found.costs,
+        f"{unseen}; {found.imaging.label}": found.residuals,
+    }
+    given = found.given
+    lines = {"Vibrations, and where they come from": [line.row for line in found.lines]}
+    return {
+        "record": channels,
+        "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],
+        "disturbance": [row_table(caption, rows) for caption, rows in lines.items() if rows],
+        "verdict": [row_table(caption, rows) for caption, rows in residuals.items() if rows]
+        + ([] if given is None else [fact_table("The gain file on this record", given)]),
+    }
+
+
+def write_diagnosis(
+    found: Diagnosis,
+    path: str | os.PathLike[str],
+    *,
+    pdf: str | os.PathLike[str] | None = None,
+    files: Sequence[str | os.PathLike[str]] = (),
+) -> tuple[Path, ...]:
+    """Write a diagnosis as one HTML file that opens offline, and as a PDF if that is wanted.
+
+    ``files`` are those of the record and of the given design, whose digests the page gives. All
+    files are written, or none; a wrong ending or a file that cannot be written raises an
+    OutputError.
+    """
+    require_page_names(path, pdf, inputs=tuple(files))
+    return write_page(diagnosis_page(found, files), path, pdf)
+
+
+def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = ()) -> Page:
+    """Return the page of a diagnosis."""
+    roles = ("record", "gain file")
+    read = [read_source(Path(file), role)[0] for file, role in zip(files, roles, strict=False)]
+    name = read[0].name if read else found.record.source or "a record"
+    record, tables = found.record, diagnosis_tables(found)
+    disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(found)]
+    sections = (
+        Section(key="verdict", title="Verdict", blocks=_verdict_blocks(found, tables["verdict"])),
+        Section(key="record", title="Record", blocks=tables["record"]),
+        Section(key="loop", title="Loop that ran", blocks=(paragraph("law"), *tables["loop"])),
+        Section(
+            key="disturbance",
+            title="Disturbance",
+            blocks=disturbance or ["No model was identified."],
+        ),
+        source_section(read),
+    )
+    return Page(
+        title=f"Diagnosis of {name}",
+        subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "
+        f"{count_text(record.axes, 'axis', 'axes')}. Made "
+        f"{time_text(creation_time())}.",
+        sections=sections,
+    )
+
+
+def _verdict_blocks(found: Diagnosis, tables: Sequence[Table]) -> list[Block]:
+    state, *rest = diagnosis_verdict(found)
+    wrong = found.doubt or any(row.serious for row in found.channels)
+    doubtful = found.loop is None or found.loop.modulus < NARROW
+    return [
+        Notice(text=state, tone="bad" if wrong else "note" if doubtful else "good"),
+        " ".join(rest),
+        *tables,
+        *_residual_charts(found),
+        *(Notice(text=f"{note[0].upper()}{note[1:]}") for note in found.notes),
+    ]

@@ -1,1 +1,0 @@
-"""The page about the autopsy of a record."""

@@ -1,0 +1,575 @@
+"""How every figure is drawn: panels with the marks of the house, on new axes or the user's own.
+
+A figure is a block of :func:`drawing`. It yields a :class:`Panel` for each pair of axes, on which
+curves, areas, rules, bars and maps are drawn; at its end the scales, the legend and the colour bar
+are set. Numbers in nm are drawn in the unit that is shown.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.report import scales
+from lbt_synth.storage.atomic_files import require_ending, write_atomically
+from lbt_synth.storage.display_unit import shown_unit
+from lbt_synth.storage.warning_filters import ignore_warnings
+from lbt_synth.validation import FloatArray
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+    from matplotlib.axes import Axes
+
+Figure: TypeAlias = "matplotlib.figure.Figure"
+OwnAxes: TypeAlias = "Axes | Sequence[Axes] | None"  # of the user, to draw on
+FIGURE_ENDINGS = (".png", ".pdf", ".svg")
+
+# Okabe and Ito's palette, in an order that also darkens and lightens in grey
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_GREY = "#404040"
+# Lengths of strokes and gaps, in widths of the line
+_DASHES: tuple[tuple[float, ...], ...] = (
+    (),
+    (4, 2),
+    (6, 2, 1, 2),
+    (1.2, 1.6),
+    (6, 1.5, 1, 1.5, 1, 1.5),
+    (2.5, 1.5),
+)
+_MARKERS = ("o", "s", "^", "D", "+", "x")
+_SHADE = 0.2  # opacity of shaded areas
+_BLANK: dict[str, Any] = {
+    "facecolor": "#d9d9d9",
+    "edgecolor": "0.55",
+    "hatch": "////",
+    "linewidth": 0,
+}
+PANEL_IN = 2.1  # height of a panel, unless it says another
+_WIDTH_IN = 7.0  # of a figure
+_LETTER_IN = 0.068  # width of a letter at 8 points, generously
+_AROUND_IN = 0.55  # below and above the axes of a panel
+_FLAG_IN = 0.15  # width of an upright text
+_LONGEST = {"name": 60, "category": 36}  # letters in a legend, and beside bars
+_MOST_OF_A_PANEL = 1 / 3  # that a legend in it may cover
+
+
+def colour(look: int | None) -> str:
+    """Colour of a look, as #rrggbb; None is grey."""
+    return _GREY if look is None else _COLOURS[look % len(_COLOURS)]
+
+
+def dashes(look: int | None) -> tuple[float, ...]:
+    """Strokes and gaps of a look [widths of the line]; () is solid."""
+    # where the colours repeat, dashes and markers are others
+    return () if look is None else _DASHES[(look + look // len(_COLOURS)) % len(_DASHES)]
+
+
+def marker_of(look: int | None) -> str:
+    """Matplotlib's name of the marker of a look."""
+    number = 0 if look is None else look
+    return _MARKERS[(number + number // len(_COLOURS)) % len(_MARKERS)]
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Matplotlib settings of this package, for the time of the block."""
+    import matplotlib as mpl
+
+    style = files("lbt_synth.report") / "house.mplstyle"
+    # a name in a script that the font does not have stays a name
+    with mpl.rc_context(fname=str(style)), ignore_warnings(message=r"Glyph .* missing"):
+        yield
+
+
+def require_figure_name(path: str | os.PathLike[str]) -> Path:
+    """Refuse a file name that is not that of a figure."""
+    return require_ending(path, "a figure", FIGURE_ENDINGS)
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write a figure, whole or not at all."""
+    target = require_figure_name(path)
+    ending = target.suffix.lower()
+    buffer = io.BytesIO()
+    # without a date, the same figure is the same file
+    undated: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+    with house_style():
+        figure.savefig(buffer, format=ending[1:], metadata=undated.get(ending))
+    return write_atomically(target, buffer.getvalue())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Series:
+    """Numbers that a figure draws, in the units that are shown: a curve, a row of a map, bars."""
+
+    panel: str  # title of its panel, and what is up its y axis
+    heading: str  # what x is, with its unit
+    name: str  # what y is
+    x: FloatArray | tuple[str, ...]  # (n,)
+    y: FloatArray  # (n,)
+
+
+_SERIES: WeakKeyDictionary[Figure, tuple[Series, ...]] = WeakKeyDictionary()
+
+
+def figure_series(figure: Figure) -> tuple[Series, ...]:
+    """Return the numbers of a figure that this package drew."""
+    return _SERIES.get(figure, ())
+
+
+@contextmanager
+def drawing(
+    heights_in: Sequence[float], *, columns: int = 1, axes: OwnAxes = None
+) -> Iterator[list[Panel]]:
+    """Yield a panel for each height [inch], row by row; set scales and legends at the end.
+
+    The panels are those of a new figure, or stand on the user's own axes.
+    """
+    with house_style():
+        if axes is None:
+            places = _new_places(heights_in, columns)
+        else:
+            places = _own_places(axes, len(heights_in))
+        panels = [Panel(place) for place in places]
+        yield panels
+        for panel in panels:
+            panel.finish()
+        figure = panels[0].figure
+        bar = _draw_colour_bar(panels, below=axes is None)
+        if axes is None:
+            rows = [heights_in[i : i + columns] for i in range(0, len(panels), columns)]
+            lines = [panel.title_lines for panel in panels]
+            height = sum(max(row) + _AROUND_IN for row in rows) + 0.6 * bar
+            height += 0.17 * sum(max(lines[i : i + columns]) for i in range(0, len(lines), columns))
+            _draw_legend(figure, panels, height)
+            if any(panel.is_equal for panel in panels):
+                # a layout that knew of equal scales would write labels over each other
+                figure.draw_without_rendering()
+                figure.set_layout_engine("none")
+        else:
+            for panel in panels:
+                _draw_own_legend(panel)
+        for panel in panels:
+            panel.axes.set_aspect("equal" if panel.is_equal else "auto")
+        _SERIES[figure] = tuple(one for panel in panels for one in panel.series)
+
+
+def _new_places(heights_in: Sequence[float], columns: int) -> list[Axes]:
+    """Return the axes of a new figure, row by row."""
+    from matplotlib.figure import Figure
+
+    rows = [max(heights_in[i : i + columns]) for i in range(0, len(heights_in), columns)]
+    figure = Figure(figsize=(_WIDTH_IN, sum(rows) + _AROUND_IN * len(rows)), layout="constrained")
+    grid = figure.add_gridspec(len(rows), columns, height_ratios=rows)
+    return [figure.add_subplot(grid[divmod(i, columns)]) for i in range(len(heights_in))]
+
+
+def _own_places(axes: OwnAxes, count: int) -> list[Axes]:
+    """Return the user's axes as a list, one per panel."""
+    from matplotlib.axes import Axes as Place
+
+    places = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(places) != count or not all(isinstance(place, Place) for place in places):
+        kinds = ", ".join(type(place).__name__ for place in places) or "none"
+        raise ProblemError(
+            f"axes must be {count} matplotlib Axes, one per panel; got {len(places)} ({kinds})."
+        )
+    return places
+
+
+def _legend_entries(panels: Sequence[Panel]) -> tuple[list[Any], list[str]]:
+    """Return marks and texts of a legend, each name with the first mark that has it."""
+    entries: dict[str, Any] = {}
+    for panel in panels:
+        for mark, name in zip(*panel.axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(name, mark)
+    return list(entries.values()), [scales.shorten(name, _LONGEST["name"]) for name in entries]
+
+
+def _draw_legend(figure: Figure, panels: Sequence[Panel], height: float) -> None:
+    """Draw the legend above the panels, and give the figure its height without it [inch]."""
+    marks, names = _legend_entries(panels)
+    if names:
+        widest = 0.55 + _LETTER_IN * max(map(len, names))
+        columns = int(max(1, min(len(names), (_WIDTH_IN - 0.2) // widest)))
+        place: dict[str, Any] = {"loc": "outside upper center", "ncols": columns}
+        figure.legend(marks, names, handlelength=3.2, **place)
+        height += 0.12 + 0.165 * -(-len(names) // columns)
+    figure.set_size_inches(_WIDTH_IN, height)
+
+
+def _draw_own_legend(panel: Panel) -> None:
+    """Draw the legend of the user's axes: in them, or beside them if it would cover too much."""
+    marks, names = _legend_entries([panel])
+    if not names:
+        return
+    legend = panel.axes.legend(marks, names, handlelength=3.2)
+    covered, whole = legend.get_window_extent(), panel.axes.get_window_extent()
+    if covered.width * covered.height > _MOST_OF_A_PANEL * whole.width * whole.height:
+        legend.set_loc("upper left")
+        legend.set_bbox_to_anchor((1.02, 1.0), transform=panel.axes.transAxes)
+
+
+def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:
+    """Draw one colour bar for all maps, and return whether there are any."""
+    from matplotlib.colors import LogNorm
+
+    mapped = [panel for panel in panels if panel.image is not None]
+    if not mapped:
+        return False
+    image, places = mapped[0].image, [panel.axes for panel in mapped]
+    style = {"location": "bottom", "shrink": 0.6, "aspect": 40} if below else {}
+    bar = mapped[0].figure.colorbar(image, ax=places, **style)
+    if isinstance(image.norm, LogNorm):
+        ticks = scales.log_ticks(image.norm.vmin, image.norm.vmax)
+        bar.set_ticks(ticks, labels=scales.log_tick_texts(ticks))
+    bar.set_label(mapped[0].image_text)
+    bar.outline.set_visible(False)
+    return True
+
+
+class Panel:
+    """Axes that a part of a figure is drawn on.
+
+    A mark with a name is in the legend, once for each name, if it reaches into the scales. A look
+    is the number of a colour with its dashes and marker; None is dark grey.
+    """
+
+    def __init__(self, axes: Axes) -> None:
+        self.axes = axes
+        self.image: Any = None  # of a map
+        self.image_text = ""
+        self.series: list[Series] = []
+        self.title_lines = 0
+        self._title = ""
+        self._axis: dict[str, dict[str, Any]] = {}
+        self._values: dict[str, list[FloatArray]] = {"x": [], "y": []}
+        # of curves: x, y, and whether they have markers
+        self._curves: list[tuple[FloatArray, FloatArray, bool]] = []
+        self._named: list[tuple[Any, FloatArray | None, FloatArray | None]] = []
+        self._cut: list[Any] = []  # areas and error bars, which end at the edges
+        self._flags: tuple[FloatArray, FloatArray, Sequence[str]] | None = None
+        self.is_equal = self._stands = self._tight = self._rows = False
+        self.set_axes({}, {})
+
+    @property
+    def figure(self) -> Figure:
+        """The figure that the axes are in."""
+        return self.axes.figure
+
+    def set_axes(
+        self, x: Mapping[str, Any], y: Mapping[str, Any], *, title: str = "", equal: bool = False
+    ) -> None:
+        """Name the axes, before anything is drawn.
+
+        Each has a label, and may have a unit ("-" of a pure number), ends (low, high), and a
+        logarithmic scale (log), on which nothing is drawn that is not positive. What is beyond an
+        end is not drawn; an end moves out where it would cut a marker.
+        """
+        for name, axis in (("x", x), ("y", y)):
+            unit, factor = shown_unit(axis.get("unit", ""))
+            text = axis.get("label", "")
+            ends = (axis.get("low"), axis.get("high"))
+            self._axis[name] = {
+                "text": f"{text} [{unit}]" if unit else text,
+                "factor": factor,
+                "log": axis.get("log", False),
+                "ends": [None if end is None else factor * end for end in ends],
+            }
+        self._title = title
+        self.is_equal = self._stands = equal
+
+    def _shown(self, name: str, values: ArrayLike) -> FloatArray:
+        """Return values of an axis in the unit that is shown."""
+        return np.asarray(self._axis[name]["factor"] * np.asarray(values, dtype=np.float64))
+
+    def curve(
+        self,
+        name: str,
+        x: ArrayLike,
+        y: ArrayLike,
+        *,
+        quiet: bool = False,
+        numbers: bool = True,
+        error: ArrayLike | None = None,
+        step: str = "default",
+        **look: Any,
+    ) -> None:
+        """Draw points, (n,) each, joined by a line or not; nan breaks the line.
+
+        Without a name, or without ``numbers``, it is a guide to the eye that is in no table; a
+        quiet one is in tables but not in the legend, one without points in the legend only.
+        ``error`` are half lengths of error bars, ``look`` is as in :func:`line_style`.
+        """
+        along, up = self._shown("x", x), self._shown("y", y)
+        style = line_style(**look)
+        label = f"_{name}" if quiet else _label(name)
+        (line,) = self.axes.plot(along, up, drawstyle=step, label=label, **style)
+        self._values["x"].append(along)
+        self._values["y"].append(up)
+        self._curves.append((along, up, "marker" in style))
+        if along.size:
+            self._named.append((line, along, up))
+        if error is not None:
+            half = self._shown("y", error)
+            ends = up - half, up + half
+            self._values["y"] += ends
+            self._cut.append(self.axes.vlines(along, *ends, color=line.get_color(), linewidth=1.0))
+        if name and numbers and along.size:
+            self._note(name, along, up)
+
+    def _note(self, name: str, x: FloatArray | tuple[str, ...], y: FloatArray) -> None:
+        heading, title = self._axis["x"]["text"], self._axis["y"]["text"]
+        if self._title:
+            title = f"{self._title}: {title}" if title else self._title
+        self.series.append(Series(panel=title, heading=heading, name=name, x=x, y=y))
+
+    def area(
+        self,
+        name: str,
+        x: ArrayLike,
+        low: ArrayLike,
+        high: ArrayLike,
+        *,
+        look: int | None = 0,
+        solid: bool = False,
+    ) -> None:
+        """Shade the area between two curves, (n,) each; a solid one hides what is below it."""
+        along, least, most = self._shown("x", x), self._shown("y", low), self._shown("y", high)
+        style = _fill_style(look, solid=solid)
+        self._cut.append(self.axes.fill_between(along, least, most, label=_label(name), **style))
+        self._values["x"].append(along)
+        self._values["y"] += [least, most]
+        self._stands = True
+        if name:
+            self._note(f"{name}, from", along, least)
+            self._note(f"{name}, to", along, most)
+
+    def rule(self, name: str, at: float, axis: str = "x", *, dash: int = 0) -> None:
+        """Draw a straight grey line across the panel at a value of an axis, below the curves."""
+        place = self._shown(axis, [at])
+        draw = self.axes.axvline if axis == "x" else self.axes.axhline
+        strokes = _DASHES[dash]
+        style = {"color": _GREY, "linewidth": 1.0, "linestyle": (0, strokes) if strokes else "-"}
+        line = draw(place[0], zorder=1.6, label=_label(name), **style)
+        self._named.append((line, *((place, None) if axis == "x" else (None, place))))
+        if axis == "y":
+            self._values["y"].append(place)
+
+    def span(
+        self, name: str, low: float, high: float, axis: str = "x", *, look: int | None = None
+    ) -> None:
+        """Shade a range of an axis, from end to end of the other."""
+        ends = self._shown(axis, [low, high])
+        shade = self.axes.axvspan if axis == "x" else self.axes.axhspan
+        patch = shade(ends[0], ends[1], label=_label(name), **_fill_style(look))
+        self._named.append((patch, *((ends, None) if axis == "x" else (None, ends))))
+
+    def bars(
+        self,
+        categories: Sequence[str],
+        bars: Mapping[str, ArrayLike],
+        intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    ) -> None:
+        """Draw bars of each name along x, (c,), one per category from the top; nan draws none.
+
+        ``intervals`` are ends around the values of a name.
+        """
+        places, height = np.arange(len(categories)), 0.8 / len(bars)
+        for look, (name, lengths) in enumerate(bars.items()):
+            values, up = self._shown("x", lengths), places + (look - (len(bars) - 1) / 2) * height
+            drawn, shade = np.isfinite(values), colour(look)
+            size = 0.9 * height
+            self.axes.barh(up[drawn], values[drawn], height=size, color=shade, label=_label(name))
+            self._values["x"] += [np.zeros(1), values]
+            if name in intervals:
+                ends = [self._shown("x", end) for end in intervals[name]]
+                self.axes.hlines(up, *ends, color="black", linewidth=1.0)
+                self._values["x"] += ends
+            self._note(f"{name} {self._axis['x']['text']}", tuple(categories), values)
+        names = [scales.shorten(name, _LONGEST["category"]) for name in categories]
+        self.axes.set_yticks(places, names)
+        self.axes.tick_params(axis="y", length=0)
+        self.axes.grid(visible=False, axis="y")
+        self._stands = self._rows = True
+
+    def flags(self, x: ArrayLike, y: ArrayLike, texts: Sequence[str]) -> None:
+        """Write upright texts along the upper edge, each with a line down to its point; x rises."""
+        self._flags = self._shown("x", x), self._shown("y", y), texts
+
+    def map(
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        values: FloatArray,
+        label: str,
+        unit: str = "",
+        *,
+        ends: tuple[float, float],
+        log: bool = False,
+        levels: Sequence[float] = (),
+        blank: str = "no value",
+    ) -> None:
+        """Draw values (ny, nx) over a grid of increasing centres, nan hatched as ``blank``.
+
+        ``ends`` are those of the colours; lines of equal value are drawn at ``levels``.
+        """
+        from matplotlib.colors import LogNorm, Normalize
+
+        along, up = self._shown("x", x), self._shown("y", y)
+        edges, shown = (
+            (scales.cell_edges(along), scales.cell_edges(up)),
+            np.ma.masked_invalid(values),
+        )
+        self.axes.grid(visible=False)
+        norm = (LogNorm if log else Normalize)(*ends)
+        self.image = self.axes.pcolormesh(*edges, shown, cmap="viridis", norm=norm, rasterized=True)
+        self.image_text = f"{label} [{unit}]" if unit else label
+        inner = scales.levels_within(values, levels)
+        if inner:
+            shades = ["white" if level < sum(ends) / 2 else "black" for level in inner]
+            lines = self.axes.contour(along, up, shown, levels=inner, linewidths=0.8, colors=shades)
+            texts = self.axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+            boxes = [text.get_window_extent().extents for text in texts]
+            for text, stays in zip(texts, scales.keep_apart(boxes), strict=True):
+                text.set_visible(stays)
+        labels = {"label": _label(blank)}
+        for left, right, low, high in scales.blank_cells(np.isnan(values), *edges):
+            self.axes.fill_between([left, right], low, high, **_BLANK, **labels)
+            labels = {}
+        self._values["x"].append(edges[0])
+        self._values["y"].append(edges[1])
+        self._stands = self._tight = True
+        for place, row in zip(up, values, strict=True):
+            self._note(f"{label} at {self._axis['y']['text']} {place:g}", along, row)
+
+    def ends(self, name: str) -> tuple[float, float]:
+        """Return the ends of the scale of an axis."""
+        if self._rows and name == "y":
+            return len(self.axes.get_yticks()) - 0.4, -0.6
+        axis, room = self._axis[name], scales.ROOM
+        if self._tight or (
+            name == "x" and not self._rows and not any(marked for *_, marked in self._curves)
+        ):
+            room = 0.0  # lines without markers need no room at the ends of x
+        # areas and bars stand on an end, and equal scales stay equal: they move none
+        curves = (
+            []
+            if self._stands
+            else [(x if name == "x" else y, marked) for x, y, marked in self._curves]
+        )
+        return scales.scale_ends(
+            self._values[name], curves, log=axis["log"], ends=axis["ends"], room=room
+        )
+
+    def finish(self) -> None:
+        """Set the scales, leave out of the legend what they do not show, and write the title."""
+        ends = {name: self.ends(name) for name in ("x", "y")}
+        for name, place in (("x", self.axes.xaxis), ("y", self.axes.yaxis)):
+            axis = self._axis[name]
+            if axis["log"]:
+                getattr(self.axes, f"set_{name}scale")("log")
+                ticks = scales.log_ticks(*ends[name])
+                place.set_ticks(ticks, scales.log_tick_texts(ticks))
+                place.set_ticks([], minor=True)
+            getattr(self.axes, f"set_{name}lim")(*ends[name])
+            place.set_label_text(axis["text"], parse_math=False)
+        for mark, x, y in self._named:
+            if not (scales.overlap(x, ends["x"]) and scales.overlap(y, ends["y"])):
+                mark.set_label("_unseen")
+        for mark in self._cut:  # programs that draw an SVG need not cut them off there
+            for path in mark.get_paths():
+                np.clip(path.vertices[:, 1], *sorted(ends["y"]), out=path.vertices[:, 1])
+        width_in = self.axes.get_window_extent().width / self.axes.figure.dpi
+        if self._flags is not None:
+            self._draw_flags(width_in)
+        letters = max(12, int(width_in / _LETTER_IN))
+        lines = textwrap.wrap(scales.shorten(self._title, 3 * letters), letters)
+        self.title_lines = len(lines)
+        self.axes.set_title("\n".join(lines), loc="left", parse_math=False)
+
+    def _draw_flags(self, width_in: float) -> None:
+        """Draw upright texts without overlaps on axes of a width."""
+        assert self._flags is not None
+        x, y, texts = self._flags
+        points = self.axes.transData.transform(np.column_stack((x, y)))
+        across = self.axes.transAxes.inverted().transform(points)[:, 0]
+        places = scales.spread_labels(across, _FLAG_IN / width_in)
+        line = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "relpos": (0.5, 0.0)}
+        for text, point, place in zip(texts, zip(x, y, strict=True), places, strict=True):
+            self.axes.annotate(
+                text,
+                xy=point,
+                xytext=(float(place), 0.985),
+                textcoords="axes fraction",
+                fontsize=6.5,
+                rotation=90,
+                ha="center",
+                va="top",
+                color="0.15",
+                arrowprops={**line, "shrinkA": 0, "shrinkB": 0},
+            )
+
+
+def _label(name: str) -> str:
+    """Return a label of a legend; without the space, a leading underscore would leave it out."""
+    return f" {name}" if name.startswith("_") else name
+
+
+def line_style(
+    look: int | None = 0,
+    *,
+    line: bool = True,
+    marker: str | None = None,
+    filled: bool = True,
+    size: float = 5.0,
+    width: float = 1.6,
+    opacity: float = 1.0,
+    dash: int | None = None,
+) -> dict[str, Any]:
+    """Return the style of a curve in a look.
+
+    A marker is one of matplotlib's, or "own" for that of the look; sizes and widths are in points.
+    ``dash`` is the number of its dashes, 0 is solid and None that of the look.
+    """
+    strokes = dashes(look if dash is None else dash)
+    style: dict[str, Any] = {
+        "color": colour(look),
+        "linewidth": width,
+        "alpha": opacity if opacity < 1 else None,
+        "linestyle": ((0, strokes) if strokes else "-") if line else "none",
+    }
+    if marker is not None:
+        style |= {
+            "marker": marker_of(look) if marker == "own" else marker,
+            "markersize": size,
+            "markerfacecolor": colour(look) if filled else "none",
+            "markeredgewidth": 0.4 if filled and line else 1.2,
+        }
+    return style
+
+
+def _fill_style(look: int | None, *, solid: bool = False) -> dict[str, Any]:
+    return {"color": colour(look), "alpha": 1.0 if solid else _SHADE, "linewidth": 0}
+
+
+def count_columns(panels: int) -> int:
+    """Return how many panels stand side by side: three, but two if there are four."""
+    return 2 if panels == 4 else min(panels, 3)
+
+
+def square_in(columns: int) -> float:
+    """Return the height of square axes, so many side by side [inch]."""
+    return min(_WIDTH_IN / columns - 0.75, 5.0)

@@ -1,0 +1,279 @@
+"""Figures of runs in time, and of the identification of a record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.signal import welch
+
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedModel
+from lbt_synth.linear import Controller
+from lbt_synth.loop import Simulation, close_loop
+from lbt_synth.loop.simulation.failing_sensors import Segment
+from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing
+from lbt_synth.report.figures.loops import FREQUENCY
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.validation import FloatArray, require_instance
+
+TIME = {"label": "time", "unit": "s"}
+SPECTRUM = {"label": "power spectrum", "unit": "nm²/Hz", "log": True}
+_SERIES_S = 1.0  # of a series, in which single oscillations are seen
+_WINDOW_S = 0.1  # over which the size of the residual is averaged
+_BANDS = 240  # of equal ratio over which the periodogram is averaged
+_KOLMOGOROV = 1.6276  # Kolmogorov's statistic at 1 %
+_NAMES = ("tip", "tilt")
+
+
+def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None) -> Figure:
+    """Residual series and spectra before and after the correction.
+
+    The first second of the first case is drawn; the spectra are means over all cases.
+    """
+    _, frames, n = run.residual_nm.shape
+    names = _NAMES if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
+    shown = min(frames, int(np.ceil(_SERIES_S * run.frame_rate_hz)))
+    time = np.arange(shown) / run.frame_rate_hz
+    with drawing([PANEL_IN, PANEL_IN], axes=axes) as (series, spectra):
+        series.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
+        spectra.set_axes(FREQUENCY, SPECTRUM)
+        for i, name in zip(range(n), names, strict=False):
+            y = run.residual_nm[0, :shown, i]
+            series.curve(f"{name}, residual", time, y, look=i, width=0.8, opacity=0.8, dash=0)
+            # the residual is solid, what there was before it is dotted
+            for data, word, dash in (
+                (run.total_nm, "open loop", 3),
+                (run.residual_nm, "residual", 0),
+            ):
+                f, s = welch(data[:, :, i], run.frame_rate_hz, nperseg=min(frames, 2048))
+                mean = s.mean(axis=0)[1:]
+                spectra.curve(f"{name}, {word}", f[1:], mean, look=i, width=1.0, dash=dash)
+    return series.figure
+
+
+def sensor_failure_figure(
+    run: Simulation, segments: Sequence[Segment], exact_nm: Sequence[float], *, title: str = ""
+) -> Figure:
+    """Residual of a run in which sensors fail: the series of its first case, and its size.
+
+    The size is the mean over all cases. ``exact_nm`` is the stationary residual of each segment
+    between failures and returns [nm rms], nan where there is none.
+    """
+    _, frames, n = run.residual_nm.shape
+    time = np.arange(frames) / run.frame_rate_hz
+    window = max(int(_WINDOW_S * run.frame_rate_hz), 1)
+    whole = frames // window * window
+    power = np.mean(np.sum(run.residual_nm[:, :whole] ** 2, axis=2), axis=0)
+    rms_nm = np.sqrt(power.reshape(-1, window).mean(axis=1))
+    centres = time[:whole].reshape(-1, window).mean(axis=1)
+    failures = [segment for segment in segments if segment.text]
+    looks = {text: 3 + i for i, text in enumerate(dict.fromkeys(s.text for s in failures))}
+    with drawing([PANEL_IN, PANEL_IN]) as (series, size):
+        series.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
+        size.set_axes(TIME, {"label": "residual, both axes", "unit": "nm rms", "log": True})
+        for panel in (series, size):
+            for failure in failures:
+                ends = failure.start_s, failure.end_s
+                panel.span(failure.text, *ends, look=looks[failure.text])
+        for i in range(n):
+            y = run.residual_nm[0, :, i]
+            series.curve(_NAMES[i], time, y, look=i, width=0.5, opacity=0.7, dash=0)
+        size.curve(f"in the run, over {_WINDOW_S:g} s", centres, rms_nm, look=0)
+        for segment, exact in zip(segments, exact_nm, strict=True):
+            if np.isfinite(exact):
+                size.curve("exact", [segment.start_s, segment.end_s], [exact] * 2, look=2)
+    return series.figure
+
+
+def identification_figure(
+    model: IdentifiedModel,
+    *,
+    designs: Mapping[str, Controller | Design] | None = None,
+    axes: OwnAxes = None,
+) -> Figure:
+    """Draw what was identified, one column per axis.
+
+    Parameters
+    ----------
+    model : IdentifiedModel
+        The model.
+    designs : mapping of str to Controller or Design, optional
+        Controllers whose predicted residual is drawn, by name.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Rows: density of the pseudo-open-loop measurement, with the fit, its background and the
+        lines' frequencies and rms; rms accumulated from low to high frequencies, of the
+        disturbance, of the measurement that ran (its noise included) and of what the designs
+        would leave; cumulative periodogram of the innovations less that of white noise. Titles
+        give the noise per frame and the sensor gain.
+
+    Raises
+    ------
+    ProblemError
+        If the model is none, or a design does not fit its loop,
+        or ``axes`` are not one per panel.
+    UnstableLoopError
+        If the loop of a design is unstable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> rng = np.random.default_rng(0)
+    >>> record = lbt.identification.loop_record(
+    ...     np.cumsum(rng.standard_normal((4096, 1)), axis=0), frame_rate_hz=500, unit="nm"
+    ... )
+    >>> len(lbt.report.figures.identification_figure(lbt.identify(record)).axes)
+    3
+    """
+    require_instance(model, IdentifiedModel)
+    residuals = _predicted_residuals(model, designs or {})
+    cumulative = [
+        _cumulative_curves(axis, {name: densities[i] for name, densities in residuals.items()})
+        for i, axis in enumerate(model.axes)
+    ]
+    last = [float(y[-1]) for curves in cumulative for y, _ in curves.values() if y[-1] > 0]
+    rms = {"label": "rms up to the frequency", "unit": "nm", "log": True}
+    rms |= {"low": 0.2 * min(last), "high": 1.5 * max(last)} if last else {}
+    density, n = _density_axis(model), len(model.axes)
+    heights = [height_in for height_in in (3.0, 1.9, 1.3) for _ in model.axes]
+    with drawing(heights, columns=n, axes=axes) as panels:
+        for i, axis in enumerate(model.axes):
+            first, last_hz = float(axis.frequency_hz[0]), float(axis.frequency_hz[-1])
+            frequency = FREQUENCY | {"low": first, "high": last_hz}
+            name = f"{_NAMES[i]}: " if n == len(_NAMES) else ""
+            panels[i].set_axes(frequency, density, title=name + _noise_text(axis))
+            _draw_spectrum(panels[i], axis)
+            panels[n + i].set_axes(frequency, rms)
+            for label, (y, look) in cumulative[i].items():
+                panels[n + i].curve(label, axis.frequency_hz, y, look=look, width=1.2)
+            _draw_innovations(panels[2 * n + i], axis, frequency)
+    return panels[0].figure
+
+
+def _predicted_residuals(
+    model: IdentifiedModel, designs: Mapping[str, Controller | Design]
+) -> dict[str, list[FloatArray]]:
+    """Densities of the residual that each design would leave on each axis, (f,) each."""
+    out: dict[str, list[FloatArray]] = {}
+    for name, thing in designs.items():
+        controller = thing.controller if isinstance(thing, Design) else thing
+        if not isinstance(controller, Controller):
+            raise ProblemError(
+                f"designs must be Controllers or Designs; got {type(thing).__name__} for {name!r}."
+            )
+        loop = close_loop(model.hardware, controller)
+        loop.require_stable()
+        out[name], known = [], np.zeros(0)
+        for i, axis in enumerate(model.axes):
+            f = axis.frequency_hz
+            if not np.array_equal(f, known):  # the axes of a record share their frequencies
+                known = f
+                reject, let_through = np.abs(loop.sensitivity(f)), np.abs(loop.noise_transfer(f))
+            rejected, passed = reject[:, i] ** 2, let_through[:, i] ** 2
+            density = np.zeros(f.size)
+            for j, other in enumerate(model.axes):
+                white = _noise_density(other)
+                phase = np.interp(f, other.frequency_hz, other.fitted_nm2_hz) - white
+                density += rejected[:, j] * phase
+                density += passed[:, j] * white * other.sensor_gain**2
+            out[name].append(density)
+    return out
+
+
+def _noise_density(axis: IdentifiedAxis) -> float:
+    """Density of the noise, in units of the phase [nm^2/Hz]."""
+    return 2 / axis.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
+
+
+def _noise_text(axis: IdentifiedAxis) -> str:
+    gain = f"{axis.sensor_gain:.3g}"
+    if axis.sensor_gain_error is not None:
+        gain = f"{axis.sensor_gain:.3f} ± {axis.sensor_gain_error:.3f}"
+    return f"noise {nm_text(axis.noise_nm)}, gain {gain}"
+
+
+def _density_axis(model: IdentifiedModel) -> dict[str, object]:
+    """Return the same scale for all axes, with room for the labels of lines."""
+    smooth = [_average_bands(axis.frequency_hz, axis.density_nm2_hz)[1] for axis in model.axes]
+    top = max(float(np.max(values)) for values in smooth)
+    top = max([top, *(height for axis in model.axes for height in _line_heights(axis))])
+    low = 0.2 * min(float(np.min(values)) for values in smooth)
+    labelled = any(axis.lines for axis in model.axes)
+    high = top * (top / low) ** (0.45 if labelled else 0.1)
+    return {"label": "density", "unit": "nm²/Hz", "log": True, "low": low, "high": high}
+
+
+def _line_heights(axis: IdentifiedAxis) -> FloatArray:
+    peaks = [line.frequency_hz for line in axis.lines]
+    return np.asarray(np.interp(peaks, axis.frequency_hz, axis.fitted_nm2_hz))
+
+
+def _average_bands(
+    f: FloatArray, density: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Mean frequency, mean, least and most of a density in bands of equal ratio."""
+    edges = np.unique(np.searchsorted(f, np.geomspace(f[0], f[-1] * (1 + 1e-12), _BANDS)))
+    edges = edges[edges < f.size]
+    count = np.diff(np.append(edges, f.size))
+    return (
+        np.add.reduceat(f, edges) / count,
+        np.add.reduceat(density, edges) / count,
+        np.minimum.reduceat(density, edges),
+        np.maximum.reduceat(density, edges),
+    )
+
+
+def _draw_spectrum(panel: Panel, axis: IdentifiedAxis) -> None:
+    f = axis.frequency_hz
+    centres, smooth, least, most = _average_bands(f, axis.density_nm2_hz)
+    panel.area("periodogram: range", centres, least, most, look=None)
+    panel.curve("periodogram: mean", centres, smooth, look=None, width=0.8)
+    panel.curve("fit", f, axis.fitted_nm2_hz, look=0, width=1.3)
+    panel.curve("fit without lines", f, axis.background_nm2_hz, look=1, width=1.2)
+    peaks = [line.frequency_hz for line in axis.lines]
+    panel.flags(peaks, _line_heights(axis), [_line_text(line) for line in axis.lines])
+
+
+def _line_text(line: IdentifiedLine) -> str:
+    """Return frequency and rms of a line on its axis, and the direction if both axes share it."""
+    along = "" if line.direction is None else f", {line.direction_deg:.0f}°"
+    return f"{line.frequency_hz:.2f} Hz, {nm_text(line.rms_nm)}{along}"
+
+
+def _cumulative_curves(
+    axis: IdentifiedAxis, residuals: dict[str, FloatArray]
+) -> dict[str, tuple[FloatArray, int | None]]:
+    """Return the rms that adds up from low to high frequencies, and the look of its curve."""
+    f, white = axis.frequency_hz, _noise_density(axis)
+    densities: dict[str, tuple[FloatArray, int | None]] = {
+        "disturbance, data": (axis.density_nm2_hz - white, None),
+        "disturbance, fit": (axis.fitted_nm2_hz - white, 0),
+    }
+    if axis.data.closed:
+        densities["measurement that ran"] = (axis.data.measured / axis.sensor_gain**2, 2)
+    for look, (name, density) in enumerate(residuals.items(), start=3):
+        densities[f"residual, {name}"] = (density, look)
+    step = np.gradient(f)
+    return {
+        name: (np.sqrt(np.maximum(np.cumsum(density * step), 0)), look)
+        for name, (density, look) in densities.items()
+    }
+
+
+def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, object]) -> None:
+    test = axis.whiteness
+    even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
+    bound = 100 * _KOLMOGOROV / np.sqrt(test.effective)
+    excess = 100 * (test.cumulative - even)
+    reach = max(2 * bound, 1.2 * float(np.max(np.abs(excess))))
+    y_axis = {"label": "power up to f", "unit": "%", "low": -reach, "high": reach}
+    panel.set_axes(frequency, y_axis, title="innovations, less white noise")
+    panel.span("99 % of white noise", -bound, bound, "y")
+    panel.curve("excess", test.frequency_hz, excess, width=1.0, quiet=True)

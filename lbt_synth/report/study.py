@@ -1,0 +1,572 @@
+"""The page of a robustness study: verdict, samples, comparison, dependence, worst samples.
+
+Charts are made of binned data, so that their size does not grow with the samples.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.report.draw import PANEL_IN, Panel, drawing
+from lbt_synth.report.page.blocks import (
+    Block,
+    Chart,
+    Listing,
+    Notice,
+    Page,
+    Section,
+    chart,
+    creation_time,
+    paragraph,
+    read_source,
+    source_section,
+    time_text,
+)
+from lbt_synth.report.page.html import require_page_names, write_page
+from lbt_synth.storage.array_file import digest
+from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.storage.words import count_text, duration_text, listing_text
+from lbt_synth.studies import Failure, Study, study_statistics
+from lbt_synth.studies.study import summary
+from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
+from lbt_synth.studies.study.controller_samples import (
+    ControllerSamples,
+    read_column,
+    read_controller_samples,
+)
+from lbt_synth.studies.study.statistics import (
+    ControllerStatistics,
+    StudyStatistics,
+    sample_losses,
+)
+from lbt_synth.validation import FloatArray
+
+_UNSTABLE_PANELS = 4
+_HIGH = 40.0  # Strehl ratio [%] above which the axis need not start at 0
+_MOST_FAILURES = 10  # that are listed
+_PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
+_SAMPLING = {
+    "sobol": "points of a scrambled Sobol sequence",
+    "latin_hypercube": "a Latin hypercube",
+}
+_EVALUATION = {
+    "exact": "each evaluated exactly, by integrals over its spectra",
+    "simulation": "each simulated in the time domain",
+}
+Names = Mapping[str, str]  # what each parameter is called
+
+
+def write_study_page(
+    study: Study,
+    columns: Mapping[str, ArrayLike],
+    path: str | os.PathLike[str],
+    *,
+    statistics: StudyStatistics | None = None,
+    failures: Sequence[Failure] = (),
+    computing_s: float | None = None,
+    pdf: str | os.PathLike[str] | None = None,
+) -> tuple[Path, ...]:
+    """Write the page of a study as one HTML file that opens offline, and as a PDF if wanted.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    columns : mapping of str to (n,) array_like
+        Its results, all or those that there are so far.
+    path : path-like
+        File to write, that ends in .html, in the directory of the results.
+    statistics : StudyStatistics, optional
+        Those of the columns, if they are known already.
+    failures : sequence of Failure, optional
+        What failed.
+    computing_s : float, optional
+        Time of all its batches, of all processes together [s].
+    pdf : path-like, optional
+        File to write, that ends in .pdf.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The files; all of them are written, or none.
+
+    Raises
+    ------
+    ProblemError
+        If the columns are not those of the study.
+    OutputError
+        If a name ends in something else, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> values = study.values(0, 2)
+    >>> columns = dict(zip(study.parameter_names, values.T))
+    >>> columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = lbt.report.write_study_page(
+    ...         study, columns, pathlib.Path(folder) / "summary.html"
+    ...     )
+    >>> files[0].name
+    'summary.html'
+    """
+    require_page_names(path, pdf, inputs=study.inputs)
+    if statistics is None:
+        names = [each.name for each in study.controllers]
+        statistics = study_statistics(columns, study.parameter_names, names)
+    page = study_page(
+        study,
+        statistics,
+        columns,
+        folder=Path(path).parent,
+        failures=failures,
+        computing_s=computing_s,
+    )
+    return write_page(page, path, pdf)
+
+
+def study_page(
+    study: Study,
+    statistics: StudyStatistics,
+    columns: Mapping[str, ArrayLike],
+    *,
+    folder: Path,
+    failures: Sequence[Failure] = (),
+    computing_s: float | None = None,
+) -> Page:
+    """Return the page of a study's results; columns (n,) have one value per sample."""
+    samples = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
+    if any(len(each.strehl) != statistics.samples for each in samples):
+        raise ProblemError(
+            f"the columns must have the {statistics.samples} samples of the statistics; got "
+            f"{len(samples[0].strehl)}."
+        )
+    values = {
+        name: read_column(columns, name, statistics.samples) for name in statistics.parameters
+    }
+    names = summary.short_names(statistics.parameters)
+    varying = sum(np.ptp(column) > 0 for column in values.values())
+    reading = [paragraph(name) for name in ("intervals", "indices")]
+    made = time_text(creation_time())
+    return Page(
+        title=f"Robustness study {study.source.name}",
+        subtitle=(
+            f"{statistics.samples} samples of {varying} parameters, "
+            f"{count_text(len(statistics.controllers), 'controller')}. Made {made}."
+        ),
+        sections=(
+            _summary_section(study, statistics, samples),
+            _samples_section(study, values, names),
+            _controllers_section(study, statistics, failures),
+            _comparison_section(statistics, samples),
+            _dependence_section(statistics, samples, values, names),
+            _worst_section(study, statistics, names, folder),
+            Section(key="reading", title="How to read the figures", blocks=reading),
+            _origin_section(study, statistics, computing_s),
+        ),
+    )
+
+
+def _summary_section(
+    study: Study, statistics: StudyStatistics, samples: Sequence[ControllerSamples]
+) -> Section:
+    """Open with what is wrong, the verdict, and the Strehl ratios."""
+    unstable = [each for each in statistics.controllers if each.unstable.count]
+    failed = [each for each in statistics.controllers if each.failed]
+    warnings = []
+    if statistics.samples < study.samples:
+        warnings.append(paragraph("incomplete", done=statistics.samples, samples=study.samples))
+    if unstable:
+        parts = ", ".join(
+            f"{each.controller} in {each.unstable.count} of {each.samples} "
+            f"({summary.percent(each.unstable.value, 2)} %)"
+            for each in unstable
+        )
+        warnings.append(f"Unstable loops: {parts}.")
+    if failed:
+        parts = ", ".join(f"{each.controller} {each.failed}" for each in failed)
+        warnings.append(f"Evaluations that failed, and are in none of the figures: {parts}.")
+    blocks: list[Block] = [Notice(text=text, tone="bad") for text in warnings]
+    if not unstable and not failed and statistics.samples:
+        text = "Every controller is stable in every sample, and none failed."
+        blocks.append(Notice(text=text, tone="good"))
+    blocks += [
+        _verdict_text(statistics.controllers),
+        summary.strehl_table(statistics),
+    ]
+    return Section(key="summary", title="Summary", blocks=(*blocks, *_distribution_chart(samples)))
+
+
+def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
+    """Say which controller leads by each measure; the reader decides which measure counts."""
+    with_data = [each for each in controllers if each.samples]
+    if not with_data:
+        return "No controller was evaluated on any sample."
+
+    def leader(value: Callable[[ControllerStatistics], float]) -> str:
+        best = max(with_data, key=value)
+        return f"{best.controller}, {summary.percent(value(best))} %"
+
+    text = paragraph(
+        "leaders",
+        mean=leader(lambda each: each.mean),
+        median=leader(lambda each: each.strehl[3].value),
+        low=leader(lambda each: each.strehl[1].value),
+    )
+    least = min(with_data, key=lambda each: each.loss.loss[1].value)
+    loss = least.loss.loss[1].value
+    if len(with_data) == 1 or not np.isfinite(loss):
+        return text
+    return f"{text} {paragraph('regret', name=least.controller, loss=summary.percent(loss))}"
+
+
+def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Names) -> Section:
+    """Show the parameters and their histograms."""
+    distributions = {each.name: each.distribution.text for each in study.parameters}
+    rows = tuple(
+        (
+            names[name],
+            name,
+            distributions.get(name, ""),
+            *_rounded_texts(np.percentile(column, (0, 50, 100))),
+        )
+        for name, column in values.items()
+        if column.size
+    )
+    table = Table(
+        caption="Parameters",
+        headings=("parameter", "its place", "distribution", "least", "median", "greatest"),
+        rows=rows,
+        words=(1, 2),
+    )
+    settings = study.settings
+    opening = (
+        f"{study.samples} samples, {_SAMPLING[settings.sampling]}, seed {settings.seed}; "
+        f"{_EVALUATION[settings.evaluation]}."
+    )
+    blocks = (
+        opening,
+        table,
+        *(_histogram_chart(values, names) if rows else ()),
+    )
+    return Section(key="samples", title="What was sampled", blocks=blocks)
+
+
+def _rounded_texts(values: FloatArray) -> list[str]:
+    """Return numbers with four digits of their range, or of their size if all are equal."""
+    span = float(np.ptp(values)) or float(np.max(np.abs(values))) or 1.0
+    digits = 3 - int(np.floor(np.log10(span)))
+    return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
+
+
+def _controllers_section(
+    study: Study, statistics: StudyStatistics, failures: Sequence[Failure]
+) -> Section:
+    """List the controllers, with digests of what is the same for all samples, and failures."""
+    origins = {each.name: each.origin for each in study.controllers}
+    digests = {
+        each.name: digest({name: getattr(each.design.controller, name) for name in "ABCD"}, {})
+        for each in study.controllers
+        if each.design is not None
+    }
+    rows = tuple(
+        (
+            each.controller,
+            origins.get(each.controller, ""),
+            digests.get(each.controller, "-")[:16],
+            str(each.samples),
+            _count_cell(each.unstable.count),
+            _count_cell(each.failed),
+        )
+        for each in statistics.controllers
+    )
+    headings = ("controller", "origin", "digest", "evaluated", "unstable", "failed")
+    blocks: list[Block] = [Table(caption="Controllers", headings=headings, rows=rows, words=(1, 2))]
+    if failures:
+        more = len(failures) - _MOST_FAILURES
+        caption = f": the first {_MOST_FAILURES}, and {more} more" if more > 0 else ""
+        listed = tuple((str(f.row), f.controller, f.error) for f in failures[:_MOST_FAILURES])
+        blocks.append(
+            Table(
+                caption=f"Evaluations that failed{caption}",
+                headings=("row", "controller", "error"),
+                rows=listed,
+                words=(1, 2),
+            )
+        )
+    return Section(key="controllers", title="Controllers", blocks=blocks)
+
+
+def _count_cell(count: int) -> Cell:
+    return Cell(text=str(count), tone="bad" if count else "plain")
+
+
+def _comparison_section(
+    statistics: StudyStatistics, samples: Sequence[ControllerSamples]
+) -> Section:
+    """Compare the controllers on the same samples."""
+    table = summary.comparison_table(statistics)
+    blocks: tuple[Block, ...] = (
+        *([table] if table.rows else []),
+        *_loss_chart(samples),
+        summary.residual_table(statistics),
+    )
+    return Section(key="comparison", title="Comparison on the same samples", blocks=blocks)
+
+
+def _dependence_section(
+    statistics: StudyStatistics,
+    samples: Sequence[ControllerSamples],
+    values: Mapping[str, FloatArray],
+    names: Names,
+) -> Section:
+    """Show what the Strehl ratio depends on."""
+    if not summary.varying_parameters(statistics):
+        blocks: tuple[Block, ...] = (Notice(text=paragraph("no-index")),)
+        return Section(key="dependence", title="Dependence", blocks=blocks)
+    blocks = (
+        *_sensitivity_chart(statistics, names),
+        summary.sensitivity_table(statistics, names=names),
+        summary.swing_table(statistics, names=names),
+        *_conditional_charts(statistics, names),
+        *_map_charts(statistics, samples, values, names),
+    )
+    return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)
+
+
+def _worst_section(
+    study: Study, statistics: StudyStatistics, names: Names, folder: Path
+) -> Section:
+    """List the worst samples, and the commands that replay them."""
+    blocks: list[Block] = []
+    words = ["lbt-synth", "study", os.fspath(study.source), "-o", os.fspath(folder), "--row"]
+    commands = []
+    most = 0
+    for each, one in zip(statistics.controllers, statistics.sensitivities, strict=True):
+        if each.worst:
+            ranked = tuple(p.parameter for p in one.ranked)
+            others = tuple(name for name in statistics.parameters if name not in ranked)
+            shown = (ranked or others)[:_PARAMETERS]
+            most = max(most, len(ranked) - len(shown))
+            blocks.append(summary.worst_table(each, shown, names=names))
+            commands.append(shlex.join([*words, str(each.worst[0].row)]))
+    if most:
+        blocks.insert(0, paragraph("worst", count=_PARAMETERS))
+    if commands:
+        caption = "Commands that replay the first of each table; any other row likewise"
+        blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
+    return Section(key="worst", title="Worst samples", blocks=blocks)
+
+
+def _origin_section(
+    study: Study, statistics: StudyStatistics, computing_s: float | None
+) -> Section:
+    """Name the files and programs that the page was made from."""
+    rows = [
+        ("samples with results", f"{statistics.samples} of {study.samples}"),
+        ("digest of the study", study.digest),
+    ]
+    if computing_s is not None:
+        rows.append(("computing time, of all processes together", duration_text(computing_s)))
+    about = Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,))
+    roles, sources, texts = ["study", "configuration"], [], {}
+    for place, path in enumerate(study.inputs):
+        role = roles[place] if place < len(roles) else "gain file"
+        source, content = read_source(path, role)
+        sources.append(source)
+        if place < len(roles):
+            texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8-sig", "replace")
+    return source_section(sources, texts=texts, about=about)
+
+
+def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
+    """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
+    medians = []
+    steps: list[tuple[str, int, FloatArray, FloatArray]] = []
+    for look, each in enumerate(samples):
+        values = each.strehl[each.evaluated]
+        if not values.size:
+            medians.append(f"{each.controller} has none")
+            continue
+        medians.append(f"{each.controller} has a median of {100 * np.median(values):.1f} %")
+        level, share = cumulative_points(values)
+        # from nothing just below the first value
+        steps.append(
+            (each.controller, look, 100 * np.append(level[:1], level), 100 * np.append(0.0, share))
+        )
+    if not steps:
+        return []
+    top = max(float(x[-1]) for *_, x, _ in steps)
+    least = 100 / max(int(each.evaluated.sum()) for each in samples)
+    low = min(10.0, 10.0 ** np.floor(np.log10(least)))
+    x_axis = {"label": "Strehl ratio", "unit": "%", "low": 0}
+    x_axis["high"] = min(100.0, max(1.02 * top, 1.0))
+    y_axis = {"label": "samples at or below", "unit": "%", "high": 100}
+    with drawing([PANEL_IN] * 2, columns=2) as (plain, tail):
+        plain.set_axes(x_axis, y_axis | {"low": 0}, title="all samples")
+        tail.set_axes(x_axis, y_axis | {"low": low, "log": True}, title="lower tail")
+        plain.rule("half of the samples", 50, "y")
+        for name, look, x, y in steps:
+            _draw_steps(plain, name, x, y, look)
+            _draw_steps(tail, name, x[1:], y[1:], look)
+    return [chart("distribution", plain.figure, medians="; ".join(medians))]
+
+
+def _draw_steps(panel: Panel, name: str, x: FloatArray, y: FloatArray, look: int) -> None:
+    panel.curve(name, x, y, look=look, step="steps-post", width=1.8)
+
+
+def _loss_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
+    """How much each controller loses against the best of each sample, and how often."""
+    losses = sample_losses(samples)
+    if len(samples) < 2 or not losses[0].size:
+        return []
+    y_axis = {"label": "samples that lose more", "unit": "%", "low": 0, "high": 100}
+    with drawing([PANEL_IN]) as (panel,):
+        panel.set_axes({"label": "loss of Strehl ratio", "unit": "points", "low": 0}, y_axis)
+        for look, (each, loss) in enumerate(zip(samples, losses, strict=True)):
+            level, share = cumulative_points(loss)
+            x, y = np.append(0.0, level), np.append(1.0, 1 - share)
+            _draw_steps(panel, each.controller, 100 * x, 100 * y, look)
+    return [chart("loss", panel.figure)]
+
+
+def _histogram_chart(parameters: Mapping[str, FloatArray], names: Names) -> list[Chart]:
+    """Histograms of the parameters that vary."""
+    varying = {name: values for name, values in parameters.items() if np.ptp(values) > 0}
+    if not varying:
+        return []
+    with drawing([1.7] * len(varying), columns=min(len(varying), 3)) as panels:
+        for panel, (name, values) in zip(panels, varying.items(), strict=True):
+            panel.set_axes({"label": names[name]}, {"label": "samples", "unit": "%", "low": 0})
+            listed = value_shares(values)
+            if listed is not None:
+                places, share = listed
+                x, y = np.repeat(places, 3), np.zeros(3 * len(places))
+                y[1::3] = 100 * share
+                x[2::3] = np.nan  # the stems are not joined
+                panel.curve("", x, y, dash=0, width=5)
+                panel.curve("samples [%]", places, 100 * share, line=False, marker="o", quiet=True)
+            else:
+                edges, share = histogram(values)
+                x = np.repeat(edges, 2)
+                y = np.concatenate(([0.0], np.repeat(100 * share, 2), [0.0]))
+                panel.area("", x, np.zeros_like(y), y)
+                panel.curve("samples [%]", x, y, dash=0, quiet=True)
+    listed_names = listing_text([names[name] for name in varying])
+    return [chart("parameters", panels[0].figure, names=listed_names)]
+
+
+def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
+    """First-order indices as bars, one series per controller."""
+    varying = summary.varying_parameters(statistics)
+    if not varying:
+        return []
+    bars: dict[str, FloatArray] = {}
+    intervals: dict[str, tuple[FloatArray, FloatArray]] = {}
+    strongest = []
+    for one in statistics.sensitivities:
+        index = {each.parameter: each.index for each in one.parameters}
+        value = 100 * np.array([index[name].value for name in varying])
+        error = 200 * np.array([index[name].error for name in varying])
+        bars[one.controller], low, high = np.maximum((value, value - error, value + error), 0)
+        intervals[one.controller] = low, high
+        strongest += [
+            f"{one.controller} depends most on {each.parameter}, {100 * each.index.value:.0f} %"
+            for each in one.ranked[:1]
+        ] or [f"{one.controller} has none"]
+    height_in = min(max(0.8, 0.24 * len(varying) * len(bars) + 0.2), 7.5)  # fits a sheet
+    with drawing([height_in]) as (panel,):
+        panel.set_axes({"label": "variance explained by itself", "unit": "%", "low": 0}, {})
+        panel.bars([names[name] for name in varying], bars, intervals)
+    return [chart("sensitivity", panel.figure, strongest="; ".join(strongest))]
+
+
+def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart]:
+    """Mean and 10th percentile of the Strehl ratio over each parameter, and unstable loops.
+
+    The latter are drawn over the parameters that their part changes most with.
+    """
+    curves = {
+        name: [
+            (look, one.controller, each.curve)
+            for look, one in enumerate(statistics.sensitivities)
+            for each in one.parameters
+            if each.parameter == name and each.curve is not None
+        ]
+        for name in summary.varying_parameters(statistics)
+    }
+    curves = {name: own for name, own in curves.items() if own}
+    if not curves:
+        return []
+    style: dict[str, Any] = {"marker": "own", "width": 1.8}
+    with drawing([PANEL_IN] * len(curves), columns=min(len(curves), 2)) as panels:
+        for panel, (name, own) in zip(panels, curves.items(), strict=True):
+            least = min(100 * float(np.min(curve.low)) for *_, curve in own)
+            y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0 if least < _HIGH else None}
+            panel.set_axes({"label": names[name]}, y_axis)
+            for look, controller, curve in own:
+                panel.curve(controller, curve.parameter, 100 * curve.mean, look=look, **style)
+            for look, controller, curve in own:
+                label, y = f"{controller}, 10th percentile", 100 * curve.low
+                panel.curve(label, curve.parameter, y, look=look, width=0.9, quiet=True)
+            panel.curve("10th percentile (thin)", [], [], look=None, width=0.9)
+    charts = [
+        chart("curves", panels[0].figure, names=listing_text([names[name] for name in curves]))
+    ]
+    unstable = {
+        name: [(look, controller, curve) for look, controller, curve in own if curve.unstable.any()]
+        for name, own in curves.items()
+    }
+    spans = {
+        name: max(float(np.ptp(curve.unstable)) for *_, curve in own)
+        for name, own in unstable.items()
+        if own
+    }
+    if not spans:
+        return charts
+    most = sorted(spans, key=lambda name: -spans[name])[:_UNSTABLE_PANELS]
+    with drawing([PANEL_IN] * len(most), columns=min(len(most), 2)) as panels:
+        for panel, name in zip(panels, most, strict=True):
+            panel.set_axes({"label": names[name]}, {"label": "unstable", "unit": "%", "low": 0})
+            for look, controller, curve in unstable[name]:
+                panel.curve(controller, curve.parameter, 100 * curve.unstable, look=look, **style)
+    return [
+        *charts,
+        chart("unstable", panels[0].figure, names=listing_text([names[name] for name in most])),
+    ]
+
+
+def _map_charts(
+    statistics: StudyStatistics,
+    samples: Sequence[ControllerSamples],
+    parameters: Mapping[str, FloatArray],
+    names: Names,
+) -> list[Chart]:
+    """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
+    charts = []
+    for place, (one, each) in enumerate(zip(statistics.sensitivities, samples, strict=True)):
+        if len(one.ranked) < 2:
+            continue
+        first, second = (parameter.parameter for parameter in one.ranked[:2])
+        kept = each.evaluated
+        grid = binned_map(parameters[first][kept], parameters[second][kept], each.strehl[kept])
+        low, high = (100 * float(end(grid.mean)) for end in (np.nanmin, np.nanmax))
+        ends = 5 * float(np.floor(low / 5)), 5 * float(np.floor(high / 5)) + 5
+        with drawing([2.6]) as (panel,):
+            panel.set_axes({"label": names[first]}, {"label": names[second]})
+            label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
+            panel.map(grid.x, grid.y, 100 * grid.mean, ends=ends, blank="no sample", **label)
+        facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
+        facts |= {"controller": each.controller, "low": f"{low:.1f}", "high": f"{high:.1f}"}
+        charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
+    return charts

@@ -1,0 +1,88 @@
+"""Figures of runs in time, and labels of lines in the figure of an identified spectrum."""
+
+import numpy as np
+import pytest
+from support.eris import eris_model
+
+import lbt_synth as lbt
+from lbt_synth.loop.simulation.failing_sensors import Drop, run_segments, simulate_sensors
+from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
+
+
+@pytest.fixture(scope="module")
+def model():
+    return eris_model()
+
+
+def test_figure_of_a_short_spectrum(model):
+    figure = lbt.report.figures.identification_figure(model)
+    figure.draw_without_rendering()
+    labels = [text.get_text() for text in figure.axes[4].get_xticklabels() if text.get_text()]
+    assert {"10", "20", "50"} <= set(labels)
+    for plot, axis in zip(figure.axes[:2], model.axes, strict=True):
+        assert len(plot.texts) == len(axis.lines)
+        edges = plot.get_window_extent()
+        places = [plot.transAxes.transform(text.get_position())[0] for text in plot.texts]
+        # 6.5 points of type, and a little more
+        assert np.all(np.diff(places) > 1.1 * 6.5 / 72 * figure.dpi)
+        highest = np.max(
+            np.interp([x.frequency_hz for x in axis.lines], axis.frequency_hz, axis.fitted_nm2_hz)
+        )
+        top = plot.transData.transform((10, highest))[1]
+        for text in plot.texts:
+            x, y = plot.transAxes.transform(text.get_position())
+            assert edges.x0 < x < edges.x1
+            assert y > top
+
+
+def test_the_labels_of_axes_are_whole_and_beside_their_numbers(model):
+    figure = lbt.report.figures.identification_figure(model)
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        label = axes.yaxis.label.get_window_extent()
+        assert label.x0 >= 0
+        numbers = [text for text in axes.get_yticklabels() if text.get_text()]
+        assert label.x1 <= min(text.get_window_extent().x0 for text in numbers)
+
+
+def test_the_interval_of_white_noise_does_not_fill_its_panel(model):
+    axes = lbt.report.figures.identification_figure(model).axes[-1]
+    (band,) = axes.patches
+    low, high = axes.get_ylim()
+    assert band.get_height() <= (high - low) / 2
+
+
+def test_simulation_figure(config):
+    run = lbt.simulate(
+        lbt.kalman(config.plant).controller, config.truth, hardware=config.hardware, frames=600
+    )
+    series, spectrum = simulation_figure(run, title="Kalman").axes
+    assert series.get_xlabel() == "time [s]"
+    assert "[nm²/Hz]" in spectrum.get_ylabel()
+
+
+def test_modes_count_from_one_as_everywhere():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=3)
+    truth = lbt.Truth(turbulence=None, noise_nm=5.0)
+    run = lbt.simulate(lbt.integrator(path, gain=0.5).controller, truth, hardware=path, frames=256)
+    figure = simulation_figure(run)
+    names = [line.get_label() for line in figure.axes[0].get_lines()]
+    assert names == [f"mode {i}, residual" for i in (1, 2, 3)]
+
+
+def test_spans_and_levels(sensors_design, sensors_config):
+    drops = [Drop(unit="m1", start_s=0.5, end_s=1), Drop(unit="m1", start_s=1.5)]
+    run = simulate_sensors(
+        sensors_design.controllers,
+        sensors_config.truth,
+        hardware=sensors_design.hardware,
+        frames=2000,
+        drops=drops,
+    )
+    segments = run_segments(drops, 2.0)
+    levels = [20.0, 60.0, 20.0, np.nan]
+    figure = sensor_failure_figure(run, segments, levels)
+    series, size = figure.axes
+    assert len(series.patches) == len(size.patches) == 2
+    drawn = [line for line in size.lines if len(line.get_xdata()) == 2]
+    assert [float(line.get_ydata()[0]) for line in drawn] == [20.0, 60.0, 20.0]

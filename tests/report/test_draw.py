@@ -1,0 +1,189 @@
+"""How figures are drawn: looks, legends, titles, the user's own axes, numbers and files."""
+
+import re
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from support.figures import legend
+from support.pages import every_mark
+
+import lbt_synth as lbt
+from lbt_synth.report.draw import (
+    colour,
+    dashes,
+    drawing,
+    figure_series,
+    marker_of,
+    save_figure,
+)
+from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
+
+X, Y = {"label": "x"}, {"label": "y"}
+LONG = "a very long name " * 3
+
+
+def test_different_looks_differ():
+    assert len({(colour(i), dashes(i)) for i in range(36)}) == 36
+    assert len({(colour(i), marker_of(i)) for i in range(36)}) == 36
+    assert colour(None) not in [colour(i) for i in range(36)]
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3])
+def test_titles_are_whole_and_stay_above_their_panel(columns):
+    with drawing([2.0] * columns, columns=columns) as panels:
+        for panel in panels:
+            panel.set_axes(X, Y, title=LONG)
+            panel.curve("a", [0.0, 1.0], [0.0, 1.0])
+    figure = panels[0].figure
+    figure.draw_without_rendering()
+    (names,) = figure.legends
+    for axes in figure.axes:
+        assert axes.get_title(loc="left").split() == LONG.split()
+        title = axes._left_title.get_window_extent()
+        assert title.x1 <= axes.get_window_extent().x1 + 1
+        assert title.y1 <= names.get_window_extent().y0 + 1
+
+
+def test_areas_and_errors_end_at_the_edges_of_their_panel():
+    """Programs that draw an SVG need not cut them off there."""
+    x = np.array([1.0, 2.0, 3.0])
+    with drawing([2.0]) as (panel,):
+        panel.set_axes(X, {"label": "y", "low": 0.1, "high": 2.5})
+        panel.area("", x, x * 1e-9, x)
+        panel.curve("", x, x, error=2 * x)
+    assert panel.axes.get_ylim() == (0.1, 2.5)
+    for drawn in panel.axes.collections:
+        heights = np.concatenate([path.vertices[:, 1] for path in drawn.get_paths()])
+        assert heights.min() == 0.1
+        assert heights.max() == 2.5
+
+
+def test_a_legend_names_what_is_seen():
+    x = np.array([1.0, 3.0])
+    with drawing([2.0, 2.0]) as panels:
+        for panel, high in zip(panels, (None, 50.0), strict=True):
+            panel.set_axes({"label": "x", "high": high}, {"label": "y", "low": 0.0, "high": 10.0})
+            panel.curve("curve", x, x)
+            panel.curve("far above", x, x + 50)
+            panel.curve("unstable", [], [])
+            panel.rule("line", 2.0)
+            panel.rule("line beyond", 20.0)
+            panel.rule("level", 9.0, "y")
+            panel.span("band at the edge", 2.9, 40.0)
+            panel.span("band beyond", 30.0, 40.0)
+    seen = ["curve", "unstable", "line", "level", "band at the edge"]
+    assert legend(panels[0].axes) == seen
+    assert set(legend(panels[1].axes)) == {*seen, "line beyond", "band beyond"}
+
+
+def test_names_that_are_shortened_alike_stay_two():
+    with drawing([2.0]) as (panel,):
+        for middle in "ab":
+            panel.curve(50 * "x" + middle + 50 * "x", [0.0, 1.0], [0.0, 1.0])
+    assert len(panel.figure.legends[0].get_texts()) == 2
+
+
+@pytest.mark.parametrize("count", [2, 9])
+def test_a_legend_on_own_axes_does_not_cover_them(count):
+    axes = Figure(figsize=(4, 2.5), layout="constrained").subplots()
+    with drawing([2.0], axes=axes) as (panel,):
+        for i in range(count):
+            panel.curve(f"curve with a long name {i}", [0.0, 1.0], [0.0, i], look=i)
+    axes.figure.draw_without_rendering()
+    names, place = axes.get_legend().get_window_extent(), axes.get_window_extent()
+    assert (names.x0 >= place.x1) == (count == 9)
+    if count == 2:
+        assert names.width * names.height < place.width * place.height / 3
+
+
+def draw_two(axes=None):
+    with drawing([2.0, 2.0], axes=axes) as panels:
+        for panel, name in zip(panels, ("_first", "second"), strict=True):
+            panel.set_axes({"label": "frequency", "unit": "Hz"}, Y)
+            panel.curve(name, [0.0, 1.0], [0.0, 1.0])
+    return panels[0].figure
+
+
+def test_a_figure_on_axes_of_the_user():
+    axes = Figure().subplots(2, 1)
+    assert draw_two(axes) is axes[0].figure
+    assert axes[0].get_xlabel() == "frequency [Hz]"
+    names = [[text.get_text() for text in one.get_legend().get_texts()] for one in axes]
+    assert names == [[" _first"], ["second"]]
+    assert not axes[0].figure.legends
+    own = Figure()
+    with drawing([2.0], axes=own.subplots()) as (panel,):
+        panel.set_axes(X, Y)
+        panel.map(np.arange(2.0), np.arange(2.0), np.eye(2), "ratio", "%", ends=(0.0, 1.0))
+    assert own.axes[1].get_ylabel() == "ratio [%]"  # of the colour bar
+
+
+def test_axes_that_do_not_fit_are_refused():
+    for axes, words in (
+        (Figure().subplots(), "got 1 (Axes)"),
+        (Figure().subplots(3), "got 3 (Axes, Axes, Axes)"),
+        ("above", "got 1 (str)"),
+        ([1, 2], "got 2 (int, int)"),
+        ([], "got 0 (none)"),
+    ):
+        expected = f"axes must be 2 matplotlib Axes, one per panel; {words}."
+        with pytest.raises(lbt.errors.ProblemError, match=f"^{re.escape(expected)}$"):
+            draw_two(axes)
+
+
+def test_flags_and_error_bars_are_drawn():
+    above = every_mark()[0].figure.axes[0]
+    assert [text.get_text() for text in above.texts] == ["first", "flag"]
+    first, second = (text.get_position()[0] for text in above.texts)
+    assert 0 < first < second < 1
+    (bars,) = [found for found in above.collections if hasattr(found, "get_segments")]
+    low, high = bars.get_segments()[0][:, 1]
+    assert (low, high) == pytest.approx((5.0, 15.0))
+
+
+def test_circles_are_round_and_labels_beside_them():
+    with drawing([2.5] * 4, columns=2) as panels:
+        for panel in panels:
+            axis = {"label": "part", "low": -1.0, "high": 1.0}
+            panel.set_axes(axis, axis, title="title", equal=True)
+            panel.curve("circle", [1.0, 0.0], [0.0, 1.0])
+    panels[0].figure.draw_without_rendering()
+    for axes in panels[0].figure.axes:
+        box = axes.get_window_extent()
+        assert box.width == pytest.approx(box.height, rel=1e-6)
+        assert box.width > 2 * panels[0].figure.dpi
+    above, below = (panels[i].axes for i in (0, 2))
+    assert above.xaxis.label.get_window_extent().y0 > below._left_title.get_window_extent().y1
+
+
+def test_numbers_are_those_that_are_drawn_in_the_unit_that_is_shown():
+    lines, maps, rest = (figure_series(chart.figure) for chart in every_mark())
+    first, steps = (one for one in lines if one.name == "first")
+    assert (first.heading, first.panel, steps.panel) == ("frequency [Hz]", "size [-]", "steps [nm]")
+    np.testing.assert_allclose(first.x * first.y, 1.0)
+    assert "only named" not in {one.name for one in lines}
+    assert [one.name for one in maps[:2]] == ["ratio at gain [-] 0.2", "ratio at gain [-] 0.4"]
+    np.testing.assert_array_equal(maps[1].y, np.arange(6.0, 12.0))
+    bars = {one.name: (one.x, list(one.y)) for one in rest}
+    assert bars["first order share [%]"] == (("a.b", "first", "c"), [1, 2, 3])
+    with own_display_unit():
+        show_in(DisplayUnit(name="mas", nm=10.0))
+        figure = every_mark()[0].figure
+    (_, other) = (one for one in figure_series(figure) if one.name == "first")
+    assert other.panel == "steps [mas]"
+    np.testing.assert_allclose(other.y, steps.y / 10)
+    assert figure.axes[1].get_ylabel() == "steps [mas]"
+
+
+@pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
+def test_figures_are_files(tmp_path, ending):
+    path = save_figure(draw_two(), tmp_path / f"f.{ending}")
+    magic = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}[ending]
+    assert path.read_bytes().startswith(magic)
+    assert path.stat().st_size < 400_000
+
+
+def test_other_endings_are_refused(tmp_path):
+    with pytest.raises(lbt.errors.OutputError, match=r"must end in .png, .pdf, .svg; got 'f.gif'"):
+        save_figure(draw_two(), tmp_path / "f.gif")
