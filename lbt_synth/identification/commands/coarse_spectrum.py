@@ -15,11 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from lbt_synth.identification.fit.periodogram import half_angle_square, tukey
+from lbt_synth.identification.fit.periodogram import (
+    LoopPeriodogram,
+    half_angle_square,
+    tukey,
+)
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _SEGMENT_S = 6.0
@@ -38,49 +41,16 @@ _SURROUNDINGS, _REACH, _MOST_PEAKS = 81, 40, 16  # frequencies, frequencies, pea
 _APART = 4  # frequencies between peaks
 
 
-class Quadratic(NamedTuple):
-    """Powers of ``y + g c`` as ``measured + 2 g crossed + g^2 corrected``."""
-
-    measured: FloatArray  # (f,)
-    crossed: FloatArray  # (guesses, f)
-    corrected: FloatArray  # (guesses, f)
-
-    def take(self, guess: IntArray) -> Quadratic:
-        """Return the quadratics of some guesses, one per row."""
-        return Quadratic(self.measured, self.crossed[guess], self.corrected[guess])
-
-    def power(self, gain: FloatArray) -> FloatArray:
-        """Return the power of each row at its gain, (rows, f)."""
-        g = gain[:, None]
-        power = self.measured + g * (2 * self.crossed + g * self.corrected)
-        return np.asarray(np.maximum(power, _SMALLEST * self.measured))
-
-    def slope(self, gain: FloatArray) -> FloatArray:
-        """Return its derivative by the gain, (rows, f)."""
-        return np.asarray(2 * (self.crossed + gain[:, None] * self.corrected))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CoarseAxis:
     """Powers of one axis in bands and at peaks, and the shapes that may explain them."""
 
-    count: FloatArray  # (b,): independent periodograms of each band
-    bands: Quadratic
-    peak_count: float  # the same of each frequency at a peak
-    peaks: Quadratic
+    bands: LoopPeriodogram  # of all guesses
+    peaks: LoopPeriodogram  # the same at the frequencies of peaks
     shapes: FloatArray  # (k, b): noise, turbulence and resonances, at most 1
     square: FloatArray  # (b,): frequency squared, warped as that of a sampled process [Hz^2]
     lines: FloatArray  # (l,): logarithms of the frequencies of the peaks
     line_width: FloatArray  # (l,): how far each may be off
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CoarseFit:
-    """The best gain of each guess."""
-
-    contrast: FloatArray  # (guesses,): minus the logarithm of the likelihood
-    gain: FloatArray  # (guesses,)
-    misfit: FloatArray  # (guesses,): mean deviance of a band, about 1 if the shapes suffice
 
 
 def segment_transforms(
@@ -129,29 +99,26 @@ def coarse_axis(
     power = np.mean(abs(measured) ** 2, axis=0)
     is_peak, lines, width = find_spectral_peaks(frequency_hz, power)
     step = float(frequency_hz[1] - frequency_hz[0])
-    band = _bands(frequency_hz[~is_peak], frame_rate_hz, step)
-    size = np.bincount(band)
-    quadratic = Quadratic(
-        power,
-        np.mean((measured.conj() * guesses).real, axis=1),
-        np.mean(guesses.real**2 + guesses.imag**2, axis=1),
+    every = LoopPeriodogram(
+        frequency_hz=frequency_hz,
+        measured=power,
+        crossed=np.mean((measured.conj() * guesses).real, axis=1),
+        corrected=np.mean(guesses.real**2 + guesses.imag**2, axis=1),
+        count=np.full(power.size, independent),
+        frame_rate_hz=frame_rate_hz,
+        resolution_hz=step,
     )
-
-    def merge(values: FloatArray) -> FloatArray:
-        rows = np.atleast_2d(values[..., ~is_peak])
-        means = np.array([np.bincount(band, weights=row) / size for row in rows])
-        return means.reshape((*values.shape[:-1], size.size))
+    bands = every.take(~is_peak)
+    bands = bands.merge(_bands(bands.frequency_hz, frame_rate_hz, step))
 
     def warp(f: FloatArray) -> FloatArray:
         return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
 
-    square = warp(merge(frequency_hz))
+    square = warp(bands.frequency_hz)
     known = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in resonances]
     return CoarseAxis(
-        count=np.asarray(size * independent, dtype=np.float64),
-        bands=Quadratic(*map(merge, quadratic)),
-        peak_count=independent,
-        peaks=Quadratic(*(part[..., is_peak] for part in quadratic)),
+        bands=bands,
+        peaks=every.take(is_peak),
         shapes=_background_shapes(square, frequency_hz[0], known),
         square=square,
         lines=np.log(lines),
@@ -184,11 +151,10 @@ def find_spectral_peaks(
 
 
 def _bands(frequency_hz: FloatArray, frame_rate_hz: float, step: float) -> IntArray:
-    """Return the band of each frequency, (f,), of at least one step."""
+    """Return where bands of at least one step begin among the frequencies."""
     width = np.minimum(_BAND * frequency_hz, _WIDEST_BAND * frame_rate_hz)
-    width = np.maximum(width, step)
-    _, band = np.unique(np.floor(np.cumsum(step / width) - 1e-9), return_inverse=True)
-    return np.asarray(band)
+    band = np.floor(np.cumsum(step / np.maximum(width, step)) - 1e-9)
+    return np.flatnonzero(np.diff(band, prepend=-np.inf) > 0)
 
 
 def _background_shapes(
@@ -214,6 +180,11 @@ def resonance(square: FloatArray, centre_hz: FloatArray | float, damping: float)
     return np.asarray(centre**2 / ((square - centre) ** 2 + 4 * damping**2 * centre * square))
 
 
+# minus the logarithm of the likelihood of each guess, its best gain, and its misfit: the mean
+# deviance of a band, about 1 if the shapes suffice; (guesses,) each
+CoarseFit = tuple[FloatArray, FloatArray, FloatArray]
+
+
 def fit_profile(axis: CoarseAxis, gains: FloatArray) -> CoarseFit:
     """Fit the spectrum of an axis with a single guess at each of its gains (n,)."""
     return _Fit(axis, np.zeros(gains.size, dtype=np.int64), free=False).minimise(gains)
@@ -222,12 +193,10 @@ def fit_profile(axis: CoarseAxis, gains: FloatArray) -> CoarseFit:
 def fit_guesses(axis: CoarseAxis, starts: FloatArray) -> CoarseFit:
     """Fit spectrum and gain of each guess, from each of its starting gains (guesses, s)."""
     guesses, each = starts.shape
-    guess = np.repeat(np.arange(guesses), each)
-    found = _Fit(axis, guess, free=True).minimise(starts.ravel())
-    best = np.argmin(found.contrast.reshape(guesses, each), axis=1) + each * np.arange(guesses)
-    return CoarseFit(
-        contrast=found.contrast[best], gain=found.gain[best], misfit=found.misfit[best]
-    )
+    fits = _Fit(axis, np.repeat(np.arange(guesses), each), free=True).minimise(starts.ravel())
+    best = np.argmin(fits[0].reshape(guesses, each), axis=1) + each * np.arange(guesses)
+    contrast, gain, misfit = (values[best] for values in fits)
+    return contrast, gain, misfit
 
 
 class _Fit:
@@ -265,19 +234,20 @@ class _Fit:
             rows = rows[(saved > _SETTLED) & (damping[rows] < 1e4)]
             if not rows.size:
                 break
-        return CoarseFit(contrast=value, gain=theta[:, 0], misfit=self._misfit(theta))
+        return value, theta[:, 0], self._misfit(theta)
 
     def _misfit(self, theta: FloatArray) -> FloatArray:
         """Return the mean deviance of the bands of each row."""
         gain, model, *_ = self._model(theta)
-        ratio = self.axis.bands.take(self.guess).power(gain) / model
-        return np.asarray(np.mean(2 * self.axis.count * (ratio - 1 - np.log(ratio)), axis=1))
+        bands = self.axis.bands
+        ratio = _power(bands.row(self.guess), gain) / model
+        return np.asarray(np.mean(2 * bands.count * (ratio - 1 - np.log(ratio)), axis=1))
 
     def _begin(self, gain: FloatArray) -> FloatArray:
         """Return starting values, with amplitudes by multiplicative updates."""
         skirts, _ = self._skirts(self.axis.lines[None])
         shapes = np.vstack([self.axis.shapes, skirts[0]])
-        power, count = self.axis.bands.take(self.guess).power(gain), self.axis.count
+        power, count = _power(self.axis.bands.row(self.guess), gain), self.axis.bands.count
         level = np.median(power, axis=1)[:, None] / self.amplitudes
         a = level / np.mean(shapes, axis=1)
         for _ in range(_FIRST_PASSES):
@@ -319,11 +289,11 @@ class _Fit:
         """Return the contrast of each row."""
         axis, guess = self.axis, self.guess[rows]
         gain, model, *_ = self._model(theta)
-        ratio = axis.bands.take(guess).power(gain) / model
-        at_peaks = np.log(axis.peaks.take(guess).power(gain)) + 1
+        ratio = _power(axis.bands.row(guess), gain) / model
+        at_peaks = np.log(_power(axis.peaks.row(guess), gain)) + 1
         return np.asarray(
-            (np.log(model) + ratio) @ axis.count
-            + axis.peak_count * np.sum(at_peaks, axis=1)
+            (np.log(model) + ratio) @ axis.bands.count
+            + at_peaks @ axis.peaks.count
             + 0.5 * np.sum(self._away(theta) ** 2, axis=1)
         )
 
@@ -334,23 +304,23 @@ class _Fit:
         """
         axis, guess = self.axis, self.guess[rows]
         gain, model, a, skirt, slope = self._model(theta)
-        bands, peaks = axis.bands.take(guess), axis.peaks.take(guess)
-        by_gain = bands.slope(gain) / model
-        at_peaks = peaks.slope(gain) / peaks.power(gain)
-        excess = axis.count * (1 - bands.power(gain) / model)
+        bands, peaks = axis.bands.row(guess), axis.peaks.row(guess)
+        by_gain = 2 * (bands.crossed + gain[:, None] * bands.corrected) / model
+        at_peaks = 2 * (peaks.crossed + gain[:, None] * peaks.corrected) / _power(peaks, gain)
+        count, excess = bands.count, bands.count * (1 - _power(bands, gain) / model)
         share = skirt / model[:, None]
         own = np.concatenate([share, share * slope], axis=1)  # of lines, by power and place
-        weighted = own * axis.count
+        weighted = own * count
         n, k = theta.shape[1], 1 + self.fixed
         gradient, information = np.empty((len(rows), n)), np.empty((len(rows), n, n))
-        gradient[:, 0] = by_gain @ axis.count + axis.peak_count * np.sum(at_peaks, axis=1)
+        gradient[:, 0] = by_gain @ count + at_peaks @ peaks.count
         gradient[:, 1:k] = a * ((excess / model) @ axis.shapes.T)
         gradient[:, k:] = (own @ excess[:, :, None])[:, :, 0]
-        information[:, 0, 0] = (bands.corrected / model) @ (2 * axis.count)
-        information[:, 0, 0] += axis.peak_count * np.sum(at_peaks**2, axis=1)
-        information[:, 0, 1:k] = -a * ((axis.count * by_gain / model) @ axis.shapes.T)
+        information[:, 0, 0] = (bands.corrected / model) @ (2 * count)
+        information[:, 0, 0] += at_peaks**2 @ peaks.count
+        information[:, 0, 1:k] = -a * ((count * by_gain / model) @ axis.shapes.T)
         information[:, 0, k:] = -(weighted @ by_gain[:, :, None])[:, :, 0]
-        pairs = ((axis.count / model**2) @ self.pairs)[:, self.pair]
+        pairs = ((count / model**2) @ self.pairs)[:, self.pair]
         information[:, 1:k, 1:k] = a[:, :, None] * pairs * a[:, None]
         information[:, k:, 1:k] = ((weighted / model[:, None]) @ axis.shapes.T) * a[:, None]
         information[:, 1:k, k:] = information[:, k:, 1:k].transpose(0, 2, 1)
@@ -375,3 +345,8 @@ class _Fit:
         level = np.max(trial[:, 1:k], axis=1, keepdims=True)
         trial[:, 1:k] = np.maximum(trial[:, 1:k], level - 40)
         return trial
+
+
+def _power(data: LoopPeriodogram, gain: FloatArray) -> FloatArray:
+    """Return the power of each row at its gain, (rows, f), above rounding."""
+    return np.asarray(np.maximum(data.power(gain[:, None]), _SMALLEST * data.measured))

@@ -136,19 +136,18 @@ class CoarseRecord:
         """Return the likelihood of each guess, at its best gains."""
         corrections = np.array([self.transform(guess) for guess in guesses])
         fits = [self._fit_axis(i, corrections[:, i]) for i in range(self.record.axes)]
+        contrast, gain, misfit = (np.array(values) for values in zip(*fits, strict=True))
         return Comparison(
             guesses=tuple(guesses),
-            axis_contrast=np.array([fit.contrast for fit in fits]),
-            gain=np.array([fit.gain for fit in fits]),
-            misfit=np.mean([fit.misfit for fit in fits], axis=0),
+            axis_contrast=contrast,
+            gain=gain,
+            misfit=np.mean(misfit, axis=0),
         )
 
     def profile(self, guess: Guess, gains: FloatArray) -> FloatArray:
         """Return the contrasts (axes, n) at gains (axes, n)."""
-        corrections = self.transform(guess)
-        each = zip(corrections, gains, strict=True)
-        fits = [fit_profile(self._axis(i, c[None]), g) for i, (c, g) in enumerate(each)]
-        return np.array([fit.contrast for fit in fits])
+        each = enumerate(zip(self.transform(guess), gains, strict=True))
+        return np.array([fit_profile(self._axis(i, c[None]), g)[0] for i, (c, g) in each])
 
     def unrelated(self) -> float:
         """Return the contrast of commands that do not reach the measurements."""

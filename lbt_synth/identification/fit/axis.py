@@ -33,7 +33,6 @@ from lbt_synth.identification.fit.periodogram import (
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     hold_gain,
-    parameter_covariance,
     standard_errors,
 )
 from lbt_synth.identification.fit.whittle import FittedModel
@@ -189,7 +188,7 @@ def find_axis(
 
 def _gain_error(model: FittedModel) -> float:
     """Return the standard error of the logarithm of the gain."""
-    return standard_errors(model.spectrum, parameter_covariance(model)).log_gain
+    return standard_errors(model.spectrum, model.covariance).log_gain
 
 
 def _likely_gains(models: Sequence[FittedModel], error: float) -> tuple[float, float]:

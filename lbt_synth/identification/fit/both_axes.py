@@ -18,7 +18,6 @@ from lbt_synth.identification.fit.axis import (
     refit_axis,
 )
 from lbt_synth.identification.fit.close_lines import describe_close_lines, measure_separations
-from lbt_synth.identification.fit.coupled_axes import couple_axes
 from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES, Search
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
@@ -31,6 +30,7 @@ from lbt_synth.identification.fit.record_doubts import (
     find_correction_jumps,
     find_jumps,
 )
+from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.records.spectrum import SpectrumRecord

@@ -40,37 +40,36 @@ _DRIFTS_HZ = (0.3, 1.0, 3.0, 10.0)  # where a resonance in the place of a drift 
 _DRIFT_DAMPING = 0.8
 
 
-def parameter_covariance(model: FittedModel) -> FloatArray:
-    """Return the covariance of the packed parameters, the inverse of the information, (p, p)."""
-    return invert_information(model.information)
-
-
 def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> SpectrumModel:
     """Return the standard error of each parameter of a model."""
     return spectrum.unpack(np.sqrt(np.maximum(np.diag(covariance), 0)))
 
 
-def gain_error_covariance(
-    held: FloatArray, slope: FloatArray, gains: Sequence[int], error: float
+def gain_covariance(
+    search: Search, model: FittedModel, errors: Sequence[tuple[Sequence[int], float]]
 ) -> FloatArray:
-    """Return what a relative error of gains adds to the covariance of a fit at them, (p, p).
+    """Return the covariance of a fit whose gains have errors, and all that these move, (p, p).
 
-    The gains are in these places. They move the gradient of the contrast by ``slope`` (p,), and so
-    the parameters, whose covariance is ``held`` (p, p) where the gains have no error.
+    The errors are relative ones, each common to the gains of some axes.
     """
-    moves = -held @ slope
-    moves[list(gains)] = 1
-    return np.asarray(error**2 * np.outer(moves, moves))
+    rows = derivatives(search.merge(model.spectra), model.spectra)[2]
+    gains = np.array(model.spectra.starts[:-1]) + GAIN
+    information = model.information.copy()
+    information[gains] = information[:, gains] = 0  # as if it were fitted at these gains
+    held = invert_information(information)
+    out = held
+    for axes, error in errors:
+        places = gains[list(axes)]
+        moves = -held @ np.sum(rows[places], axis=0)
+        moves[places] = 1
+        out = out + error**2 * np.outer(moves, moves)
+    return out
 
 
 def hold_gain(search: Search, model: FittedModel, error: float) -> FittedModel:
-    """Return a model with a relative error of its gain, and all that this moves."""
-    slope = derivatives(search.merge(model.spectrum), model.spectrum)[2][GAIN]
-    information = model.information.copy()
-    information[GAIN] = information[:, GAIN] = 0  # as if it were fitted at that gain
-    held = invert_information(information)
-    whole = held + gain_error_covariance(held, slope, [GAIN], error)
-    return replace(model, information=invert_information(whole))
+    """Return a model of one axis with a relative error of its gain, and all that this moves."""
+    covariance = gain_covariance(search, model, [([0], error)])
+    return replace(model, information=invert_information(covariance))
 
 
 def _colour_error(search: Search, spectrum: SpectrumModel) -> float:
@@ -101,7 +100,7 @@ def describe_axis(
     data, spectrum, gain = search.data, model.spectrum, model.spectrum.gain
     rate = data.frame_rate_hz
     near = nearest_processes(search, model, shared)
-    covariance = parameter_covariance(near)
+    covariance = near.covariance
     errors = standard_errors(near.spectrum, covariance)
     slow = spectrum if spectrum.rolling == "turbulence" else near.spectrum
     each, _, _ = densities(data, near.spectrum)
@@ -297,7 +296,7 @@ def _with_slow(model: FittedModel, slow: SpectrumModel) -> FittedModel:
     """Return a fit with other components in the places of those that are no lines."""
     others, whole = iter(slow.components), model.spectrum.components
     components = tuple(c if c.kind == "line" else next(others) for c in whole)
-    return replace(model, spectrum=replace(slow, components=components))
+    return model.with_spectrum(replace(slow, components=components))
 
 
 def _exchange_drift(

@@ -42,7 +42,8 @@ def test_rounding_does_not_move_the_search() -> None:
     )
     assert len(one.parts) == len(other.parts)
     assert one.fitted_model.contrast == pytest.approx(other.fitted_model.contrast, abs=0.5)
-    assert one.sensor_gain == pytest.approx(other.sensor_gain, rel=0.01)
+    assert one.sensor_gain_error is not None  # a seventh of the gain
+    assert one.sensor_gain == pytest.approx(other.sensor_gain, abs=0.15 * one.sensor_gain_error)
 
 
 @pytest.mark.parametrize("seed", range(3))

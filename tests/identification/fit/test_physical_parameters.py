@@ -16,10 +16,10 @@ from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     hold_gain,
     nearest_processes,
-    parameter_covariance,
     standard_errors,
     whiteness,
 )
+from lbt_synth.identification.fit.spectrum_model import Spectra
 from lbt_synth.identification.fit.whittle import FittedModel, density
 
 GAIN, NOISE_NM = 0.6, 5.0
@@ -56,7 +56,7 @@ def test_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=wind, diameter_m=8.22)
     search = Search(data=expected_periodogram(air, 5.0, 0.6))
     model = search_model(search)
-    error = float(np.sqrt(parameter_covariance(model)[0, 0]))
+    error = float(np.sqrt(model.covariance[0, 0]))
     assert abs(model.spectrum.log_gain - np.log(0.6)) < 0.2 * error
     # the process of the design is near to what was fitted, down to the noise
     axis = describe_axis(search, model, error, "")
@@ -77,7 +77,7 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
         slow = search.component("slow", 1.0, 0.5, power)
         more = replace(
             model,
-            spectrum=model.spectrum.add(slow),
+            spectra=Spectra((model.spectrum.add(slow),)),
             information=np.pad(model.information, (0, 3)),
             evidence=(*model.evidence, 0.0),
         )
@@ -107,9 +107,9 @@ def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),))
     axis = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     search, model = Search(data=axis.data), axis.fitted_model
-    errors = standard_errors(model.spectrum, parameter_covariance(model))
+    errors = standard_errors(model.spectrum, model.covariance)
     more = hold_gain(search, model, 0.2)
-    wider = standard_errors(model.spectrum, parameter_covariance(more))
+    wider = standard_errors(model.spectrum, more.covariance)
     assert wider.log_gain == pytest.approx(0.2, rel=1e-6)
     assert wider.components[1].log_power > errors.components[1].log_power
 
@@ -185,5 +185,5 @@ def test_what_two_axes_share_stays() -> None:
 
 def test_turbulence_without_a_roll_off_is_left_alone() -> None:
     search, model = fit(disturbance(20.0, 0.999, 30.0), GAIN)
-    plain = replace(model, spectrum=model.spectrum.without_roll_off())
+    plain = model.with_spectrum(model.spectrum.without_roll_off())
     assert nearest_processes(search, plain) is plain
