@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.fit.close_lines import measure_separations
 from lbt_synth.identification.fit.fitting import (
     GAINS,
     LOWEST_LINE_HZ,
@@ -33,6 +32,7 @@ from lbt_synth.identification.fit.periodogram import (
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     hold_gain,
+    measure_separations,
     standard_errors,
 )
 from lbt_synth.identification.fit.whittle import FittedModel

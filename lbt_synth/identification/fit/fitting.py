@@ -36,9 +36,9 @@ MOST_LINES = 20
 DRIFT_DAMPING = 2.0  # damping ratio from which turbulence is a drift
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
+POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands at half their size
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
-COLOUR_PRICE = 9.0  # the same of noise that is not white
-_SPLIT = 9.0  # the same of the second of two lines that lie in each other's skirts
+CHEAP = 9.0  # the same of what has one place: noise that is not white, the second of a close pair
 _SKIRTS = 8.0  # half widths of the narrower one within which two lines are close
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
@@ -49,7 +49,7 @@ _POWERS = (0.0, float(np.log(4)), float(-np.log(4)))
 _FIXED, _NONE = (0.0, 0.0), (0.0, np.inf)
 _GAIN_PRIOR = (np.log(0.7), 1.0)
 _COLOUR_PRIOR = (0.0, 1.0)
-STARTING_CORNER_HZ, _CORNER_WIDTH = 50.0, 2.0
+STARTING_CORNER_HZ = 50.0
 _TURBULENCE_WIDTH = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "turbulence": (np.log(0.45), 4.0),
@@ -57,7 +57,7 @@ _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "slow": (0.0, 1.0),
     "line": (np.log(0.01 / 0.99), 4.0),
 }
-_UNKNOWN_TAPER = 2.0  # width of the prior of a line where the taper is not known
+_LOOSE = 2.0  # width of the priors of a corner, and of a damping where the taper is not known
 
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
 _WIDEST_HZ, _SHARE = 3.0, 0.1  # of a group, and of what it holds of a line
@@ -111,7 +111,7 @@ class Search:
         """Return the priors of a fit. Components but for the first of an axis stay in the band."""
         spectra = Spectra((model,)) if isinstance(model, SpectrumModel) else model
         gain = _GAIN_PRIOR if self.finds_gain and len(spectra.axes) == 1 else _FIXED
-        corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
+        corner = (self.log_angle(STARTING_CORNER_HZ), _LOOSE)
         rows, frequencies = list[tuple[float, float]](), list[int]()
         for axis in spectra.axes:
             colour = _COLOUR_PRIOR if axis.colour else _FIXED
@@ -136,7 +136,7 @@ class Search:
         if component.kind == "line":
             frequency = _NONE
             if self.data.duration_s is None:
-                damping = damping[0], _UNKNOWN_TAPER
+                damping = damping[0], _LOOSE
         return [component.announced or frequency, damping, _NONE]
 
     def place(self, component: Component) -> tuple[float, float]:
@@ -220,7 +220,7 @@ def simplify(search: Search, model: FittedModel) -> FittedModel:
             model = less
     if model.spectrum.colour:
         less = fit(search, replace(model.spectrum, colour=0.0))
-        if less is not None and less.contrast - model.contrast < COLOUR_PRICE:
+        if less is not None and less.contrast - model.contrast < CHEAP:
             model = less
     return model
 
@@ -285,7 +285,7 @@ def required_evidence(
     if spectrum.components[i].announced is not None:
         return _ANNOUNCED
     is_alone = close_line(search, spectrum, i, earlier=earlier) is None
-    return search.price if is_alone else _SPLIT
+    return search.price if is_alone else CHEAP
 
 
 def close_line(

@@ -152,6 +152,31 @@ def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatAr
     return np.asarray(4 * np.sin(np.pi * frequency_hz / frame_rate_hz) ** 2)
 
 
+def segment_transforms(
+    series: FloatArray, rows: IntArray, frame_rate_hz: float, *, levelled: bool = False
+) -> tuple[FloatArray, ComplexArray, float]:
+    """Return frequencies (f,), scaled transforms ([n,] segments, f) and independent values of each.
+
+    The series is (frames,) or (frames, n), its segments (segments, length) of frames. It is
+    differenced and tapered, and loses its mean slope where it is to be ``levelled``. The square of
+    a transform is a one-sided density.
+    """
+    from scipy.fft import next_fast_len, rfft
+
+    length = rows.shape[1] - 1
+    taper, size = tukey(length), int(next_fast_len(length, real=True))
+    frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
+    scale = np.sqrt(2 / frame_rate_hz / np.sum(taper**2))
+    scale = scale / np.sqrt(half_angle_square(frequency, frame_rate_hz))
+    steps = np.diff(np.ascontiguousarray(series.T)[..., rows])
+    if levelled:
+        steps -= np.mean(steps, axis=-1, keepdims=True)
+    transforms = scale * rfft(taper * steps, size)[..., 1 : (size + 1) // 2]
+    # neighbours of a padded or tapered transform are not independent
+    independent = len(rows) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
+    return frequency, np.asarray(transforms), float(independent)
+
+
 def loop_periodogram(
     measurement: FloatArray,
     correction: FloatArray | None,
@@ -164,37 +189,26 @@ def loop_periodogram(
     Segments of one length are cut from all usable stretches. That length uses most of the data,
     and is the whole stretch where there is one of at most 2^16 frames.
     """
-    from scipy.fft import next_fast_len, rfft
-
     length = _segment_length([stop - start for start, stop in stretches])
     starts: list[int] = []
     for start, stop in stretches:
         many, spare = divmod(stop - start, length)
         starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
     rows = np.array(starts)[:, None] + np.arange(length)
-    taper, size = tukey(length - 1), int(next_fast_len(length - 1, real=True))
-    frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
-    scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
-
-    def transform(series: FloatArray) -> ComplexArray:
-        """Return the transform of the differences, ([axes,] segments, f)."""
-        steps = np.diff(np.ascontiguousarray(series.T)[..., rows])
-        return np.asarray(rfft(taper * steps, size)[..., 1 : (size + 1) // 2])
-
-    y = transform(measurement)
-    c = np.zeros_like(y) if correction is None else transform(correction)
-    measured = scale * np.mean(np.abs(y) ** 2, axis=-2)
+    frequency, y, independent = segment_transforms(measurement, rows, frame_rate_hz)
+    c = np.zeros_like(y)
+    if correction is not None:
+        _, c, _ = segment_transforms(correction, rows, frame_rate_hz)
+    measured = np.mean(np.abs(y) ** 2, axis=-2)
     between = None
     if measurement.ndim > 1:
         first, second = np.stack([y, c], axis=1)
-        between = scale * np.mean(first[:, None] * second.conj(), axis=-2)
-    # neighbours of a padded or tapered transform are not independent
-    independent = len(rows) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
+        between = np.mean(first[:, None] * second.conj(), axis=-2)
     return LoopPeriodogram(
         frequency_hz=frequency,
         measured=measured + _FLOOR * np.mean(measured, axis=-1, keepdims=True),
-        crossed=scale * np.mean((y * c.conj()).real, axis=-2),
-        corrected=scale * np.mean(np.abs(c) ** 2, axis=-2),
+        crossed=np.mean((y * c.conj()).real, axis=-2),
+        corrected=np.mean(np.abs(c) ** 2, axis=-2),
         count=np.full(frequency.size, independent),
         frame_rate_hz=frame_rate_hz,
         resolution_hz=frame_rate_hz / length,

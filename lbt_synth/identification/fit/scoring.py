@@ -19,7 +19,7 @@ SEARCHED, EXACT = 1e-2, 1e-5  # log-likelihood that a step may still gain where 
 _FARTHEST = 60.0  # of a logarithm: exp stays finite
 _LEAST_INFORMATION = 1e-6  # of a parameter: a step is finite where the data say nothing
 _RADIUS, _LARGEST_RADIUS = 1.0, 8.0  # of the trust region
-_MOST_STEPS, _MOST_DAMPINGS = 40, 30
+MOST_STEPS = 40
 _ACCEPTED, _POOR, _GOOD = 0.15, 0.25, 0.75  # of what a step should gain
 _ALONG = 1e-4  # cosine below which a secant says nothing
 _WITHIN = 0.99  # of the radius: a longer step ends at it
@@ -70,7 +70,7 @@ def scoring_minimum(
     x, radius = np.clip(start, low, high), _RADIUS
     value, gradient, information = evaluate(x)
     rest = np.zeros_like(information)  # of the second derivatives
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         if not (np.isfinite(value) and np.all(np.isfinite(information))):
             return None
         curvature, slope = information + rest, gradient
@@ -115,7 +115,7 @@ def _best_step(
     gain, more = float(-0.5 * (gradient @ step)), 0.0
     if float(np.linalg.norm(step)) <= radius:
         return step, gain, gain
-    for _ in range(_MOST_DAMPINGS):
+    for _ in range(MOST_STEPS):
         stiffer = curvature.copy()
         stiffer.flat[:: step.size + 1] += more
         factor, step, _ = dposv(stiffer, -gradient)

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.close_lines import measure_separations
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     gain_covariance,
+    measure_separations,
     standard_errors,
 )
 from lbt_synth.identification.fit.scoring import EXACT

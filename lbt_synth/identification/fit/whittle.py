@@ -49,7 +49,7 @@ from lbt_synth.models.resonance_spectrum import (
 )
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_DIFFERENCE = 1e-4  # of a logarithm
+DIFFERENCE = 1e-4  # of a logarithm
 WIDE = 30.0  # half width above which a line is not smeared
 _FAR = 400.0  # distance beyond which no line is smeared
 _NOTHING = 0.003  # change of the logarithm of a line that is neglected
@@ -468,9 +468,9 @@ def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Prior
     free, theta = priors.free, model.spectra.pack()
     _, gradient, _ = derivatives(data, model.spectra)
     rows = []
-    for step in _DIFFERENCE * np.eye(theta.size)[free]:
+    for step in DIFFERENCE * np.eye(theta.size)[free]:
         moved = derivatives(data, model.spectra.unpack(theta + step))[1]
-        rows.append((moved - gradient)[free] / _DIFFERENCE)
+        rows.append((moved - gradient)[free] / DIFFERENCE)
     exact = (np.array(rows) + np.transpose(rows)) / 2 + np.diag(1 / priors.width[free] ** 2)
     if np.min(np.linalg.eigvalsh(exact)) <= 0:
         return model
