@@ -10,8 +10,7 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, design_from_record
-from lbt_synth.identification.auto import LEAST_SECONDS, RecordedDesign
-from lbt_synth.identification.method_choice import MethodChoice
+from lbt_synth.identification.auto import LEAST_SECONDS, MethodChoice, RecordedDesign
 from lbt_synth.identification.prediction.comparison import RAN, ResidualRow
 from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.storage.display_unit import nm_text

@@ -1,23 +1,44 @@
-"""The model of a record at the likeliest sensor gain, and the gains that record and model allow."""
+"""The model of a record at the likeliest sensor gain, and the gains that record and model allow.
+
+The sensor gains that a record allows, and the designs that are stable at all of them.
+
+A design that is stable at all sensor gains that a record and its model allow.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import NumericalError
-from lbt_synth.identification.commands.doubts import STEPPED, rounding_share
-from lbt_synth.identification.commands.gain_interval import POSSIBLE_GAINS, allowed_gains
+from lbt_synth.design import Design
+from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
+from lbt_synth.identification.commands.control_law import record_control_law
+from lbt_synth.identification.commands.doubts import STEPPED, gain_dilution, rounding_share
+from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
+from lbt_synth.identification.commands.plausibility import could_have_run
 from lbt_synth.identification.fit.both_axes import identify
-from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, Search
-from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS, Search
+from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import FloatArray
+from lbt_synth.loop import close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.validation import BoolArray, FloatArray
 
 _OUTSIDE = 1.3  # factor beyond an interval of gains
+_LEAST, _MOST = POSSIBLE_GAINS
+_FAR_STEPS = 16
+_NEAR = np.geomspace(0.7, 1.43, 21)  # of the best gain, itself included
+_FAR = 6.0  # nats below the best gain that a record still allows
+_FARTHEST = 1.5  # factor by which a gain may be off that lies among those that a record allows
+_CAREFUL = (0.9, 0.8)  # of the fitted gain: slower designs at little cost
+_WIDE = 1.4  # by which the gain of a design is below the largest of a wide interval
+_UNEVEN = 1.3  # ratio of the gains of two axes that one sensor hardly has
+_HALF = 0.5  # of the gains are left of commands recorded at half their size
 
 
 def identify_with_gains(
@@ -141,3 +162,255 @@ def _criterion(model: IdentifiedModel) -> float:
     price = _price(model)
     fits = [axis.fitted_model for axis in model.axes]
     return float(sum(fit.contrast + price * len(fit.spectrum.components) for fit in fits))
+
+
+def allowed_gains(record: LoopRecord, model: IdentifiedModel | None = None) -> FloatArray:
+    """Return the interval of sensor gains of each axis that a closed-loop record allows.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        A closed-loop record with its delay.
+    model : IdentifiedModel, optional
+        Its resonances are part of the coarse spectrum, which has no wide ones of its own above
+        25 Hz and would explain such by a wrong gain.
+
+    Returns
+    -------
+    (axes, 2) ndarray
+        Least and largest gain whose profile likelihood, by a coarse model of the spectrum, is
+        within 6 of the best, more where the model misfits, and at which the recorded law is
+        stable; 0.08 to 2.5 at most.
+
+    Raises
+    ------
+    ProblemError
+        If the record has no delay.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=500)
+    >>> truth = lbt.Truth(turbulence=slow, noise_nm=5.0, sensor_gain=0.6)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    >>> run = lbt.simulate(
+    ...     lbt.integrator(path, gain=0.4).controller, truth, hardware=path, frames=10_000
+    ... )
+    >>> record = lbt.identification.loop_record(
+    ...     run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
+    ... )
+    >>> low, high = lbt.identification.allowed_gains(record)[0]
+    >>> bool(low < 0.6 < high < 2)
+    True
+    """
+    everything = np.tile([_LEAST, _MOST], (record.axes, 1))
+    coarse = CoarseRecord(record, None if model is None else _resonances(model))
+    if not coarse.stretches:
+        return everything
+    given = Guess(kind="as given")
+    best = coarse.compare([given])
+    far = np.geomspace(_LEAST, _MOST, _FAR_STEPS)
+    grid = np.array([[*far, *(gain * _NEAR)] for gain in best.gain[:, 0]])
+    excess = coarse.profile(given, grid) - best.axis_contrast
+    allowed = excess < _FAR * best.dispersion(0)
+    allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
+    ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
+    low, high = np.array(ends, dtype=np.float64).T
+    high = high * gain_dilution(coarse) ** 2  # in steps, a gain looks smaller
+    intervals: FloatArray = np.clip(np.column_stack([low, high]), _LEAST, _MOST)
+    running = far[_has_run(record, far)]
+    if not running.size:
+        return intervals
+    inside = np.clip(intervals, running[0], running[-1])
+    apart = (intervals[:, 0] > running[-1]) | (intervals[:, 1] <= running[0])
+    return np.where(apart[:, None], [running[0], running[-1]], inside)
+
+
+def _resonances(model: IdentifiedModel) -> list[list[tuple[float, float]]]:
+    """Return frequency [Hz] and damping ratio of the components of each axis."""
+    to_hz = model.frame_rate_hz / (2 * np.pi)
+    each = (axis.fitted_model.spectrum.components for axis in model.axes)
+    return [[(c.frequency * to_hz, c.damping_ratio) for c in components] for components in each]
+
+
+def _has_run(record: LoopRecord, gains: FloatArray) -> BoolArray:
+    """Return at which gains (n,) the recorded law is stable; at all where there is no law."""
+    try:
+        law = record_control_law(record)
+    except ProblemError:
+        return np.ones(gains.size, dtype=np.bool_)
+    if law.kind == "none" or law.lag_frames < 0:
+        return np.ones(gains.size, dtype=np.bool_)
+    given, one = Guess(kind="as given"), np.ones((1, record.axes))
+    return np.array([could_have_run(given, gain * one, record, law) for gain in gains])
+
+
+def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
+    """Return sensor gains within intervals (axes, 2) at which a design's loop is unstable.
+
+    Each corner of the box is tried, and all common factors on the design's own gains that its
+    sides allow: exact for axes that decouple. None if the loop is stable at all of them.
+    """
+    hardware = design.hardware
+    assert hardware is not None
+    for corner in product(*gains):
+        path = replace(hardware, sensor_matrix=np.diag(corner))
+        if not close_loop(path, design.controller).is_stable:
+            return np.array(corner)
+    own = np.diag(hardware.sensor)
+    factors = gains / own[:, None]
+    low, high = stable_sensor_gains(hardware, design.controller)
+    for factor in (np.min(factors), np.max(factors)):
+        if not low < factor < high:
+            return np.asarray(factor * own)
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SafeDesign:
+    """A design that is stable at all possible gains, its model, and what is to be said of it."""
+
+    model: IdentifiedModel
+    design: Design
+    assumptions: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
+    """Return the interval of gains of each axis that the record or its models allow.
+
+    What a model leaves out moves its gain by more than its errors say. So all gains count that the
+    record allows; where those of the fits are among them, and plausible, only the ones not too far
+    from these. Gains of fits that are as likely count, too.
+    """
+    gains = np.array([each.sensor_gains for each in models])
+    known = all(axis.sensor_gain_error is not None for each in models for axis in each.axes)
+    low, high = allowed.T
+    least, most = PLAUSIBLE_GAINS
+    inside = (np.maximum(low, least) <= gains) & (gains <= np.minimum(high, most))
+    if known and inside.all():
+        low = np.maximum(low, gains.min(axis=0) / _FARTHEST)
+        high = np.minimum(high, gains.max(axis=0) * _FARTHEST)
+    found = [low, high]
+    for own, each in zip(gains, models, strict=True):
+        errors = [DIFFERENT * (axis.sensor_gain_error or 0.0) for axis in each.axes]
+        found += [own - np.minimum(errors, own / 2), own + errors]
+        likely = [axis.likely_gains or 2 * (axis.sensor_gain,) for axis in each.axes]
+        found += list(np.transpose(likely))
+    return np.column_stack([np.min(found, axis=0), np.max(found, axis=0)])
+
+
+def is_stable_at_gains(design: Design, allowed: FloatArray, model: IdentifiedModel) -> bool:
+    """Return whether a design is stable at all sensor gains that record and model allow."""
+    return unstable_gains(design, possible_gains(allowed, model)) is None
+
+
+def design_for_gains(
+    fit_model: Callable[..., IdentifiedModel],
+    design: Callable[[IdentifiedModel], Design],
+    design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
+    models: tuple[IdentifiedModel, IdentifiedModel],
+    allowed: FloatArray | None,
+    *,
+    command_scale_known: bool,
+) -> SafeDesign:
+    """Return a design that is stable at all possible gains of two models, for the first of them.
+
+    Commands that were recorded at half their size look like twice the sensor gain, and no record
+    can tell; so half of the gains are possible, unless the scale of the commands is known. Where
+    the axes have different gains, the commands of either may have another size than was recorded,
+    and each axis may have the gains of both.
+    """
+    model, _ = models
+    made = design(model)
+    if allowed is None:
+        return SafeDesign(model=model, design=made)
+    intervals = possible_gains(allowed, *models)
+    assumed = (
+        f"the sensor gain lies within {_in_words(intervals)}, as the record and its model allow; "
+        "the loop is stable at all of these"
+    )
+    known = intervals
+    if command_scale_known:
+        assumed += ". The commands were recorded at the size that was applied, as was stated"
+    else:
+        intervals = known * [_HALF, 1.0]
+        assumed += " and at half of them, should the commands be recorded at half their size"
+        if _are_uneven(model):
+            low = np.minimum(intervals[:, 0], known.min())
+            intervals = np.column_stack([low, np.full(len(low), known.max())])
+            assumed += ", and each axis at those of both, because they differ"
+    bad = unstable_gains(made, intervals)
+    if bad is None:
+        return SafeDesign(model=model, design=made, assumptions=(assumed,))
+    used, careful = _design_carefully(fit_model, design, model, intervals)
+    if careful is None:
+        careful = _robust(model, bad, intervals, design_robustly, command_scale_known)
+    note = (
+        f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
+        f"{nm_text(_residual_nm(careful, model))} in the model; without that it would leave "
+        f"{nm_text(_residual_nm(made, model))}"
+    )
+    if not command_scale_known and unstable_gains(made, known) is None:
+        note += " (--command-scale 1: the commands were recorded at the size that was applied)"
+    return SafeDesign(model=used, design=careful, assumptions=(assumed,), notes=(note,))
+
+
+def _design_carefully(
+    fit_model: Callable[..., IdentifiedModel],
+    design: Callable[[IdentifiedModel], Design],
+    model: IdentifiedModel,
+    intervals: FloatArray,
+) -> tuple[IdentifiedModel, Design | None]:
+    """Return the first design for other gains that is stable within intervals, and its model."""
+    low, high = float(np.min(intervals)), float(np.max(intervals))
+    own = float(np.mean(model.sensor_gains))
+    middle = float(np.sqrt(low * high))
+    gains = [*(own * part for part in _CAREFUL), high / _WIDE, middle]
+    if _are_uneven(model):
+        gains.insert(0, max(model.sensor_gains))
+    for gain in gains:
+        fitted = fit_model(start=model, sensor_gain=gain)
+        made = design(fitted)
+        if unstable_gains(made, intervals) is None:
+            return fitted, made
+    return model, None
+
+
+def _residual_nm(design: Design, model: IdentifiedModel) -> float:
+    """Return what a design leaves in a model; infinite where its loop is unstable."""
+    loop = close_loop(model.hardware, design.controller)
+    return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else np.inf
+
+
+def _robust(
+    model: IdentifiedModel,
+    bad: FloatArray,
+    intervals: FloatArray,
+    design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
+    command_scale_known: bool,
+) -> Design:
+    """Return a design by robust synthesis, or refuse with the gains that are bad for another."""
+    factors = intervals / np.array(model.sensor_gains)[:, None]
+    try:
+        found = design_robustly(model, (float(np.min(factors)), float(np.max(factors))))
+        if unstable_gains(found, intervals) is None:
+            return found
+    except (SynthesisError, ProblemError):  # a plant without lines has no such design
+        pass  # the refusal says what the record lacks
+    gain = ", ".join(f"{value:.3g}" for value in bad)
+    advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
+    raise CertificateError(
+        f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
+        f"{_in_words(intervals)}. Record with a higher loop gain, look for jumps in the record, "
+        f"give the sensor gain{advice}."
+    )
+
+
+def _are_uneven(model: IdentifiedModel) -> bool:
+    """Return whether the axes have gains that one sensor hardly has."""
+    return max(model.sensor_gains) > _UNEVEN * min(model.sensor_gains)
+
+
+def _in_words(intervals: FloatArray) -> str:
+    return " and ".join(dict.fromkeys(f"{low:.3g} to {high:.3g}" for low, high in intervals))

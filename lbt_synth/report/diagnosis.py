@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
-from lbt_synth.identification.diagnosis.channels import AXES
-from lbt_synth.identification.diagnosis.running_loop import command_row, law_row
-from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
+from lbt_synth.identification.diagnosis.diagnosis import NARROW, diagnosis_verdict
+from lbt_synth.identification.diagnosis.running_loop import AXES, command_row, law_row
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing

@@ -1,16 +1,31 @@
-"""A design from a record, and what is noted against it."""
+"""A design from a record, and what is noted against it.
+
+The method that a record asks for, and when the default one stays.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from support.night import GAIN, night_record
 from support.recorded_loops import LINE, RATE, spliced_record
 
 import lbt_synth as lbt
-from lbt_synth.identification.auto import note_drift
+from lbt_synth.errors import CertificateError
+from lbt_synth.identification import auto
+from lbt_synth.identification.auto import choose_method, note_drift, quick_methods
+from lbt_synth.identification.prediction.forward_chaining import (
+    forward_split,
+    record_splits,
+)
+from lbt_synth.methods import method_named, registry
+from lbt_synth.methods.registry import default_method
 
 DRIFT_HZ = 500.0
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=DRIFT_HZ)
+KNOWN = {"sensor_gain": GAIN, "most_lines": 1}
 
 
 def test_a_design_is_doubted_where_the_gains_disagree() -> None:
@@ -76,3 +91,125 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
     assert note.startswith("axis 1 of the record stands 3e+03 nm off zero and drifts by -200 nm/s.")
     said = float(note.split("leaves up to ")[1].split(" nm")[0])
     assert said == pytest.approx(left * (3000 + 5 * 200), rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return night_record()
+
+
+@pytest.fixture(scope="module")
+def models(record):
+    """Models of the first half and of three quarters."""
+    return [
+        lbt.identify(record, stretches=training, **KNOWN)
+        for training, _ in record_splits(record, 2)
+    ]
+
+
+def worse(plant):
+    """An integrator."""
+    return lbt.integrator(plant.hardware, gain=0.3)
+
+
+def choose(record, models, designs, *, is_safe=lambda _: True):
+    """Choose among methods that stand for other designs; return what was identified, too."""
+    asked = []
+
+    def identify_past(**given):
+        asked.append(given)
+        return models[1]
+
+    def design(name, model, _options):
+        if name not in designs:
+            raise CertificateError("it was not asked for.")
+        return designs[name](model.plant())
+
+    found = choose_method(
+        record, models[0], identify_past=identify_past, design=design, is_safe=is_safe
+    )
+    return found, asked
+
+
+def test_a_method_that_leaves_clearly_less_is_chosen(record, models):
+    found, asked = choose(record, models, {"kalman": worse, "hinf": lbt.kalman})
+    assert found.method == "hinf"
+    assert [row.name for row in found.rows] == ["H-infinity filter", "Kalman filter"]
+    # the first half is not identified again
+    pairs = record_splits(record, 2)
+    assert asked == [{"stretches": pairs[1][0], "start": models[0]}]
+    left = []
+    for (training, test), model in zip(pairs, models, strict=True):
+        split = forward_split(record, training, test, model=model)
+        assert split.model is model
+        left += [
+            np.sum(split.replay(make(model.plant()).controller) ** 2, axis=1)
+            for make in (worse, lbt.kalman)
+        ]
+    bad, good = (np.mean(np.concatenate(left[i::2])) for i in range(2))
+    assert found.rows[1].above_nm2 == pytest.approx(bad - good, rel=0.02)  # but for part chunks
+    assert found.rows[1].above == pytest.approx((bad - good) / good, rel=0.02)
+    assert found.rows[1].above_nm2 > 2 * found.rows[1].above_error_nm2
+    assert (found.rows[0].above_nm2, found.rows[0].above_error_nm2) == (0, 0)
+    assert "H-infinity filter is chosen" in found.notes[0]
+    assert "less than the Kalman filter, by" in found.notes[0]
+    assert "LQG controller is left out: it was not asked for" in found.notes[1]
+    assert not any(note.endswith(".") for note in found.notes)  # whoever prints one ends it
+
+
+def test_a_method_that_a_possible_gain_makes_unstable_is_not_chosen(record, models):
+    designs = {"kalman": worse, "hinf": lbt.kalman, "lqg": worse}
+    found, _ = choose(record, models, designs, is_safe=lambda _: False)
+    assert found.method == "kalman"
+    assert [row.name for row in found.rows] == ["Kalman filter", "LQG controller"]
+    assert any("H-infinity filter is left out: its loop is unstable" in n for n in found.notes)
+
+
+def test_without_the_default_the_best_is_chosen(record, models):
+    found, _ = choose(record, models, {"lqg": worse, "hinf": lbt.kalman})
+    assert found.method == "hinf"
+    assert "of the methods that are left" in found.notes[0]
+    assert "Kalman filter is left out" in " ".join(found.notes)
+
+
+def test_what_cannot_be_compared_leaves_the_default(record, models):
+    found, _ = choose(record, models, {})
+    assert (found.method, found.rows) == ("kalman", ())
+    assert "were not compared: no design can be compared" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("difference", "scatter", "chosen"),
+    [
+        (20.0, 20.0, "hinf"),  # 20 +- 1, as 400 chunks have it
+        (2.5, 20.0, "hinf"),
+        (1.5, 20.0, "kalman"),  # within two errors
+        (0.4, 0.1, "kalman"),  # sure, but less than a thousandth
+        (-20.0, 20.0, "kalman"),
+    ],
+)
+def test_the_default_stays_within_two_errors(
+    record, models, monkeypatch, difference, scatter, chosen
+):
+    random = np.random.default_rng(0)
+    common, own = random.standard_normal((2, 400))
+    own = (own - np.mean(own)) / np.std(own)
+    usual = 1000 + 300 * common**2
+    squares = {"kalman": usual, "hinf": usual - difference + scatter * own}
+    chain = lbt.identification.PairedResiduals(squares_nm2=squares)
+    monkeypatch.setattr(auto, "compare_on_splits", lambda *_: chain)
+    found, _ = choose(record, models, {"hinf": lbt.kalman})
+    assert found.method == chosen
+    row = next(row for row in found.rows if row.above_nm2 != 0)
+    assert abs(row.above_nm2) == pytest.approx(abs(difference))
+    assert row.above_error_nm2 == pytest.approx(scatter / 20, rel=0.2)
+
+
+def test_slow_methods_are_not_tried(monkeypatch):
+    assert default_method() in quick_methods()
+    assert not any(method_named(name).slow for name in quick_methods())
+    usual = method_named(default_method())
+    for slow in (False, True):
+        newcomer = replace(usual, name="newcomer", slow=slow)
+        monkeypatch.setitem(registry._methods_of_folder(), "newcomer", newcomer)
+        assert ("newcomer" in quick_methods()) is not slow

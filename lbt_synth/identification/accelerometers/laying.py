@@ -22,12 +22,12 @@ from lbt_synth.identification.accelerometers.line_bands import (
     line_bands,
 )
 from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
 
-_SHORTEST = 256  # frames side by side
 _PASSES = 3
 _NEAR_S = 1.0  # within which a shift is refined
 _ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
@@ -51,15 +51,6 @@ class ClockShift:
     by_phases: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Laid:
-    """Readings beside the wavefront: by how many frames late, and fits."""
-
-    lag: int
-    fits: list[Pair]
-    shift: ClockShift  # beyond the whole frames
-
-
 def lay_and_fit(
     model: IdentifiedModel,
     record: LoopRecord,
@@ -68,8 +59,11 @@ def lay_and_fit(
     lines: Sequence[IdentifiedLine],
     largest: int,
     limit: float,
-) -> Laid:
-    """Lay readings beside the wavefront, and fit them there."""
+) -> tuple[int, list[Pair], ClockShift]:
+    """Lay readings beside the wavefront, and fit them there.
+
+    Return by how many frames they are late, the fits, and the shift beyond the whole frames.
+    """
     gains, lag = np.array(model.sensor_gains), 0
     errors = np.array([axis.sensor_gain_error or 0.0 for axis in model.axes])
     series = record.pseudo_open_loop(gains)
@@ -84,11 +78,11 @@ def lay_and_fit(
         frames = np.arange(record.frames) + lag
         known = (frames >= 0) & (frames < len(readings))
         usable = record.usable & known & good[np.where(known, frames, 0)]
-        found = tuple((int(a), int(b)) for a, b in runs(usable) if b - a >= _SHORTEST)
+        found = tuple((int(a), int(b)) for a, b in runs(usable) if b - a >= SHORTEST_SEGMENT)
         if not found:
             raise ProblemError(
-                f"record and accelerations must have {_SHORTEST} usable frames in a row side by "
-                f"side; they have {record.frames} and {len(readings)} frames."
+                f"record and accelerations must have {SHORTEST_SEGMENT} usable frames in a row "
+                f"side by side; they have {record.frames} and {len(readings)} frames."
             )
         return found
 
@@ -100,7 +94,7 @@ def lay_and_fit(
         if step == _PASSES - 1 or not sure or not round(shift.frames):
             break
         lag += round(shift.frames)
-    return Laid(lag=lag, fits=fits, shift=shift)
+    return lag, fits, shift
 
 
 def fit_pairs(bands: Sequence[LineBand]) -> list[Pair]:

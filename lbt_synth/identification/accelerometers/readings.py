@@ -1,4 +1,7 @@
-"""Readings of accelerometers: from a file, averaged over the frames of a loop."""
+"""Readings of accelerometers: from a file, averaged over the frames of a loop.
+
+Units of accelerations.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +15,20 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
-from lbt_synth.identification.accelerometers.units import M_S2
 from lbt_synth.identification.records.clock import build_clock
-from lbt_synth.identification.records.column_selection import CLOCKS
 from lbt_synth.identification.records.columns import Column, seconds_per
-from lbt_synth.identification.records.contents import Contents, read_contents
+from lbt_synth.identification.records.contents import CLOCKS, Contents, read_contents
 from lbt_synth.identification.records.faults import fill, find_outliers, find_stuck, mark, runs
+from lbt_synth.identification.records.record import BRIDGED_FRAMES
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
 _MOST_M_S2 = 1e12
-_BRIDGED = 3  # frames of a gap
 _NAME = re.compile(r"\w[\w .+-]*$")
 _SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
 _SAME = 1e-7  # relative, between rates that are one
 _FEWEST_READINGS = 4  # that a spline needs
+M_S2 = {"m/s2": 1.0, "mm/s2": 1e-3, "um/s2": 1e-6, "g": 9.80665, "mg": 9.80665e-3}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -196,7 +198,7 @@ def fill_missing(accelerations: ArrayLike) -> tuple[FloatArray, BoolArray]:
         good[:, c] &= ~held & ~find_outliers(series, good[:, c] & ~held)
         filled[:, c] = fill(series, good[:, c])
         gaps = runs(~good[:, c])
-        good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= _BRIDGED], len(given))
+        good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= BRIDGED_FRAMES], len(given))
     fine = np.mean(good, axis=0) >= 1 - _MISSING
     if not fine.any() and ended.all():  # one that ends early may be whole until then
         fine = good.any(axis=0)

@@ -226,8 +226,7 @@ def accelerometer_transfers(
     widest = max(line.damping * line.frequency_hz for line in lines)
     tried = len(live) * len(lines) * (1 + np.ceil(4 * widest * largest / model.frame_rate_hz))
     limit = alarm / tried
-    laid = lay_and_fit(model, record, readings[:, live], good, lines, largest, limit)
-    fits = laid.fits
+    lag, fits, shift = lay_and_fit(model, record, readings[:, live], good, lines, largest, limit)
     rows = [_row(fit, names[live[fit[3]]], places, model, limit) for fit in fits]
     rows.sort(key=lambda row: (names.index(row.channel), row.frequency_hz))
     noises = {live[c]: _noise(fits, c, model.frame_rate_hz, limit) for c in range(len(live))}
@@ -236,8 +235,8 @@ def accelerometer_transfers(
     return AccelerometerTransfers(
         transfers=tuple(replace(row, useful=row.useful and row.channel in best) for row in rows),
         channels=_channel_rows(names, rows, noises, faults, best),
-        shift=replace(laid.shift, frames=laid.shift.frames + laid.lag),
-        age_frames=laid.lag + 1,
+        shift=replace(shift, frames=shift.frames + lag),
+        age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
     )
 

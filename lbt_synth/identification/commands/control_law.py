@@ -1,4 +1,7 @@
-"""The control law of a record: how its commands follow from its measurements."""
+"""The control law of a record: how its commands follow from its measurements.
+
+What a matrix between two pairs of axes does: signs, exchanged axes, or a mixture.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.commands.axis_matrix import AxisMatrix, classify_matrix
 from lbt_synth.identification.commands.law_search import (
     LAGS,
+    SHORT_ORDER,
     LawCoefficients,
     LawShape,
     LoopSeries,
@@ -21,7 +24,16 @@ from lbt_synth.identification.commands.law_search import (
     simplest_short_law,
 )
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, matrix, read_only
+from lbt_synth.validation import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    matrix,
+    number,
+    read_only,
+    square,
+)
 
 LawKind: TypeAlias = Literal[
     "pure integrator",
@@ -33,7 +45,7 @@ LawKind: TypeAlias = Literal[
 ]
 _LEAST_ROWS = 400
 _EXACT = 1e-6  # part of the increments' variance, below which a law is exact
-_SHORT_ORDER, _LONG_ORDER = 3, 32
+_LONG_ORDER = 32
 _SHORT_ROWS, _LONG_ROWS = 60_000, 16_000
 _ROWS_PER_VALUE = 8
 _LEAST_COHERENCE = 0.1
@@ -45,9 +57,10 @@ _ROUNDING = 1e-12
 _AS_GOOD = 0.9
 _NEARLY = 2.0  # times the residual of a law that knows the future, which one that does not may have
 _SURE = 0.05  # most that a law leaves unexplained whose lag counts
-_COUNTS = 0.05  # of the largest weight of an axis
 FOLLOWED = 0.5  # coherence of an axis whose law counts
-_ROUGH = 0.05  # residual beyond which a law that knows the future is doubtful
+AxisKind: TypeAlias = Literal["diagonal", "swapped", "general", "zero"]
+_SIGMAS = 4.0  # standard errors within which a weight is zero
+_TOLERANCE = 0.05  # of the largest element
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,7 +113,7 @@ class ControlLaw:
     def axis_lags(self) -> IntArray:
         """Lag of the first measurement that counts for each axis [frames], (axes,)."""
         size = np.linalg.norm(self.taps, axis=2)
-        counts = size > _COUNTS * np.max(size, axis=1, keepdims=True)
+        counts = size > _TOLERANCE * np.max(size, axis=1, keepdims=True)
         return np.asarray(self.lag_frames + np.argmax(counts, axis=1))
 
 
@@ -203,7 +216,7 @@ def _find_law(
 
 def _search(series: LoopSeries) -> ControlLaw:
     """Return the shortest law that explains as much as a long one."""
-    regression = _regression(series, _SHORT_ORDER, _SHORT_ROWS)
+    regression = _regression(series, SHORT_ORDER, _SHORT_ROWS)
     if not regression.moving:
         return _no_law(regression)
     found = simplest_short_law(regression)
@@ -224,7 +237,7 @@ def _least_anticipating(regression: Regression, law: ControlLaw) -> ControlLaw:
         later = _describe(regression, simplest_law(regression, range(first, LAGS.stop)))
         if later.kind != "none" and later.residual < _NEARLY * law.residual:
             return later
-        if first == 0 and law.residual > _ROUGH:
+        if first == 0 and not law.is_sure:
             as_good = np.max(later.axis_coherence) > _AS_GOOD * np.max(law.axis_coherence)
             if as_good or np.sum(later.taps[:, 0] * law.taps[:, 0]) < 0:
                 return later
@@ -336,3 +349,48 @@ def _no_law(
         axis_coherence=read_only(known),
         odd_frames=0,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AxisMatrix:
+    """Structure of a matrix between axes.
+
+    Attributes
+    ----------
+    kind : str
+        "diagonal"; "swapped" (only the other diagonal is not zero); "general" (a rotation, for
+        example); "zero" (nothing differs from 0).
+    signs : (axes,) tuple of int
+        Signs of the elements on the diagonal, of a swapped matrix on the other one, of each row;
+        0 of any other.
+    """
+
+    kind: AxisKind
+    signs: tuple[int, ...]
+
+
+def classify_matrix(
+    values: ArrayLike, errors: ArrayLike = 0.0, *, tolerance: float = _TOLERANCE
+) -> AxisMatrix:
+    """Return what a matrix (n, n) of one or two axes does: the first kind that fits.
+
+    Elements within four standard errors of zero, or below a part of the largest one, the tolerance,
+    count as zero.
+    """
+    g = square(values, "values")
+    part = number(tolerance, "tolerance", at_least=0)
+    doubt = _SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
+    least = np.where(np.isfinite(doubt), doubt, np.inf)
+    g = np.where(np.abs(g) <= np.maximum(least, part * np.max(np.abs(g), initial=0.0)), 0.0, g)
+    on, off = np.diag(g), (g - np.diag(np.diag(g))).sum(axis=1)
+    if not g.any():
+        return AxisMatrix(kind="zero", signs=(0,) * len(g))
+    if not off.any():
+        return AxisMatrix(kind="diagonal", signs=_signs(on))
+    if not on.any():
+        return AxisMatrix(kind="swapped", signs=_signs(off))
+    return AxisMatrix(kind="general", signs=(0,) * len(g))
+
+
+def _signs(values: FloatArray) -> tuple[int, ...]:
+    return tuple(int(sign) for sign in np.sign(values))

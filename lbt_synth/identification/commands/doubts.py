@@ -11,7 +11,8 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.commands.control_law import FOLLOWED, ControlLaw, fit_control_law
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
-from lbt_synth.identification.commands.plausibility import could_have_run
+from lbt_synth.identification.commands.plausibility import CLEAR, SHORT_LAW, could_have_run
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records.faults import equal_runs, mark, runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.loop_hardware import past_corrections
@@ -20,7 +21,6 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray, read_only
 
 _SAME_ROWS = 0.05  # sine of the angle between the rows of a gain that are one
 _NO_STEADY_GAIN = 1e-3  # of the size of the taps, in their sum
-_SHORT = 3  # order of a law whose loop can be judged
 _PARTS_OF_GAIN, _TRIED = np.array([1.0, 0.3, 0.1]), np.geomspace(1.0, 1e-6, 19)
 _PARTS = 8  # of a record whose series may slip
 _ALIKE = 0.2  # of the largest tap, between laws that are one
@@ -28,10 +28,8 @@ _RELATED = 30.0  # nats by which the commands of an axis must be likelier than n
 _FUZZ = 1e-6  # of the range of values, within which two are the same
 STEPPED = 1e-6  # of the variance of increments, in rounding that may move a gain
 _DROWNED = 1.15  # factor by which rounding makes a gain too small to be used
-_SEGMENT = 256  # frames whose spectrum is taken
 _LEAST_SEGMENTS = 4
 _BANDS = 20
-_CLEAR = 20.0  # nats that decide
 
 
 def doubt_law(law: ControlLaw) -> str | None:
@@ -67,7 +65,7 @@ def doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray)
 
     ``gains`` (axes,) are the likeliest ones.
     """
-    if law is None or not law.exact or law.order > _SHORT:
+    if law is None or not law.exact or law.order > SHORT_LAW:
         return None
     tried = np.vstack([gains * _PARTS_OF_GAIN[:, None], _TRIED[:, None] * np.ones(record.axes)])
     if could_have_run(Guess(kind="as given"), tried, record, law):
@@ -196,7 +194,7 @@ def held_while_moving(record: LoopRecord) -> str:
         _excess(*axis)
         for axis in zip(record.measurements.T, opened.T, still, still ^ record.usable, strict=True)
     )
-    if nats < _CLEAR:
+    if nats < CLEAR:
         return ""
     share = 100 * float(np.max(np.mean(still, axis=1)))
     return (
@@ -208,7 +206,7 @@ def held_while_moving(record: LoopRecord) -> str:
 def _still(correction: FloatArray, usable: BoolArray) -> BoolArray:
     """Return the frames of long stretches in which a correction does not move."""
     each = equal_runs(correction, usable)
-    return mark(each[each[:, 1] - each[:, 0] >= _SEGMENT], len(correction))
+    return mark(each[each[:, 1] - each[:, 0] >= SHORTEST_SEGMENT], len(correction))
 
 
 def _excess(closed: FloatArray, opened: FloatArray, still: BoolArray, moving: BoolArray) -> float:
@@ -231,14 +229,14 @@ def _segments(frames: BoolArray) -> IntArray:
     starts = [
         first
         for start, stop in runs(frames)
-        for first in range(start, stop - _SEGMENT + 1, _SEGMENT)
+        for first in range(start, stop - SHORTEST_SEGMENT + 1, SHORTEST_SEGMENT)
     ]
-    return np.array(starts, dtype=np.int64)[:, None] + np.arange(_SEGMENT)
+    return np.array(starts, dtype=np.int64)[:, None] + np.arange(SHORTEST_SEGMENT)
 
 
 def _spectrum(segments: FloatArray) -> FloatArray:
     """Return the mean power in each of some bands, but for the mean, (bands,)."""
-    window = np.hanning(_SEGMENT + 1)[:-1]
+    window = np.hanning(SHORTEST_SEGMENT + 1)[:-1]
     transforms = np.fft.rfft((segments - segments.mean(axis=1, keepdims=True)) * window)
     power = np.mean(np.abs(transforms[:, 2:]) ** 2, axis=0)
     edges = np.unique(np.geomspace(1, power.size, _BANDS).astype(np.int64)) - 1

@@ -11,11 +11,12 @@ laws apart is in their increments.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
-from lbt_synth.identification.records.faults import find_saturated
+from lbt_synth.identification.records.faults import MAD, find_saturated
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 LAGS = range(-4, 5)  # frames by which the first measurement may be late
@@ -25,11 +26,9 @@ _ALIKE = 3.0  # over the residual of the richest law, within which a simple one 
 _FLOOR = 1e-10  # part of the increments' variance that rounding may leave
 _SAME = 1.05  # times the residual, within which a tap is idle
 _SPARE = 0.2  # of what the richest law explains, that a simple one may leave
-_SHORT = ((0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 3))  # order, and taps after the first
-_ORDERS = (4, 5, 6, 8, 10, 12, 16, 20, 24, 32)
+SHORT_ORDER = 3  # most past commands of a short law
 _JUMP = 30.0  # median deviations
 _MOST_JUMPS = 0.02  # of the frames
-_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 _ODD = 8.0  # deviations of a frame that follows another law
 _ODD_FLOOR = 1e-3  # of the increments
 _MOST_ODD = 0.1  # of the frames
@@ -74,7 +73,7 @@ class LoopSeries:
             left -= y[rows - lag] @ taps[:, index].T
         left = np.abs(left - np.median(left, axis=0))
         floor = _ODD_FLOOR * np.std(u[rows] - u[rows - 1], axis=0)
-        beyond = np.any(left > np.maximum(_ODD * _MAD * np.median(left, axis=0), floor), axis=1)
+        beyond = np.any(left > np.maximum(_ODD * MAD * np.median(left, axis=0), floor), axis=1)
         odd = np.zeros(len(u), dtype=np.bool_)
         if np.mean(beyond) < _MOST_ODD:
             odd[rows[beyond]] = True
@@ -259,7 +258,9 @@ def _lowest(regression: Regression, order: int, more: int, lags: range) -> tuple
 def simplest_short_law(regression: Regression, lags: range = LAGS) -> LawShape | None:
     """Return the shortest law of up to three states that explains as much as the richest one."""
     most = regression.most_residual(lags)
-    for order, more in _SHORT:
+    for order, more in product(range(SHORT_ORDER + 1), repeat=2):
+        if not order - 1 <= more <= order:
+            continue
         left, shape = _lowest(regression, order, more, lags)
         if left <= most:
             return _without_idle_taps(regression, left, shape)
@@ -270,13 +271,14 @@ def simplest_law(regression: Regression, lags: range = LAGS) -> LawShape:
     """Return the shortest law that explains as much as the richest one."""
     if found := simplest_short_law(regression, lags):
         return found
-    most, below = regression.most_residual(lags), _SHORT[-1][0]
+    most, below = regression.most_residual(lags), SHORT_ORDER
     left, shape = 1.0, LawShape(regression.order, 0, regression.order)
-    for order in (each for each in _ORDERS if each <= regression.order):
+    order = below
+    while order < regression.order:
+        below, order = order, min(2 * order, regression.order)
         left, shape = _lowest(regression, order, order, lags)
         if left <= most:
             return _lower_order(regression, left, shape, below, most)
-        below = order
     return _without_idle_taps(regression, left, shape)
 
 

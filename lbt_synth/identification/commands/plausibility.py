@@ -10,11 +10,10 @@ from typing import TypeAlias
 import numpy as np
 
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.identification.commands.axis_matrix import classify_matrix
-from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.commands.guesses import CoarseRecord, Comparison, Guess
+from lbt_synth.identification.commands.control_law import ControlLaw, classify_matrix
+from lbt_synth.identification.commands.guesses import SEGMENT_S, CoarseRecord, Comparison, Guess
 from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
-from lbt_synth.identification.fit.order_search import find_components, try_other_gains
+from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components, try_other_gains
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.record import LoopRecord
@@ -26,7 +25,8 @@ from lbt_synth.validation import BoolArray, FloatArray, number
 _NEAR_ONE = 0.2  # distance from 1 of the pole of a law that adds up
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _STABLE = 1 - 1e-9  # spectral radius below which a loop has run
-_SHORT = 3  # order of a law that does not couple axes
+SHORT_LAW = 3  # order of a law that does not couple axes, and whose loop can be judged
+CLEAR = 20.0  # nats that decide
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _CONTRADICTED = 60.0  # nats by which a guess is likelier than all that a law allows
 _GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
@@ -34,8 +34,7 @@ _TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
 _NEAR = 0.4  # such a distance that a coarse gain may have
 _LIKE = 3.0  # factor between a coarse gain and the fitted one of the same record
-_SEGMENT_S = 6.0
-_ROUNDS, _LINES = 3, 10  # of the search for lines
+_LINES = 10  # at most, of the search for lines
 
 _Fit: TypeAlias = tuple[Search, FittedModel | None]
 
@@ -185,7 +184,7 @@ def _is_surprising(guess: Guess, law: ControlLaw | None, lag: int) -> bool:
     if turned.kind == "swapped" or min(turned.signs) < 0:
         return True
     # a long law may couple the axes, as a filter of lines along diagonals does
-    return turned.kind != "diagonal" and law.order <= _SHORT
+    return turned.kind != "diagonal" and law.order <= SHORT_LAW
 
 
 def finer_saving(coarse: CoarseRecord, guess: Guess, clear: float) -> float:
@@ -246,7 +245,7 @@ def _fit_axes(
     """
     record = coarse.record
     corrections = coarse.corrections(guess)
-    length = int(_SEGMENT_S * record.frame_rate_hz)
+    length = int(SEGMENT_S * record.frame_rate_hz)
     pieces = [
         (start, min(start + length, b))
         for a, b in coarse.stretches
@@ -260,7 +259,7 @@ def _fit_axes(
             search = replace(search, starting_gains=(float(begin_at[i]),))
         found: FittedModel | None = None
         with suppress(NumericalError):
-            found = find_components(search, None, rounds=_ROUNDS)
+            found = find_components(search, None, rounds=FEW_ROUNDS)
             if other_gains:
                 found, _ = try_other_gains(search, found)
         out.append((search, found))

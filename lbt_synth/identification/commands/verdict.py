@@ -1,4 +1,9 @@
-"""The verdict on the commands of a record: whether they reach its measurements as given."""
+"""The verdict on the commands of a record: whether they reach its measurements as given.
+
+The factor of commands whose sensor gains are implausible, by the coarse model and by the fit.
+
+What turns the commands of a record into those that its mirror followed.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +24,36 @@ from lbt_synth.identification.commands.doubts import (
     held_while_moving,
     moving_axes,
 )
-from lbt_synth.identification.commands.guesses import SHIFTS, CoarseRecord, Guess, list_guesses
-from lbt_synth.identification.commands.plausibility import finer_saving, score_guesses
-from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
-from lbt_synth.identification.commands.scale import find_scale, likely_factors, wrong_scale
+from lbt_synth.identification.commands.guesses import (
+    MOST_SHIFT_FRAMES,
+    CoarseRecord,
+    Guess,
+    list_guesses,
+)
+from lbt_synth.identification.commands.plausibility import (
+    CLEAR,
+    could_have_run,
+    finer_saving,
+    finer_saving_of_gain,
+    fit_gains,
+    score_guesses,
+)
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_instance
+from lbt_synth.validation import (
+    BoolArray,
+    FloatArray,
+    frozen_copy,
+    integer,
+    number,
+    read_only,
+    real_array,
+    require_instance,
+    set_fields,
+)
 
 AS_GIVEN = "as given"
-_CLEAR = 20.0  # nats that decide
 _CLEAR_FINER = 8.0  # the same by the criterion of the fit
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
@@ -38,6 +62,13 @@ _NOT_SHOWN = 3.0  # factor beyond plausible gains
 _WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
 _FIT_ERRORS = 4.0  # of a fitted gain from a plausible one that refute the unit
 _WORST_CONDITION = 100.0  # of the gain of a law that is inverted
+_FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
+_USUAL_GAIN = 0.7
+_COARSE = 1.5  # factor by which a coarse gain may be wrong
+_APART = 1.6  # between gains of two axes that have scales of their own
+_INSIDE = 8  # gains that are tried of the plausible ones
+_SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
+_MOST_SHIFT = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -227,7 +258,7 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
     """Return the best explanation; None where commands do not reach the measurements."""
     record = coarse.record
     guesses = list_guesses(record, earliest_frames=1.0 - lag)
-    if lag > SHIFTS[-1]:
+    if lag > MOST_SHIFT_FRAMES:
         guesses.append(Guess(kind="shift", shift_frames=-lag))
     if law is not None and law.is_sure and law.axis_matrix.kind == "general":
         guesses += [Guess(kind="matrix", matrix=each) for each in _unmix_axes(law.gain)]
@@ -240,7 +271,7 @@ def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best 
         other = int(expected[np.argmin(score[expected])])
         if finer_saving(coarse, guesses[other], _CLEAR_FINER) >= _CLEAR_FINER:
             best, score[0] = other, np.inf
-    clear = _CLEAR * compared.dispersion(best)
+    clear = CLEAR * compared.dispersion(best)
     no_law = law is None or law.kind == "none"
     saved = coarse.unrelated() - np.min(compared.contrast) if no_law else np.inf
     if saved < _RELATED * compared.dispersion(best):
@@ -338,3 +369,204 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
         gain=frozen_copy(gains / scale),
         law=None,
     )
+
+
+def find_scale(
+    coarse: CoarseRecord,
+    law: ControlLaw | None,
+    guess: Guess,
+    found: FloatArray,
+    *,
+    contrast: float,
+    clear: float,
+    plausible: tuple[float, float],
+) -> FloatArray:
+    """Return the factors (axes,) of commands that make implausible gains plausible ones.
+
+    ``found`` are the gains (axes,) of a guess, ``contrast`` is its contrast there, and ``clear``
+    what decides.
+    """
+    low, high = plausible
+    bounded, nothing = np.clip(found, low, high), np.ones(found.size)
+    if np.all(bounded == found):
+        return nothing
+    inside = np.geomspace(low, high, _INSIDE)
+    near = coarse.profile(guess, np.tile(inside, (found.size, 1)))
+    if np.sum(np.min(near, axis=1)) - contrast < clear:
+        return nothing
+    gains = fit_gains(coarse, guess, found)
+    scale, usual = likely_factors(gains, plausible), _usual_gain(plausible)
+    gain = float(np.exp(np.mean(np.log(gains))))
+    if law is not None and law.is_sure:
+        if not could_have_run(guess, inside[:, None] * nothing, coarse.record, law):
+            return scale
+        if gain < low:  # commands that are too large come from a law that is too strong
+            return nothing
+    shown = finer_saving_of_gain(coarse, guess, plausible, usual) >= clear
+    return scale if shown else nothing
+
+
+def _usual_gain(plausible: tuple[float, float]) -> float:
+    """Return the gain that a sensor has most often."""
+    return float(np.clip(_USUAL_GAIN, *plausible))
+
+
+def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
+    """Return the likeliest factor of the commands of each axis with these gains, (axes,)."""
+    low, high = plausible
+    if np.max(gains) < _APART * np.min(gains):
+        together = float(np.exp(np.mean(np.log(gains))))
+        return np.full(gains.size, _likely_factor(together, plausible))
+    each = [1.0 if low <= gain <= high else _likely_factor(gain, plausible) for gain in gains]
+    return np.array(each)
+
+
+def _likely_factor(gain: float, plausible: tuple[float, float]) -> float:
+    """Return the likeliest factor of commands with a gain."""
+    low, high = plausible
+    usual = _usual_gain(plausible)
+    fits = [f for f in _FACTORS if low <= gain / f <= high]
+    fits = fits or [f for f in _FACTORS if low / _COARSE <= gain / f <= _COARSE * high]
+    if fits:
+        return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
+    return float(f"{gain / usual:.2g}")
+
+
+def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
+    """Return the words for commands that need a factor on each axis, (axes,)."""
+    sizes = [
+        f"{1 / factor:g} times too large" if factor < 1 else f"{factor:g} times too small"
+        for factor in scale
+    ]
+    words = f"they are {sizes[0]}"
+    if np.ptp(scale):
+        each = zip(sizes, scale, strict=True)
+        words = " and ".join(
+            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(each) if factor != 1
+        )
+    gains = ", ".join(f"{value:.3g}" for value in gain)
+    return f"{words} (with them the sensor has a gain of {gains})"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandRepair:
+    """A correction of recorded commands, in the order of the fields.
+
+    Parameters
+    ----------
+    increments : bool, optional
+        The record has increments: they are added up.
+    shift_frames : int, optional
+        Frames by which the commands move to later frames; negative to earlier ones.
+    swap_axes : bool, optional
+        The commands of the two axes change places.
+    sign : tuple of int, optional
+        1 or -1 for each axis, or for both.
+    matrix : tuple of float, optional
+        Matrix from commands to the axes of the measurements, in rows.
+    scale : float or sequence of float, optional
+        Factor of the commands of both axes, or of each: from volts or counts to the unit of the
+        measurements, for example.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.identification.CommandRepair(sign=(-1,), scale=0.001).options
+    '--command-sign -1 --command-scale 0.001'
+    """
+
+    increments: bool = False
+    shift_frames: int = 0
+    swap_axes: bool = False
+    sign: tuple[int, ...] = ()
+    matrix: tuple[float, ...] = ()
+    scale: float | tuple[float, ...] = 1.0
+
+    def __post_init__(self) -> None:
+        given = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
+        scales = tuple(number(scale, "command_scale", above=0) for scale in given)
+        set_fields(self, scale=scales[0] if len(set(scales)) == 1 else scales)
+        shift = integer(self.shift_frames, "command_shift_frames", at_least=-_MOST_SHIFT)
+        number(shift, "command_shift_frames", at_most=_MOST_SHIFT)
+        if any(sign not in (-1, 1) for sign in self.sign):
+            raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
+        real_array(self.matrix, "command_matrix")
+
+    @property
+    def options(self) -> str:
+        """The options of the command line that do the same."""
+
+        def values(each: tuple[float, ...]) -> str:
+            return " ".join(f"{value:g}" for value in each)
+
+        words = [
+            "--command-increments" if self.increments else "",
+            f"--command-shift-frames {self.shift_frames}" if self.shift_frames else "",
+            "--swap-axes" if self.swap_axes else "",
+            f"--command-sign {values(self.sign)}" if self.sign else "",
+            f"--command-matrix {values(self.matrix)}" if self.matrix else "",
+            f"--command-scale {values(self._scales)}" if self.scale != 1 else "",
+        ]
+        return " ".join(filter(None, words))
+
+    @property
+    def _scales(self) -> tuple[float, ...]:
+        return self.scale if isinstance(self.scale, tuple) else (self.scale,)
+
+    def turn(self, axes: int) -> FloatArray:
+        """Return the matrix that swap, sign, matrix and scale are together."""
+        if axes != 2 and self.swap_axes:
+            raise ProblemError(
+                "swapped commands need two axes; the record has one. Leave "
+                f"{self.options} out, or choose two columns."
+            )
+        if len(self._scales) not in (1, axes):
+            raise ProblemError(
+                f"command_scale must be one factor, or {axes}; got {list(self._scales)}."
+            )
+        out = np.diag(np.broadcast_to(np.array(self._scales), axes))
+        if self.matrix:
+            if len(self.matrix) != axes**2:
+                raise ProblemError(
+                    f"command_matrix must have {axes**2} numbers for {axes} axes, row after row; "
+                    f"got {len(self.matrix)}."
+                )
+            out = out @ np.reshape(self.matrix, (axes, axes))
+        if self.sign:
+            if len(self.sign) not in (1, axes):
+                raise ProblemError(
+                    f"command_sign must be one sign, or {axes}; got {list(self.sign)}."
+                )
+            out = out @ np.diag(np.broadcast_to(np.array(self.sign, dtype=float), axes))
+        return out @ _SWAP if self.swap_axes else out
+
+
+def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
+    """Return a closed-loop record with the commands that the mirror followed.
+
+    The usable frames are those of the new commands. ProblemError refuses a record
+    without commands, and a repair that does not fit its axes.
+    """
+    if record.commands is None:
+        raise ProblemError("the record is of an open loop: it has no commands to repair.")
+    commands = np.array(record.commands)
+    good = np.ones(record.frames, dtype=np.bool_)
+    if record.commanded is not None:
+        good = np.array(record.commanded)
+    if repair.increments:
+        commands = np.cumsum(commands, axis=0)
+        good &= np.logical_and.accumulate(good)
+    if repair.shift_frames:
+        commands = np.roll(commands, repair.shift_frames, axis=0)
+        good = np.roll(good, repair.shift_frames)
+        late = repair.shift_frames > 0
+        unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
+        commands[unknown], good[unknown] = 0.0, False
+    commands = commands @ repair.turn(record.axes).T
+    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
+    return repaired if record.delay_frames is None else repaired.with_delay(record.delay_frames)

@@ -1,27 +1,31 @@
-"""Where the lines of a record come from: one axis, a diagonal, or both axes without relation."""
+"""Where the lines of a record come from: one axis, a diagonal, or both axes without relation.
+
+What each part of the disturbance costs a loop, in nm and in Strehl ratio.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import detrend
 
-from lbt_synth.identification.diagnosis.channels import AXES
-from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.diagnosis.running_loop import AXES
+from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.stretches import Stretches
-from lbt_synth.models import Vibration
-from lbt_synth.storage.rows import column, fill_row, nm_column, table_row
+from lbt_synth.linear import Controller
+from lbt_synth.loop import Imaging, close_loop, jitter_strehl, model_budget
+from lbt_synth.loop.budget import line_covariance
+from lbt_synth.models import TipTiltPlant, Vibration
+from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_SAME = 3.0  # standard errors between frequencies of one line
 _SEGMENTS = 16
 _LEAST_SEGMENT = 64  # frames
 _LINEAR = 0.1  # of the power, that a line along a direction may have across it
 _RELATED = 0.5  # coherence of axes that move together
 _NEAR_AXIS_DEG = 6.0
-_SIGMAS = 3.0
 
 
 @table_row
@@ -103,7 +107,7 @@ def _is_same(one: IdentifiedLine, other: IdentifiedLine, model: IdentifiedModel)
     """Whether lines of two axes are one: their frequencies agree."""
     error = float(np.hypot(one.frequency_error_hz, other.frequency_error_hz))
     width = max(one.damping * one.frequency_hz, other.damping * other.frequency_hz)
-    near = max(_SAME * error, min(width, model.axes[0].resolution_hz * 2))
+    near = max(DIFFERENT * error, min(width, model.axes[0].resolution_hz * 2))
     return abs(one.frequency_hz - other.frequency_hz) <= near
 
 
@@ -167,7 +171,7 @@ def _origin(
 
 def _name_direction(angle_deg: float, error_deg: float) -> tuple[float, str]:
     """Return a direction [deg], near tilt from 0 to 180, and what it is along."""
-    near = max(_NEAR_AXIS_DEG, _SIGMAS * error_deg)
+    near = max(_NEAR_AXIS_DEG, DIFFERENT * error_deg)
     if abs(angle_deg) < near:
         return angle_deg, AXES[0]
     if abs(angle_deg) > 90 - near:
@@ -197,3 +201,85 @@ def _power_at(
     rest = np.count_nonzero(near) * level
     widths = 1 + np.pi * damping * frequency_hz / step  # independent values of a wide line
     return density[near].sum(axis=0) - rest, rest.real, max(len(starts) * 0.6 * widths, 1.0)
+
+
+@table_row
+class CostRow:
+    """One part of the disturbance, and what it costs two loops by the model."""
+
+    part: str = column("part", help="Part of the disturbance")
+    running_nm: float = nm_column("running", help="Residual that it leaves in the loop that ran")
+    running_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
+    best_nm: float = nm_column("best design", help="Residual that it leaves in the best design")
+    best_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
+
+
+def disturbance_costs(
+    plant: TipTiltPlant,
+    lines: Sequence[LineOrigin],
+    running: Controller | None,
+    best: Controller | None,
+    imaging: Imaging,
+) -> tuple[CostRow, ...]:
+    """Return a row per part of the disturbance, the most costly first, and one of all.
+
+    The Strehl ratio that a part costs is that of the residual without it, less that with it: as
+    residuals add up in the exponent, these do not add up to the whole loss.
+    """
+    tables = [_covariances(plant, lines, controller) for controller in (running, best)]
+    names = next((list(table) for table in tables if table), [])
+    losses = [_losses(table, imaging) for table in tables]
+    rows = [
+        CostRow(
+            part=name,
+            running_nm=_rms(tables[0], name),
+            running_strehl=losses[0].get(name, np.nan),
+            best_nm=_rms(tables[1], name),
+            best_strehl=losses[1].get(name, np.nan),
+        )
+        for name in names
+    ]
+    by = "running_nm" if tables[0] else "best_nm"
+    return tuple(sorted(rows[:-1], key=lambda row: -getattr(row, by))) + tuple(rows[-1:])
+
+
+def _covariances(
+    plant: TipTiltPlant, lines: Sequence[LineOrigin], controller: Controller | None
+) -> dict[str, FloatArray]:
+    """Return the covariance (n, n) of the residual by part, and of all; none of no stable loop."""
+    if controller is None:
+        return {}
+    loop = close_loop(plant.hardware, controller)
+    if not loop.is_stable:
+        return {}
+    budget = model_budget(loop, plant, frame_means=True)
+    out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
+    for line in lines:
+        parts = [line_covariance(loop, vibration) for vibration in line.vibrations]
+        name = line.name if line.name not in out else f"{line.name}, another"
+        out[name] = np.sum(parts, axis=0)
+    rest = budget.total_nm2 - np.sum(list(out.values()), axis=0)
+    out["turbulence"] = out["turbulence"] + rest  # slow resonances are turbulence
+    return out | {"all": budget.total_nm2}
+
+
+def _losses(parts: Mapping[str, FloatArray], imaging: Imaging) -> dict[str, float]:
+    """Return the Strehl ratio that each part costs."""
+    if not parts:
+        return {}
+    whole = parts["all"]
+    strehl = jitter_strehl(whole, imaging=imaging)
+    return {
+        name: jitter_strehl(_without(whole, part), imaging=imaging) - strehl
+        for name, part in parts.items()
+    }
+
+
+def _without(whole: FloatArray, part: FloatArray) -> FloatArray:
+    """Return a covariance without a part of it, positive semidefinite in spite of rounding."""
+    values, vectors = np.linalg.eigh(whole - part)
+    return np.asarray(vectors @ np.diag(np.maximum(values, 0)) @ vectors.T)
+
+
+def _rms(parts: Mapping[str, FloatArray], name: str) -> float:
+    return float(np.sqrt(max(np.trace(parts[name]), 0.0))) if name in parts else np.nan

@@ -1,21 +1,44 @@
-"""The loop that ran: its commands, its control law, and the identified sensor gain."""
+"""The loop that ran: its commands, its control law, and the identified sensor gain.
+
+The channels of a record, one by one: clipped, stuck, dead, drifting and noisy ones.
+
+A design of a gain file, in the loop of a record: stability, residual, agreement.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.plausibility import law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict
-from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
+from lbt_synth.identification.prediction.comparison import PredictionRow
+from lbt_synth.identification.records.from_series import LEAST_QUARTER, TREND
+from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, loop_margins
-from lbt_synth.storage.rows import column, percent_column, table_row
+from lbt_synth.loop.margins import stable_sensor_gains
+from lbt_synth.methods.registry import design_title
+from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.validation import BoolArray, FloatArray
 
 _FIND = "find the commands that belong to these measurements"
-_KNOWN = 0.05  # part of the increments that a law may leave, to be taken for the controller
+AXES = ("tip", "tilt")
+_DEAD = 0.5  # of the frames, on one value
+_NOISIER = 3.0  # times the other axis
+_FEW = 0.01  # of the frames, with a fault
+DEAD = "dead"
+_WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
+_WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
+_SAME_RATE = 1e-3
+_AGREES = 0.1  # of the residual that its own model promises
 
 
 @table_row
@@ -89,7 +112,7 @@ def _distinct(texts: Iterable[str]) -> list[str]:
 
 def running_controller(law: ControlLaw | None, frame_rate_hz: float) -> Controller | None:
     """Return the controller that ran, None where its law is not known well enough."""
-    if law is None or law.kind == "none" or law.lag_frames < 0 or law.residual > _KNOWN:
+    if law is None or not law.is_sure or law.lag_frames < 0:
         return None
     return law_controller(law, frame_rate_hz)
 
@@ -170,3 +193,217 @@ def _doubt_law(law: ControlLaw) -> tuple[str, str]:
     if law.kind == "proportional":
         return "by their law they are increments, not positions", "add them up"
     return "", ""
+
+
+@table_row
+class ChannelRow:
+    """One channel of a record."""
+
+    channel: str = column("channel", help="What it is")
+    rms_nm: float = nm_column("rms", help="Deviation from its mean")
+    step_nm: float = column(
+        "frame to frame", unit="nm", format=".3g", help="Rms difference of two frames"
+    )
+    mean_nm: float = column(unit="nm", help="Mean")
+    drift_nm: float = nm_column("drift", help="Mean of the last quarter less that of the first")
+    change: float = column(
+        "scatter, end/start", format=".2f", help="Rms difference, last quarter over first"
+    )
+    faulty: float = column(help="Part of the frames with a fault of this channel")
+    state: str = column("state", help="What is wrong with it, or good")
+
+    @property
+    def serious(self) -> bool:
+        """Whether something is wrong with it that more than a few frames have."""
+        return self.state == DEAD or self.faulty > _FEW or any(map(self.state.count, _WHOLE))
+
+
+def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
+    """Return what is known of each channel of a record, the measurements first."""
+    names = AXES if record.axes == len(AXES) else ("",)
+    measured = record.usable if record.measured is None else record.measured
+    everything = np.ones(record.frames, dtype=np.bool_)
+    commanded = everything if record.commanded is None else record.commanded
+    closed = record.commands is not None
+    rows = _judge_series(record, "measurements", record.measurements, measured, names, closed)
+    if record.commands is not None:
+        rows += _judge_series(record, "commands", record.commands, commanded, names, closed)
+    return tuple(rows)
+
+
+def live_axes(record: LoopRecord) -> list[int]:
+    """Return the axes whose measurements are not dead."""
+    rows = judge_channels(record)[: record.axes]
+    return [axis for axis, row in enumerate(rows) if row.state != DEAD]
+
+
+def _judge_series(
+    record: LoopRecord,
+    series: str,
+    values: FloatArray,
+    good: BoolArray,
+    names: tuple[str, ...],
+    closed: bool,
+) -> list[ChannelRow]:
+    steps = [_step_rms(one, good) for one in values.T]
+    rows = []
+    for axis, one in enumerate(values.T):
+        found = [
+            each
+            for each in record.health.findings
+            if each.series == series and each.axis == axis and each.kind in _WORDS
+        ]
+        here = one[good] if good.any() else one
+        first, last = _quarters(good)
+        ends = [_step_rms(one, part) for part in (first, last)]
+        change = ends[1] / ends[0] if ends[0] > 0 else np.nan
+        drift = float(np.mean(one[last]) - np.mean(one[first])) if last.any() else np.nan
+        held = sum(each.fraction for each in found if each.kind in ("stuck", "held"))
+        words = [f"{_WORDS[each.kind]} ({_percent(each.fraction)})" for each in found]
+        if np.ptp(here) == 0 or held > _DEAD:
+            words = [DEAD]
+        elif series == "measurements":
+            others = [step for i, step in enumerate(steps) if i != axis]
+            if others and steps[axis] > _NOISIER * max(others):
+                words.append(_WHOLE[0])
+            if closed and abs(drift) > float(np.std(here)):
+                words.append(_WHOLE[1])
+            if not 1 / TREND <= (1.0 if np.isnan(change) else change) <= TREND:
+                words.append(_WHOLE[2])
+        rows.append(
+            ChannelRow(
+                channel=f"{names[axis]} {series.removesuffix('s')}".strip(),
+                rms_nm=float(np.std(here)),
+                step_nm=steps[axis],
+                mean_nm=float(np.mean(here)),
+                drift_nm=drift,
+                change=change,
+                faulty=sum(each.fraction for each in found),
+                state=", ".join(words) or "good",
+            )
+        )
+    return rows
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.2g} %"
+
+
+def _step_rms(series: FloatArray, good: BoolArray) -> float:
+    """Return the rms difference of neighbouring good frames, nan without any."""
+    pairs = good[1:] & good[:-1]
+    return float(np.sqrt(np.mean(np.diff(series)[pairs] ** 2))) if pairs.any() else np.nan
+
+
+def _quarters(good: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Return the good frames of the first and of the last quarter, none if they are few."""
+    first, last = np.zeros((2, len(good)), dtype=np.bool_)
+    where = np.flatnonzero(good)
+    quarter = where.size // 4
+    if quarter >= LEAST_QUARTER:
+        first[where[:quarter]] = True
+        last[where[-quarter:]] = True
+    return first, last
+
+
+@table_row
+class GivenDesignRow:
+    """A given design on the record."""
+
+    design: str = column("design", help="Its name")
+    method: str = column("method", help="Method of synthesis")
+    stable: bool = column("stable", help="Whether its loop is stable at the identified gain")
+    spectral_radius: float = column("spectral radius", format=".5f", help="1 and more is unstable")
+    stable_gains: str = column("stable sensor gains", help="Real sensor gains that are stable")
+    sensor_gain: str = column("identified sensor gain", help="That of the record")
+    replayed_nm: float = column(
+        "residual on the record", unit="nm", format=".2f", help="On frames of no fit"
+    )
+    replayed_error_nm: float = column("+-", unit="nm", format=".2f", help="Its standard error")
+    own_model_nm: float = column(
+        "promised by its own model", unit="nm", format=".2f", help="For which it was designed"
+    )
+    model_nm: float = column(
+        "by the record's model", unit="nm", format=".2f", help="Identified from the record"
+    )
+    agreement: str = column("agrees with its model", help="Whether the record does")
+
+
+def given_controller(design: Design, model: IdentifiedModel) -> Controller:
+    """Return a given controller at the frame rate of the record; refuse one of another loop."""
+    path = model.hardware
+    sizes = design.controller.D.shape
+    if sizes != (path.n_commands, path.n_measurements):
+        raise ProblemError(
+            f"the gain file is of {sizes[1]} measurements and {sizes[0]} commands, and the record "
+            f"has {path.modes} axes. Give one for this record, or choose the axes."
+        )
+    rate = 1 / design.controller.dt_s
+    if not np.isclose(rate, path.frame_rate_hz, rtol=_SAME_RATE):
+        raise ProblemError(
+            f"the gain file is for {rate:.6g} Hz, and the record has {path.frame_rate_hz:.6g} Hz. "
+            "Give one for this frame rate."
+        )
+    return replace(design.controller, dt_s=path.dt_s)
+
+
+def given_design_row(
+    name: str,
+    design: Design,
+    model: IdentifiedModel,
+    replayed: PredictionRow | None,
+) -> GivenDesignRow:
+    """Return what a given design does on the record, replayed where its loop is stable."""
+    controller = given_controller(design, model)
+    loop = close_loop(model.hardware, controller)
+    nominal = float(np.mean(model.sensor_gains))
+    stable = ""
+    if loop.is_stable:
+        low, high = stable_sensor_gains(model.hardware, controller)
+        stable = f"{low * nominal:.3g} to {high * nominal:.3g}"
+    promised = design.rms
+    return GivenDesignRow(
+        design=name,
+        method=design_title(design.method),
+        stable=loop.is_stable,
+        spectral_radius=loop.spectral_radius,
+        stable_gains=stable,
+        sensor_gain=f"{nominal:.3f}",
+        replayed_nm=np.nan if replayed is None else replayed.replayed_nm,
+        replayed_error_nm=np.nan if replayed is None else replayed.replayed_error_nm,
+        own_model_nm=promised,
+        model_nm=np.nan if replayed is None else replayed.model_nm,
+        agreement=_agreement(promised, replayed),
+    )
+
+
+def _agreement(promised_nm: float, replayed: PredictionRow | None) -> str:
+    """Say whether the data agree with the residual that the design's own model promises."""
+    if replayed is None or not promised_nm > 0 or not replayed.replayed_nm > 0:
+        return "not known"
+    ratio = replayed.replayed_nm / promised_nm
+    # the error of the logarithm, so that a large residual does not excuse itself
+    if abs(np.log(ratio)) <= DIFFERENT * replayed.replayed_error_nm / replayed.replayed_nm:
+        return "yes"
+    if abs(ratio - 1) <= _AGREES:
+        return f"yes, within {100 * _AGREES:.0f} %"
+    return f"no: {'more' if ratio > 1 else 'less'} than promised, by a factor {ratio:.2f}"
+
+
+def design_differences(design: Design, model: IdentifiedModel) -> list[str]:
+    """Say how the loop that a design was made for differs from that of the record."""
+    if design.hardware is None:
+        return []
+    own = design.hardware
+    notes = []
+    sensor = np.diag(own.sensor) if own.sensor.shape == (own.modes, own.modes) else np.zeros(0)
+    if sensor.size == len(model.axes):
+        for i, (axis, assumed) in enumerate(zip(model.axes, sensor.tolist(), strict=True)):
+            error = axis.sensor_gain_error
+            if error is not None and abs(assumed - axis.sensor_gain) > DIFFERENT * error:
+                notes.append(
+                    f"the gain file assumes a sensor gain of {assumed:.3f} on axis {i}; the record "
+                    f"has {axis.sensor_gain:.3f} +- {error:.3f}"
+                )
+    here = replace(model.hardware, sensor_matrix=own.sensor, influence_matrix=own.influence)
+    return [*notes, *(f"the gain file was {text}" for text in loop_differences(own, here))]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.fit.close_lines import measure_separations
 from lbt_synth.identification.fit.fitting import (
     GAINS,
     LOWEST_LINE_HZ,
@@ -33,7 +32,7 @@ from lbt_synth.identification.fit.periodogram import (
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     hold_gain,
-    parameter_covariance,
+    measure_separations,
     standard_errors,
 )
 from lbt_synth.identification.fit.whittle import FittedModel
@@ -189,7 +188,7 @@ def find_axis(
 
 def _gain_error(model: FittedModel) -> float:
     """Return the standard error of the logarithm of the gain."""
-    return standard_errors(model.spectrum, parameter_covariance(model)).log_gain
+    return standard_errors(model.spectrum, model.covariance).log_gain
 
 
 def _likely_gains(models: Sequence[FittedModel], error: float) -> tuple[float, float]:

@@ -1,10 +1,13 @@
-"""The model of a loop from its record: both axes, with one sensor gain if they agree."""
+"""The model of a loop from its record: both axes, with one sensor gain if they agree.
+
+Doubts about a record: jumps, where series go on elsewhere.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import count
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -17,35 +20,38 @@ from lbt_synth.identification.fit.axis import (
     identify_spectrum,
     refit_axis,
 )
-from lbt_synth.identification.fit.close_lines import describe_close_lines, measure_separations
-from lbt_synth.identification.fit.coupled_axes import couple_axes
-from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES, Search
+from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES, POSSIBLE_GAINS, Search
 from lbt_synth.identification.fit.identified_model import (
+    DIFFERENT,
     IdentifiedAxis,
     IdentifiedLine,
     IdentifiedModel,
 )
 from lbt_synth.identification.fit.line_drift import describe_drifts
-from lbt_synth.identification.fit.record_doubts import (
-    cut_at_jumps,
-    find_correction_jumps,
-    find_jumps,
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, half_angle_square, tukey
+from lbt_synth.identification.fit.physical_parameters import (
+    describe_close_lines,
+    measure_separations,
 )
+from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.records.line_priors import LinePrior
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.spectrum import SpectrumRecord
+from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
-from lbt_synth.validation import require_instance
+from lbt_synth.storage.words import count_text
+from lbt_synth.validation import FloatArray, IntArray, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
-_LEAST_GAIN, _MOST_GAIN = 0.04, 2.5  # of a plausible sensor
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
-_GAIN_ERRORS = 3.0  # by which a gain must lie above that
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
-_APART = 3.0  # standard errors between gains that differ
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
 _NOT_WHITE = 1e-3  # probability of white innovations below which a note says so
-_BOTH = 2  # axes that may share resonances
+_LARGE = 12.0  # standard deviations of the change of a correction
+_UNLIKELY = 8.0  # standard deviations of the innovations
+_EDGE = 0.06  # of a stretch, at either end, where the taper hides jumps
+_CLUSTER = 20  # frames within which outliers are one jump
+_AROUND = 3  # frames left out on either side
+_SAME_JUMP = 50  # frames within which the axes have one jump
+_MOST_JUMPS = 20  # at which a record is cut
 
 
 def identify(
@@ -158,7 +164,7 @@ def identify(
         axes, note = _pool_gains(axes, found_gain, step, options)
         notes.append(note)
     shared: tuple[IdentifiedLine, ...] = ()
-    if len(axes) == _BOTH:
+    if len(axes) == 2:
         axes, shared, more = couple_axes(record, axes, cut, lowest_line_hz)
         notes += more
     if not shared:
@@ -261,7 +267,7 @@ def _pool_gains(
     errors = np.array([axes[i].sensor_gain_error for i in found_gain], dtype=float)
     log, weight = np.log(gains), (gains / errors) ** 2
     mean = float(np.sum(weight * log) / np.sum(weight))
-    if np.any(np.abs(log - mean) * gains > _APART * errors):
+    if np.any(np.abs(log - mean) * gains > DIFFERENT * errors):
         values = ", ".join(f"{g:.3f} +- {e:.3f}" for g, e in zip(gains, errors, strict=True))
         return axes, (
             f"warning: the axes have different sensor gains, {values}: the commands of one may be "
@@ -286,7 +292,7 @@ def _doubt_scale(axes: Sequence[IdentifiedAxis]) -> Iterator[str]:
         f"{axis.sensor_gain:.3f} +- {axis.sensor_gain_error:.3f}"
         for axis in axes
         if axis.sensor_gain_error is not None
-        and _CALIBRATED + _GAIN_ERRORS * axis.sensor_gain_error < axis.sensor_gain < _MOST_GAIN
+        and _CALIBRATED + DIFFERENT * axis.sensor_gain_error < axis.sensor_gain < POSSIBLE_GAINS[1]
     }
     if above:
         yield (
@@ -301,7 +307,7 @@ def _find_doubts(
 ) -> Iterator[str]:
     """Yield notes on odd gains, hidden noise, close and too many lines, and what no model has."""
     for i in found_gain:
-        if not _LEAST_GAIN < axes[i].sensor_gain < _MOST_GAIN:
+        if not POSSIBLE_GAINS[0] < axes[i].sensor_gain < POSSIBLE_GAINS[1]:
             yield (
                 f"warning: axis {i} has a sensor gain of {axes[i].sensor_gain:.3g}: are the units, "
                 "signs and axes of the commands right?"
@@ -373,3 +379,102 @@ def _identify_spectra(
         delay_frames=_DELAY if delay_frames is None else delay_frames,
         notes=tuple(notes),
     )
+
+
+Jump = tuple[int, float]  # frame where a series goes on elsewhere, standard deviations of that
+
+
+def find_jumps(
+    series: FloatArray, axes: Sequence[IdentifiedAxis], stretches: Stretches
+) -> list[Jump]:
+    """Find where the innovations of pseudo-open-loop series (frames, axes) are far too large."""
+    each = zip(series.T, axes, strict=True)
+    return _merge_jumps([jump for one, axis in each for jump in _axis_jumps(one, axis, stretches)])
+
+
+def _axis_jumps(series: FloatArray, axis: IdentifiedAxis, stretches: Stretches) -> list[Jump]:
+    """Find the jumps of one axis, in differences over the root of the fitted spectrum."""
+    out: list[Jump] = []
+    log_f, log_density = np.log(axis.frequency_hz), np.log(axis.fitted_nm2_hz)
+    for start, stop in stretches:
+        count = stop - start - 1
+        if count < SHORTEST_SEGMENT:
+            continue
+        transform = np.fft.rfft(tukey(count) * np.diff(series[start:stop]))
+        f: FloatArray = np.arange(1.0, transform.size) * (axis.frame_rate_hz / count)
+        density = np.exp(np.interp(np.log(f), log_f, log_density))
+        power = density * half_angle_square(f, axis.frame_rate_hz) * axis.frame_rate_hz / 2
+        transform[0] = 0
+        transform[1:] /= np.sqrt(power)
+        size = np.abs(np.fft.irfft(transform, count))
+        edge = int(_EDGE * count)
+        scale = float(np.median(size)) / 0.6745
+        far = edge + np.flatnonzero(size[edge : count - edge] > _UNLIKELY * scale)
+        out += _largest_of_clusters(size / scale, far, start)
+    return out
+
+
+def find_correction_jumps(corrections: FloatArray, stretches: Stretches) -> list[Jump]:
+    """Find where the corrections (frames, axes) go on elsewhere.
+
+    A fit would choose a sensor gain at which a jump of the commands does not show: they are
+    looked for before anything is fitted.
+    """
+    inside = np.zeros(len(corrections) - 1, dtype=np.bool_)
+    for start, stop in stretches:
+        inside[start : stop - 1] = True
+    out: list[Jump] = []
+    for change in np.abs(np.diff(corrections, axis=0)).T:
+        scale = float(np.median(change[inside])) / 0.6745 if inside.any() else 0.0
+        if scale > 0:
+            far = np.flatnonzero(inside & (change > _LARGE * scale))
+            out += _largest_of_clusters(change / scale, far, 0)
+    return _merge_jumps(out)
+
+
+def _largest_of_clusters(size: FloatArray, far: IntArray, start: int) -> list[Jump]:
+    """Return the largest of each cluster of differences that are too large."""
+    out = []
+    for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _CLUSTER)):
+        if place.size:
+            best = int(place[np.argmax(size[place])])
+            out.append((start + 1 + best, float(size[best])))
+    return out
+
+
+def _merge_jumps(found: Sequence[Jump]) -> list[Jump]:
+    """Return jumps by rising frame, each place once."""
+    out: list[Jump] = []
+    for jump in sorted(found, key=lambda jump: jump[0]):
+        if not out or jump[0] - out[-1][0] > _SAME_JUMP:
+            out.append(jump)
+    return out
+
+
+def cut_at_jumps(
+    stretches: Stretches, jumps: Sequence[Jump], series: str
+) -> tuple[Stretches, list[str]]:
+    """Return stretches without the neighbourhood of the jumps of some series, and a note.
+
+    Nothing is cut if there are too many jumps.
+    """
+    if not jumps:
+        return stretches, []
+    frame, size = max(jumps, key=lambda jump: jump[1])
+    note = (
+        f"warning: {count_text(len(jumps), 'jump')} of the {series}, the largest "
+        f"at frame {frame} with {size:.0f} standard deviations"
+    )
+    if len(jumps) > _MOST_JUMPS:
+        return stretches, [f"{note}; too many to cut the record there, and the model suffers"]
+    cut = cut_around(stretches, [frame for frame, _ in jumps])
+    return cut, [f"{note}; the record was cut there"]
+
+
+def cut_around(stretches: Stretches, frames: Sequence[int]) -> Stretches:
+    """Return stretches without the neighbourhood of some frames."""
+    for frame in frames:
+        low, high = frame - _AROUND, frame + _AROUND
+        pieces = chain(*(((a, min(b, low)), (max(a, high), b)) for a, b in stretches))
+        stretches = tuple((a, b) for a, b in pieces if b > a)
+    return stretches

@@ -14,11 +14,13 @@ from lbt_synth.identification.fit.scoring import EXACT, SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import (
     Component,
     Kind,
+    Spectra,
     SpectrumModel,
     damping_parameter,
 )
 from lbt_synth.identification.fit.whittle import (
     FittedModel,
+    Model,
     component_densities,
     contrast,
     contrasts,
@@ -27,16 +29,16 @@ from lbt_synth.identification.fit.whittle import (
     observe_information,
 )
 from lbt_synth.models.resonance_spectrum import PARAMETERS
-from lbt_synth.validation import IntArray, integer, number
+from lbt_synth.validation import integer, number
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
 DRIFT_DAMPING = 2.0  # damping ratio from which turbulence is a drift
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
+POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands at half their size
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
-COLOUR_PRICE = 9.0  # the same of noise that is not white
-_SPLIT = 9.0  # the same of the second of two lines that lie in each other's skirts
+CHEAP = 9.0  # the same of what has one place: noise that is not white, the second of a close pair
 _SKIRTS = 8.0  # half widths of the narrower one within which two lines are close
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
@@ -47,7 +49,7 @@ _POWERS = (0.0, float(np.log(4)), float(-np.log(4)))
 _FIXED, _NONE = (0.0, 0.0), (0.0, np.inf)
 _GAIN_PRIOR = (np.log(0.7), 1.0)
 _COLOUR_PRIOR = (0.0, 1.0)
-STARTING_CORNER_HZ, _CORNER_WIDTH = 50.0, 2.0
+STARTING_CORNER_HZ = 50.0
 _TURBULENCE_WIDTH = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "turbulence": (np.log(0.45), 4.0),
@@ -55,7 +57,7 @@ _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "slow": (0.0, 1.0),
     "line": (np.log(0.01 / 0.99), 4.0),
 }
-_UNKNOWN_TAPER = 2.0  # width of the prior of a line where the taper is not known
+_LOOSE = 2.0  # width of the priors of a corner, and of a damping where the taper is not known
 
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
 _WIDEST_HZ, _SHARE = 3.0, 0.1  # of a group, and of what it holds of a line
@@ -105,21 +107,37 @@ class Search:
         damping = damping_parameter(kind, ratio)
         return Component(kind, self.log_angle(frequency_hz), damping, float(np.log(power)))
 
-    def priors(self, spectrum: SpectrumModel) -> Priors:
-        """Return the priors of a fit."""
-        gain = _GAIN_PRIOR if self.finds_gain else _FIXED
-        corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
-        colour = _COLOUR_PRIOR if spectrum.colour else _FIXED
-        rows = [gain, _NONE, colour, corner if spectrum.rolls_off else _FIXED]
-        for c in spectrum.components:
-            frequency, damping = (self.log_angle(1.0), _TURBULENCE_WIDTH), _DAMPING_PRIORS[c.kind]
-            if c.kind == "line":
-                frequency = _NONE
-                if self.data.duration_s is None:
-                    damping = damping[0], _UNKNOWN_TAPER
-            rows += [c.announced or frequency, damping, _NONE]
+    def priors(self, model: Model) -> Priors:
+        """Return the priors of a fit. Components but for the first of an axis stay in the band."""
+        spectra = Spectra((model,)) if isinstance(model, SpectrumModel) else model
+        gain = _GAIN_PRIOR if self.finds_gain and len(spectra.axes) == 1 else _FIXED
+        corner = (self.log_angle(STARTING_CORNER_HZ), _LOOSE)
+        rows, frequencies = list[tuple[float, float]](), list[int]()
+        for axis in spectra.axes:
+            colour = _COLOUR_PRIOR if axis.colour else _FIXED
+            rows += [gain, _NONE, colour, corner if axis.rolls_off else _FIXED]
+            for c in axis.components:
+                frequencies += [len(rows)] * (c is not axis.components[0])
+                rows += self._component_priors(c)
+        for shared in spectra.shared:
+            frequencies.append(len(rows))
+            ratio = _FIXED if shared.holds_ratio else _NONE
+            rows += [*self._component_priors(shared), ratio, _FIXED]
         centre, width = np.array(rows).T
-        return Priors(centre=centre, width=width)
+        priors = Priors(centre=centre, width=width)
+        low, high = (np.full(centre.size, end) for end in priors.bounds)
+        low[frequencies], high[frequencies] = self.log_angle(_LOWEST * self.data.step_hz), _HIGHEST
+        return replace(priors, bounds=(low, high))
+
+    def _component_priors(self, component: Component) -> list[tuple[float, float]]:
+        """Return the priors of frequency, damping and power."""
+        frequency = (self.log_angle(1.0), _TURBULENCE_WIDTH)
+        damping = _DAMPING_PRIORS[component.kind]
+        if component.kind == "line":
+            frequency = _NONE
+            if self.data.duration_s is None:
+                damping = damping[0], _LOOSE
+        return [component.announced or frequency, damping, _NONE]
 
     def place(self, component: Component) -> tuple[float, float]:
         """Return the frequency and the half width of a component [Hz], at least a bin wide."""
@@ -131,15 +149,11 @@ class Search:
         lowest = self.log_angle(_LOWEST * self.data.step_hz)
         return bool(lowest < component.log_frequency < _HIGHEST)
 
-    def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
+    def merge(self, model: Model) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
-        return self.data.merge(self.groups(spectrum))
-
-    def groups(self, spectrum: SpectrumModel) -> IntArray:
-        """Return where groups of bins begin within which a model is nearly constant."""
         f, step = self.data.frequency_hz, self.data.step_hz
         size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
-        for line in spectrum.lines:
+        for line in model.lines:
             centre, half_width = self.place(line)
             fine = _SIDELOBES if half_width < _SMEARED * step else _BINS
             reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
@@ -148,12 +162,12 @@ class Search:
             wide = _SHARE * np.maximum(half_width, 2 * away)
             size[near] = np.minimum(size[near], np.maximum(step, wide))
         group = np.floor(np.cumsum(step / size) - 1e-9)
-        return np.flatnonzero(np.diff(group, prepend=-np.inf) > 0)
+        return self.data.merge(np.flatnonzero(np.diff(group, prepend=-np.inf) > 0))
 
 
 def fit(
     search: Search,
-    start: SpectrumModel,
+    start: Model,
     *,
     better_than: FittedModel | None = None,
     margin: float = 0.0,
@@ -161,16 +175,19 @@ def fit(
 ) -> FittedModel | None:
     """Fit all parameters; None if no fit settles.
 
-    Components that leave the band, from the first bin to the Nyquist frequency, are dropped, and so
-    is a drift whose damping ratio falls below 2, if another part can take its place. A fit is given
-    up where its log-likelihood does not reach that of ``better_than`` minus a margin.
+    Components of one axis that would leave the band, from the first bin to the Nyquist frequency,
+    are dropped, and so is a drift whose damping ratio falls below 2, if another part can take its
+    place; those of two axes stay at its ends. A fit is given up where its log-likelihood does not
+    reach that of ``better_than`` minus a margin.
     """
+    if isinstance(start, SpectrumModel):
+        start = start.keep(search.covers)
     data, bound = search.merge(start), float("inf")
     if better_than is not None:
-        bound = contrast(data, better_than.spectrum) + margin
+        bound = contrast(data, better_than.spectra) + margin
     found = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
-    if found is None or found.contrast > bound:
-        return None
+    if found is None or found.contrast > bound or isinstance(start, Spectra):
+        return None if found is None or found.contrast > bound else found
     inside = found.spectrum.keep(search.covers)
     first = inside.components[0]
     if first.kind == "drift" and first.damping_ratio < DRIFT_DAMPING:
@@ -203,7 +220,7 @@ def simplify(search: Search, model: FittedModel) -> FittedModel:
             model = less
     if model.spectrum.colour:
         less = fit(search, replace(model.spectrum, colour=0.0))
-        if less is not None and less.contrast - model.contrast < COLOUR_PRICE:
+        if less is not None and less.contrast - model.contrast < CHEAP:
             model = less
     return model
 
@@ -268,7 +285,7 @@ def required_evidence(
     if spectrum.components[i].announced is not None:
         return _ANNOUNCED
     is_alone = close_line(search, spectrum, i, earlier=earlier) is None
-    return search.price if is_alone else _SPLIT
+    return search.price if is_alone else CHEAP
 
 
 def close_line(

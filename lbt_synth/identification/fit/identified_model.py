@@ -27,6 +27,7 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 Kind = Literal["line", "broad", "turbulence"]
+DIFFERENT = 3.0  # standard errors beyond which two values differ: chance 0.3 %
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,8 +29,7 @@ from lbt_synth.validation import ComplexArray, FloatArray
 
 _REACH_HZ = 3.0  # of the band on either side, and between lines that may be one
 _FEWEST_BINS = 16  # of a band
-_NARROW = 3.0  # half width in bins: a wider line is no sinusoid
-_LEAST_BINS = 3.0  # through which a line must drift to be one that does
+_NARROW = 3.0  # bins: a line of a larger half width is no sinusoid, one that drifts less stands
 _LEAST_SHARE = 0.5  # of the power in the band that the sinusoid must have, beside 1 / bins
 _MOST_DAMPING = 0.05
 _LEAST_ERROR = 0.05  # of the rms: an even drift is an approximation
@@ -59,11 +58,11 @@ class LineDrift:
     def is_clear(self) -> bool:
         """Whether a resonance that only wanders hardly looks like it."""
         bins = self.range_hz * self.duration_s
-        return bins > _LEAST_BINS and self.share > _LEAST_SHARE + 1 / bins
+        return bins > _NARROW and self.share > _LEAST_SHARE + 1 / bins
 
     def covers(self, line: IdentifiedLine) -> bool:
         """Whether a line lies where the sinusoid has been."""
-        reach = self.range_hz / 2 + _LEAST_BINS / self.duration_s
+        reach = self.range_hz / 2 + _NARROW / self.duration_s
         return abs(line.frequency_hz - self.frequency_hz) < reach
 
     def correct(self, lines: Sequence[IdentifiedLine]) -> list[IdentifiedLine]:

@@ -5,6 +5,8 @@ narrow lines hardly touch. Bands with too much power become components, all para
 together, and what adds less to the logarithm of the likelihood than a criterion asks is dropped
 again: the Bayesian one asks ``3 / 2 log n`` for a line of three parameters among n values
 (G. Schwarz, Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
+
+Bands in which a spectrum has more power than its model.
 """
 
 from __future__ import annotations
@@ -17,14 +19,14 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.excesses import Candidate, find_candidates, measure_excess
 from lbt_synth.identification.fit.fitting import GAINS, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
-from lbt_synth.identification.fit.spectrum_model import Component, Kind, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import Component, SpectrumModel
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
+from lbt_synth.validation import FloatArray
 
-_FEW_ROUNDS = 3
+FEW_ROUNDS = 3
 _LITTLE, _CLEARLY = 0.1, 1.0  # log-likelihood that a component or a move must save at least
 _MOST_ROUNDS = 12
 _HALF = float(np.log(0.5))
@@ -44,6 +46,10 @@ _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _MOST_DRIFTS = 2  # fits of both
 _BANDS = 80
 _GAINS = (2 * GAINS["above"], GAINS["below"] / 2)
+_WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
+_NARROWEST = 1e-4  # damping ratio of a new component
+
+Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
 
 def search_model(
@@ -70,7 +76,7 @@ def _may_be_coloured(search: Search, model: FittedModel) -> bool:
     if not all(c.is_narrow for c in spectrum.components[1:]):
         return True
     near = fitting.fit(search, replace(spectrum, colour=_COLOUR))
-    return near is not None and model.contrast - near.contrast > fitting.COLOUR_PRICE
+    return near is not None and model.contrast - near.contrast > fitting.CHEAP
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
@@ -80,7 +86,7 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
     """
     spectrum = model.spectrum
     wide = sum(not c.is_narrow for c in spectrum.lines)
-    coloured = fitting.COLOUR_PRICE * bool(spectrum.colour)
+    coloured = fitting.CHEAP * bool(spectrum.colour)
     return _cost_with_gain(search, model) + search.price * wide + coloured
 
 
@@ -109,7 +115,7 @@ def try_other_gains(
         begin = replace(search, gain=gain, colour=colour)
         try:
             known = replace(spectrum, colour=colour)
-            held = find_components(begin, known, rounds=_FEW_ROUNDS, moves=False)
+            held = find_components(begin, known, rounds=FEW_ROUNDS, moves=False)
         except NumericalError:
             continue
         free = fitting.fit(search, held.spectrum)
@@ -201,14 +207,14 @@ def _trials(
     nearly_first_order = first.kind == "drift" or first.damping_ratio > fitting.DRIFT_DAMPING
     # where no line can be added, a second turbulence would take the place of one
     room = len(lines) < search.most_lines
-    found = _find_excesses(search, spectrum)
-    found = [c for c in found if c.evidence > 0.25 * found[0].evidence]
-    either = [_add_candidates(search, spectrum, found)] if found else []
+    found = find_excesses(search, spectrum)
+    found = [excess for excess in found if excess[0] > 0.25 * found[0][0]]
+    either = [_add_centred(search, spectrum, found)] if found else []
     if room and not nearly_first_order:
         either += _other_backgrounds(search, spectrum, lines, drifts=True)
     yield either, _LITTLE
     while found := found[: len(found) // 2]:
-        yield [_add_candidates(search, spectrum, found)], _LITTLE
+        yield [_add_centred(search, spectrum, found)], _LITTLE
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
             yield from (([trial], _CLEARLY) for trial in _line_moves(search, spectrum, i))
@@ -235,27 +241,20 @@ def _begin(search: Search) -> FittedModel | None:
     """
     known = search if not search.finds_gain else replace(search, gain=search.starting_gains[0])
     model = fit_background(known, known.gain or 1.0)
-    for _ in range(_FEW_ROUNDS):
-        found = [] if model is None else _find_excesses(known, model.spectrum)
-        clear = [c for c in found if c.evidence > max(2 * search.price, 0.02 * found[0].evidence)]
+    for _ in range(FEW_ROUNDS):
+        found = [] if model is None else find_excesses(known, model.spectrum)
+        clear = [one for one in found if one[0] > max(2 * search.price, 0.02 * found[0][0])]
         if model is None or not clear:
             break
-        model = fitting.fit(known, _add_candidates(known, model.spectrum, clear))
+        model = fitting.fit(known, _add_centred(known, model.spectrum, clear))
     if model is None or not search.finds_gain:
         return model
     return fitting.fit(search, model.spectrum)
 
 
-def _add_candidates(
-    search: Search, spectrum: SpectrumModel, found: list[Candidate]
-) -> SpectrumModel:
-    """Return the model with candidates as components."""
-    whole = spectrum
-    for c in found:
-        line = c.frequency_hz >= search.lowest_line_hz
-        ratio = np.clip(c.half_width_hz / c.frequency_hz, 1e-4, 0.3) if line else 0.3
-        kind: Kind = "line" if line else "slow"
-        whole = whole.add(search.component(kind, c.frequency_hz, ratio, c.variance_nm2))
+def _add_centred(search: Search, spectrum: SpectrumModel, new: list[Excess]) -> SpectrumModel:
+    """Return the model with more components, each where it fits best."""
+    whole = spectrum.add(*(component for _, component in new))
     for i in range(len(spectrum.components), len(whole.components)):
         whole = fitting.centre_line(search, whole, i)
     return whole
@@ -284,17 +283,23 @@ def _add_announced(search: Search, model: FittedModel) -> FittedModel:
     return model if made is None else fitting.prune(search, made)
 
 
-def _find_excesses(search: Search, spectrum: SpectrumModel) -> list[Candidate]:
-    """Find bands with too much power, as many as there may be more lines."""
+def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
+    """Find components where a model lacks power, as many as there may be more lines."""
     room = search.most_lines - len(spectrum.lines)
     if room <= 0:
         return []
     data = search.data
     power, model = data.power(spectrum.gain), density(data, spectrum)
-    found = find_candidates(data, power, model, least=search.price, most=room)
+    out = []
+    for worth, *ends in _excess_bands(data, power / model, least=search.price, most=room):
+        component = _highest_excess(search, power, model, slice(*ends), _WIDEST)
+        if search.place(component)[0] < search.lowest_line_hz:
+            slow = search.component("slow", search.place(component)[0], _WIDEST, 1.0)
+            component = replace(slow, log_power=component.log_power)
+        out.append((worth, component))
     if len(spectrum.components) - len(spectrum.lines) >= _MOST_TURBULENCES:
-        found = [c for c in found if c.frequency_hz >= search.lowest_line_hz]
-    return found
+        out = [(worth, component) for worth, component in out if component.kind == "line"]
+    return out
 
 
 def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[SpectrumModel]:
@@ -309,10 +314,9 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     lowest = min(max(centre - reach, search.lowest_line_hz), centre)
     start, stop = np.searchsorted(data.frequency_hz, [lowest, centre + reach])
     rest = density(data, spectrum.exchange(i))
-    seen = measure_excess(data, data.power(spectrum.gain), rest, int(start), int(stop))
-    if abs(seen.frequency_hz - centre) > 0.5 * half + step:
-        ratio = min(seen.half_width_hz / seen.frequency_hz, 0.5)
-        again = search.component("line", seen.frequency_hz, ratio, seen.variance_nm2)
+    band = slice(int(start), int(stop))
+    again = _highest_excess(search, data.power(spectrum.gain), rest, band, 0.5)
+    if abs(search.place(again)[0] - centre) > 0.5 * half + step:
         yield spectrum.exchange(i, replace(again, announced=line.announced))
     if half > 3 * step and len(spectrum.lines) < search.most_lines:
         lower, upper = (
@@ -398,3 +402,62 @@ def _smooth_background(data: LoopPeriodogram, gain: float) -> LoopPeriodogram:
     return replace(
         data, frequency_hz=centre, measured=level, crossed=zero, corrected=zero, count=weight
     )
+
+
+def _excess_bands(
+    data: LoopPeriodogram, ratio: FloatArray, *, least: float, most: int
+) -> list[tuple[float, int, int]]:
+    """Return the bands with the most significant excess of power over a model.
+
+    Each is what a model with its mean would add to the log-likelihood, and where it starts and
+    stops. Bands of 1, 2, 4, ... bins are tried everywhere, at steps of a quarter of their width. A
+    band of n values with the mean ratio R of power to model would gain ``n (R - 1 - log R)``.
+    """
+    f, step = data.frequency_hz, data.step_hz
+    total, weight = (np.cumsum(np.append(0.0, values)) for values in (ratio, data.count))
+    bands: list[tuple[float, int, int]] = []
+    width = 1
+    while width * step < _WIDEST * f[-1] and width < f.size:
+        starts = np.arange(0, f.size - width + 1, max(1, width // 4))
+        widest = np.maximum(_WIDEST * f[starts + width // 2], 4 * step)
+        starts = starts[width * step <= widest]
+        mean = np.maximum((total[starts + width] - total[starts]) / width, 1)
+        gain = (weight[starts + width] - weight[starts]) * (mean - 1 - np.log(mean))
+        best = np.argsort(gain)[::-1][: 8 * most]
+        best = best[gain[best] > least]
+        bands += [(float(gain[i]), int(starts[i]), int(starts[i]) + width) for i in best]
+        width *= 2
+    apart: list[tuple[float, int, int]] = []
+    for worth, start, stop in sorted(bands, reverse=True):
+        reach = max(3, stop - start)
+        if all(start >= b + reach or stop <= a - reach for _, a, b in apart):
+            apart.append((worth, start, stop))
+    return apart[:most]
+
+
+def _highest_excess(
+    search: Search, power: FloatArray, model: FloatArray, band: slice, widest: float
+) -> Component:
+    """Return a line of the place, width and variance of the highest excess in a band of bins."""
+    data, excess = search.data, power[band] - model[band]
+    count = max(1, excess.size // 2).bit_length()
+    each = [(2**k, _moving_mean(excess, 2**k)) for k in range(count)]
+    # the smoothing at which the peak is highest over its scatter, which falls with its root
+    _, smooth = max(each, key=lambda one: float(np.max(one[1])) * np.sqrt(one[0]))
+    peak = int(np.argmax(smooth))
+    low_enough = np.flatnonzero(smooth <= 0.5 * smooth[peak])
+    low = low_enough[low_enough <= peak].max(initial=0)
+    high = low_enough[low_enough >= peak].min(initial=smooth.size - 1)
+    half = max(0.5 * float(high - low - 1), 0.5) * data.step_hz
+    height = max(float(smooth[peak]), float(np.min(model[band])))
+    frequency = float(data.frequency_hz[band.start + peak])
+    ratio = min(max(half / frequency, _NARROWEST), widest)
+    return search.component("line", frequency, ratio, np.pi * half * height)
+
+
+def _moving_mean(series: FloatArray, width: int) -> FloatArray:
+    """Return the mean over a width around each value, (n,), with zeros beyond the ends."""
+    total = np.cumsum(np.append(0.0, series))
+    last = np.arange(series.size) + (width - 1) // 2 + 1
+    first = np.maximum(last - width, 0)
+    return np.asarray((total[np.minimum(last, series.size)] - total[first]) / width)

@@ -11,14 +11,14 @@ at both ends, and the power divided by that of the difference, ``|1 - z^-1|^2``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 TAPER = 0.1  # of a segment, both ends together
 SHORTEST_SEGMENT = 256
@@ -34,16 +34,22 @@ def tukey(length: int) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoopPeriodogram:
-    """One-sided densities over frequency, of the measurement and of the correction in it."""
+    """One-sided densities over frequency, of measurements and of the corrections in them.
+
+    The densities are (f,) of one axis and (axes, f) of several. With many guesses of the
+    correction, those that contain it are (guesses, f).
+    """
 
     frequency_hz: FloatArray  # (f,), increasing
-    measured: FloatArray  # (f,): |Y|^2 [nm^2/Hz]
-    crossed: FloatArray  # (f,): Re(Y C*) [nm^2/Hz]; zeros without corrections
-    corrected: FloatArray  # (f,): |C|^2 [nm^2/Hz]; zeros without corrections
+    measured: FloatArray  # (..., f): |Y|^2 [nm^2/Hz]
+    crossed: FloatArray  # (..., f): Re(Y C*) [nm^2/Hz]; zeros without corrections
+    corrected: FloatArray  # (..., f): |C|^2 [nm^2/Hz]; zeros without corrections
     count: FloatArray  # (f,): independent periodograms that each value is the mean of
     frame_rate_hz: float
     resolution_hz: float  # width of a frequency bin of the transform
     duration_s: float | None = None  # of the tapered segments; None for a density from elsewhere
+    # (2, 2, f): (Y1, C1) times (Y2, C2)* of two axes [nm^2/Hz]
+    between: ComplexArray | None = None
 
     @property
     def closed(self) -> bool:
@@ -71,28 +77,51 @@ class LoopPeriodogram:
         """Angle per frame of 1 Hz."""
         return 2 * np.pi / self.frame_rate_hz
 
-    def power(self, gain: float) -> FloatArray:
-        """Return the density of ``y + gain c`` [nm^2/Hz], (f,)."""
+    def row(self, i: int | IntArray) -> LoopPeriodogram:
+        """Return the periodogram of some of several axes or guesses."""
+        measured = self.measured if self.measured.ndim == 1 else self.measured[i]
+        crossed, corrected = self.crossed[i], self.corrected[i]
+        return replace(self, measured=measured, crossed=crossed, corrected=corrected, between=None)
+
+    def power(self, gain: float | FloatArray) -> FloatArray:
+        """Return the density of ``y + gain c`` [nm^2/Hz], (..., f); gains are (..., 1)."""
         return np.asarray(self.measured + gain * (2 * self.crossed + gain * self.corrected))
 
-    def power_slopes(self, gain: float) -> tuple[FloatArray, FloatArray]:
-        """Return the first two derivatives of that density by the logarithm of the gain, (f,)."""
+    def power_slopes(self, gain: float | FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the first two derivatives of that density by the logarithm of the gain."""
         cross, square = 2 * gain * self.crossed, 2 * gain**2 * self.corrected
         return cross + square, cross + 2 * square
+
+    def cross_power(self, gains: Sequence[float]) -> tuple[ComplexArray, ComplexArray]:
+        """Return ``Z1 Z2*`` of two axes at their gains, (f,), and its log slopes by these, (2, f).
+
+        Its unit is nm^2/Hz.
+        """
+        assert self.between is not None
+        ((yy, yc), (cy, cc)), (one, other) = self.between, gains
+        own = [one * (cy + other * cc), other * (yc + one * cc)]
+        return yy + own[0] + other * yc, np.array(own)
 
     def merge(self, starts: IntArray) -> LoopPeriodogram:
         """Return the means over groups of neighbours that begin at these indices."""
         size = np.diff(np.append(starts, len(self.frequency_hz)))
-        names = ("frequency_hz", "measured", "crossed", "corrected")
-        means: Any = {name: np.add.reduceat(getattr(self, name), starts) / size for name in names}
-        return replace(self, **means, count=np.add.reduceat(self.count, starts))
+        means = self._map(lambda values: np.add.reduceat(values, starts, axis=-1) / size)
+        return replace(means, count=np.add.reduceat(self.count, starts))
 
     def window(self, low_hz: float, high_hz: float) -> LoopPeriodogram:
         """Return the values between two frequencies."""
-        inside = slice(*np.searchsorted(self.frequency_hz, [low_hz, high_hz]))
-        names = ("frequency_hz", "measured", "crossed", "corrected", "count")
-        values: Any = {name: getattr(self, name)[inside] for name in names}
-        return replace(self, **values)
+        return self.take(slice(*np.searchsorted(self.frequency_hz, [low_hz, high_hz])))
+
+    def take(self, inside: BoolArray | slice) -> LoopPeriodogram:
+        """Return the values at some frequencies."""
+        return replace(self._map(lambda values: values[..., inside]), count=self.count[inside])
+
+    def _map(self, change: Callable[[Any], Any]) -> LoopPeriodogram:
+        """Return the periodogram with its frequencies and densities changed."""
+        names = ("frequency_hz", "measured", "crossed", "corrected")
+        values: Any = {name: change(getattr(self, name)) for name in names}
+        between = None if self.between is None else change(self.between)
+        return replace(self, **values, between=between)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,38 +152,29 @@ def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatAr
     return np.asarray(4 * np.sin(np.pi * frequency_hz / frame_rate_hz) ** 2)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Segments:
-    """Segments of one length, cut from all stretches, and their transform."""
+def segment_transforms(
+    series: FloatArray, rows: IntArray, frame_rate_hz: float, *, levelled: bool = False
+) -> tuple[FloatArray, ComplexArray, float]:
+    """Return frequencies (f,), scaled transforms ([n,] segments, f) and independent values of each.
 
-    rows: IntArray  # (segments, length): frames
-    taper: FloatArray  # (length - 1,)
-    size: int  # of the transform
-    scale: FloatArray  # (f,): from squared moduli to densities
-    frequency_hz: FloatArray  # (f,)
+    The series is (frames,) or (frames, n), its segments (segments, length) of frames. It is
+    differenced and tapered, and loses its mean slope where it is to be ``levelled``. The square of
+    a transform is a one-sided density.
+    """
+    from scipy.fft import next_fast_len, rfft
 
-    @classmethod
-    def cut(cls, stretches: Sequence[tuple[int, int]], frame_rate_hz: float) -> _Segments:
-        """Cut the segments; that length uses most of the data."""
-        from scipy.fft import next_fast_len
-
-        length = _segment_length([stop - start for start, stop in stretches])
-        starts: list[int] = []
-        for start, stop in stretches:
-            many, spare = divmod(stop - start, length)
-            starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
-        taper = tukey(length - 1)
-        size = int(next_fast_len(length - 1, real=True))
-        frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
-        scale = 2 / frame_rate_hz / np.sum(taper**2) / half_angle_square(frequency, frame_rate_hz)
-        return cls(np.array(starts)[:, None] + np.arange(length), taper, size, scale, frequency)
-
-    def transform(self, series: FloatArray) -> ComplexArray:
-        """Return the transform of the differences of a series (frames,), (segments, f)."""
-        from scipy.fft import rfft
-
-        tapered = self.taper * np.diff(series[self.rows], axis=1)
-        return np.asarray(rfft(tapered, self.size, axis=1)[:, 1 : (self.size + 1) // 2])
+    length = rows.shape[1] - 1
+    taper, size = tukey(length), int(next_fast_len(length, real=True))
+    frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
+    scale = np.sqrt(2 / frame_rate_hz / np.sum(taper**2))
+    scale = scale / np.sqrt(half_angle_square(frequency, frame_rate_hz))
+    steps = np.diff(np.ascontiguousarray(series.T)[..., rows])
+    if levelled:
+        steps -= np.mean(steps, axis=-1, keepdims=True)
+    transforms = scale * rfft(taper * steps, size)[..., 1 : (size + 1) // 2]
+    # neighbours of a padded or tapered transform are not independent
+    independent = len(rows) * np.sum(taper**2) ** 2 / np.sum(taper**4) / size
+    return frequency, np.asarray(transforms), float(independent)
 
 
 def loop_periodogram(
@@ -164,45 +184,37 @@ def loop_periodogram(
     frame_rate_hz: float,
     stretches: Sequence[tuple[int, int]],
 ) -> LoopPeriodogram:
-    """Return the periodogram of one axis, series (frames,), over its usable stretches.
+    """Return the periodogram of one axis, series (frames,), or of two, (frames, 2).
 
-    Segments of one length are cut from all stretches. That length uses most of the data, and is
-    the whole stretch where there is one of at most 2^16 frames.
+    Segments of one length are cut from all usable stretches. That length uses most of the data,
+    and is the whole stretch where there is one of at most 2^16 frames.
     """
-    segments = _Segments.cut(stretches, frame_rate_hz)
-    count, length = segments.rows.shape
-    frequency, taper, scale = segments.frequency_hz, segments.taper, segments.scale
-    y = segments.transform(measurement)
-    c = np.zeros_like(y) if correction is None else segments.transform(correction)
-    measured = scale * np.mean(np.abs(y) ** 2, axis=0)
-    # neighbours of a padded or tapered transform are not independent
-    independent = count * np.sum(taper**2) ** 2 / np.sum(taper**4) / segments.size
+    length = _segment_length([stop - start for start, stop in stretches])
+    starts: list[int] = []
+    for start, stop in stretches:
+        many, spare = divmod(stop - start, length)
+        starts += [start + int(spare * (i + 0.5) / many) + i * length for i in range(many)]
+    rows = np.array(starts)[:, None] + np.arange(length)
+    frequency, y, independent = segment_transforms(measurement, rows, frame_rate_hz)
+    c = np.zeros_like(y)
+    if correction is not None:
+        _, c, _ = segment_transforms(correction, rows, frame_rate_hz)
+    measured = np.mean(np.abs(y) ** 2, axis=-2)
+    between = None
+    if measurement.ndim > 1:
+        first, second = np.stack([y, c], axis=1)
+        between = np.mean(first[:, None] * second.conj(), axis=-2)
     return LoopPeriodogram(
         frequency_hz=frequency,
-        measured=measured + _FLOOR * np.mean(measured),
-        crossed=scale * np.mean((y * c.conj()).real, axis=0),
-        corrected=scale * np.mean(np.abs(c) ** 2, axis=0),
+        measured=measured + _FLOOR * np.mean(measured, axis=-1, keepdims=True),
+        crossed=np.mean((y * c.conj()).real, axis=-2),
+        corrected=np.mean(np.abs(c) ** 2, axis=-2),
         count=np.full(frequency.size, independent),
         frame_rate_hz=frame_rate_hz,
         resolution_hz=frame_rate_hz / length,
         duration_s=(length - 1) / frame_rate_hz,
+        between=between,
     )
-
-
-def cross_periodogram(
-    first: FloatArray,
-    second: FloatArray,
-    *,
-    frame_rate_hz: float,
-    stretches: Sequence[tuple[int, int]],
-) -> ComplexArray:
-    """Return the cross-periodogram ``Z1 Z2*`` of two series (frames,), (f,).
-
-    Its frequencies are those of :func:`loop_periodogram` over the same stretches.
-    """
-    segments = _Segments.cut(stretches, frame_rate_hz)
-    product = segments.transform(first) * segments.transform(second).conj()
-    return np.asarray(segments.scale * np.mean(product, axis=0))
 
 
 def _segment_length(lengths: list[int]) -> int:

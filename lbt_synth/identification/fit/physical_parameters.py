@@ -1,15 +1,23 @@
-"""Physical parameters of a fitted model, with standard errors, and its nearest processes."""
+"""Physical parameters of a fitted model, with standard errors, and its nearest processes.
+
+Lines that may be several, closer to each other than the record can separate.
+
+The sum of two resonances within some half widths has nearly the spectrum of one, and the fit gives
+one: at the mean of their frequencies, with the sum of their power. Its standard errors hold for
+these. Here each line becomes two of like damping, and what that adds to the likelihood decides.
+Below some separation it adds too little, and nobody can know.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.fitting import Search, close_line
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
@@ -17,9 +25,12 @@ from lbt_synth.identification.fit.identified_model import (
     Kind,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
+from lbt_synth.identification.fit.scoring import SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
+    DIFFERENCE,
     FittedModel,
+    contrast,
     densities,
     density,
     derivatives,
@@ -33,16 +44,20 @@ from lbt_synth.validation import FloatArray, frozen_copy
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 _LEAST_PART = 1e-3  # of the noise: a part of the turbulence with less is none
-_DIFFERENCE = 1e-4  # of a logarithm
 _LAGS = 100
 _LOWEST = 3  # bins in which the ends of the taper show
 _DRIFTS_HZ = (0.3, 1.0, 3.0, 10.0)  # where a resonance in the place of a drift may lie
 _DRIFT_DAMPING = 0.8
-
-
-def parameter_covariance(model: FittedModel) -> FloatArray:
-    """Return the covariance of the packed parameters, the inverse of the information, (p, p)."""
-    return invert_information(model.information)
+_LIKELY = 5.5  # log-likelihood that a split rarely adds to a single line
+_WEAK = 40.0  # the same of a line in the skirts of another whose errors are too small
+_SHARES = (0.5, 0.8, 0.2)  # of the power in the lower line, where a fit begins
+_APART = 1.4  # half widths between the lines there
+_NARROWER = -0.25  # of the logarithm of the damping
+_LIKE = 0.5  # width of the prior around that
+_REACH = 20.0  # half widths around a line that are fitted
+_NEAR = 0.2  # of the logarithm of what a pair adds, where a separation is near enough
+_MOST_STEPS = 8
+_STEEPNESS = 4.0  # of what a pair adds with its separation, where nothing is known
 
 
 def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> SpectrumModel:
@@ -50,27 +65,31 @@ def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> Spectrum
     return spectrum.unpack(np.sqrt(np.maximum(np.diag(covariance), 0)))
 
 
-def gain_error_covariance(
-    held: FloatArray, slope: FloatArray, gains: Sequence[int], error: float
+def gain_covariance(
+    search: Search, model: FittedModel, errors: Sequence[tuple[Sequence[int], float]]
 ) -> FloatArray:
-    """Return what a relative error of gains adds to the covariance of a fit at them, (p, p).
+    """Return the covariance of a fit whose gains have errors, and all that these move, (p, p).
 
-    The gains are in these places. They move the gradient of the contrast by ``slope`` (p,), and so
-    the parameters, whose covariance is ``held`` (p, p) where the gains have no error.
+    The errors are relative ones, each common to the gains of some axes.
     """
-    moves = -held @ slope
-    moves[list(gains)] = 1
-    return np.asarray(error**2 * np.outer(moves, moves))
+    rows = derivatives(search.merge(model.spectra), model.spectra)[2]
+    gains = np.array(model.spectra.starts[:-1]) + GAIN
+    information = model.information.copy()
+    information[gains] = information[:, gains] = 0  # as if it were fitted at these gains
+    held = invert_information(information)
+    out = held
+    for axes, error in errors:
+        places = gains[list(axes)]
+        moves = -held @ np.sum(rows[places], axis=0)
+        moves[places] = 1
+        out = out + error**2 * np.outer(moves, moves)
+    return out
 
 
 def hold_gain(search: Search, model: FittedModel, error: float) -> FittedModel:
-    """Return a model with a relative error of its gain, and all that this moves."""
-    slope = derivatives(search.merge(model.spectrum), model.spectrum)[2][GAIN]
-    information = model.information.copy()
-    information[GAIN] = information[:, GAIN] = 0  # as if it were fitted at that gain
-    held = invert_information(information)
-    whole = held + gain_error_covariance(held, slope, [GAIN], error)
-    return replace(model, information=invert_information(whole))
+    """Return a model of one axis with a relative error of its gain, and all that this moves."""
+    covariance = gain_covariance(search, model, [([0], error)])
+    return replace(model, information=invert_information(covariance))
 
 
 def _colour_error(search: Search, spectrum: SpectrumModel) -> float:
@@ -101,7 +120,7 @@ def describe_axis(
     data, spectrum, gain = search.data, model.spectrum, model.spectrum.gain
     rate = data.frame_rate_hz
     near = nearest_processes(search, model, shared)
-    covariance = parameter_covariance(near)
+    covariance = near.covariance
     errors = standard_errors(near.spectrum, covariance)
     slow = spectrum if spectrum.rolling == "turbulence" else near.spectrum
     each, _, _ = densities(data, near.spectrum)
@@ -210,8 +229,8 @@ def _describe_turbulence(
     def rms(change: FloatArray) -> float:
         return _turbulence_process(spectrum.unpack(theta + change), rate).rms_nm
 
-    steps = _DIFFERENCE * np.eye(theta.size)
-    slope = np.log([rms(step) / rms(-step) for step in steps]) / (2 * _DIFFERENCE)
+    steps = DIFFERENCE * np.eye(theta.size)
+    slope = np.log([rms(step) / rms(-step) for step in steps]) / (2 * DIFFERENCE)
     turbulence, error, to_hz = spectrum.components[0], errors.components[0], rate / (2 * np.pi)
     corner = float(np.exp(spectrum.log_corner)) * to_hz if spectrum.rolls_off else None
     return IdentifiedTurbulence(
@@ -297,7 +316,7 @@ def _with_slow(model: FittedModel, slow: SpectrumModel) -> FittedModel:
     """Return a fit with other components in the places of those that are no lines."""
     others, whole = iter(slow.components), model.spectrum.components
     components = tuple(c if c.kind == "line" else next(others) for c in whole)
-    return replace(model, spectrum=replace(slow, components=components))
+    return model.with_spectrum(replace(slow, components=components))
 
 
 def _exchange_drift(
@@ -331,3 +350,99 @@ def _fit_nearest(
     first[-1] = start.rolls_off
     width = np.where(np.append(first, moves), priors.width, 0)
     return minimise(fitted, start, replace(priors, width=width), held=held)
+
+
+def describe_close_lines(axis: IdentifiedAxis, name: int) -> Iterator[str]:
+    """Yield notes on lines that may be several, and on lines that are hardly separate."""
+    search, model = Search(data=axis.data), axis.fitted_model
+    spectrum = model.spectrum
+    lines = [i for i, c in enumerate(spectrum.components) if c.is_narrow]
+    for i in lines:
+        place = (
+            f"warning: the line of axis {name} at {search.place(spectrum.components[i])[0]:.4g} Hz"
+        )
+        if split_gain(search, spectrum, i, worth=_LIKELY) > _LIKELY:
+            yield (
+                f"{place} may be two, closer than the record separates: its errors hold for the "
+                "mean of their frequencies and for their power together"
+            )
+        elif model.evidence[i] < _WEAK and close_line(search, spectrum, i) is not None:
+            yield f"{place} lies in the skirts of another: the errors of both may be too small"
+
+
+def split_gain(search: Search, spectrum: SpectrumModel, i: int, *, worth: float = 0.0) -> float:
+    """Return what two lines of like damping in the place of line i add to the log-likelihood.
+
+    Nothing beside zero frequency, where there is no place for two. Fits that will hardly add what
+    is worth it are given up.
+    """
+    line = spectrum.components[i]
+    centre, half = search.place(line)
+    if centre < 2 * half:
+        return 0.0
+    data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
+    single, rest = contrast(data, spectrum), density(data, spectrum.exchange(i))
+    best = single
+    for share in _SHARES:
+        lower, upper = (
+            line.shift(float(np.log1p(move * half / centre)), _NARROWER, float(np.log(power)))
+            for move, power in ((-_APART * (1 - share), share), (_APART * share, 1 - share))
+        )
+        start = spectrum.alone(lower, replace(upper, announced=None))
+        width = np.zeros(start.pack().size)
+        width[-2 * PARAMETERS :] = 2 * (np.inf, _LIKE, np.inf)
+        priors = Priors(centre=start.pack(), width=width)
+        found = minimise(data, start, priors, held=rest, bound=best - worth, accuracy=SEARCHED)
+        if found is not None:
+            away = (found.spectrum.pack() - priors.centre)[[1 - 2 * PARAMETERS, 1 - PARAMETERS]]
+            best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)
+    return single - best
+
+
+def measure_separations(axis: IdentifiedAxis) -> IdentifiedAxis:
+    """Return an axis each of whose lines knows how far apart two like it have to be."""
+    search, spectrum = Search(data=axis.data), axis.fitted_model.spectrum
+    centres = np.array([search.place(c)[0] for c in spectrum.components[1:]])
+    parts = list(axis.parts)
+    for k, part in enumerate(parts):
+        if part.kind == "line":
+            i = 1 + int(np.argmin(np.abs(centres - part.frequency_hz)))
+            parts[k] = replace(part, separable_hz=separable_hz(search, spectrum, i))
+    return replace(axis, parts=tuple(parts))
+
+
+def separable_hz(search: Search, spectrum: SpectrumModel, i: int) -> float:
+    """Return how far apart two like lines have to be to be seen as two in the place of line i.
+
+    There the likelihood expects as much of a pair as a split rarely adds to a single line [Hz]. At
+    most some half widths: beyond, a line is hardly seen.
+    """
+    line = spectrum.components[i]
+    centre, half = search.place(line)
+    data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
+    rest, zero = density(data, spectrum.exchange(i)), np.zeros_like(data.measured)
+    data = replace(data, measured=density(data, spectrum), crossed=zero, corrected=zero)
+    single = contrast(data, spectrum)
+    start = spectrum.alone(*(line.shift(0.0, _NARROWER, float(np.log(0.5))) for _ in range(2)))
+    places = start.pack().size - PARAMETERS * np.array([2, 1])
+    width = np.zeros(start.pack().size)
+    width[-2 * PARAMETERS :] = 2 * (0.0, np.inf, np.inf)
+    most = min(centre, _REACH * half)
+    apart, known = min(3 * half, most), []
+    for _ in range(_MOST_STEPS):
+        theta = start.pack()
+        theta[places] = line.log_frequency + np.log1p(np.array([-0.5, 0.5]) * apart / centre)
+        at = start.unpack(theta)
+        found = minimise(data, at, Priors(centre=theta, width=width), held=rest, accuracy=SEARCHED)
+        if found is None:
+            break
+        start = found.spectrum
+        known.append((np.log(apart), np.log(max(found.contrast - single, 1e-9) / _LIKELY)))
+        if abs(known[-1][1]) < _NEAR or (apart == most and known[-1][1] < 0):
+            break
+        slope = _STEEPNESS
+        if len(known) > 1:
+            run, rise = np.subtract(known[-1], known[-2])
+            slope = max(rise / run, 1.0)
+        apart = min(apart * float(np.exp(np.clip(-known[-1][1] / slope, -1, 1))), most)
+    return apart

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dposv
+from scipy.linalg.lapack import dposv, dpotrs
 
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -19,7 +19,7 @@ SEARCHED, EXACT = 1e-2, 1e-5  # log-likelihood that a step may still gain where 
 _FARTHEST = 60.0  # of a logarithm: exp stays finite
 _LEAST_INFORMATION = 1e-6  # of a parameter: a step is finite where the data say nothing
 _RADIUS, _LARGEST_RADIUS = 1.0, 8.0  # of the trust region
-_MOST_STEPS, _MOST_DAMPINGS = 40, 30
+MOST_STEPS = 40
 _ACCEPTED, _POOR, _GOOD = 0.15, 0.25, 0.75  # of what a step should gain
 _ALONG = 1e-4  # cosine below which a secant says nothing
 _WITHIN = 0.99  # of the radius: a longer step ends at it
@@ -32,6 +32,7 @@ class Priors:
 
     centre: FloatArray  # (p,): means
     width: FloatArray  # (p,): standard deviations
+    bounds: tuple[FloatArray | float, FloatArray | float] = (-_FARTHEST, _FARTHEST)  # (p,) each
 
     @property
     def free(self) -> IntArray:
@@ -47,7 +48,7 @@ def scoring_minimum(
     bound: float = float("inf"),
     accuracy: float = EXACT,
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Minimise a contrast of the free parameters and their priors.
+    """Minimise a contrast of the free parameters and their priors, within bounds.
 
     ``differentiate`` returns the contrast, its gradient and its information matrix. Return the
     parameters (free,) and the information (free, free); None if the contrast is not finite, or
@@ -55,6 +56,7 @@ def scoring_minimum(
     """
     free = priors.free
     centre, precision = priors.centre[free], 1 / priors.width[free] ** 2
+    low, high = (np.broadcast_to(ends, priors.width.shape)[free] for ends in priors.bounds)
 
     def evaluate(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         value, gradient, information = differentiate(x)
@@ -65,19 +67,24 @@ def scoring_minimum(
             information + np.diag(precision + _LEAST_INFORMATION),
         )
 
-    x, radius = np.clip(start, -_FARTHEST, _FARTHEST), _RADIUS
+    x, radius = np.clip(start, low, high), _RADIUS
     value, gradient, information = evaluate(x)
     rest = np.zeros_like(information)  # of the second derivatives
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         if not (np.isfinite(value) and np.all(np.isfinite(information))):
             return None
-        step, gain, expected = _best_step(information + rest, gradient, radius)
+        curvature, slope = information + rest, gradient
+        stays = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))  # at a bound
+        if np.any(stays):
+            curvature[stays] = curvature[:, stays] = 0
+            curvature[stays, stays], slope = 1, np.where(stays, 0, slope)
+        step, gain, expected = _best_step(curvature, slope, radius)
         if gain < accuracy:
             break
         size = float(np.linalg.norm(step))
         if value - _HOPE * gain > bound and size < _WITHIN * radius:
             return None  # a whole step, which can be trusted
-        trial = np.clip(x + step, -_FARTHEST, _FARTHEST)
+        trial = np.clip(x + step, low, high)
         made = evaluate(trial)
         if np.isfinite(made[0]):
             between = 0.5 * (information + made[2])
@@ -100,15 +107,24 @@ def _best_step(
     The first is that of the minimum without a radius, the second that of this step. The curvature
     (p, p) counts by its absolute value.
     """
-    whole, info = dposv(curvature, -gradient)[1:]
-    if info == 0 and float(np.linalg.norm(whole)) <= radius:
-        gain = -0.5 * float(gradient @ whole)
-        return whole, gain, gain
-    size, axes = np.linalg.eigh(curvature)
-    size, slope = np.maximum(np.abs(size), _LEAST_INFORMATION), gradient @ axes
-    step = _trust_step(slope, size, radius)
-    gain = 0.5 * float(np.sum(slope**2 / size))
-    return axes @ step, gain, -float(slope @ step + 0.5 * step @ (size * step))
+    _, step, info = dposv(curvature, -gradient)
+    if info:  # it is not positive definite
+        size, axes = np.linalg.eigh(curvature)
+        curvature = axes * np.maximum(np.abs(size), _LEAST_INFORMATION) @ axes.T
+        _, step, _ = dposv(curvature, -gradient)
+    gain, more = float(-0.5 * (gradient @ step)), 0.0
+    if float(np.linalg.norm(step)) <= radius:
+        return step, gain, gain
+    for _ in range(MOST_STEPS):
+        stiffer = curvature.copy()
+        stiffer.flat[:: step.size + 1] += more
+        factor, step, _ = dposv(stiffer, -gradient)
+        length = float(np.linalg.norm(step))
+        if length <= 1.001 * radius:
+            break
+        # Newton's method for 1 / length = 1 / radius, from below
+        more += length**2 / float(step @ dpotrs(factor, step)[0]) * (length / radius - 1)
+    return step, gain, -float(gradient @ step + 0.5 * step @ (curvature @ step))
 
 
 def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
@@ -116,16 +132,3 @@ def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
     along = float(missing @ step)
     least = _ALONG * float(np.linalg.norm(missing) * np.linalg.norm(step))
     return np.outer(missing, missing) / along if abs(along) > least else np.zeros((step.size,) * 2)
-
-
-def _trust_step(slope: FloatArray, curvature: FloatArray, radius: float) -> FloatArray:
-    """Return the step (p,) to the minimum of a quadratic form within a radius, in its axes."""
-    more = 0.0
-    for _ in range(_MOST_DAMPINGS):
-        step = -slope / (curvature + more)
-        size = float(np.linalg.norm(step))
-        if size <= 1.001 * radius:
-            break
-        # Newton's method for 1 / size = 1 / radius, from below
-        more += size**2 / float(np.sum(step**2 / (curvature + more))) * (size / radius - 1)
-    return step

@@ -1,19 +1,23 @@
-"""A spectrum of resonances over white noise, by the parameters that a fit varies."""
+"""Spectra of resonances over white noise, by the parameters that a fit varies.
+
+Each axis has its own noise and components; two axes may share resonances as well.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import accumulate, chain, pairwise
 from typing import Literal
 
 import numpy as np
 
-from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
+from lbt_synth.models.resonance_spectrum import PARAMETERS, WIDE_DAMPING
 from lbt_synth.validation import FloatArray
 
 GAIN, NOISE, COLOUR, CORNER, COMPONENTS = range(5)  # where they begin in a packed vector
+SHARED = PARAMETERS + 2  # parameters of a resonance of two axes: ratio and phase are the last
 _NO_CORNER = 50.0  # angle per frame; a corner above it is none
 _TILT_ORDER = 5 / 6  # of its roll-off: tilt falls with f^(-17/3), a second-order process with f^-4
 _LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
@@ -38,6 +42,7 @@ class Component:
     damping: float
     log_power: float  # of the variance, in units of the measurement
     announced: tuple[float, float] | None = None  # log_frequency known beforehand, and its error
+    name: int = 0  # by which a search for what axes share finds it again
 
     @property
     def frequency(self) -> float:
@@ -116,7 +121,10 @@ class SpectrumModel:
         """Return the model with the numbers of a vector (p,)."""
         gain, noise, colour, corner, *rest = vector.tolist()
         rows = zip(self.components, rest[::3], rest[1::3], rest[2::3], strict=True)
-        each = (Component(c.kind, f, damping, power, c.announced) for c, f, damping, power in rows)
+        each = (
+            Component(c.kind, f, damping, power, c.announced, c.name)
+            for c, f, damping, power in rows
+        )
         return SpectrumModel(gain, noise, colour, corner, tuple(each), self.roll_off_order)
 
     @property
@@ -178,3 +186,93 @@ class SpectrumModel:
             return self.exchange(i)
         slow = [j for j, c in enumerate(self.components) if c.kind == "slow"]
         return self.promote(self.strongest(slow)) if slow else None
+
+
+@dataclass(frozen=True, slots=True)
+class Shared(Component):
+    """A resonance of two axes, with the cross-spectrum ``sqrt(S1 S2) e^(i phase)``.
+
+    With a phase of 0 or pi it moves along a line, with any other on an ellipse. Its power is that
+    on the first axis.
+    """
+
+    log_ratio: float = 0.0  # of its variance on the second axis over that on the first
+    phase: float = 0.0  # by which the first axis is ahead
+    before: tuple[Component | None, Component | None] = (None, None)  # what it has replaced
+    holds_ratio: bool = False  # whether the ratio is not fitted
+
+    def on(self, axis: int) -> Component:
+        """Return what one axis shows of it."""
+        power = self.log_power + axis * self.log_ratio
+        return Component(self.kind, self.log_frequency, self.damping, power, self.announced)
+
+
+@dataclass(frozen=True, slots=True)
+class Spectra:
+    """The spectra of one or two axes, and the resonances that two share."""
+
+    axes: tuple[SpectrumModel, ...]
+    shared: tuple[Shared, ...] = ()
+
+    @property
+    def starts(self) -> list[int]:
+        """Where the parameters of each axis begin in the vector, and those of shared ones."""
+        sizes = (COMPONENTS + PARAMETERS * len(axis.components) for axis in self.axes)
+        return list(accumulate(sizes, initial=0))
+
+    @property
+    def gains(self) -> FloatArray:
+        """The sensor gain of each axis, (axes,)."""
+        return np.array([axis.gain for axis in self.axes])
+
+    @property
+    def lines(self) -> tuple[Component, ...]:
+        """The components of all axes that are lines."""
+        parts = chain(self.shared, *(axis.components for axis in self.axes))
+        return tuple(c for c in parts if c.kind == "line")
+
+    def whole(self, i: int) -> SpectrumModel:
+        """Return the spectrum of an axis, with its part of shared resonances at the end."""
+        return self.axes[i].add(*(resonance.on(i) for resonance in self.shared))
+
+    def axis_map(self, i: int) -> FloatArray:
+        """Return the derivatives of an axis' whole parameters (a,) by all parameters (p,)."""
+        start, stop = self.starts[i : i + 2]
+        count, first = len(self.shared), self.starts[-1]
+        out = np.zeros((stop - start + PARAMETERS * count, first + SHARED * count))
+        out[: stop - start, start:stop] = np.eye(stop - start)
+        for k in range(count):
+            row, column = stop - start + PARAMETERS * k, first + SHARED * k
+            out[row : row + PARAMETERS, column : column + PARAMETERS] = np.eye(PARAMETERS)
+            out[row + PARAMETERS - 1, column + PARAMETERS] = i  # the ratio of a second axis
+        return out
+
+    def pack(self) -> FloatArray:
+        """Return the parameters of all axes, and of what they share, as a vector (p,)."""
+        shared = [
+            [c.log_frequency, c.damping, c.log_power, c.log_ratio, c.phase] for c in self.shared
+        ]
+        return np.concatenate([*(axis.pack() for axis in self.axes), *shared])
+
+    def unpack(self, vector: FloatArray) -> Spectra:
+        """Return the model with the numbers of a vector (p,)."""
+        ends = pairwise(self.starts)
+        axes = tuple(axis.unpack(vector[a:b]) for axis, (a, b) in zip(self.axes, ends, strict=True))
+        rows = vector[self.starts[-1] :].reshape(-1, SHARED).tolist()
+        shared = tuple(
+            replace(c, log_frequency=f, damping=ratio, log_power=power, log_ratio=rise, phase=phase)
+            for c, (f, ratio, power, rise, phase) in zip(self.shared, rows, strict=True)
+        )
+        return Spectra(axes, shared)
+
+    def on_axis(self, i: int, model: SpectrumModel) -> Spectra:
+        """Return the spectra with another one of an axis, beside what is shared."""
+        return replace(self, axes=(*self.axes[:i], model, *self.axes[i + 1 :]))
+
+    def release(self, k: int, *parts: Component | None) -> Spectra:
+        """Return the spectra with a component on each axis, or none, for shared resonance k."""
+        axes = tuple(
+            axis if part is None else axis.add(part)
+            for axis, part in zip(self.axes, parts or (None,) * len(self.axes), strict=True)
+        )
+        return Spectra(axes, self.shared[:k] + self.shared[k + 1 :])

@@ -12,19 +12,17 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.identification.prediction.predictor import least_squares_predictor
-from lbt_synth.identification.prediction.replay import (
-    Replay,
-    choose_warm_up,
-    measured_replay,
-    replay,
-    replay_frames,
-)
 from lbt_synth.identification.prediction.residual import (
-    PredictionData,
+    Replay,
     ResidualEstimate,
     check_series,
+    choose_warm_up,
+    estimate_replay,
     inverse_sensor,
-    prediction_data,
+    measured_replay,
+    mode_noise,
+    replay,
+    replay_frames,
 )
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
 from lbt_synth.linear import Controller
@@ -259,7 +257,7 @@ def prediction_against_data(
     hardware = plant.hardware
     series, _ = check_series(open_loop, hardware.modes, stretches)
     runs, fitted, tested = split_frames(stretches, fit, test, len(series))
-    data = prediction_data(series, hardware, plant.R, noise_error_nm=noise_error_nm, stretches=runs)
+    noise = mode_noise(hardware, plant.R, noise_error_nm=noise_error_nm)
     for name in controllers:
         if name in _RESERVED or not isinstance(name, str):
             raise ProblemError(
@@ -277,12 +275,12 @@ def prediction_against_data(
         promised = None
         if running is not None:
             promised = _model_means(_close_stable_loop(plant, RAN, running), plant)
-        ran = _measured_replay(data, hardware, measurements, tested)
-        rows.append(_build_row(RAN, data.estimate(ran, frames), promised, imaging))
+        ran = _measured_replay(series, hardware, measurements, tested)
+        rows.append(_build_row(RAN, estimate_replay(ran, frames, noise), promised, imaging))
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
     for name, loop in loops.items():
-        replayed = data.estimate(replays[name], frames)
+        replayed = estimate_replay(replays[name], frames, noise)
         rows.append(_build_row(name, replayed, _model_means(loop, plant), imaging))
     notes = [*_note_starts(rows, loops), *_note_refuted(rows)]
     try:
@@ -343,13 +341,13 @@ def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Desig
 
 
 def _measured_replay(
-    data: PredictionData, hardware: LoopHardware, measurements: ArrayLike, test: Stretches
+    open_loop: FloatArray, hardware: LoopHardware, measurements: ArrayLike, test: Stretches
 ) -> Replay:
     """Return the residual of the loop that ran, from its own measurements."""
     y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
-    if len(y) != len(data.open_loop):
+    if len(y) != len(open_loop):
         raise ProblemError(
-            f"measurements must have the {len(data.open_loop)} frames of open_loop; got {len(y)}."
+            f"measurements must have the {len(open_loop)} frames of open_loop; got {len(y)}."
         )
     return measured_replay(y @ inverse_sensor(hardware).T)
 

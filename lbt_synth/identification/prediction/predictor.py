@@ -20,7 +20,13 @@ from lbt_synth.identification.stretches import StretchesLike
 from lbt_synth.linear import Controller
 from lbt_synth.loop import youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
+from lbt_synth.validation import (
+    FloatArray,
+    frozen_copy,
+    integer,
+    number,
+    require_instance,
+)
 
 _MOST_TAPS = 1000
 _LEAST_ROWS = 4  # frames per coefficient

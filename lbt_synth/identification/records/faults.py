@@ -23,7 +23,7 @@ _LEAST_AT_LIMIT = 4  # values at an end of the range
 _LIMIT_RATIO = 4  # over the next values inside
 _LEVELS = 3
 _OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
-_MAD = 1.482602218505602  # standard deviation of a normal law over its median deviation
+MAD = 1.482602218505602  # standard deviation of a normal law over its median deviation
 _BLOCK = 256  # frames of a local scale
 _PASSES = 6
 
@@ -163,7 +163,7 @@ def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray,
 def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
     """Return the scale of the second difference at each frame, at least that of the record."""
     frames = len(size)
-    whole = _MAD * float(np.median(size[valid]))
+    whole = MAD * float(np.median(size[valid]))
     blocks = -(-frames // _BLOCK)
     padded = np.full(blocks * _BLOCK, np.nan)
     padded[:frames] = np.where(valid, size, np.nan)
@@ -171,7 +171,7 @@ def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
     enough = np.sum(np.isfinite(table), axis=1) >= _BLOCK // 4
     local = np.full(blocks, whole)
     if enough.any():
-        local[enough] = np.maximum(whole, _MAD * np.nanmedian(table[enough], axis=1))
+        local[enough] = np.maximum(whole, MAD * np.nanmedian(table[enough], axis=1))
     return np.repeat(np.maximum(local, _neighbours(local)), _BLOCK)[:frames]
 
 

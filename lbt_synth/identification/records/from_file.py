@@ -14,17 +14,19 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import Telemetry, load_telemetry
-from lbt_synth.identification.records.column_selection import (
+from lbt_synth.identification.records.columns import Column, unit_name
+from lbt_synth.identification.records.contents import (
+    FITS,
     KINDS,
+    Contents,
     Series,
     choose_axes,
+    name_in_errors,
+    read_contents,
     select_series,
 )
-from lbt_synth.identification.records.columns import Column, unit_name
-from lbt_synth.identification.records.contents import FITS, Contents, name_in_errors, read_contents
 from lbt_synth.identification.records.from_series import build_record, join_commands
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.spectrum import SpectrumRecord
+from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import read_cards
 from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input

@@ -1,21 +1,21 @@
-"""Records from named series, whose commands may be in a second file."""
+"""Records from named series, whose commands may be in a second file.
+
+Records from arrays, converted to nm, laid on a regular grid and searched for faults.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from lbt_synth.errors import ProblemError, TelemetryError
-from lbt_synth.identification.records.column_selection import (
-    CLOCKS,
-    Series,
-    join_names,
-    number_axes,
-)
+from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
+from lbt_synth.identification.records import faults
+from lbt_synth.identification.records.clock import build_clock
 from lbt_synth.identification.records.columns import (
     VOLTS,
     Column,
@@ -26,13 +26,18 @@ from lbt_synth.identification.records.columns import (
     same_unit,
     seconds_per,
 )
-from lbt_synth.identification.records.contents import Contents
-from lbt_synth.identification.records.faults import merge_notes
-from lbt_synth.identification.records.from_arrays import loop_record
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.records.spectrum import SpectrumRecord
+from lbt_synth.identification.records.contents import (
+    CLOCKS,
+    Contents,
+    Series,
+    join_names,
+    number_axes,
+)
+from lbt_synth.identification.records.faults import Finding, RecordHealth, findings_in, merge_notes
+from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
-from lbt_synth.validation import FloatArray, IntArray, number
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array, number
 
 _RATES_HZ = (5.0, 1e5)  # plausible for times without a unit
 _FACTS = {
@@ -43,6 +48,13 @@ _UNITS = {
     "loop": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
     "spectrum": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
 }
+_LARGEST_NM = 1e100  # a larger number is none: its square would overflow
+_SMALLEST_NM = 1e-30  # squares of less are lost to rounding
+_OPEN_FRAMES = 20  # of zero or equal commands
+TREND = 2.0  # ratio of scatters
+LEAST_QUARTER = 64  # pairs of frames that show a trend
+
+Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
 
 
 def build_record(
@@ -327,3 +339,225 @@ def _match_rows(one: FloatArray, other: FloatArray, role: str, path: Path) -> In
 def _median_step(clock: FloatArray) -> float:
     steps = np.diff(clock)
     return float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+
+
+def loop_record(
+    measurements: ArrayLike,
+    commands: ArrayLike | None = None,
+    *,
+    frame_rate_hz: float | None = None,
+    unit: str,
+    delay_frames: float | None = None,
+    mirror: PositionLoop | None = None,
+    times_s: ArrayLike | None = None,
+    frame_numbers: ArrayLike | None = None,
+    command_unit: str | None = None,
+    diameter_m: float | None = None,
+    obstruction: float | None = None,
+    source: str = "arrays",
+    notes: Sequence[str] = (),
+) -> LoopRecord:
+    """Make a record of series, and find its faults.
+
+    Parameters
+    ----------
+    measurements : (frames, axes) or (frames,) array_like
+        Measurements y(k) of one or two axes; the pseudo-open-loop series, without commands.
+        NaN and infinities are gaps.
+    commands : (frames, axes) or (frames,) array_like, optional
+        Commands u(k), computed from the measurements up to y(k).
+    frame_rate_hz : float, optional
+        Frame rate [Hz]; that of ``times_s`` by default.
+    unit : str
+        Unit of the measurements: nm, um or m rms of wavefront, or mas, arcsec, urad or rad of
+        tilt, for which the diameter is needed.
+    delay_frames : float, optional
+        Total delay [frames], from the middle of an exposure to that of its command.
+    mirror : PositionLoop, optional
+        Dynamics of the mirror; one that settles at once by default.
+    times_s : (frames,) array_like, optional
+        Time of each row [s]; missing frames become holes.
+    frame_numbers : (frames,) array_like, optional
+        Counter of frames of each row; missing frames become holes.
+    command_unit : str, optional
+        Unit of the commands; that of the measurements by default.
+    diameter_m, obstruction : float, optional
+        Telescope diameter [m], and its central obstruction as a fraction of it.
+    source : str, optional
+        Where it is from.
+    notes : sequence of str, optional
+        Notes for its ``health``.
+
+    Returns
+    -------
+    LoopRecord
+        Series in nm on the regular grid, and the faults that were found.
+
+    Raises
+    ------
+    ProblemError
+        If sizes clash, the rate is not known or is contradicted, times run backwards, a unit is
+        unknown, or a value is out of range.
+
+    Notes
+    -----
+    A frame is spoilt where a measurement is missing, not finite, held (a run of equal values
+    longer than chance), at an end of the range that is reached repeatedly, or outlying: a second
+    difference of more than 6.5 standard deviations, by median deviations of the record and of
+    the frames around. A command that is missing, not finite or at a limit spoils the
+    frames whose correction it is part of. Commands that are zero or held, and a scatter that
+    changes by more than 2 between the first quarter and the last, are reported only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> y = np.random.default_rng(0).standard_normal((1000, 2))
+    >>> y[400, 0] = 80.0
+    >>> seen = lbt.identification.loop_record(y, frame_rate_hz=1000, unit="mas", diameter_m=8.22)
+    >>> seen.health.summary()
+    '999 of 1000 frames are usable; 1 outlier (measurements).'
+    >>> round(float(seen.measurements[0, 0] / y[0, 0]), 3)
+    9.963
+    """
+    scale = nm_per(unit, diameter_m=diameter_m)
+    y, u = _series_in_nm(measurements, "measurements", scale), None
+    if commands is not None:
+        own = unit if command_unit is None else command_unit
+        scale = nm_per(own, diameter_m=diameter_m, name="command_unit")
+        u = _series_in_nm(commands, "commands", scale)
+        if u.shape != y.shape:
+            raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
+    clock = build_clock(
+        len(y), frame_rate_hz=frame_rate_hz, times_s=times_s, frame_numbers=frame_numbers
+    )
+    findings, said = list[Finding](), [*notes, *clock.notes]
+    rows = y if u is None else np.hstack([y, u])
+    rows, there = _lay_on_grid(rows, clock.frame_of_row, findings, said)
+    axes, frames = y.shape[1], len(rows)
+    y, measured = _judge_series(rows[:, :axes], there, "measurements", _MEASURED, findings)
+    commanded = np.ones(frames, dtype=np.bool_)
+    if u is not None:
+        u, commanded = _judge_series(rows[:, axes:], there, "commands", _COMMANDED, findings)
+        findings += _held_commands(u, commanded)
+    said += _note_trends(y, measured)
+    record = LoopRecord(
+        frame_rate_hz=clock.frame_rate_hz,
+        measurements=y,
+        commands=u,
+        delay_frames=delay_frames,
+        mirror=mirror,
+        usable=measured,
+        health=RecordHealth(
+            frames=frames,
+            usable=int(np.sum(measured)),
+            findings=tuple(findings),
+            notes=merge_notes(said),
+            jitter_frames=clock.jitter_frames,
+        ),
+        diameter_m=diameter_m,
+        obstruction=obstruction,
+        source=source,
+        measured=measured,
+        commanded=commanded,
+    )
+    return record if record.delay_frames is None else record.with_delay(record.delay_frames)
+
+
+def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
+    """Return a series as (frames, axes) in nm, NaN where it is masked, not finite or absurd."""
+    if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "fiub":
+        value = np.ma.filled(value.astype(np.float64), np.nan)
+    out = float_array(value, name)
+    if out.ndim == 1:
+        out = out[:, None]
+    if out.ndim != 2 or out.size == 0:
+        raise DimensionError(f"{name} must be (frames, axes) and not empty; got {out.shape}.")
+    if out.shape[1] > 2:
+        turn = " Transpose it." if out.shape[0] <= 2 else " Choose tip and tilt."
+        raise DimensionError(f"{name} must have one or two axes; got {out.shape}.{turn}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = scale * out
+        size = np.abs(scaled)
+        scaled = np.where(size < _LARGEST_NM, scaled, np.nan)
+        return np.where(size < _SMALLEST_NM, 0.0, scaled)
+
+
+def _lay_on_grid(
+    rows: FloatArray, frame: IntArray, findings: list[Finding], said: list[str]
+) -> tuple[FloatArray, BoolArray]:
+    """Return the first row of each frame, NaN without one, and the frames whose rows agree."""
+    is_first = np.diff(frame, prepend=-1) > 0
+    first = np.flatnonzero(is_first)
+    earlier = rows[first[np.cumsum(is_first) - 1]]
+    differs = ~np.all((rows == earlier) | (np.isnan(rows) & np.isnan(earlier)), axis=1)
+    there, torn = np.zeros((2, frame[-1] + 1), dtype=np.bool_)
+    there[frame], torn[frame[differs]] = True, True
+    findings += findings_in(~there, "missing", "frames")
+    findings += findings_in(torn, "repeated", "frames")
+    if again := len(rows) - len(first):
+        said.append(f"{again} rows of a time that had been recorded already were left out")
+    out = np.full((len(there), rows.shape[1]), np.nan)
+    out[frame[first]] = rows[first]
+    return out, there & ~torn
+
+
+def _judge_series(
+    series: FloatArray, there: BoolArray, name: str, finders: Finders, findings: list[Finding]
+) -> tuple[FloatArray, BoolArray]:
+    """Return the series with faults filled, and the frames that are good on all axes."""
+    out, all_good = np.empty(series.shape), np.ones(len(series), dtype=np.bool_)
+    for axis, column in enumerate(series.T):
+        good = there & np.isfinite(column)
+        findings += findings_in(there & ~good, "not finite", name, axis)
+        for kind, finder in finders:
+            found = finder(np.where(np.isfinite(column), column, 0.0), good)
+            findings += findings_in(found, kind, name, axis)
+            good &= ~found
+        out[:, axis] = faults.fill(column, good)
+        all_good &= good
+    return out, all_good
+
+
+def _find_clipped(series: FloatArray, good: BoolArray) -> BoolArray:
+    """Find commands at a limit; zeros are those of an open loop."""
+    return faults.find_saturated(series, good & (series != 0))
+
+
+_MEASURED: Finders = (
+    ("saturated", faults.find_saturated),
+    ("stuck", faults.find_stuck),
+    ("outlier", faults.find_outliers),
+)
+_COMMANDED: Finders = (("saturated", _find_clipped),)
+
+
+def _held_commands(commands: FloatArray, good: BoolArray) -> Iterator[Finding]:
+    """Yield where the loop was open, and where its commands stood still."""
+    frames, is_zero = len(commands), np.all(commands == 0, axis=1)
+    is_open = faults.mark(_longest(faults.runs(is_zero & good)), frames)
+    yield from findings_in(is_open, "loop open", "commands", spoils=False)
+    for axis, column in enumerate(commands.T):
+        held = faults.mark(_longest(faults.equal_runs(column, good)), frames) & ~is_open
+        yield from findings_in(held, "held", "commands", axis, spoils=False)
+
+
+def _longest(stretches: IntArray) -> IntArray:
+    return stretches[stretches[:, 1] - stretches[:, 0] >= _OPEN_FRAMES]
+
+
+def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
+    """Note where the scatter from frame to frame changes between the ends of the record."""
+    pairs = np.flatnonzero(good[1:] & good[:-1])
+    quarter = pairs.size // 4
+    if quarter < LEAST_QUARTER:
+        return []
+    said, squares = [], np.diff(series, axis=0)[pairs] ** 2
+    ends = np.sqrt([squares[:quarter].mean(axis=0), squares[-quarter:].mean(axis=0)])
+    for axis, (first, last) in enumerate(ends.T):
+        if max(first, last) > TREND * min(first, last):
+            said.append(
+                f"axis {axis} is not stationary: the rms difference of two frames is "
+                f"{nm_text(first)} in the first quarter and {nm_text(last)} in the last"
+            )
+    return said

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
-from lbt_synth.identification.records.column_selection import join_names
 from lbt_synth.identification.records.columns import Column
-from lbt_synth.identification.records.contents import TEXTS, read_contents
+from lbt_synth.identification.records.contents import TEXTS, join_names, read_contents
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.validation import (
     BoolArray,

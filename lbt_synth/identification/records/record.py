@@ -1,23 +1,29 @@
-"""A record of tip and tilt: measurements, commands, and the frames that are usable."""
+"""A record of tip and tilt: measurements, commands, and the frames that are usable.
+
+A record that consists of power spectra of tip and tilt.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records.faults import RecordHealth, findings_in, merge_notes, runs
-from lbt_synth.models import LoopHardware, PositionLoop
+from lbt_synth.models import LoopHardware, PositionLoop, TabulatedSpectrum
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import (
     BoolArray,
+    Count,
     FloatArray,
     Obstruction,
     Positive,
     check_fields,
+    frozen_copy,
     integer,
     matrix,
     number,
@@ -27,14 +33,13 @@ from lbt_synth.validation import (
     set_fields,
 )
 
-_BRIDGED_FRAMES = 3
+BRIDGED_FRAMES = 3
 _BRIDGED_FRACTION = 0.01
 NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 
 _LEAST_FRAMES = 4096  # that show a model
 LEAST_SECONDS = 4.0
-_SHORTEST_STRETCH = 256  # frames of a stretch that counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -229,7 +234,7 @@ class LoopRecord:
 
     def bridged(
         self,
-        most: int = _BRIDGED_FRAMES,
+        most: int = BRIDGED_FRAMES,
         *,
         most_fraction: float = _BRIDGED_FRACTION,
         sensor_gain: ArrayLike = 1.0,
@@ -324,13 +329,98 @@ def require_length(
     known = record.commands is None or record.delay_frames is None
     before = 0 if known else len(record.hardware.mirror_taps)  # commands that no record knows
     lengths = [stop - (start if start > before else 0) for start, stop in record.stretches()]
-    count = sum(length for length in lengths if length >= _SHORTEST_STRETCH)
+    count = sum(length for length in lengths if length >= SHORTEST_SEGMENT)
     longest = max(lengths, default=0)
     if count < needed:
         raise ProblemError(
             f"the record needs {needed} usable frames ({needed / rate:.3g} s at {rate:.6g} Hz) in "
-            f"stretches of at least {_SHORTEST_STRETCH}; got {count} ({count / rate:.3g} s), the "
+            f"stretches of at least {SHORTEST_SEGMENT}; got {count} ({count / rate:.3g} s), the "
             f"longest stretch {longest}. {record.health.summary()} Record for longer, or lose "
             "fewer frames."
         )
     return count
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SpectrumRecord:
+    """One-sided power spectra of one or two axes.
+
+    Parameters
+    ----------
+    frequency_hz : (f,) array_like
+        Increasing frequencies, at least 0 [Hz].
+    density_nm2_hz : (f, axes) array_like
+        Densities [nm^2/Hz], at least 0, of the disturbance in open loop; integrated over the
+        frequencies above 0 they give the variance.
+    frame_rate_hz : float, optional
+        Frame rate of the series that they were computed from [Hz].
+    averages : int, optional
+        Periodograms that were averaged.
+    diameter_m : float, optional
+        Telescope diameter [m].
+    source : str, optional
+        Where it is from.
+    notes : tuple of str, optional
+        How the file was read.
+
+    Raises
+    ------
+    ProblemError
+        If frequencies do not increase or lie above half the frame rate, a density is negative,
+        or sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> flat = lbt.identification.SpectrumRecord(
+    ...     frequency_hz=[0, 50, 100], density_nm2_hz=[[4], [4], [4]]
+    ... )
+    >>> flat.rms_nm.tolist(), flat.axes
+    ([20.0], 1)
+    """
+
+    frequency_hz: FloatArray
+    density_nm2_hz: FloatArray
+    frame_rate_hz: Positive | None = None
+    averages: Count | None = None
+    diameter_m: Positive | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        density: Any = real_array(self.density_nm2_hz, "density_nm2_hz")
+        density = matrix(density[:, None] if density.ndim == 1 else density, "density_nm2_hz")
+        frequency = real_array(self.frequency_hz, "frequency_hz")
+        if frequency.shape != density.shape[:1] or not 1 <= density.shape[1] <= 2:
+            raise DimensionError(
+                "density_nm2_hz must have a row per frequency, and one or two axes; got "
+                f"{density.shape} and {frequency.shape} frequencies."
+            )
+        for column in density.T:
+            TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=column)
+        check_fields(self, frequency_hz=frequency, density_nm2_hz=density)
+        half = np.inf if self.frame_rate_hz is None else self.frame_rate_hz / 2
+        if frequency[-1] > half * (1 + 1e-9):
+            raise ProblemError(
+                f"frequencies must lie below half the frame rate, {half:.6g} Hz; got "
+                f"{frequency[-1]:.6g} Hz."
+            )
+
+    @property
+    def axes(self) -> int:
+        """Number of axes, 1 or 2."""
+        return int(self.density_nm2_hz.shape[1])
+
+    @property
+    def rms_nm(self) -> FloatArray:
+        """Root of the integral over the frequencies of the record, (axes,) [nm]."""
+        middles = (self.density_nm2_hz[1:] + self.density_nm2_hz[:-1]) / 2
+        return frozen_copy(np.sqrt(np.diff(self.frequency_hz) @ middles))
+
+    @property
+    def spectra(self) -> tuple[TabulatedSpectrum, ...]:
+        """The spectra as disturbances of a :class:`Truth`, one per axis."""
+        return tuple(
+            TabulatedSpectrum(frequency_hz=self.frequency_hz, density_nm2_hz=column)
+            for column in self.density_nm2_hz.T
+        )

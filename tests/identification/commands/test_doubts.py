@@ -11,9 +11,9 @@ from support.wrong_commands import record
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.doubts import gain_dilution, held_while_moving
-from lbt_synth.identification.commands.gain_interval import allowed_gains
 from lbt_synth.identification.commands.guesses import CoarseRecord
 from lbt_synth.identification.commands.verdict import explain_commands
+from lbt_synth.identification.likeliest_gain import allowed_gains
 
 RATE_HZ, FRAMES = 800.0, 8000
 HELD = np.arange(FRAMES) // 2000 % 2 == 1

@@ -1,4 +1,7 @@
-"""Guesses of how commands reach measurements, on one record."""
+"""Guesses of how commands reach measurements, on one record.
+
+The coarse spectrum: transforms, bands, and the likelihood of guesses.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,21 @@ import pytest
 from support.control_laws import ordinary_loop
 from support.wrong_commands import record
 
-from lbt_synth.identification.commands.guesses import CoarseRecord, Guess, list_guesses
+from lbt_synth.identification.commands.guesses import (
+    CoarseAxis,
+    CoarseRecord,
+    Guess,
+    _segments,
+    find_spectral_peaks,
+    list_guesses,
+)
+from lbt_synth.identification.fit.periodogram import segment_transforms
+
+RATE, FRAMES = 1000.0, 24_000
+
+
+def coarse_transforms(series: np.ndarray, stretches: list, rate: float) -> tuple:
+    return segment_transforms(series, _segments(stretches, rate), rate, levelled=True)
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +74,116 @@ def test_other_gains_are_less_likely(coarse) -> None:
     own = coarse.profile(given, best.gain) - best.axis_contrast
     np.testing.assert_allclose(own, 0, atol=0.02)  # what fits end within
     assert coarse.unrelated() > np.sum(best.axis_contrast) + 100
+
+
+def white(seed: int, n: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((FRAMES, n))
+
+
+def axis_of(y: np.ndarray, guesses: np.ndarray) -> CoarseAxis:
+    """The coarse axis of one measurement (frames,) and guesses (frames, n)."""
+    f, z, n = coarse_transforms(np.column_stack([y, guesses]), [(0, FRAMES)], RATE)
+    return CoarseAxis(f, z[0], z[1:], independent=n, frame_rate_hz=RATE)
+
+
+def test_the_square_of_a_transform_is_a_density() -> None:
+    f, z, _ = coarse_transforms(3.0 * white(0), [(0, FRAMES)], RATE)
+    density = np.mean(abs(z[0]) ** 2, axis=0)
+    assert np.mean(density) == pytest.approx(2 * 9.0 / RATE, rel=0.03)
+    t = np.arange(FRAMES) / RATE
+    f, z, _ = coarse_transforms(50 * np.sin(2 * np.pi * 40 * t)[:, None], [(0, FRAMES)], RATE)
+    power = np.sum(np.mean(abs(z[0]) ** 2, axis=0)) * (f[1] - f[0])
+    assert power == pytest.approx(50**2 / 2, rel=0.01)
+
+
+def test_a_mean_slope_does_not_show() -> None:
+    y = white(1)
+    sloped = y + 0.5 * np.arange(FRAMES)[:, None] + 1e4
+    one, other = (coarse_transforms(x, [(0, FRAMES)], RATE)[1] for x in (y, sloped))
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
+    axis = axis_of(white(2)[:, 0], white(3))
+    (contrast,), _, (misfit,) = axis.fit_profile(np.zeros(1))
+    power, count = axis.bands.measured, axis.bands.count
+    rest = np.sum(axis.peaks.count * (np.log(axis.peaks.measured) + 1))
+    least = np.sum(count * (np.log(power) + 1)) + rest
+    mean = np.average(power, weights=count)
+    only_noise = np.sum(count) * (np.log(mean) + 1) + rest
+    assert least < contrast <= only_noise + 0.1
+    assert misfit == pytest.approx(1.0, abs=0.4)
+
+
+def test_bands_are_as_wide_beside_a_peak_at_the_lowest_frequencies() -> None:
+    f, z, n = coarse_transforms(white(2), [(0, FRAMES)], RATE)
+    plain = CoarseAxis(f, z[0], z, independent=n, frame_rate_hz=RATE)
+    peaked = z[0].copy()
+    peaked[:, 4:7] *= 30.0
+    found = CoarseAxis(f, peaked, z, independent=n, frame_rate_hz=RATE)
+    assert found.lines.size > plain.lines.size
+    assert found.bands.count.size <= plain.bands.count.size
+    total = np.sum(found.bands.count) + np.sum(found.peaks.count)
+    assert total == pytest.approx(n * f.size)
+
+
+def test_the_right_correction_is_found_with_its_gain() -> None:
+    slow = np.zeros(FRAMES)
+    w = 20 * white(4)[:, 0]
+    for k in range(1, FRAMES):
+        slow[k] = 0.99 * slow[k - 1] + w[k]
+    noise = 5 * white(5)[:, 0]
+    y, u = np.zeros((2, FRAMES))
+    for k in range(2, FRAMES):
+        y[k] = 0.6 * (slow[k - 1] - u[k - 2]) + noise[k]
+        u[k] = u[k - 1] + 0.5 * y[k]
+    guesses = np.column_stack([np.roll(u, 2), 1e-3 * np.roll(u, 2), np.roll(u, 3), -np.roll(u, 2)])
+    starts = np.array([[0.3, 1.0], [300.0, 1000.0], [0.3, 1.0], [0.3, 1.0]])
+    contrast, gain, _ = axis_of(y, guesses).fit_guesses(starts)
+    assert gain[0] == pytest.approx(0.6, rel=0.1)
+    assert gain[1] == pytest.approx(1000 * gain[0], rel=0.01)
+    assert contrast[1] == pytest.approx(contrast[0], abs=0.5)
+    assert np.all(contrast[2:] > contrast[0] + 100)
+
+
+def test_derivatives_of_the_contrast() -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(FRAMES) / RATE
+    y = white(7)[:, 0] + 4 * np.sin(2 * np.pi * 33 * t)
+    fit, rows = axis_of(y, white(8)), np.zeros(1, dtype=np.intp)
+    theta = fit._begin(np.array([0.4]), rows)
+    assert fit.lines.size == 1
+    theta = theta + 0.01 * rng.standard_normal(theta.shape)
+    gradient = fit._derivatives(theta, rows, free=True)[0][0]
+    steps = 1e-5 * np.eye(theta.size)
+    numeric = [
+        (fit._contrast(theta + h, rows)[0] - fit._contrast(theta - h, rows)[0]) / 2e-5
+        for h in steps
+    ]
+    np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-3 * np.max(abs(gradient)))
+
+
+@pytest.mark.parametrize("rate_hz", [1e-3, 0.8, 10.0])
+def test_slow_loops_have_whole_segments(rate_hz):
+    """Six seconds are few frames there, or none: 0.8 may be a rate in kHz."""
+    series = np.random.default_rng(0).standard_normal((2000, 1))
+    f, z, independent = coarse_transforms(series, [(0, 1500)], rate_hz)
+    assert z.shape == (1, 2, f.size)
+    assert f.size == 255
+    density = np.mean(np.abs(z) ** 2)
+    assert density == pytest.approx(2 / rate_hz, rel=0.1)  # of white noise of variance 1
+    assert independent > 1
+
+
+def test_peaks_are_the_lines_of_a_spectrum():
+    rng = np.random.default_rng(1)
+    frequency = np.arange(1, 2000) / 6
+    lines = [40 / (1 + (frequency - f) ** 2) for f in (60, 200)]
+    power = 1e3 / frequency**2 + 1 + lines[0] + lines[1]
+    scatter = rng.gamma(8.0, 1 / 8.0, frequency.size)
+    is_peak, places, width = find_spectral_peaks(frequency, power * scatter)
+    assert [min(abs(places - f)) < 1 for f in (60, 200)] == [True, True]
+    assert is_peak[np.searchsorted(frequency, [60, 200])].all()
+    assert width.shape == places.shape
+    assert np.all(width > 0)
+    assert np.mean(is_peak) < 0.2

@@ -1,14 +1,23 @@
-"""What a diagnosis says of commands that no option repairs."""
+"""What a diagnosis says of commands that no option repairs.
+
+The channels of a record, with one thing wrong at a time.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.control_laws import ordinary_loop
+from support.control_laws import RATE, ordinary_loop
 from support.wrong_commands import record
 
+import lbt_synth as lbt
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.diagnosis.running_loop import command_row, doubt_commands
+from lbt_synth.identification.diagnosis.running_loop import (
+    command_row,
+    doubt_commands,
+    judge_channels,
+    live_axes,
+)
 
 
 @pytest.mark.parametrize(
@@ -26,3 +35,87 @@ def test_advice_is_that_of_the_explanation(spoil, doubt: str, advice: str) -> No
     assert repair.startswith(advice)
     assert np.isnan(verdict.gain).all()
     assert command_row(verdict).repair == verdict.options
+
+
+def states(y, u=None):
+    record = lbt.identification.loop_record(
+        y, u, frame_rate_hz=RATE, delay_frames=None if u is None else 2, unit="nm"
+    )
+    rows = judge_channels(record)
+    return {row.channel: row.state for row in rows}, rows, live_axes(record)
+
+
+def loop():
+    return [each.copy() for each in ordinary_loop()]
+
+
+def test_a_good_record():
+    y, u = loop()
+    found, rows, live = states(y, u)
+    assert found == dict.fromkeys(
+        ["tip measurement", "tilt measurement", "tip command", "tilt command"], "good"
+    )
+    assert live == [0, 1]
+    assert not any(row.serious for row in rows)
+    np.testing.assert_allclose([row.rms_nm for row in rows[:2]], np.std(y, axis=0))
+    steps = np.sqrt(np.mean(np.diff(u, axis=0) ** 2, axis=0))
+    np.testing.assert_allclose([row.step_nm for row in rows[2:]], steps)
+    assert list(states(y[:, :1])[0]) == ["measurement"]
+
+
+def hold(y, u):
+    y[2000:2900, 0] = 7.0
+
+
+def kill(y, u):
+    y[:, 1] = 0.0
+
+
+def clip(y, u):
+    np.clip(u[:, 1], -250, 250, out=u[:, 1])
+
+
+def shake(y, u):
+    y[:, 0] += 150 * np.random.default_rng(0).standard_normal(len(y))
+
+
+def drift(y, u):
+    y[:, 0] += np.linspace(0, 400, len(y))
+
+
+def grow(y, u):
+    y[:, 1] *= np.linspace(0.3, 2, len(y))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "channel", "word"),
+    [
+        (kill, "tilt measurement", "dead"),
+        (hold, "tip measurement", "stuck (9 %)"),
+        (clip, "tilt command", "clipped ("),
+        (shake, "tip measurement", "noisy"),
+        (drift, "tip measurement", "drifting"),
+        (grow, "tilt measurement", "scatter changes"),
+    ],
+)
+def test_a_bad_channel(spoil, channel, word):
+    y, u = loop()
+    spoil(y, u)
+    found, rows, _ = states(y, u)
+    assert found.pop(channel).startswith(word)
+    assert set(found.values()) == {"good"}
+    assert [row.channel for row in rows if row.serious] == [channel]
+
+
+def test_a_dead_axis_does_not_live():
+    y, u = loop()
+    y[:, 0] = 3.0
+    assert states(y, u)[2] == [1]
+
+
+def test_few_outliers_are_not_serious():
+    y, u = loop()
+    y[[500, 3000], 0] += 1e4
+    found, rows, _ = states(y, u)
+    assert found["tip measurement"].startswith("outliers (0.0")
+    assert not any(row.serious for row in rows)

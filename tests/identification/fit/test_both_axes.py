@@ -1,4 +1,7 @@
-"""Both axes identified with one sensor gain, and records that are not what they seem."""
+"""Both axes identified with one sensor gain, and records that are not what they seem.
+
+Jumps in a record: found, noted, and cut out; a wrong delay is found out.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from support.eris import ERIS_FILE, eris_example, eris_model, eris_record
-from support.recorded_loops import LINE, integrator_loop, spliced_record
+from support.recorded_loops import LINE, RATE, integrator_loop, spliced_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification.fit.both_axes import cut_around
 from lbt_synth.identification.records.faults import RecordHealth
-
-RATE = 1000.0
-
 
 FRAMES = 16_384
 
@@ -292,3 +293,37 @@ def test_a_printed_model_lists_its_vibrations_with_their_errors(model):
     assert len(repr(model.axes[0])) <= 100
     page = ElementTree.fromstring(model._repr_html_())
     assert len(list(page.iter("figure"))) == 1
+
+
+def test_a_jump_is_found_noted_and_cut() -> None:
+    clean = lbt.identify(spliced_record(lines=LINE, frames=20_000))
+    spliced = spliced_record((0, 1), lines=LINE, frames=20_000)
+    found = lbt.identify(spliced)
+    assert not clean.notes
+    assert all(note.startswith("warning: 1 jump of the") for note in found.notes)
+    assert "the record was cut there" in found.notes[0]
+    axis = found.axes[0]
+    assert axis.sensor_gain_error is not None
+    assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
+    assert axis.noise_nm == pytest.approx(6, abs=4 * axis.noise_error_nm)
+
+
+@pytest.mark.parametrize("lost", [(5008, 6154), (3000, 4500), (7000, 9900), (2000, 9000)])
+def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> None:
+    whole = spliced_record((3,), lines=LINE, frames=20_000)
+    y, u = (
+        np.vstack([series[: lost[0]], series[lost[1] :]])
+        for series in (whole.measurements, whole.commands)
+    )
+    spliced = lbt.identification.loop_record(y, u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    found = lbt.identify(spliced)
+    axis = found.axes[0]
+    assert axis.sensor_gain_error is not None
+    assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
+    assert axis.sensor_gain_error < 0.05
+    assert any("jump" in note for note in found.notes)
+
+
+def test_stretches_are_cut() -> None:
+    assert cut_around(((0, 100), (200, 300)), [50, 200]) == ((0, 47), (53, 100), (203, 300))
+    assert cut_around(((0, 4),), [1]) == ()

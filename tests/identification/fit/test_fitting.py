@@ -62,7 +62,7 @@ def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:
     start = SpectrumModel(0.0, float(np.log(0.3**2)), 0.0, search.log_angle(50.0), (slow, wide))
     found = fit(search, start)
     assert found is not None
-    stuck = replace(found, spectrum=start, contrast=contrast(data, start))
+    stuck = replace(found.with_spectrum(start), contrast=contrast(data, start))
     pruned = prune(search, stuck).spectrum
     assert pruned.lines == ()
     assert np.exp(pruned.log_noise) == pytest.approx(26**2, rel=0.05)

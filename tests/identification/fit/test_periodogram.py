@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lbt_synth.identification.fit.periodogram import cross_periodogram, loop_periodogram
+from lbt_synth.identification.fit.periodogram import loop_periodogram
 
 RATE = 1000.0
 
@@ -47,15 +47,25 @@ def test_a_gap_shortens_the_segments_and_keeps_most_frames() -> None:
     assert 0.8 * 15_000 < np.sum(data.count) < 15_000
 
 
-def test_the_cross_periodogram_belongs_to_those_of_the_axes() -> None:
+def test_what_lies_between_two_axes_at_any_gains() -> None:
     rng = np.random.default_rng(3)
-    x, y = np.cumsum(rng.standard_normal((2, 3000)), axis=1)
+    y, c = np.cumsum(rng.standard_normal((2, 3000, 2)), axis=1)
     options = {"frame_rate_hz": 500.0, "stretches": [(0, 1400), (1410, 3000)]}
+    gains = np.array([0.7, 1.3])
+    data = loop_periodogram(y, c, **options)
+    for i in range(2):
+        alone = loop_periodogram(y[:, i], c[:, i], **options)
+        assert data.row(i).power(0.6) == pytest.approx(alone.power(0.6))
+    crossed, slopes = data.cross_power(gains)
+    z = y + gains * c
     one, other, both = (
-        loop_periodogram(series, None, **options).measured for series in (x, y, x + y)
+        loop_periodogram(series, None, **options).measured for series in (*z.T, z.sum(axis=1))
     )
-    crossed = cross_periodogram(x, y, **options)
     assert one + other + 2 * crossed.real == pytest.approx(both, rel=1e-9)
-    assert cross_periodogram(y, x, **options) == pytest.approx(crossed.conj())
-    assert cross_periodogram(x, x, **options).real == pytest.approx(one, rel=1e-9)
+    exchanged = loop_periodogram(z[:, ::-1], None, **options)
+    assert exchanged.cross_power([1.0, 1.0])[0] == pytest.approx(crossed.conj())
     assert np.all(np.abs(crossed) ** 2 < 1.000001 * one * other)
+    for i, slope in enumerate(slopes):
+        step = np.exp(1e-6 * np.eye(2)[i])
+        moved = data.cross_power(gains * step)[0] - data.cross_power(gains / step)[0]
+        assert moved / 2e-6 == pytest.approx(slope, abs=1e-6 * np.max(np.abs(slope)))

@@ -1,4 +1,7 @@
-"""Whiteness, errors at a held gain, and the process of turbulence that falls as tilt does."""
+"""Whiteness, errors at a held gain, and the process of turbulence that falls as tilt does.
+
+Lines that may be two, against the exact likelihood of the pair that is there.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +9,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from support.recorded_loops import RATE, expected_periodogram, integrator_loop
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.fitting import Search, fit
 from lbt_synth.identification.fit.order_search import search_model
-from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
+    describe_close_lines,
     hold_gain,
     nearest_processes,
-    parameter_covariance,
+    separable_hz,
+    split_gain,
     standard_errors,
     whiteness,
 )
-from lbt_synth.identification.fit.whittle import FittedModel, density
+from lbt_synth.identification.fit.spectrum_model import Spectra, SpectrumModel
+from lbt_synth.identification.fit.whittle import FittedModel, contrast, density
 
 GAIN, NOISE_NM = 0.6, 5.0
+SPECTRUM_RATE, DURATION_S = 500.0, 60.0
+DAMPING = 0.005
 
 
 def test_what_is_left_out_is_not_white() -> None:
@@ -56,7 +65,7 @@ def test_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=wind, diameter_m=8.22)
     search = Search(data=expected_periodogram(air, 5.0, 0.6))
     model = search_model(search)
-    error = float(np.sqrt(parameter_covariance(model)[0, 0]))
+    error = float(np.sqrt(model.covariance[0, 0]))
     assert abs(model.spectrum.log_gain - np.log(0.6)) < 0.2 * error
     # the process of the design is near to what was fitted, down to the noise
     axis = describe_axis(search, model, error, "")
@@ -77,7 +86,7 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
         slow = search.component("slow", 1.0, 0.5, power)
         more = replace(
             model,
-            spectrum=model.spectrum.add(slow),
+            spectra=Spectra((model.spectrum.add(slow),)),
             information=np.pad(model.information, (0, 3)),
             evidence=(*model.evidence, 0.0),
         )
@@ -107,9 +116,9 @@ def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),))
     axis = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     search, model = Search(data=axis.data), axis.fitted_model
-    errors = standard_errors(model.spectrum, parameter_covariance(model))
+    errors = standard_errors(model.spectrum, model.covariance)
     more = hold_gain(search, model, 0.2)
-    wider = standard_errors(model.spectrum, parameter_covariance(more))
+    wider = standard_errors(model.spectrum, more.covariance)
     assert wider.log_gain == pytest.approx(0.2, rel=1e-6)
     assert wider.components[1].log_power > errors.components[1].log_power
 
@@ -131,7 +140,9 @@ def disturbance(wind: float, pole: float, rms_nm: float) -> lbt.models.SumSpectr
     return lbt.models.SumSpectrum(parts=[air, drift])
 
 
-def fit(total: lbt.models.SumSpectrum, gain: float | None = None) -> tuple[Search, FittedModel]:
+def fit_loop(
+    total: lbt.models.SumSpectrum, gain: float | None = None
+) -> tuple[Search, FittedModel]:
     """Return the fit to what a minute of an integrator's loop scatters about."""
     search = Search(data=expected_periodogram(total, NOISE_NM, GAIN), gain=gain)
     return search, search_model(search)
@@ -140,7 +151,7 @@ def fit(total: lbt.models.SumSpectrum, gain: float | None = None) -> tuple[Searc
 @pytest.mark.parametrize("wind", [8.0, 20.0])
 def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
     """Without a roll-off beside the drift it was a quarter too low: 13 standard errors."""
-    _, model = fit(disturbance(wind, 0.999, 30.0))
+    _, model = fit_loop(disturbance(wind, 0.999, 30.0))
     assert [c.kind for c in model.spectrum.components] == ["drift", "slow"]
     assert model.spectrum.rolls_off
     assert model.spectrum.gain == pytest.approx(GAIN, rel=0.02)
@@ -153,7 +164,7 @@ def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
 def test_the_filter_of_the_nearest_processes(wind, pole, rms_nm, first) -> None:
     """A weak drift is a resonance beside turbulence; a strong one has the first place."""
     total = disturbance(wind, pole, rms_nm)
-    search, model = fit(total, GAIN)
+    search, model = fit_loop(total, GAIN)
     near = nearest_processes(search, model)
     assert near.spectrum.components[0].kind == first
     axis = describe_axis(search, model, None, "")
@@ -166,7 +177,7 @@ def test_the_filter_of_the_nearest_processes(wind, pole, rms_nm, first) -> None:
 
 
 def test_errors_follow_the_processes_that_change_places() -> None:
-    search, model = fit(disturbance(20.0, 0.999, 30.0), GAIN)
+    search, model = fit_loop(disturbance(20.0, 0.999, 30.0), GAIN)
     near = nearest_processes(search, model)
     own = np.diag(model.information)[-6:]
     np.testing.assert_array_equal(np.diag(near.information)[-6:], np.roll(own, 3))
@@ -174,7 +185,7 @@ def test_errors_follow_the_processes_that_change_places() -> None:
 
 
 def test_what_two_axes_share_stays() -> None:
-    search, model = fit(disturbance(20.0, 0.999, 30.0), GAIN)
+    search, model = fit_loop(disturbance(20.0, 0.999, 30.0), GAIN)
     drift, slow = model.spectrum.components
     near = nearest_processes(search, model, [1]).spectrum
     assert near.components[1] == slow
@@ -184,6 +195,106 @@ def test_what_two_axes_share_stays() -> None:
 
 
 def test_turbulence_without_a_roll_off_is_left_alone() -> None:
-    search, model = fit(disturbance(20.0, 0.999, 30.0), GAIN)
-    plain = replace(model, spectrum=model.spectrum.without_roll_off())
+    search, model = fit_loop(disturbance(20.0, 0.999, 30.0), GAIN)
+    plain = model.with_spectrum(model.spectrum.without_roll_off())
     assert nearest_processes(search, plain) is plain
+
+
+def exact(separation: float, second_nm2: float = 500.0):
+    """Return the exact spectrum of a pair as data, its model, and that of one line fitted to it.
+
+    The separation is in half widths; the second line has half the power of the first.
+    """
+    f = np.arange(1, int(SPECTRUM_RATE / 2 * DURATION_S)) / DURATION_S
+    data = LoopPeriodogram(
+        frequency_hz=f,
+        measured=np.ones_like(f),
+        crossed=np.zeros_like(f),
+        corrected=np.zeros_like(f),
+        count=np.ones_like(f),
+        frame_rate_hz=SPECTRUM_RATE,
+        resolution_hz=1 / DURATION_S,
+        duration_s=DURATION_S,
+    )
+    search = Search(data=data)
+    slow = search.component("turbulence", 1.0, 0.5, 1e4)
+    ground = SpectrumModel(0.0, 0.0, 0.0, 0.0, (slow,)).without_roll_off()
+    places = ((40.0, 1000.0), (40.0 * (1 + separation * DAMPING), second_nm2))
+    pair = ground.add(*(search.component("line", hz, DAMPING, power) for hz, power in places))
+    data = replace(data, measured=density(data, pair))
+    search = Search(data=data)
+    single = fit(search, ground.add(search.component("line", 40.05, DAMPING, 1500.0)))
+    assert single is not None
+    return search, pair, single.spectrum
+
+
+@pytest.mark.parametrize("separation", [2.5, 3.5])
+def test_a_split_gains_what_the_pair_is_likelier(separation: float) -> None:
+    search, pair, single = exact(separation)
+    gain = contrast(search.data, single) - contrast(search.data, pair)
+    assert gain > 1
+    # the rest of the model stays, and merged bins see a little less
+    assert split_gain(search, single, 1) == pytest.approx(gain, rel=0.15)
+
+
+def test_a_single_line_gains_nothing() -> None:
+    search, _, single = exact(0.0)
+    assert split_gain(search, single, 1) == pytest.approx(0, abs=0.1)
+
+
+def test_lines_can_be_separated_where_a_split_tells_the_exact_pair() -> None:
+    def gain(separation: float) -> float:
+        search, pair, single = exact(separation, 1000.0)
+        return contrast(search.data, single) - contrast(search.data, pair)
+
+    there = brentq(lambda x: gain(x) - 5.5, 1.0, 6.0, xtol=0.01)
+    search, _, single = exact(there, 1000.0)
+    assert separable_hz(search, single, 1) == pytest.approx(40.0 * DAMPING * there, rel=0.08)
+
+
+def test_a_longer_record_or_one_of_less_noise_separates_closer_lines() -> None:
+    search, _, single = exact(0.0)
+    first = separable_hz(search, single, 1)
+    longer = replace(search, data=replace(search.data, count=10 * search.data.count))
+    loud = replace(single, log_noise=single.log_noise + np.log(1e6))
+    assert separable_hz(longer, single, 1) < 0.8 * first
+    assert separable_hz(search, loud, 1) > 1.2 * first
+
+
+def test_a_line_beside_zero_is_not_split() -> None:
+    search, _, single = exact(0.0)
+    slow = search.component("line", 1 / DURATION_S, DAMPING, 1.0)
+    assert split_gain(search, single.add(slow), 2) == 0
+
+
+def simulated(second_hz: float, seed: int):
+    """Identify a loop with a line at 40 Hz and another."""
+    lines = tuple(
+        lbt.Vibration(frequency_hz=hz, damping=DAMPING, rms_nm=50, direction=(1.0,))
+        for hz in (40.0, second_hz)
+    )
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=2.0, frame_rate_hz=SPECTRUM_RATE)
+    truth = lbt.Truth(turbulence=slow, vibrations=lines, noise_nm=5.0)
+    loop = lbt.integrator(lbt.LoopHardware(frame_rate_hz=SPECTRUM_RATE, modes=1), gain=0.4)
+    path = lbt.LoopHardware(frame_rate_hz=SPECTRUM_RATE, modes=1)
+    run = lbt.simulate(loop.controller, truth, hardware=path, frames=30_000, seed=seed)
+    y, u = run.measurements[0, :, 0], run.commands[0, :, 0]
+    return lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=SPECTRUM_RATE)
+
+
+def test_a_note_names_the_line_that_may_be_two() -> None:
+    axis = simulated(40.5, 4)
+    (line,) = axis.lines
+    (note,) = describe_close_lines(axis, 0)
+    assert f"the line of axis 0 at {line.frequency_hz:.4g} Hz may be two" in note
+
+
+def test_a_note_names_a_line_that_is_hardly_separate() -> None:
+    axis = simulated(41.2, 1)
+    second = axis.lines[1]
+    assert not list(describe_close_lines(axis, 1))
+    model = axis.fitted_model
+    at = 1 + int(model.spectrum.components[2].frequency > model.spectrum.components[1].frequency)
+    weak = replace(model, evidence=tuple(20.0 if i == at else 500.0 for i in range(3)))
+    (note,) = describe_close_lines(replace(axis, fitted_model=weak), 1)
+    assert f"the line of axis 1 at {second.frequency_hz:.4g} Hz lies in the skirts" in note

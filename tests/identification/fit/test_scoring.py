@@ -49,3 +49,13 @@ def test_parameters_without_information_leave_the_steps_finite() -> None:
     assert found is not None
     assert np.all(np.isfinite(found[0]))
     assert found[0][0] == pytest.approx(1, abs=1e-3)
+
+
+def test_a_minimum_beyond_a_bound_lies_on_it() -> None:
+    """What else is free goes on: the valley's floor at x = 0.5 is y = 0.25."""
+    priors = Priors(
+        centre=np.zeros(2), width=np.full(2, np.inf), bounds=(-9.0, np.array([0.5, 9.0]))
+    )
+    found = scoring_minimum(rosenbrock, np.array([-1.2, 1.0]), priors, accuracy=1e-12)
+    assert found is not None
+    assert found[0] == pytest.approx([0.5, 0.25], abs=1e-6)

@@ -1,41 +1,142 @@
-"""The likelihood: gradient and information."""
+"""The likelihood: how the taper smears lines, gradient and information, of one axis and of two."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad, trapezoid
 from scipy.optimize import approx_fprime
-from support.recorded_loops import integrator_loop
+from support.recorded_loops import RATE, integrator_loop, open_record
 
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
-from lbt_synth.identification.fit.spectrum_model import GAIN, Component, SpectrumModel
+import lbt_synth as lbt
+from lbt_synth.identification.fit.fitting import Search, fit
+from lbt_synth.identification.fit.periodogram import TAPER, LoopPeriodogram, loop_periodogram
+from lbt_synth.identification.fit.spectrum_model import (
+    GAIN,
+    Component,
+    Shared,
+    Spectra,
+    SpectrumModel,
+)
 from lbt_synth.identification.fit.whittle import (
+    WIDE,
+    FittedModel,
     contrast,
     density,
     derivatives,
-    second_derivatives,
+    joint_density,
+    log_smearing,
+    observe_information,
+    smearing_reach,
 )
 
-RATE = 1000.0
+W = 2 * np.pi / RATE
+LINE = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=50, direction=(0.8, -0.6))
 
 
-FRAMES = 16_384
+def taper(x: float) -> float:
+    """Return the taper at a part of its length, by its definition."""
+    edge = min(x, 1 - x)
+    if edge < 0:
+        return 0.0
+    return 1.0 if edge >= TAPER / 2 else 0.5 * (1 - math.cos(2 * math.pi * edge / TAPER))
+
+
+@cache
+def correlations() -> tuple[np.ndarray, np.ndarray]:
+    """Return lags and the autocorrelation of the taper at them."""
+    t = np.linspace(0, 1, 1201)
+    products = [
+        quad(lambda x, lag=lag: taper(x) * taper(x + lag), 0, 1 - lag, limit=400)[0] for lag in t
+    ]
+    return t, np.array(products) / products[0]
+
+
+@pytest.mark.parametrize(("width", "distance"), [(0.02, 0.4), (0.3, 1.3), (2.0, 0.0), (8.0, 5.0)])
+def test_smearing_is_the_integral_that_defines_it(width: float, distance: float) -> None:
+    t, r = correlations()
+    kernel = r * np.exp(-2 * np.pi * width * t) * np.cos(2 * np.pi * distance * t)
+    smeared = 2 * trapezoid(kernel, t)
+    line = width / np.pi / (width**2 + distance**2)
+    found = log_smearing(width, np.array([distance]))[0][0]
+    assert found == pytest.approx(np.log(smeared / line), abs=5e-3)
+
+
+@given(width=st.floats(1e-8, 25), distance=st.floats(0.02, 390))
+@settings(max_examples=60, deadline=None)
+def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
+    d = np.array([-distance, distance])
+    _, by_width, by_distance = log_smearing(width, d)
+    h = 1e-6
+    numeric = (log_smearing(width * np.exp(h), d)[0] - log_smearing(width * np.exp(-h), d)[0]) / (
+        2 * h
+    )
+    assert by_width == pytest.approx(numeric, abs=1e-4)
+    numeric = (log_smearing(width, d + h)[0] - log_smearing(width, d - h)[0]) / (2 * h)
+    # the cubics of neighbours meet with the same slope, but not with the same bend
+    assert by_distance == pytest.approx(numeric, rel=1e-3, abs=2e-2)
+    assert by_distance[0] == pytest.approx(-by_distance[1])
+
+
+def test_wide_lines_are_as_they_are() -> None:
+    value, _, _ = log_smearing(WIDE, np.linspace(-100, 100, 201))
+    assert np.max(np.abs(value)) < 0.02
+
+
+@pytest.mark.parametrize("frequency", [20.0, 123.4567])
+def test_periodogram_of_a_sinusoid_is_the_taper(frequency: float) -> None:
+    n, rate, rms = 48_000, 800.0, 100.0
+    k = np.arange(n)
+    y = rms * np.sqrt(2) * np.cos(2 * np.pi * frequency * k / rate + 0.3)
+    data = loop_periodogram(y, None, frame_rate_hz=rate, stretches=[(0, n)])
+    assert data.duration_s is not None
+    d = (data.frequency_hz - frequency) * data.duration_s
+    width = 1e-8
+    for low, high in ((0, 1.5), (1.5, 4), (4, 10), (10, 20), (20, 40)):
+        inside = (np.abs(d) >= low) & (np.abs(d) < high)
+        line = width / np.pi / (width**2 + d[inside] ** 2)
+        model = line * np.exp(log_smearing(width, d[inside])[0]) * rms**2 * data.duration_s
+        assert np.mean(data.power(1.0)[inside]) == pytest.approx(np.mean(model), rel=0.06)
+
+
+@pytest.mark.parametrize("width", [1e-3, 0.02, 0.3, 2.0, 12.0])
+def test_skirts_are_those_of_the_line_beyond_its_reach(width: float) -> None:
+    """In 4096 samples of the taper they were 3 % too high at the end of the table."""
+    (reach,) = smearing_reach(np.array([width]))
+    beyond = np.linspace(reach, 500, 4000)
+    assert np.max(np.abs(log_smearing(width, beyond[beyond < 400])[0]), initial=0) < 0.004
+    t, r = correlations()
+    d = reach + np.arange(8) + 0.5  # at the middle of lobes, whose mean the table has
+    decay = r * np.exp(-2 * np.pi * width * t)
+    smeared = [2 * trapezoid(decay * np.sinc(t) * np.cos(2 * np.pi * at * t), t) for at in d]
+    line = width / np.pi / (width**2 + d**2)
+    aliased = np.sinc(d / (t.size - 1)) ** 2  # of the same sum over samples
+    assert np.mean(smeared * aliased / line) == pytest.approx(1, abs=0.05)
+
+
+def test_wider_lines_reach_less() -> None:
+    reach = smearing_reach(np.append(np.geomspace(1e-12, 1.0, 200), [3.0, WIDE]))
+    assert np.all(np.diff(reach) <= 0)
+    assert reach[0] > 400 > 50 > reach[199] > reach[-1] == 0
 
 
 def case(*, drift: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=4096)
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
-    w = 2 * np.pi / RATE
-    turbulence = Component("turbulence", np.log(1.1 * w), np.log(0.5), np.log(200.0**2))
-    line = Component("line", np.log(39 * w), np.log(0.02 / 0.98), np.log(15.0**2))
+    turbulence = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(200.0**2))
+    line = Component("line", np.log(39 * W), np.log(0.02 / 0.98), np.log(15.0**2))
     components = (turbulence, line)
     if drift:  # then all that is slow rolls off
-        first = Component("drift", np.log(0.3 * w), np.log(8.0), np.log(50.0**2))
-        slow = Component("slow", np.log(3 * w), 0.3, np.log(50.0**2))
+        first = Component("drift", np.log(0.3 * W), np.log(8.0), np.log(50.0**2))
+        slow = Component("slow", np.log(3 * W), 0.3, np.log(50.0**2))
         components = (first, turbulence.convert("slow"), line, slow)
-    return data, SpectrumModel(np.log(0.7), np.log(30), 0.3, np.log(20 * w), components)
+    return data, SpectrumModel(np.log(0.7), np.log(30), 0.3, np.log(20 * W), components)
 
 
 @pytest.mark.parametrize("drift", [False, True])
@@ -77,19 +178,131 @@ def test_gradient_and_information_of_the_likelihood(drift: bool) -> None:
 @pytest.mark.parametrize("taper", [False, True])
 @pytest.mark.parametrize("drift", [False, True])
 def test_second_derivatives_of_the_likelihood(drift: bool, taper: bool) -> None:
-    """The slope of the table that smears lines has corners: differences see them."""
-    data, spectrum = case(drift=drift)
+    """At a minimum; the slope of the table that smears lines has corners: differences see them."""
+    data, start = case(drift=drift)
     if not taper:
         data = dataclasses.replace(data, duration_s=None)
-    theta, step = spectrum.pack(), 1e-4
+    search = Search(data=data)
+    model = fit(search, start, accuracy=1e-8)
+    assert model is not None
+    merged, priors = search.merge(model.spectrum), search.priors(model.spectrum)
+    theta, step = model.spectrum.pack(), 1e-4
 
     def gradient(change: np.ndarray) -> np.ndarray:
-        return derivatives(data, spectrum.unpack(theta + change))[1]
+        return derivatives(merged, model.spectrum.unpack(theta + change))[1]
 
     rows = [(gradient(h) - gradient(-h)) / (2 * step) for h in step * np.eye(theta.size)]
-    found = second_derivatives(data, spectrum)
+    expected = np.array(rows) + np.diag(1 / priors.width**2)
+    found = observe_information(merged, model, priors).information
     scale = np.sqrt(np.abs(np.diag(found)))
     assert found / np.outer(scale, scale) == pytest.approx(
-        np.array(rows) / np.outer(scale, scale), abs=1e-2 if taper else 1e-4
+        expected / np.outer(scale, scale), abs=2e-2 if taper else 1e-3
     )
     assert found == pytest.approx(found.T, rel=1e-12)
+
+
+def spectrum(*parts: Component) -> SpectrumModel:
+    turbulence = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(280.0**2))
+    return SpectrumModel(0.0, np.log(40), 0.0, np.log(30 * W), (turbulence, *parts))
+
+
+def line(frequency: float, ratio: float, rms: float) -> Component:
+    odds = float(np.log(ratio / (1 - ratio)))
+    return Component("line", float(np.log(frequency * W)), odds, 2 * float(np.log(rms)))
+
+
+@pytest.fixture(scope="module")
+def both() -> LoopPeriodogram:
+    """Return the periodogram of two axes in a loop."""
+    record = open_record(((LINE, 0),), frames=4096)
+    corrections = np.random.default_rng(5).standard_normal(record.measurements.shape)
+    return loop_periodogram(
+        record.measurements,
+        corrections + 0.1 * record.measurements[:, ::-1],
+        frame_rate_hz=RATE,
+        stretches=[(0, record.frames)],
+    )
+
+
+@pytest.fixture
+def coupled() -> Spectra:
+    shared = Shared(
+        *dataclasses.astuple(line(41, 0.02, 35))[:4], log_ratio=2 * np.log(25 / 35), phase=2.5
+    )
+    return Spectra((spectrum(line(70, 0.05, 20)), spectrum()), (shared,))
+
+
+def matrices(diagonal: np.ndarray, crossed: np.ndarray) -> np.ndarray:
+    rows = [[diagonal[0], crossed], [crossed.conj(), diagonal[1]]]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def test_the_likelihood_of_two_axes_is_that_of_the_matrices(both, coupled) -> None:
+    gains = np.array([0.7, 1.3])
+    for i, gain in enumerate(gains):
+        model = dataclasses.replace(coupled.axes[i], log_gain=float(np.log(gain)))
+        coupled = coupled.on_axis(i, model)
+    *diagonal, crossed = joint_density(both, coupled)
+    seen, _ = both.cross_power(gains)
+    power = both.power(gains[:, None])
+    S, data = matrices(np.array(diagonal), crossed), matrices(power, seen)
+    trace = np.trace(np.linalg.solve(S, data), axis1=1, axis2=2).real
+    value = np.sum(both.count * (np.linalg.slogdet(S)[1] + trace))
+    assert contrast(both, coupled) == pytest.approx(value, rel=1e-12)
+    assert derivatives(both, coupled)[0] == pytest.approx(value, rel=1e-12)
+
+
+def test_axes_without_shared_resonances_are_separate(both, coupled) -> None:
+    apart = dataclasses.replace(coupled, shared=())
+    each = (contrast(both.row(i), model) for i, model in enumerate(apart.axes))
+    assert contrast(both, apart) == pytest.approx(sum(each))
+
+
+def test_slopes_of_two_axes_are_those_of_differences(both, coupled) -> None:
+    theta = coupled.pack()
+    _, slope, _ = derivatives(both, coupled)
+    numeric = np.array(
+        [
+            contrast(both, coupled.unpack(theta + h)) - contrast(both, coupled.unpack(theta - h))
+            for h in 1e-5 * np.eye(theta.size)
+        ]
+    )
+    numeric /= 2e-5
+    assert slope == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.max(np.abs(numeric)))
+
+
+def test_information_is_the_second_derivative_where_the_data_are_the_model(both, coupled) -> None:
+    *diagonal, crossed = joint_density(both, coupled)
+    zero = np.zeros_like(both.measured)
+    between = np.zeros_like(both.between)
+    between[0, 0] = crossed
+    pure = dataclasses.replace(
+        both, measured=np.array(diagonal), crossed=zero, corrected=zero, between=between
+    )
+    theta = coupled.pack()
+    _, slope, information = derivatives(pure, coupled)
+    assert slope == pytest.approx(0, abs=1e-7)
+    rows = [
+        derivatives(pure, coupled.unpack(theta + h))[1]
+        - derivatives(pure, coupled.unpack(theta - h))[1]
+        for h in 1e-5 * np.eye(theta.size)
+    ]
+    exact = np.array(rows) / 2e-5
+    assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
+    # gains change the data, and what they move is exact
+    _, _, information = derivatives(both, coupled)
+    gains = [start + GAIN for start in coupled.starts[:-1]]
+    others = [i for i in range(theta.size) if i not in gains]
+    for gain in gains:
+        h = 1e-5 * np.eye(theta.size)[gain]
+        row = derivatives(both, coupled.unpack(theta + h))[1]
+        row = (row - derivatives(both, coupled.unpack(theta - h))[1])[others] / 2e-5
+        assert information[gain][others] == pytest.approx(row, rel=1e-3, abs=1e-5 * max(abs(row)))
+
+
+def test_a_component_that_would_leave_the_band_stays_at_its_end(both) -> None:
+    """Noise that falls towards the Nyquist frequency draws a wide component beyond it."""
+    wide = Component("line", np.log(3.1), 0.0, 2 * np.log(20.0))
+    found = fit(Search(data=both, gain=1.0), Spectra((spectrum(wide), spectrum())))
+    assert isinstance(found, FittedModel)
+    assert found.spectra.axes[0].components[-1].frequency < np.pi

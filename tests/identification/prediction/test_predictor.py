@@ -1,4 +1,7 @@
-"""The least-squares predictor, against textbook regression and closed forms."""
+"""The least-squares predictor, against textbook regression and closed forms.
+
+The controller of a given order that leaves least of a measured spectrum.
+"""
 
 import numpy as np
 import pytest

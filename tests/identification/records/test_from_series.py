@@ -1,13 +1,19 @@
-"""Commands from a second file, matched by counters and times."""
+"""Commands from a second file, matched by counters and times.
+
+Records from arrays: gaps, units, commands, and what is refused.
+"""
 
 import numpy as np
 import pytest
 from support.record_files import csv
+from support.records import SHELL, kinds, ran
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, TelemetryError
+from lbt_synth.identification import loop_record, require_length
 
 RATE = 500.0
+RATE_2 = 1000.0
 
 
 def test_commands_from_another_file(tmp_path, series):
@@ -90,3 +96,145 @@ def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
         lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="V")
     seen = lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="um")
     assert np.allclose(seen.commands[:, 0], 1e3 * u)
+
+
+def test_gaps_of_every_kind():
+    y = 10 * np.random.default_rng(1).standard_normal((2000, 2))
+    y[100, 0] = np.nan
+    y[200:203, 1] = np.inf
+    y[500:540, 0] = y[500, 0]
+    seen = loop_record(y, frame_rate_hz=RATE_2, unit="nm")
+    assert seen.health.rows() == (
+        ("not finite", "measurements", 0, 1, 0.05, 100, "spoilt"),
+        ("stuck", "measurements", 0, 40, 2.0, 500, "spoilt"),
+        ("not finite", "measurements", 1, 3, 0.15, 200, "spoilt"),
+    )
+    assert not seen.health.clean
+    assert seen.health.usable == np.sum(seen.usable) == 2000 - 44
+    assert seen.stretches() == ((0, 100), (101, 200), (203, 500), (540, 2000))
+    assert np.all(np.isfinite(seen.measurements))
+    assert seen.health.summary() == (
+        "1956 of 2000 frames are usable; 1 not finite (measurements), 40 stuck (measurements), "
+        "3 not finite (measurements)."
+    )
+
+
+def test_values_whose_squares_are_lost_are_zero():
+    y = 1e-200 * np.arange(600.0)[:, None]
+    u = np.arange(600.0)[:, None]
+    record = loop_record(y, u, frame_rate_hz=500, delay_frames=2, unit="nm")
+    assert not np.any(record.measurements)
+
+
+def test_masked_and_absurd_values_are_gaps():
+    y = np.random.default_rng(0).standard_normal((100, 1))
+    y[20] = 1e308
+    y[30] = -3e105
+    masked = np.ma.masked_array(y, mask=np.arange(100)[:, None] == 50)
+    for unit in ("nm", "m"):
+        seen = loop_record(masked, frame_rate_hz=RATE_2, unit=unit)
+        assert np.flatnonzero(~seen.usable).tolist() == [20, 30, 50]
+        assert np.all(np.abs(seen.measurements) < 1e11)
+
+
+def test_a_dead_axis_leaves_nothing():
+    y = np.random.default_rng(0).standard_normal((5000, 2))
+    y[:, 1] = 0.0
+    seen = loop_record(y, frame_rate_hz=RATE_2, unit="nm")
+    assert not seen.usable.any()
+    assert kinds(seen) == {("stuck", "measurements", 1)}
+    with pytest.raises(
+        lbt.errors.ProblemError, match=r"got 0 \(0 s\), the longest stretch 0. 0 of 5000 frames"
+    ):
+        require_length(seen)
+
+
+def test_clipped_commands_spoil_open_loops_are_reported():
+    path = lbt.LoopHardware(frame_rate_hz=RATE_2)
+    run = ran(path, frames=3000, noise_nm=5)
+    u = np.clip(run.commands[0], -250, None)
+    u[1000:1100] = 0.0
+    u[2000:2050, 0] = u[2000, 0]
+    seen = loop_record(run.measurements[0], u, frame_rate_hz=RATE_2, delay_frames=2, unit="nm")
+    assert kinds(seen, spoils=False) == {("loop open", "commands", None), ("held", "commands", 0)}
+    count = {f.kind: (f.count, f.first_frame) for f in seen.health.findings if not f.spoils}
+    assert count == {"loop open": (100, 1000), "held": (50, 2000)}
+    clipped = np.any(run.commands[0] < -250, axis=1) & np.all(u != 0, axis=1)
+    expected = np.zeros(3000, dtype=bool)
+    expected[:2] = True
+    expected[2:] |= clipped[:-2]
+    assert clipped.sum() > 5
+    assert np.array_equal(~seen.usable, expected)
+
+
+def test_an_open_loop_with_zero_commands():
+    y = np.random.default_rng(0).standard_normal((200, 2))
+    seen = loop_record(y, 0 * y, frame_rate_hz=RATE_2, delay_frames=2, unit="nm")
+    assert ("loop open", "commands", None, 200, 100.0, 0, "reported") in seen.health.rows()
+    assert seen.usable[2:].all()
+    assert np.array_equal(seen.pseudo_open_loop(), y)
+
+
+def test_a_scatter_that_changes_is_said():
+    y = np.random.default_rng(0).standard_normal((4000, 2))
+    y[:, 1] *= np.linspace(1, 6, 4000)
+    seen = loop_record(y, frame_rate_hz=RATE_2, unit="nm")
+    (note,) = seen.health.notes
+    assert note.startswith("axis 1 is not stationary: the rms difference of two frames is 2")
+    assert seen.usable.all()
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [
+        ("nm", 1.0),
+        ("um", 1e3),
+        ("µm", 1e3),
+        ("m", 1e9),
+        ("mas", 9.96292),
+        ("arcsec", 9962.92),
+        ("urad", 2055.0),  # D/4 = 2.055 m a radian
+        ("rad", 2.055e9),
+    ],
+)
+def test_units(unit, factor):
+    y = np.array([1.0, 2.0, -1.0])
+    seen = loop_record(y / factor, frame_rate_hz=RATE_2, unit=unit, diameter_m=8.22)
+    assert seen.measurements[:, 0] == pytest.approx(y, rel=1e-5)
+    if unit in ("mas", "arcsec", "urad", "rad"):
+        with pytest.raises(lbt.errors.ProblemError, match="give diameter_m"):
+            loop_record(y, frame_rate_hz=RATE_2, unit=unit)
+
+
+def test_commands_may_have_a_unit_of_their_own():
+    y = np.random.default_rng(0).standard_normal((30, 1))
+    seen = loop_record(y, y, frame_rate_hz=RATE_2, unit="nm", command_unit="um")
+    assert np.allclose(seen.commands, 1e3 * y)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"unit": "volt"}, "unit must be one of nm, um, m, mas"),
+        ({"unit": 3}, "unit must be one of"),
+        ({"command_unit": "pixel"}, "unit must be one of"),
+        ({"measurements": np.ones((3, 5))}, "one or two axes.*Choose tip and tilt"),
+        ({"measurements": np.ones((2, 50))}, "one or two axes.*Transpose it"),
+        ({"measurements": []}, "not empty"),
+        ({"measurements": [["a"]]}, "array of numbers"),
+        ({"commands": np.ones((30, 1))}, "commands must match measurements"),
+        ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
+        ({"diameter_m": -1}, "diameter_m must be above 0"),
+        ({"obstruction": 1}, "obstruction must be below 1"),
+        ({"mirror": "shell"}, "expected a PositionLoop"),
+        (
+            {"frame_rate_hz": 777, "delay_frames": 2, "mirror": SHELL},
+            "whole number of samples per frame",
+        ),
+    ],
+)
+def test_arrays_that_are_refused(change, words):
+    y = np.random.default_rng(0).standard_normal((30, 2))
+    fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE_2, "unit": "nm"}
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        loop_record(**{**fields, **change})
