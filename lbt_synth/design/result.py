@@ -222,12 +222,6 @@ class Design(Summarised, ABC):
         """For each mode that was shaped, the first one that is equal to it."""
         return []
 
-    @property
-    def model(self) -> TipTiltPlant | None:
-        """Plant whose disturbances the design estimates; None where it estimates none."""
-        named = isinstance(self.problem, TipTiltPlant)
-        return self.problem if self.is_estimator and named else None
-
     def violated_demands(self, controller: Controller) -> tuple[str, ...] | None:
         """Return the demands on the design that a controller violates; None if it has none."""
         return None

@@ -239,10 +239,12 @@ class TrackingController:
 
 def _plant_of(design: object) -> TipTiltPlant:
     """Return the plant of a filter; refuse a design that is none, or of another problem."""
-    if not isinstance(design, FilterDesign) or not isinstance(design.problem, TipTiltPlant):
+    plant: TipTiltPlant | None = getattr(design, "plant", None)
+    same = plant is getattr(design, "problem", None)  # not so the full form of a plant
+    if plant is None or not same or not hasattr(design, "gain_filter"):
         kind = getattr(design, "method", type(design).__name__)
         raise ProblemError(
             "only filters of a TipTiltPlant can take over in a running loop (kalman, hinf, mixed, "
             f"central); got {kind!r}. Their estimate does not depend on the commands."
         )
-    return design.problem
+    return plant

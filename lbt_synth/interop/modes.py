@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 
@@ -74,8 +74,8 @@ def mode_designs(
 
     ``modal`` requires those of modes, ``mixed`` allows several.
     """
-    if isinstance(design, ModalFilters):
-        design = design.start()
+    start = getattr(design, "start", None)  # of a stack of designs
+    design = cast("Design | MixedController", design if start is None else start())
     if hardware is not None and getattr(design, "hardware", None) is not None:
         raise ProblemError("hardware must be left out where a design has a loop; got both.")
     if isinstance(design, MixedController):
@@ -128,13 +128,13 @@ def _mode_designs(control: MixedController, hardware: LoopHardware | None) -> li
     if loop is None:
         raise ProblemError("hardware must be given where no filter has a loop; got None.")
     designs: list[ModeDesign] = []
-    if isinstance(control.filter, ModalFilters):
+    if hasattr(control.filter, "designs"):
         filtered, which = np.array(control.filtered), control.filter.which
         designs += [
             ModeDesign(design, tuple(filtered[which == i].tolist()))
             for i, design in enumerate(control.filter.designs)
         ]
-    elif isinstance(control.filter, Design):
+    elif hasattr(control.filter, "certificate"):
         require_modal(control.filter)
         designs.append(ModeDesign(control.filter, tuple(control.filtered)))
     elif control.filter is not None:

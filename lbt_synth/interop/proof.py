@@ -230,7 +230,7 @@ def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     drive = np.sqrt(1 - _POLE**2)
     slow = ARModel(coefficients=np.array([_POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
     sources, noise = [(slow, row) for row in np.eye(n)], _NOISE * np.eye(q)
-    if (plant := design.model) is not None:
+    if design.is_estimator and (plant := design.plant) is not None:
         sources = list(zip(plant.turbulence, np.eye(n), strict=True))
         sources += [(v.ar_model(rate), np.asarray(v.direction)) for v in plant.vibrations]
         noise = plant.D[:, -q:]

@@ -26,6 +26,7 @@ from lbt_synth.identification.prediction.residual import (
 )
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
 from lbt_synth.linear import Controller
+from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import LoopHardware, TipTiltPlant
@@ -328,9 +329,7 @@ def _note_refuted(rows: Sequence[PredictionRow]) -> list[str]:
 
 
 def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Design) -> ClosedLoop:
-    controller = thing.controller if isinstance(thing, Design) else thing
-    require_instance(controller, Controller)
-    loop = close_loop(plant.hardware, controller)
+    loop = close_loop(plant.hardware, as_controller(thing))
     try:
         loop.require_stable()
     except UnstableLoopError as error:

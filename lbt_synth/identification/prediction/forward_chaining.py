@@ -34,6 +34,7 @@ from lbt_synth.identification.prediction.residual import replay
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.linear import Controller
+from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import (
@@ -296,7 +297,7 @@ def compare_on_splits(
                 continue
             try:
                 made = build(split)
-                measured = split.replay(made.controller if isinstance(made, Design) else made)
+                measured = split.replay(as_controller(made))
             except LbtSynthError as error:
                 failures[name] = str(error)
                 continue

@@ -16,7 +16,6 @@ from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop, broken_loops, close_loop, loop_margins, step_response
 from lbt_synth.loop.broken_loops import BrokenLoop
 from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
-from lbt_synth.models import TipTiltPlant
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing, square_in
 from lbt_synth.report.scales import shorten
 from lbt_synth.validation import ComplexArray, FloatArray
@@ -211,8 +210,8 @@ def _vibration_frequencies(designs: Iterable[Design]) -> list[float]:
     frequencies_hz = {
         line.frequency_hz
         for design in designs
-        if design.is_estimator and isinstance(design.problem, TipTiltPlant)
-        for line in design.problem.vibrations
+        if design.is_estimator and design.plant is not None
+        for line in design.plant.vibrations
     }
     return sorted(frequencies_hz)
 

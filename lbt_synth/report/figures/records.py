@@ -11,6 +11,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedModel
 from lbt_synth.linear import Controller
+from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import Simulation, close_loop
 from lbt_synth.loop.simulation.failing_sensors import Segment
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing
@@ -163,7 +164,7 @@ def _predicted_residuals(
     """Densities of the residual that each design would leave on each axis, (f,) each."""
     out: dict[str, list[FloatArray]] = {}
     for name, thing in designs.items():
-        controller = thing.controller if isinstance(thing, Design) else thing
+        controller = as_controller(thing)
         if not isinstance(controller, Controller):
             raise ProblemError(
                 f"designs must be Controllers or Designs; got {type(thing).__name__} for {name!r}."
