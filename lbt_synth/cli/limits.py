@@ -68,7 +68,11 @@ def _limit_notes(study: LimitStudy, config: Config) -> list[str]:
         ]
     notes = [
         say_limit(study.limit, config)
-        + (" (sinusoids of known frequency cost nothing)" if study.band is not None else "")
+        + (
+            " (of sinusoids of known frequency, what moves within frames)"
+            if study.band is not None
+            else ""
+        )
     ]
     if study.band is not None and study.band_hz is not None:
         low, high = study.band_hz
