@@ -18,7 +18,6 @@ import time
 from pathlib import Path
 from statistics import median, quantiles
 
-
 import lbt_synth as lbt
 from lbt_synth.report.explore.exploration import (
     Wish,
