@@ -162,7 +162,8 @@ def drawing(
             for panel in panels:
                 _draw_own_legend(panel)
         for panel in panels:
-            panel.axes.set_aspect("equal" if panel.is_equal else "auto")
+            if panel.is_equal:
+                panel.axes.set_aspect("equal")
         _SERIES[figure] = tuple(one for panel in panels for one in panel.series)
 
 

@@ -93,7 +93,7 @@ def _loop_gains(one: Shown) -> tuple[FloatArray, FloatArray]:
 
 
 class LivePanel:
-    """A place for a figure, which is made anew only where its designs are others."""
+    """A place for a figure, which is made again only where its designs are others."""
 
     def __init__(self, key: str) -> None:
         self.root = GridBox(name=key, sizing_mode="stretch_width")

@@ -92,13 +92,6 @@ def test_the_page_is_complete(text, report, config):
         assert figure["id"] in {a["href"][1:] for a in reader.named("a")}
 
 
-@pytest.mark.e2e
-def test_the_pdf(report, tmp_path):
-    files = lbt.report.write_report(report, tmp_path / "a.html", pdf=tmp_path / "a.pdf")
-    assert [path.name for path in files] == ["a.html", "a.pdf"]
-    assert files[1].read_bytes().startswith(b"%PDF")
-
-
 def test_a_truth_without_vibrations(config, designs):
     calm = replace(config, truth=replace(config.truth, vibrations=()))
     report = lbt.report.design_report(calm, {"slow": designs["slow"]})
