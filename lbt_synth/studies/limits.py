@@ -229,10 +229,12 @@ def _evaluate_loop(
     if not loop.is_stable:
         return np.nan, np.nan, np.full(shifts.size, np.nan)
     budget = residual_budget(loop, truth)
-    rest = np.trace(budget.turbulence_nm2 + budget.noise_nm2)
+    if not np.any(shifts):
+        return budget.rms_nm, strehl(budget, imaging), np.full(shifts.size, budget.rms_nm)
     still = replace(truth, turbulence=None, noise_nm=0.0)
-    variance = np.empty(shifts.size)
-    for i, shift in enumerate(shifts):
-        own = residual_budget(loop, still.with_frequency_error(float(shift)))
-        variance[i] = rest + np.trace(own.vibration_nm2)
+    shaken = [
+        residual_budget(loop, still.with_frequency_error(float(shift))) for shift in [0.0, *shifts]
+    ]
+    first, *others = (np.trace(one.total_nm2) for one in shaken)
+    variance = np.array([np.trace(budget.total_nm2) - first + other for other in others])
     return budget.rms_nm, strehl(budget, imaging), np.sqrt(variance)
