@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
 from lbt_synth.interop.modes import ModeDesign
@@ -67,7 +68,8 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
     if coupled.size:
         raise ProblemError(
             f"the modes must decouple; here measurement {coupled[0, 1] + 1} moves command "
-            f"{coupled[0, 0] + 1}. Use a target of matrices, such as c."
+            f"{coupled[0, 0] + 1}. Design with --method robust, which controls each axis alone, or "
+            "use a target of matrices, such as c."
         )
     inside = [np.flatnonzero(reached[:, mode] & shown[mode]) for mode in range(m)]
     return [_polynomials(system, mode, states) for mode, states in enumerate(inside)]
@@ -195,12 +197,13 @@ def _as_computed(design: Design, rounded: _Matrix) -> Written:
     added[: order + 1] = np.eye(order + 1, 1)  # an error of the sum enters as b_0 y(k) does
     controller, entry = (direct_form(matrix, dt_s) for matrix in (rows, added))
     loops: list[DirectFormLoop] = mode_loops(design, order)
+    sensors = np.diag(require_hardware(design, "dao").sensor)
 
     def variance(sensor_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         """Add up the rounding of each product and of each partial sum."""
         if loops:
-            columns = zip(loops, rows.T, strict=True)
-            return np.array([loop.sums_nm2(column, sensor_gain) for loop, column in columns])
+            sums = [loop.sums_nm2(c, sensor_gain) for loop, c in zip(loops, rows.T, strict=True)]
+            return np.array(sums) * sensors**2
         sizes = np.where(np.arange(len(rows))[:, None] <= order, measured, commands)
         # a bound: signs and correlations are not used
         bound = sums_variance((rows * sizes).T, 0, ROUNDOFF["single"])
