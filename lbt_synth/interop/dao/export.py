@@ -128,32 +128,18 @@ def direct_form(rows: FloatArray, dt_s: float) -> Controller:
 class InnerLoop:
     """Per mode, ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, in single precision.
 
-    The products are added one by one, in the order of the matrix's rows. The voltages are
-    ``-to_actuators u`` of a matrix (actuators, modes), by default the identity; where one exceeds
-    the limit it is clipped, and the memory holds the commands that were applied.
+    The products are added one by one, in the order of the matrix's rows. A command beyond the limit
+    is clipped, and the memory holds the commands that were applied.
     """
 
-    def __init__(
-        self, matrix: ArrayLike, to_actuators: ArrayLike | None = None, limit: float = np.inf
-    ) -> None:
+    def __init__(self, matrix: ArrayLike, limit: float = np.inf) -> None:
         self._rows = np.asarray(matrix, dtype=np.float32)
         if self._rows.ndim != 2 or len(self._rows) % 2 == 0:
             raise DimensionError(
                 "the matrix must have 2 M + 1 rows and one column per mode; got shape "
                 f"{self._rows.shape}."
             )
-        modes = self._rows.shape[1]
-        self._to_actuators = np.asarray(
-            np.eye(modes) if to_actuators is None else to_actuators, dtype=np.float32
-        )
-        if self._to_actuators.ndim != 2 or self._to_actuators.shape[1] != modes:
-            raise DimensionError(
-                f"to_actuators must have {modes} columns, one per mode; got shape "
-                f"{self._to_actuators.shape}."
-            )
-        self._to_modes = np.linalg.pinv(self._to_actuators).astype(np.float32)
-        self._limit = np.float32(limit)
-        self._past = len(self._rows) // 2  # M
+        self._limit, self._past = np.float32(limit), len(self._rows) // 2  # M
         self.reset()
 
     def reset(self) -> None:
@@ -166,9 +152,7 @@ class InnerLoop:
         memory[1:first] = memory[: first - 1].copy()
         memory[0] = y
         u = np.add.accumulate(self._rows * memory, axis=0)[-1]
-        voltages = -(self._to_actuators @ u)
-        if np.any(np.abs(voltages) > self._limit):
-            u = -(self._to_modes @ np.clip(voltages, -self._limit, self._limit))
+        u = np.clip(u, -self._limit, self._limit)
         memory[first + 1 :] = memory[first:-1].copy()
         memory[first : first + 1] = u  # nothing to write at M = 0
         return np.asarray(u, dtype=np.float64)
@@ -268,7 +252,7 @@ TARGET = Target(
     write=_write,
     read=_read,
     computed=_as_computed,
-    start=lambda matrix, limit: InnerLoop(matrix, limit=limit),
+    start=InnerLoop,
     single=lambda matrix: matrix,
     join=_join,
     split=lambda matrix, parts, _: [

@@ -31,7 +31,7 @@ from lbt_synth.validation import ComplexArray, FloatArray
 ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
 _RADIUS = 0.92  # of the roots that are added
 _ROOM = 2e-3  # of each limit, for what lies between the nodes
-_ENOUGH = 1.006  # times what the design leaves; 1.01 is proved
+_ENOUGH = 1.004  # times what the design leaves; 1.01 is proved
 _SEARCHES = 19  # at most, each with other weights of the scenarios
 _EVALUATIONS = 60  # of one search
 _HASTE = 12  # power of its residual with which a scenario gains weight
