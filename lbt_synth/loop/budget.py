@@ -37,7 +37,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.mirror.frame_rate_system import Hold
 from lbt_synth.models.plant.seen_vibration import seen_vibration
-from lbt_synth.models.sensor_suite import Motion, checked_motions
+from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
@@ -99,7 +99,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth, *, frame_means: bool = False
             turbulence += view.of_spectrum(spectrum, _entry(loop, mode))
     lines = stationary_vibrations(truth.vibrations)
     amplitudes: list[ComplexArray] = []
-    moving = checked_motions(truth.motions, loop.hardware.suite, len(lines))
+    moving = _motions(loop, truth.motions, len(lines))
     for line, motion in zip(lines, moving, strict=True):
         if isinstance(line, Vibration):
             vibration += view.of_line(line, motion, of_means=frame_means)
@@ -176,7 +176,7 @@ def plant_budget(
     turbulence, vibration = np.zeros((2, 2, loop.hardware.modes, loop.hardware.modes))
     for mode, model in enumerate(plant.turbulence):
         turbulence += view.of_spectrum(model, _entry(loop, mode))
-    moving = checked_motions(plant.motions, loop.hardware.suite, len(plant.vibrations))
+    moving = _motions(loop, plant.motions, len(plant.vibrations))
     for line, motion in zip(plant.vibrations, moving, strict=True):
         vibration += view.of_line(line, motion, of_means=True)
     return _make_budget(turbulence, vibration, view.of_noise(plant.own_noise_factor), [])
@@ -386,6 +386,13 @@ def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
 def _entry(loop: ClosedLoop, mode: int) -> FloatArray:
     """Return how the phase of a mode enters a loop, (n + q, 1)."""
     return np.eye(loop.system.B.shape[-1], 1, -mode)
+
+
+def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:
+    """Return which channels each line moves: none where the loop reads its own sensor alone."""
+    if not loop.reads_others:
+        return ({},) * lines
+    return checked_motions(motions, loop.hardware.suite, lines)
 
 
 def _moved_rows(loop: ClosedLoop, motion: Mapping[str, Motion]) -> list[tuple[int, str]]:
