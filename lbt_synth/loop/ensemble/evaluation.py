@@ -161,7 +161,7 @@ def ensemble_residuals(
     ... )
     >>> found = lbt.loop.ensemble_residuals(lbt.kalman(plant).controller, plant.hardware, ensemble)
     >>> found.rms_nm.round(1).tolist()
-    [195.4, 181.9, nan]
+    [204.2, 191.7, nan]
     """
     require_instance(hardware, LoopHardware)
     require_instance(ensemble, LoopEnsemble)

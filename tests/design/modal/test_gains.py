@@ -25,7 +25,9 @@ def best_of_means(path, truth):
             return 1e6 * gain
         return lbt.residual_budget(loop, truth, frame_means=True).rms_nm
 
-    bounds = np.array([0.001, 1]) / truth.sensor_gain
+    grid = np.geomspace(0.001, 2, 40) / truth.sensor_gain
+    place = int(np.argmin([left(gain) for gain in grid]))  # there may be two minima
+    bounds = grid[place - 1], grid[place + 1]
     best = minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-9})
     return best.x, best.fun
 
