@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from support import predictions
-from support.continuous_loops import noise_covariance, sinusoid_powers
+from support.continuous_loops import noise_covariance, power_of_two_sensors, sinusoid_powers
 from support.plants import lbt_axis_plant
 from support.sensor_loops import (
     AIR,
@@ -641,6 +641,16 @@ def test_a_loop_of_several_sensors_in_the_image(sensors):
     floor = 200**2 * (1 - share**2) * np.outer([0.6, 0.8], [0.6, 0.8])
     np.testing.assert_allclose(budget.vibration_nm2, means, rtol=1e-8)
     np.testing.assert_allclose(budget.within_nm2, floor, rtol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [2, 2.25, 2.49])
+def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
+    plant = example_plant((OTHER,), delay_frames=delay)
+    controller, loop = closed(plant)
+    truth = Truth(turbulence=None, vibrations=(sinusoid(62.5, 100, (3, 4)),))
+    budget = lbt.residual_budget(loop, truth)
+    expected = 100**2 * power_of_two_sensors(plant, controller, 62.5, (0.6, 0.8))
+    np.testing.assert_allclose(budget.vibration_nm2 + budget.within_nm2, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 2.25, 2.49, 2.9])

@@ -5,6 +5,7 @@ A frame has ``STEPS`` steps. The camera sees the phase less the mirror in the mi
 
 import numpy as np
 from scipy.linalg import expm
+from support.sensor_loops import age_frames, frames_per_reading, held_mean
 
 STEPS = 400
 
@@ -105,3 +106,33 @@ def noise_covariance(hardware, controller, noise_nm, *, frames=300, sensor_gain=
     ):
         total = total + np.real(np.einsum("tfi,tfj->ij", residual, residual.conj())) / STEPS
     return total
+
+
+def power_of_two_sensors(plant, controller, frequency_hz, along, *, frames=480):
+    """Return what a sinusoid of unit power leaves in the image, (n, n), of a settled mirror.
+
+    Beside its own sensor the loop reads one slower wavefront sensor. The mean is over 16 frames.
+    """
+    hardware, (slow,) = plant.hardware, plant.hardware.suite.wavefront
+    n, rows, rate = hardware.modes, hardware.suite.rows(hardware), hardware.frame_rate_hz
+    age, period = age_frames(hardware, slow), frames_per_reading(hardware, slow)
+    late = round((hardware.delay_frames - 1) * STEPS)
+    position = np.zeros(((frames + 8) * STEPS, n), dtype=complex)
+    means, state = np.zeros((frames, n), dtype=complex), np.zeros(controller.n_states)
+    power = np.zeros((n, n))
+    for k in range(frames):
+        y = np.zeros(hardware.n_readings, dtype=complex)
+        y[rows["wavefront"]] = hardware.sensor @ held_mean(means, k, 1, 1)
+        if k % period == 0:
+            y[rows[slow.name]] = slow.sensor_matrix @ held_mean(means, k, age, period)
+        now = controller.phase(k)
+        state = now.A @ state + now.B @ y
+        begin = k * STEPS + late
+        position[begin : begin + STEPS] = hardware.influence @ (now.C @ state + now.D @ y)
+        times = k + (np.arange(STEPS) + 0.5) / STEPS
+        wave = np.exp(2j * np.pi * frequency_hz / rate * times)[:, None] * np.asarray(along)
+        residual = wave - position[k * STEPS : (k + 1) * STEPS]
+        means[k] = residual.mean(axis=0)
+        if k >= frames - 16:
+            power += np.real(residual.T @ residual.conj()) / STEPS / 16
+    return power
