@@ -300,6 +300,9 @@ class _View:
         pieces, rest = self._residuals(np.array([line.frequency_hz]), entry)
         within = line.rms_nm**2 * self._powers(pieces[..., None], rest, entry)[0, 1]
         mean = np.einsum("g,tgi->ti", self._weights, pieces[0])
+        if self.pieces is not None:  # with the phase that it has in its own hold
+            turn = line.frequency_hz / self.loop.hardware.frame_rate_hz * self.pieces.start
+            mean = mean * np.exp(-2j * np.pi * turn)
         return line.amplitude_nm * np.fft.fft(mean, axis=0) / len(mean), within
 
     def of_noise(self, factor: FloatArray) -> FloatArray:
@@ -369,7 +372,7 @@ def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
     hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
     if frame_means or (hardware.mirror is None and hardware.delay_frames % 1 == 0):
         rows = replace(s, C=s.C[..., :n, :], D=s.D[..., :n, :])
-        return _View(loop, rows, None, not frame_means)
+        return _View(loop, _balanced(rows), None, not frame_means)
     mirror, m = hardware.mirror_system, hardware.n_commands
     command = slice(n, n + m)
     first = loop.controller.n_states  # the states of the mirror follow those of the controller
@@ -380,7 +383,12 @@ def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
     D = np.einsum("g,im,...mw->...giw", pieces.D, N, s.D[..., command, :])
     shape = len(pieces.D) * n
     C, D = C.reshape(*s.C.shape[:-2], shape, -1), D.reshape(*s.D.shape[:-2], shape, s.D.shape[-1])
-    return _View(loop, replace(s, C=C, D=D), pieces, True)
+    return _View(loop, _balanced(replace(s, C=C, D=D)), pieces, True)
+
+
+def _balanced(system: StateSpace) -> StateSpace:
+    """Return a system in states of comparable units, in which its response keeps its digits."""
+    return system.balanced() if system.period == 1 else system
 
 
 def _entry(loop: ClosedLoop, mode: int) -> FloatArray:
