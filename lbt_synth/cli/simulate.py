@@ -88,10 +88,10 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
             f"frames; got {sizes['frames']}."
         )
     with show_spinner("closing the loop", quiet=arguments.json):
-        found = run_failures(design, config, truth, drops, **sizes)
+        simulation, segments = run_failures(design, config, truth, drops, **sizes)
     report = Report(
         data={
-            "residual_nm": found.simulation.rms_nm,
+            "residual_nm": simulation.rms_nm,
             "frames": sizes["frames"],
             "cases": sizes["cases"],
             "seed": sizes["seed"],
@@ -100,16 +100,16 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
     )
     runs = count_text(sizes["cases"], "run")
     caption = f"{design.method} in the loop: {runs}; {config.imaging.label}"
-    report.add_rows("segments", caption, found.rows(config.imaging))
+    report.add_rows("segments", caption, [row for _, row in segments])
     if not truth.drifts:
         ratio = strehl(residual_budget(loop, truth), config.imaging)
         report.data["strehl_exact"] = ratio
         report.notes.append(f"Strehl ratio with all sensors, exact: {100 * ratio:.2f} %")
     report.notes += loop_difference_notes(config, design)
     if arguments.output is not None:
-        figure = sensor_failure_figure(
-            found.simulation, found.segments, found.exact_nm, title=design.method
-        )
+        exact_nm = [row.exact_nm for _, row in segments]
+        places = [segment for segment, _ in segments]
+        figure = sensor_failure_figure(simulation, places, exact_nm, title=design.method)
         report.note_written(save_figure(figure, arguments.output))
     return report
 

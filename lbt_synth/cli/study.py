@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -17,13 +16,11 @@ from lbt_synth.report.page.page_files import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import fact, facts
 from lbt_synth.storage.words import count_text, duration_text
-from lbt_synth.studies.study.run import FinishedStudy, StudyRun, output_paths
-from lbt_synth.studies.study.statistics import StudyStatistics
-from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
+from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths
 from lbt_synth.studies.study.summary import worst_table
 from lbt_synth.validation import integer
 
-_COUNTS = ("samples", "computed", "failures", "seconds")
+_FAILURE = ("row", "controller", "error")
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -45,24 +42,38 @@ def run(arguments: Namespace) -> Report:
 
 
 def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
+    run = _compute(loaded, folder, arguments)
+    names, columns = loaded.parameter_names, run.columns
+    statistics = studies.study_statistics(columns, names, tuple(loaded.controllers))
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
-    draws = not all(path.exists() for path in pages)
-    found, statistics, new = _compute(loaded, folder, pages, arguments, draws=draws)
-    files = {found.results: new, found.failed: new} | dict.fromkeys(pages, new or draws)
-    varying = [p.name for p in loaded.parameters if p.distribution.varies]
-    worst = [worst_table(each, varying) for each in statistics.controllers]
-    done = f"{folder} is finished: {found.samples} samples in {found.results.name}; none computed."
-    if new:
-        done = (
-            f"{found.computed} of {found.samples} samples computed in "
-            f"{duration_text(found.computing_s)}; with tables and page "
-            f"{duration_text(found.seconds)}."
+    draws = run.computed > 0 or not all(path.exists() for path in pages)
+    if draws:
+        write_study_page(
+            loaded,
+            columns,
+            pages[0],
+            statistics=statistics,
+            failures=run.failures,
+            computing_s=run.computing_s,
+            pdf=pages[1] if arguments.pdf else None,
         )
-    failed = f"note: {found.failures} results failed, see {found.failed}."
+    files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
+    varying = [name for name, p in loaded.settings.parameters.items() if p.varies]
+    worst = [worst_table(each, columns, varying) for each in statistics.controllers]
+    done = f"{folder} is finished: {loaded.samples} samples in {run.results.name}; none computed."
+    if run.computed:
+        done = (
+            f"{run.computed} of {loaded.samples} samples computed in "
+            f"{duration_text(run.seconds)}, {duration_text(run.computing_s)} of all processes."
+        )
+    count = len(run.failures)
     return Report(
-        data={name: getattr(found, name) for name in _COUNTS}
-        | {
-            "computing_seconds": found.computing_s,
+        data={
+            "samples": loaded.samples,
+            "computed": run.computed,
+            "failures": count,
+            "seconds": run.seconds,
+            "computing_seconds": run.computing_s,
             "files": [str(path) for path in files],
             "statistics": asdict(statistics),
         },
@@ -73,41 +84,14 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
         notes=[
             done,
             *_sampling_notes(loaded),
-            *([failed] if found.failures else []),
+            *([f"note: {count} results failed, see {run.failed}."] if count else []),
             *(f"{'written' if now else 'unchanged'}: {path}" for path, now in files.items()),
         ],
     )
 
 
-def _compute(
-    loaded: studies.Study, folder: Path, files: Sequence[Path], arguments: Namespace, *, draws: bool
-) -> tuple[StudyRun, StudyStatistics, bool]:
-    """Run a study; return also whether anything was left to compute.
-
-    Its page is written where something was, or where it ``draws`` in any case.
-    """
-    found: list[tuple[StudyStatistics, bool]] = []
-    page, *pdf = files
-    names = [controller.name for controller in loaded.controllers]
-
-    def summarise(results: FinishedStudy) -> None:
-        statistics = studies.study_statistics(results.columns, loaded.parameter_names, names)
-        found.append((statistics, results.new))
-        if results.new or draws:
-            failures = [
-                studies.Failure(row=row, controller=name, error=error)
-                for row, name, error in read_failures(folder)
-            ]
-            write_study_page(
-                loaded,
-                results.columns,
-                page,
-                statistics=statistics,
-                failures=failures,
-                computing_s=results.computing_s,
-                pdf=pdf[0] if pdf else None,
-            )
-
+def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> StudyRun:
+    """Run what is missing of a study."""
     with choose_engine(arguments) as (executor, workers):
         make_directory(folder)
         with (
@@ -116,17 +100,14 @@ def _compute(
             ) as count,
             keep_finished(folder),
         ):
-            study_run = studies.run_study(
+            return studies.run_study(
                 loaded,
                 folder,
                 executor=executor,
                 jobs=arguments.jobs,
                 workers=workers,
                 progress=count,
-                whole=summarise,
             )
-    [(statistics, new)] = found
-    return study_run, statistics, new
 
 
 def _sampling_notes(loaded: studies.Study) -> list[str]:
@@ -146,10 +127,9 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     where = count_text(count, "process", "processes")
     if workers is not None:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
-    parameters = {p.name: p.distribution.text for p in loaded.parameters}
-    controllers = {c.name: c.origin for c in loaded.controllers}
+    parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
+    controllers = {name: section.text for name, section in loaded.settings.controllers.items()}
     report = Report(data={"parameters": parameters, "controllers": controllers})
-    mb = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
     report.add_facts(
         f"Study {loaded.source}",
         facts(
@@ -158,11 +138,8 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
             seed=fact(loaded.settings.seed, "seed"),
             evaluation=fact(loaded.settings.evaluation, "evaluation"),
             workers=fact(count),
-            measured_rows=fact(cost.measured_rows, "samples measured in one process"),
-            measured_s=fact(cost.measured_s, "  their time", unit="s", format=".3g"),
-            seconds=fact(cost.seconds),  # said in a note, in words for long ones
-            disk_bytes=fact(cost.disk_bytes, "space on the disk, about", **mb),
         ),
+        cost,
     )
     report.add_table("Parameters", ("parameter", "distribution"), parameters.items())
     report.add_table("Controllers", ("controller", "what"), controllers.items())
@@ -182,10 +159,10 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
     stored, fresh = replay.stored, replay.fresh
     report = Report(
         data={name: getattr(replay, name) for name in ("row", "parameters", "stored", "fresh")}
-        | {"failures": [asdict(failure) for failure in replay.failures]},
+        | {"failures": [dict(zip(_FAILURE, each, strict=True)) for each in replay.failures]},
         notes=[
             *([] if stored else ["note: the study has no result of this row yet."]),
-            *(f"failed: {failure.controller}: {failure.error}" for failure in replay.failures),
+            *(f"failed: {name}: {error}" for _, name, error in replay.failures),
             *([f"note: {replay.unwritten}"] if replay.unwritten else []),
         ],
     )

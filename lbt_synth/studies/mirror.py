@@ -8,9 +8,10 @@ import numpy as np
 
 from lbt_synth.design import Design, kalman, lqg, optimal_integrator
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop import Imaging, close_loop, residual_budget, settling_error, strehl
-from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+from lbt_synth.loop import Imaging, close_loop, settling_error
+from lbt_synth.models import TipTiltPlant, Truth
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.studies.grid import loop_columns
 from lbt_synth.validation import require_instance
 
 
@@ -25,15 +26,13 @@ class MirrorRow:
         format=".2f",
         missing="unstable",
         help="Residual under the truth, rms",
-        default=np.nan,
     )
-    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
     unsettled_nm: float = nm_column(
         "settled less real position",
         format=".2f",
         help="What is left of the assumption that the mirror has settled, for the commands of "
         "this design: settled less real position, rms",
-        default=np.nan,
     )
 
 
@@ -100,20 +99,17 @@ def mirror(
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
     }
-    return tuple(_row(name, design, hardware, truth, imaging) for name, design in designs.items())
-
-
-def _row(
-    name: str, design: Design, hardware: LoopHardware, truth: Truth, imaging: Imaging
-) -> MirrorRow:
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    row = MirrorRow(design=name, stable=loop.is_stable)
-    if not loop.is_stable:
-        return row
-    budget = residual_budget(loop, truth)
-    return replace(
-        row,
-        residual_nm=budget.rms_nm,
-        strehl=strehl(budget, imaging),
-        unsettled_nm=settling_error(loop, truth).rms_nm,
-    )
+    rows = []
+    for name, design in designs.items():
+        loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        numbers = loop_columns(loop, truth, imaging)
+        rows.append(
+            MirrorRow(
+                design=name,
+                stable=loop.is_stable,
+                residual_nm=numbers["residual_nm"],
+                strehl=numbers["strehl"],
+                unsettled_nm=settling_error(loop, truth).rms_nm if loop.is_stable else np.nan,
+            )
+        )
+    return tuple(rows)

@@ -12,23 +12,15 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.loop import (
-    EnsembleVibration,
-    Imaging,
-    LoopEnsemble,
-    close_loop,
-    ensemble_residuals,
-    residual_budget,
-    strehl,
-)
+from lbt_synth.loop import Imaging, LoopEnsemble, close_loop, ensemble_residuals
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
+from lbt_synth.studies.grid import loop_columns, moved_lines, stack_columns
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -38,6 +30,8 @@ from lbt_synth.validation import (
     real_array,
     require_instance,
 )
+
+_GAINS_AT_ONCE = 64
 
 
 @table_row
@@ -140,21 +134,8 @@ def default_methods() -> list[str]:
 def _row(design: Design, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
     hardware = require_hardware(design, "a row")
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    known = {"error_hz": error, "stable": loop.is_stable}
-    if not loop.is_stable:
-        return fill_row(RobustnessRow, design, **known)
-    budget = residual_budget(loop, truth)
-    return fill_row(
-        RobustnessRow,
-        budget,
-        design,
-        **known,
-        strehl=strehl(budget, imaging),
-        residual_nm=budget.rms_nm,
-    )
-
-
-_GAINS_AT_ONCE = 64
+    numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
+    return fill_row(RobustnessRow, design, error_hz=error, **numbers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -264,43 +245,44 @@ def robustness_map(
         hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
         f"lie between 1 and {LONGEST_DELAY}.",
     )
-    lines = _shift_vibrations(truth, errors, hardware)
+    if not truth.vibrations and np.any(errors != 0):
+        raise ProblemError(
+            "a frequency error needs a vibration in the truth; got a truth without any."
+        )
+    lines = [
+        (ensemble_vibration(line), frequencies)
+        for line, frequencies in moved_lines(truth, errors, hardware)
+    ]
     noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
-
-    def evaluate(delay: float, some: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return Strehl ratio, residual and stability for some gains and all errors."""
-        ensemble = LoopEnsemble(
-            sensor_gain=np.repeat(some, errors.size),
-            delay_frames=hardware.delay_frames + delay,
-            noise_nm=noise_nm,
-            turbulence=truth.turbulence,
-            vibrations=tuple(
-                replace(line, frequency_hz=np.tile(line.frequency_hz, some.size)) for line in lines
-            ),
-        )
-        found = ensemble_residuals(design.controller, hardware, ensemble)
-        if advance is not None:
-            advance(some.size * errors.size)
-        shape = (some.size, errors.size)
-        return (
-            found.strehl(imaging).reshape(shape),
-            found.rms_nm.reshape(shape),
-            found.stable.reshape(shape),
-        )
-
-    parts = np.split(gains, range(_GAINS_AT_ONCE, gains.size, _GAINS_AT_ONCE))
-    found = [[evaluate(delay, some) for some in parts] for delay in delays]
-    strehls, residuals, stable = (
-        np.stack([np.concatenate([part[kind] for part in row]) for row in found])
-        for kind in range(3)
-    )
+    size = delays.size, gains.size, errors.size
+    maps = {name: np.empty(size) for name in ("strehl", "residual_nm", "stable")}
+    for d, delay in enumerate(delays):
+        for start in range(0, gains.size, _GAINS_AT_ONCE):
+            some = slice(start, start + _GAINS_AT_ONCE)
+            count = gains[some].size
+            ensemble = LoopEnsemble(
+                sensor_gain=np.repeat(gains[some], errors.size),
+                delay_frames=hardware.delay_frames + delay,
+                noise_nm=noise_nm,
+                turbulence=truth.turbulence,
+                vibrations=tuple(
+                    replace(line, frequency_hz=np.tile(frequencies, count))
+                    for line, frequencies in lines
+                ),
+            )
+            loops = ensemble_residuals(design.controller, hardware, ensemble)
+            columns = stack_columns(loops, imaging)
+            for name, numbers in maps.items():
+                numbers[d, some] = columns[name].reshape(count, errors.size)
+            if advance is not None:
+                advance(count * errors.size)
     return RobustnessMap(
         errors_hz=errors,
         sensor_gains=gains,
         delay_errors_frames=delays,
-        strehl=read_only(strehls),
-        residual_nm=read_only(residuals),
-        stable=read_only(stable[..., 0]),
+        strehl=read_only(maps["strehl"]),
+        residual_nm=read_only(maps["residual_nm"]),
+        stable=read_only(maps["stable"][..., 0] == 1),
         band_hz=_errors_in_band(design, truth),
     )
 
@@ -335,28 +317,3 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     if np.unique(axis).size != axis.size:
         raise ProblemError(f"{name} must hold each value once; got {axis.tolist()}.")
     return axis
-
-
-def _shift_vibrations(
-    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
-) -> list[EnsembleVibration]:
-    """Return the true vibrations, each at its frequency under every error."""
-    if not truth.vibrations and np.any(errors_hz != 0):
-        raise ProblemError(
-            "a frequency error needs a vibration in the truth; got a truth without any."
-        )
-    nyquist = hardware.frame_rate_hz / 2
-    moved = []
-    for vibration in stationary_vibrations(truth.vibrations):
-        checked_direction(vibration, hardware)
-        place_hz = vibration.frequency_hz
-        frequencies = place_hz + truth.frequency_shift_hz(place_hz, 1.0) * errors_hz
-        wrong = ~((frequencies > 0) & (frequencies < nyquist))
-        if np.any(wrong):
-            raise ProblemError(
-                f"errors_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
-                f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at {place_hz:.6g} Hz to "
-                f"{frequencies[wrong][0]:.6g} Hz."
-            )
-        moved.append(replace(ensemble_vibration(vibration), frequency_hz=frequencies))
-    return moved

@@ -49,10 +49,7 @@ INFO = StudyInfo(
     controllers={"steady": "kalman for the configuration"},
     digests={"steady": "0123456789abcdef" * 4},
     digest="fedcba98" * 8,
-    failures=tuple(
-        lbt.studies.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
-        for row in range(0, 300, 20)
-    ),
+    failures=tuple((row, "frail", f"<b>no</b> design in row {row}") for row in range(0, 300, 20)),
     files=(),
     texts={"Study night.yaml": "samples: 300 # & <script>"},
     versions=(("numpy", "2.4"),),

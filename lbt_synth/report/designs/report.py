@@ -20,8 +20,7 @@ from lbt_synth.report.designs.assessment import DesignAssessment, assess_design,
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
 from lbt_synth.report.figures.loop import frequency_grid
 from lbt_synth.studies import LimitRow
-from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.truth_comparison import TruthComparison
+from lbt_synth.studies.limits import LimitStudy, TruthComparison
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")

@@ -10,10 +10,15 @@ import numpy as np
 from lbt_synth.report.charts.description import Area, Axis, Bars, Chart, Curve, Map, Panel, Rule
 from lbt_synth.report.page.words import chart
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
-from lbt_synth.studies.study.controller_samples import ControllerSamples
-from lbt_synth.studies.study.statistics import StudyStatistics, sample_losses
-from lbt_synth.studies.study.summary import varying_parameters
+from lbt_synth.studies.study.statistics import (
+    ControllerSamples,
+    StudyStatistics,
+    binned_map,
+    cumulative_points,
+    histogram,
+    sample_losses,
+    value_shares,
+)
 from lbt_synth.validation import FloatArray
 
 _UNSTABLE_PANELS = 4
@@ -120,20 +125,19 @@ def _parameter_chart(key: str, panels: Sequence[Panel], columns: int) -> list[Ch
 
 def sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     """First-order indices as bars, one series per controller."""
-    varying = varying_parameters(statistics)
+    varying = statistics.ranked
     if not varying:
         return []
     bars, strongest = [], []
-    for look, one in enumerate(statistics.sensitivities):
-        index = {each.parameter: each.index for each in one.parameters}
-        value = 100 * np.array([index[name].value for name in varying])
-        error = 200 * np.array([index[name].error for name in varying])
+    for look, one in enumerate(statistics.controllers):
+        value = 100 * np.array([one.sensitivity[name]["index"] for name in varying])
+        error = 200 * np.array([one.sensitivity[name]["index_error"] for name in varying])
         shown, low, high = np.maximum((value, value - error, value + error), 0)
         bars.append(Bars(name=one.controller, values=shown, low=low, high=high, look=look))
         first = one.ranked[:1]
         strongest += [
-            f"{one.controller} depends most on {each.parameter}, {100 * each.index.value:.0f} %"
-            for each in first
+            f"{one.controller} depends most on {name}, {100 * one.sensitivity[name]['index']:.0f} %"
+            for name in first
         ] or [f"{one.controller} has none"]
     panel = Panel(
         x=Axis(label="variance explained by itself", unit="%", low=0),
@@ -150,21 +154,20 @@ def conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart]
     The latter are drawn over the parameters that their part changes most with.
     """
     panels, unstable = [], []
-    for name in varying_parameters(statistics):
+    for name in statistics.ranked:
         marks, parts = [], []
         least, span = 100.0, 0.0
-        for look, one in enumerate(statistics.sensitivities):
-            curve = next(each.curve for each in one.parameters if each.parameter == name)
-            if curve is None:
+        for look, one in enumerate(statistics.controllers):
+            if (curve := one.curves.get(name)) is None:
                 continue
-            style: dict[str, Any] = {"x": curve.parameter, "look": look}
+            style: dict[str, Any] = {"x": curve["parameter"], "look": look}
             own = style | {"name": one.controller, "marker": "own", "width": 1.8}
-            mean, low = 100 * curve.mean, 100 * curve.low
+            mean, low = 100 * curve["mean"], 100 * curve["low"]
             marks += [Curve(y=mean, **own), Curve(name="", y=low, width=0.9, hover=False, **style)]
             least = min(least, float(np.min(low)))
-            if curve.unstable.any():
-                parts.append(Curve(y=100 * curve.unstable, **own))
-                span = max(span, float(np.ptp(curve.unstable)))
+            if curve["unstable"].any():
+                parts.append(Curve(y=100 * curve["unstable"], **own))
+                span = max(span, float(np.ptp(curve["unstable"])))
         x = Axis(label=names[name])
         y = Axis(label="Strehl ratio", unit="%", low=0 if least < _HIGH else None)
         panels.append(Panel(x=x, y=y, marks=tuple(marks)))
@@ -186,17 +189,18 @@ def map_charts(
 ) -> list[Chart]:
     """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
     charts = []
-    for place, (one, each) in enumerate(zip(statistics.sensitivities, found, strict=True)):
+    for place, (one, each) in enumerate(zip(statistics.controllers, found, strict=True)):
         if len(one.ranked) < 2:
             continue
-        first, second = (parameter.parameter for parameter in one.ranked[:2])
+        first, second = one.ranked[:2]
         kept = each.evaluated
-        binned = binned_map(parameters[first][kept], parameters[second][kept], each.strehl[kept])
-        low, high = (100 * float(end(binned.mean)) for end in (np.nanmin, np.nanmax))
+        places = parameters[first][kept], parameters[second][kept]
+        columns, rows, mean = binned_map(*places, each.strehl[kept])
+        low, high = (100 * float(end(mean)) for end in (np.nanmin, np.nanmax))
         mark = Map(
-            x=binned.x,
-            y=binned.y,
-            values=100 * binned.mean,
+            x=columns,
+            y=rows,
+            values=100 * mean,
             label="mean Strehl ratio",
             unit="%",
             low=5 * np.floor(low / 5),

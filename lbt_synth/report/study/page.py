@@ -14,7 +14,8 @@ from lbt_synth.report.page.page_files import require_page_names, write_page
 from lbt_synth.report.provenance import time_text
 from lbt_synth.report.study.sections import StudyInfo, study_info, study_sections
 from lbt_synth.storage.words import count_text
-from lbt_synth.studies import Failure, Study, study_statistics
+from lbt_synth.studies import Study, study_statistics
+from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study.statistics import StudyStatistics
 
 
@@ -40,8 +41,8 @@ def write_study_page(
         File to write, that ends in .html, in the directory of the results.
     statistics : StudyStatistics, optional
         Those of the columns, if they are known already.
-    failures : sequence of Failure, optional
-        What failed.
+    failures : sequence of (int, str, str), optional
+        Row, controller and error of what failed.
     computing_s : float, optional
         Time of all its batches, of all processes together [s].
     pdf : path-like, optional
@@ -65,7 +66,7 @@ def write_study_page(
     >>> study = lbt.studies.load_study("examples/study.yaml")
     >>> values = study.values(0, 2)
     >>> columns = dict(zip(study.parameter_names, values.T))
-    >>> columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    >>> columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = lbt.report.write_study_page(
     ...         study, columns, pathlib.Path(folder) / "summary.html"
@@ -75,7 +76,7 @@ def write_study_page(
     """
     require_page_names(path, pdf, inputs=study.inputs)
     if statistics is None:
-        names = [each.name for each in study.controllers]
+        names = tuple(study.controllers)
         statistics = study_statistics(columns, study.parameter_names, names)
     info = study_info(
         study, directory=Path(path).parent, failures=failures, computing_s=computing_s

@@ -11,6 +11,7 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import provenance
 from lbt_synth.report.page.blocks import Block, Listing, Notice, Paragraph, Section
@@ -20,14 +21,16 @@ from lbt_synth.report.study import charts
 from lbt_synth.storage.array_file import digest
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import duration_text
-from lbt_synth.studies import Failure, Study
+from lbt_synth.studies import Study
+from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study import summary
-from lbt_synth.studies.study.controller_samples import (
+from lbt_synth.studies.study.statistics import (
     ControllerSamples,
+    ControllerStatistics,
+    StudyStatistics,
     read_column,
     read_controller_samples,
 )
-from lbt_synth.studies.study.statistics import ControllerStatistics, StudyStatistics
 from lbt_synth.validation import FloatArray
 
 _MOST_FAILURES = 10  # that are listed
@@ -86,12 +89,12 @@ def study_info(
         samples=study.samples,
         sampling=f"{_SAMPLING[settings.sampling]}, seed {settings.seed}",
         evaluation=_EVALUATION[settings.evaluation],
-        parameters={each.name: each.distribution.text for each in study.parameters},
-        controllers={each.name: each.origin for each in study.controllers},
+        parameters={name: section.text for name, section in settings.parameters.items()},
+        controllers={name: section.text for name, section in settings.controllers.items()},
         digests={
-            each.name: digest({name: getattr(each.design.controller, name) for name in "ABCD"}, {})
-            for each in study.controllers
-            if each.design is not None
+            name: digest({matrix: getattr(each.controller, matrix) for matrix in "ABCD"}, {})
+            for name, each in study.controllers.items()
+            if isinstance(each, Design)
         },
         digest=study.digest,
         failures=tuple(failures),
@@ -125,7 +128,7 @@ def study_sections(
         _controllers_section(info, statistics),
         _comparison_section(statistics, found),
         _dependence_section(statistics, found, values, names),
-        _worst_section(info, statistics, names),
+        _worst_section(info, statistics, columns, names),
         Section(
             key="reading",
             title="How to read the figures",
@@ -140,15 +143,15 @@ def _summary_section(
     info: StudyInfo, statistics: StudyStatistics, found: Sequence[ControllerSamples]
 ) -> Section:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    unstable = [each for each in statistics.controllers if each.unstable.count]
+    unstable = [each for each in statistics.controllers if each.unstable]
     failed = [each for each in statistics.controllers if each.failed]
     warnings = []
     if statistics.samples < info.samples:
         warnings.append(paragraph("incomplete", done=statistics.samples, samples=info.samples))
     if unstable:
         parts = ", ".join(
-            f"{each.controller} in {each.unstable.count} of {each.samples} "
-            f"({summary.percent(each.unstable.value, 2)} %)"
+            f"{each.controller} in {each.unstable} of {each.samples} "
+            f"({summary.percent(each.unstable_share.value, 2)} %)"
             for each in unstable
         )
         warnings.append(f"Unstable loops: {parts}.")
@@ -181,11 +184,11 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     text = paragraph(
         "leaders",
         mean=leader(lambda each: each.mean),
-        median=leader(lambda each: each.strehl[3].value),
-        low=leader(lambda each: each.strehl[1].value),
+        median=leader(lambda each: each.strehl[50].value),
+        low=leader(lambda each: each.strehl[5].value),
     )
-    least = min(with_data, key=lambda each: each.loss.loss[1].value)
-    loss = least.loss.loss[1].value
+    least = min(with_data, key=lambda each: each.loss[95].value)
+    loss = least.loss[95].value
     if len(with_data) == 1 or not np.isfinite(loss):
         return text
     return f"{text} {paragraph('regret', name=least.controller, loss=summary.percent(loss))}"
@@ -239,7 +242,7 @@ def _controllers_section(info: StudyInfo, statistics: StudyStatistics) -> Sectio
                     info.controllers.get(each.controller, ""),
                     info.digests.get(each.controller, "-")[:16],
                     str(each.samples),
-                    _count_cell(each.unstable.count),
+                    _count_cell(each.unstable),
                     _count_cell(each.failed),
                 )
                 for each in statistics.controllers
@@ -255,8 +258,7 @@ def _controllers_section(info: StudyInfo, statistics: StudyStatistics) -> Sectio
                 + (f": the first {_MOST_FAILURES}, and {more} more" if more > 0 else ""),
                 headings=("row", "controller", "error"),
                 rows=tuple(
-                    (str(each.row), each.controller, each.error)
-                    for each in info.failures[:_MOST_FAILURES]
+                    (str(row), name, error) for row, name, error in info.failures[:_MOST_FAILURES]
                 ),
                 words=(1, 2),
             )
@@ -286,7 +288,7 @@ def _dependence_section(
     names: Mapping[str, str],
 ) -> Section:
     """Show what the Strehl ratio depends on."""
-    if not summary.varying_parameters(statistics):
+    if not statistics.ranked:
         blocks: tuple[Block, ...] = (Notice(text=paragraph("no-index")),)
         return Section(key="dependence", title="Dependence", blocks=blocks)
     blocks = (
@@ -300,20 +302,24 @@ def _dependence_section(
 
 
 def _worst_section(
-    info: StudyInfo, statistics: StudyStatistics, names: Mapping[str, str]
+    info: StudyInfo,
+    statistics: StudyStatistics,
+    columns: Mapping[str, ArrayLike],
+    names: Mapping[str, str],
 ) -> Section:
     """List the worst samples, and the commands that replay them."""
     blocks: list[Block] = []
     commands = []
     most = 0
-    for each, one in zip(statistics.controllers, statistics.sensitivities, strict=True):
+    for each in statistics.controllers:
         if each.worst:
-            ranked = tuple(p.parameter for p in one.ranked)
+            ranked = each.ranked
             others = tuple(name for name in statistics.parameters if name not in ranked)
             shown = (ranked or others)[:_PARAMETERS]
             most = max(most, len(ranked) - len(shown))
-            blocks.append(summary.worst_table(each, shown, names=names))
-            commands.append(info.replay.replace("{row}", str(each.worst[0].row)))
+            table = summary.worst_table(each, columns, shown, names=names)
+            blocks.append(table)
+            commands.append(info.replay.replace("{row}", str(table.rows[0][0])))
     if most:
         blocks.insert(0, Paragraph(text=paragraph("worst", count=_PARAMETERS)))
     if commands:

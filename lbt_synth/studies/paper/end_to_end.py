@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design, integrator
-from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop import EndToEndSetup, calibrate
 from lbt_synth.interop.specula.cases import make_case, run_case
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
+from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import SinusoidalVibration, Truth
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.studies.grid import loop_columns
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.parameters import TABLE_II, TABLE_III, VIBRATION_HZ, PublishedRow
 from lbt_synth.validation import choice, set_fields
@@ -338,11 +339,9 @@ def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndS
         wavelength_um=system.imaging_wavelength_um,
         other_modes=result["other_modes_strehl"],
     )
-    try:
-        loop = close_loop(system.hardware, row.controller, sensor_gain=gain)
-        return 100 * strehl(residual_budget(loop, truth), imaging)
-    except UnstableLoopError:
-        return 0.0
+    loop = close_loop(system.hardware, row.controller, sensor_gain=gain)
+    numbers = loop_columns(loop, truth, imaging)
+    return 100 * numbers["strehl"] if loop.is_stable else 0.0
 
 
 def rms_modal_difference(table: Iterable[EndToEndEntry], method: str) -> float:

@@ -8,10 +8,9 @@ from dataclasses import field, replace
 import numpy as np
 
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, optimal_integrator
-from lbt_synth.design.result import require_hardware
-from lbt_synth.loop import close_loop, residual_budget, strehl
-from lbt_synth.models import Truth
+from lbt_synth.loop import close_loop
 from lbt_synth.storage.rows import column, table_row
+from lbt_synth.studies.grid import loop_columns
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.parameters import TABLE_II, TABLE_III, VIBRATION_HZ
 from lbt_synth.studies.robustness import RobustnessRow, robustness
@@ -52,7 +51,7 @@ def table_ii() -> list[TableEntry]:
     """Table II: three controllers without and with the vibration."""
     filters = paper_filters()
     hardware = given.kalman_plant().hardware
-    out = []
+    entries = []
     for row in TABLE_II:
         lines = given.PAPER_TRUTH.vibrations if row.vibration else ()
         truth = replace(given.PAPER_TRUTH, vibrations=lines)
@@ -64,16 +63,12 @@ def table_ii() -> list[TableEntry]:
             classical = optimal_integrator(hardware, truth)
         named = {"classical": classical, **{design.method: design for design in filters}}
         for method, design in named.items():
-            out.append(
-                TableEntry(
-                    table="II",
-                    label=row.label,
-                    method=method,
-                    ours=_strehl_percent(design, truth),
-                    paper=getattr(row, method),
-                )
-            )
-    return out
+            loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+            ours = 100 * loop_columns(loop, truth, given.imaging())["strehl"]
+            paper = getattr(row, method)
+            entry = TableEntry(table="II", label=row.label, method=method, ours=ours, paper=paper)
+            entries.append(entry)
+    return entries
 
 
 def table_iii() -> Iterator[RobustnessRow]:
@@ -103,9 +98,3 @@ def compare_with_paper(rows: list[RobustnessRow]) -> list[TableEntry]:
         )
         for row in rows
     ]
-
-
-def _strehl_percent(design: Design, truth: Truth) -> float:
-    hardware = require_hardware(design, "a table")
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    return 100 * strehl(residual_budget(loop, truth), given.imaging())

@@ -17,10 +17,12 @@ from lbt_synth.config.schema import Ar2Section, FileSection
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
+from lbt_synth.methods.request import DesignRequest
 from lbt_synth.storage.atomic_files import refuse_replacing
+from lbt_synth.studies.grid import Failure
+from lbt_synth.studies.study.run import read_manifest, study_parts
 from lbt_synth.studies.study.sample import Sample, design_for_sample, evaluate_row, make_sample
-from lbt_synth.studies.study.store import list_parts, read_manifest, read_row, require_unchanged
-from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Failure, Study
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import integer
 
 _NOISELESS = "has no noise, which no configuration takes: there is none to simulate it with."
@@ -82,19 +84,22 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
         raise ProblemError(f"the study has rows 0 to {study.samples - 1}; got row {row}.")
     folder = Path(directory)
     stored = {}
-    if (manifest := read_manifest(folder, study.digest)) is not None:
-        require_unchanged(folder, manifest)
-        stored = read_row(folder, study, row, list_parts(folder))
+    if read_manifest(folder, study) is not None:
+        parts = study_parts(folder, study)
+        for (start, stop), path in parts.paths().items():
+            if start <= row < stop:
+                numbers = parts.read(path)[0][row - start]
+                stored = dict(zip(study.result_columns, numbers.tolist(), strict=True))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
-    sample = make_sample(study, values)
-    has_noise = bool(np.all(np.asarray(sample.truth.noise_nm) > 0))
+    sample = _, _, truth = make_sample(study, values)
+    has_noise = bool(np.all(np.asarray(truth.noise_nm) > 0))
     return Replay(
         row=row,
         parameters=study.parameters_by_name(values),
         stored=stored,
         fresh=fresh,
-        failures=failures,
+        failures=tuple(failures),
         files=_write_files(study, folder, row, sample, with_config=has_noise),
         unwritten="" if has_noise else f"row {row} {_NOISELESS}",
     )
@@ -105,7 +110,11 @@ def _write_files(
 ) -> tuple[Path, ...]:
     """Write the configuration of a sample and its own designs, and return their paths."""
     path = folder / f"row_{row}.yaml"
-    own = {folder / f"row_{row}_{c.name}.fits": c for c in study.controllers if c.for_sample}
+    own = {
+        folder / f"row_{row}_{name}.fits": controller
+        for name, controller in study.controllers.items()
+        if isinstance(controller, DesignRequest)
+    }
     refuse_replacing([path, *own], study.inputs)
     files = []
     if with_config:
@@ -119,11 +128,11 @@ def _write_files(
 
 def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
     """Return the configuration of the real loop of a sample, and comments on it."""
-    config, truth = sample.config, sample.truth
+    config, hardware, truth = sample
     content = config.settings.model_dump(exclude_unset=True)
     comments = {"": f"Row {row} of the study {study.source.name}: the real loop of the sample."}
-    if sample.hardware is not config.hardware:
-        content["loop"]["delay_frames"] = sample.hardware.delay_frames
+    if hardware is not config.hardware:
+        content["loop"]["delay_frames"] = hardware.delay_frames
         assumed = config.hardware.delay_frames
         comments["loop.delay_frames"] = f"designs assume {assumed:.12g} ({DELAY_ERROR})"
     if truth is not config.truth:

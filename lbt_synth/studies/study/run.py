@@ -2,76 +2,74 @@
 
 from __future__ import annotations
 
-import contextlib
+import json
 import os
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+import lbt_synth
+from lbt_synth.design import Design
 from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.storage.atomic_files import exclusive_lock, make_directory, refuse_replacing
-from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.thread_limits import limit_threads
-from lbt_synth.storage.worker_processes import WorkerPool
-from lbt_synth.studies.study import store
-from lbt_synth.studies.study.batch_evaluation import are_evaluated_together, evaluate_samples
-from lbt_synth.studies.study.engine import (
-    Evaluate,
-    InlineExecutor,
-    TimedBatch,
-    cut_parts,
-    evaluate_parts,
+from lbt_synth.files import save_gain
+from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.storage.atomic_files import (
+    exclusive_lock,
+    open_atomically,
+    refuse_replacing,
+    write_atomically,
 )
-from lbt_synth.studies.study.store import read_results, write_failures, write_results
-from lbt_synth.studies.study.study import Failure, Study
+from lbt_synth.storage.input_files import read_json
+from lbt_synth.storage.rows import Facts, fact, facts
+from lbt_synth.storage.tables import csv_bytes
+from lbt_synth.studies.grid import (
+    Failure,
+    Parts,
+    Result,
+    count_workers,
+    refuse,
+    remove_unfinished,
+    timed,
+)
+from lbt_synth.studies.study.sample import are_evaluated_together, evaluate_samples
+from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
+MANIFEST, PARTS, RESULTS, FAILED = "study.json", "parts", "results.csv", "failed.csv"
+PAGE, PRINT = "summary.html", "summary.pdf"
+_SCHEMA, _SCHEMA_VERSION = "lbt_synth study", 2
+_PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 _MOST_JOBS = 64
 # Rows of a part whose samples are evaluated together: some tenths of a second, of which the check
 # of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
 # each sample takes milliseconds or seconds, a killed study shall lose few of them.
 _ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
 _PARTS_PER_WORKER = 4  # at least, so that none waits long for the last
-_IN_FLIGHT = 2  # parts per worker, so that none waits for the next
 _MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
 _LONG_ENOUGH_S = 1.0
 _NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
 
+Evaluate = Callable[[Study, FloatArray, int], Result]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FinishedStudy:
-    """All results of a finished study."""
-
-    columns: dict[str, FloatArray]  # by name, (n,) each
-    computing_s: float  # time of all batches, summed over processes [s]
-    new: bool  # whether some were computed now; else all were read from the table
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class StudyRun:
-    """What a run of a study did."""
+    """What a run of a study did, and all results."""
 
-    directory: Path  # directory, table of results and table of failures
-    results: Path
+    results: Path  # the table of results, and that of failures
     failed: Path
-    samples: int  # rows of the results
-    computed: int  # how many of them this run computed
-    failures: int  # controllers of samples that have no result
-    computing_s: float  # time of this run until the last row was computed, and to its end [s]
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
-    """What a study will cost."""
-
-    measured_rows: int  # rows of the batch that was measured
-    measured_s: float  # time that it took in one process [s]
-    seconds: float  # time of the whole study on the requested processes [s]
-    disk_bytes: int  # largest size of its directory, while it holds both results and parts
+    columns: dict[str, FloatArray]  # row, parameters and results by name, (n,) each
+    failures: tuple[Failure, ...]  # row, controller and error, in the order of the rows
+    computed: int  # how many rows this run computed
+    computing_s: float  # time of all parts, summed over processes [s]
+    seconds: float  # time of this run [s]
+    new: bool  # whether this run wrote the table of results
 
 
 def run_study(
@@ -83,14 +81,13 @@ def run_study(
     workers: int | None = None,
     evaluate: Evaluate = evaluate_samples,
     progress: Callable[[int], None] | None = None,
-    whole: Callable[[FinishedStudy], None] | None = None,
 ) -> StudyRun:
     """Run what is missing of a study, and write its results.
 
     Every part, a fixed number of rows, is a file in ``parts`` as soon as it is computed, written
     completely or not at all: a study that is killed at any moment, or whose worker died, resumes
     where it was. When all rows are computed, ``results.csv`` is written with one row per sample in
-    order, and ``failed.csv`` with the failures; then the parts are removed.
+    order, and ``failed.csv`` with the failures.
 
     Parameters
     ----------
@@ -107,19 +104,16 @@ def run_study(
         How many parts the executor runs at once, if it does not say so itself; twice as many are
         in flight.
     evaluate : callable, optional
-        ``evaluate(study, values, start)`` returns the :class:`BatchResult` of rows of
-        ``study.values``. Other processes must be able to import it by name.
+        ``evaluate(study, values, start)`` returns columns and failures of rows of
+        ``study.values``, as :func:`evaluate_samples` does. Other processes must be able to import
+        it by name.
     progress : callable, optional
         Called with the number of rows that were found or finished since its last call.
-    whole : callable, optional
-        Called with all results when all rows are computed. The manifest records the end of the
-        study only after it, so that a call that fails is repeated. A study that was finished
-        before calls it, too.
 
     Returns
     -------
     StudyRun
-        What was done. A finished study is not run again.
+        What was done, and all results. A finished study is not run again.
 
     Raises
     ------
@@ -127,7 +121,7 @@ def run_study(
         If there are too many or too few jobs.
     OutputError
         If the directory belongs to another study, is in use or cannot be written, files in it
-        would be replaced, or its results were changed.
+        would be replaced, or a part or a design in it was changed.
     NumericalError
         If a worker dies, or an executor breaks; what is finished is kept.
 
@@ -141,174 +135,173 @@ def run_study(
     ...     _ = (folder / "lbt.yaml").write_bytes(pathlib.Path("examples/lbt.yaml").read_bytes())
     ...     run = lbt.studies.run_study(lbt.studies.load_study(folder / "small.yaml"), folder)
     ...     again = lbt.studies.run_study(lbt.studies.load_study(folder / "small.yaml"), folder)
-    >>> run.results.name, run.computed, again.computed
-    ('results.csv', 4, 0)
+    >>> run.results.name, run.computed, again.computed, run.columns["kalman.strehl"].shape
+    ('results.csv', 4, 0, (4,))
     """
     require_instance(study, Study)
     jobs = integer(jobs, "jobs", at_least=1)
     most = max(_MOST_JOBS, 8 * (os.cpu_count() or 1))
     if jobs > most:
         raise ProblemError(f"jobs must be at most {most} on this machine; got {jobs}.")
-    if executor is not None:
-        at_once = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
-        jobs = integer(at_once, "workers", at_least=1)
+    at_once = integer(count_workers(executor, jobs, workers), "workers", at_least=1)
     folder = Path(directory)
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
-    computed, computing_s = 0, 0.0
-    count = progress or (lambda rows: None)
+    parts, count = study_parts(folder, study), progress or (lambda rows: None)
     with exclusive_lock(folder, "study"):
-        store.remove_unfinished(folder)
-        manifest = _begin(folder, study)
-        if manifest.finished:
-            store.remove_parts(folder)  # a run was killed while it removed them
-            count(study.samples)
-            if whole is not None:
-                columns, spent = read_results(folder, study), manifest.computing_seconds
-                whole(FinishedStudy(columns=columns, computing_s=spent, new=False))
-        else:
-            log, missing = _read_parts(study, folder)
-            computed = sum(stop - start for start, stop in missing)
-            if computed < study.samples:
-                count(study.samples - computed)
-            if missing:
-                with _choose_executor(executor, jobs) as chosen:
-                    parts = cut_parts(missing, _part_rows(study, jobs))
-                    in_flight = 1 if isinstance(chosen, InlineExecutor) else _IN_FLIGHT * jobs
-                    batches = evaluate_parts(study, parts, evaluate, chosen, in_flight=in_flight)
-                    _write_parts(study, folder, batches, log, count)
-            computing_s = time.perf_counter() - began
-            manifest = _write_tables(folder, study, manifest, log, began, whole)
+        remove_unfinished(folder, parts.folder)
+        _begin(folder, study, parts)
+        for path in parts.paths().values():
+            parts.read(path)  # refuses what is damaged before any work
+        computed = sum(stop - start for start, stop in parts.missing())
+        if computed < study.samples:
+            count(study.samples - computed)
+        if computed:
+            parts.compute_missing(
+                partial(evaluate, study),
+                lambda rows: (study.values(*rows), rows[0]),
+                part_rows=_part_rows(study, at_once),
+                executor=executor,
+                jobs=at_once,
+                progress=count,
+            )
+        contents = [parts.read(path) for path in parts.paths().values()]
+        failures = sorted(failure for _, failed, _ in contents for failure in failed)
+        results = np.concatenate([result for result, _, _ in contents])
+        table = np.column_stack([np.arange(study.samples), study.values(), results])
+        new = _write_tables(folder, study, table, failures)
     return StudyRun(
-        directory=folder,
-        results=folder / store.RESULTS,
-        failed=folder / store.FAILED,
-        samples=study.samples,
+        results=folder / RESULTS,
+        failed=folder / FAILED,
+        columns=dict(zip(study.columns, np.ascontiguousarray(table.T), strict=True)),
+        failures=tuple(failures),
         computed=computed,
-        failures=manifest.failures,
-        computing_s=computing_s,
+        computing_s=sum(seconds for _, _, seconds in contents),
         seconds=time.perf_counter() - began,
+        new=new,
     )
 
 
-@contextlib.contextmanager
-def _choose_executor(executor: Executor | None, jobs: int) -> Iterator[Executor]:
-    """Provide the caller's executor, new processes with one thread each, or this process."""
-    with ExitStack() as environment:
-        if executor is None and jobs > 1:
-            environment.enter_context(limit_threads())
-            executor = environment.enter_context(WorkerPool(jobs))
-        yield executor or InlineExecutor()
-
-
-def _part_rows(study: Study, workers: int) -> int:
-    """Return the number of rows of a part."""
-    together = all(are_evaluated_together(study, each) for each in study.controllers)
-    share = -(-study.samples // (_PARTS_PER_WORKER * workers))
-    return min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share)
+def study_parts(folder: Path, study: Study) -> Parts:
+    """Return the parts of a study in its directory."""
+    return Parts(
+        folder=folder / PARTS,
+        columns=study.result_columns,
+        rows=study.samples,
+        digest=study.digest,
+    )
 
 
 def output_paths(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, without its parts."""
-    designs = [f"{c.name}.fits" for c in study.controllers if c.is_designed]
-    tables = [store.RESULTS, store.FAILED, store.PAGE, store.PRINT]
-    return [folder / name for name in (store.MANIFEST, *tables, *designs)]
+    designs = [f"{name}.fits" for name in study.designed]
+    return [folder / name for name in (MANIFEST, RESULTS, FAILED, PAGE, PRINT, *designs)]
 
 
-def _begin(folder: Path, study: Study) -> store.Manifest:
-    """Return the manifest of a directory; begin the study if there is none."""
-    manifest = store.read_manifest(folder, study.digest)
-    if manifest is not None:
-        store.read_designs(folder, manifest)
-        if manifest.finished:
-            if all((folder / name).exists() for name in (store.RESULTS, store.FAILED)):
-                store.require_unchanged(folder, manifest)
-            else:
-                manifest = manifest.write(folder, finished=False, tables={})
-    else:
-        if store.list_parts(folder):
-            why = f"holds parts of a study without its {store.MANIFEST}. Name another directory, or"
-            store.refuse(folder, f"{why} delete {folder / store.PARTS}.")
+def _part_rows(study: Study, workers: int) -> int:
+    """Return the number of rows of a part."""
+    together = all(are_evaluated_together(study, each) for each in study.controllers.values())
+    share = -(-study.samples // (_PARTS_PER_WORKER * workers))
+    return min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share)
+
+
+def read_manifest(folder: Path, study: Study) -> dict[str, Any] | None:
+    """Return the manifest of a study in its directory, None if it was not begun there."""
+    path = folder / MANIFEST
+    if not path.exists():
+        return None
+    try:
+        manifest = dict(read_json(path, OutputError))
+        readable = (manifest["schema"], manifest["schema_version"]) == (_SCHEMA, _SCHEMA_VERSION)
+        source, version, _ = manifest["source"], manifest["version"], dict(manifest["designs"])
+    except (ValueError, KeyError, TypeError):
+        readable = False
+    if not readable:
+        refuse(path, "is no manifest of a study that this version reads. Name another directory.")
+    if manifest["digest"] != study.digest:
+        why = (
+            f"was made by lbt_synth {version}; this is {lbt_synth.__version__}"
+            if version != lbt_synth.__version__
+            else f"is of another study: {source} as it was, with its configuration and gain files"
+        )
+        refuse(folder, f"{why}. Name another directory, or delete it.")
+    return manifest
+
+
+def read_designs(folder: Path, study: Study) -> dict[str, Design]:
+    """Return the designs that a study wrote for its controllers, none if it was not begun."""
+    designs = {}
+    for name, expected in ((read_manifest(folder, study) or {}).get("designs", {})).items():
+        if name in study.settings.controllers:
+            path = folder / f"{name}.fits"
+            designs[name], digest = load_with_digest(path)
+            if digest != expected:
+                refuse(
+                    path,
+                    "is not the design that the study was begun with. Put that back, or name "
+                    "another directory.",
+                )
+    return designs
+
+
+def _begin(folder: Path, study: Study, parts: Parts) -> None:
+    """Begin a study with its manifest and its designs, or check that it was begun here."""
+    manifest = read_manifest(folder, study)
+    if manifest is None:
+        if parts.paths():
+            why = f"holds parts of a study without its {MANIFEST}. Name another directory, or"
+            refuse(folder, f"{why} delete {parts.folder}.")
         for path in output_paths(folder, study):
             if path.exists():
                 why = "is not of a study in this directory, and would be replaced. Name another"
-                store.refuse(path, f"{why} directory, or delete it.")
-        manifest = store.new_manifest(study).write(folder)
-    if set(manifest.designs) != {c.name for c in study.controllers if c.is_designed}:
-        # begun now, or killed before they were written
-        manifest = manifest.write(folder, designs=store.write_designs(folder, study))
-    return manifest
+                refuse(path, f"{why} directory, or delete it.")
+        sections = study.settings
+        manifest = {
+            "schema": _SCHEMA,
+            "schema_version": _SCHEMA_VERSION,
+            "digest": study.digest,
+            "version": lbt_synth.__version__,
+            "source": str(study.source),
+            "samples": study.samples,
+            "evaluation": sections.evaluation,
+            "parameters": {name: section.text for name, section in sections.parameters.items()},
+            "controllers": {name: section.text for name, section in sections.controllers.items()},
+            "designs": {},
+        }
+        _write_manifest(folder, manifest)
+    if manifest["designs"].keys() == study.designed.keys():
+        read_designs(folder, study)
+        return
+    # begun now, or killed before they were written
+    saved = {n: save_gain(folder / f"{n}.fits", design) for n, design in study.designed.items()}
+    digests = {name: load_with_digest(path)[1] for name, path in saved.items()}
+    _write_manifest(folder, manifest | {"designs": digests})
 
 
-@dataclass(slots=True)
-class _Log:
-    """What all parts say of their results."""
-
-    failures: list[Failure] = field(default_factory=list)
-    seconds: float = 0.0  # of their batches
-
-    def add(self, failures: Sequence[Failure], seconds: float) -> None:
-        """Add what one part says."""
-        self.failures.extend(failures)
-        self.seconds += seconds
+def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode() + b"\n")
 
 
-def _read_parts(study: Study, folder: Path) -> tuple[_Log, list[store.RowRange]]:
-    """Return what the parts of earlier runs say, and the rows that none of them has."""
-    log, parts = _Log(), store.list_parts(folder)
-    for part in parts:
-        _, failures, seconds = store.read_part(part, study)
-        log.add(failures, seconds)
-    return log, store.missing_rows(parts, study.samples)
-
-
-def _write_parts(
-    study: Study,
-    folder: Path,
-    batches: Generator[TimedBatch, None, None],
-    log: _Log,
-    progress: Callable[[int], None],
-) -> None:
-    """Write each part as it comes."""
-    if make_directory(folder / store.PARTS).is_symlink():
-        path = folder / store.PARTS
-        raise OutputError(f"cannot make the directory {path}: it is a link.", path=folder)
-    with contextlib.closing(batches):
-        for batch, seconds in batches:
-            part = store.write_part(folder, study, batch, seconds)
-            log.add(batch.failures, seconds)
-            progress(part.stop - part.start)
-
-
-def _write_tables(
-    folder: Path,
-    study: Study,
-    manifest: store.Manifest,
-    log: _Log,
-    began: float,
-    whole: Callable[[FinishedStudy], None] | None,
-) -> store.Manifest:
-    """Write the results of all parts, then the manifest, then remove the parts."""
-    parts = store.list_parts(folder)
-    tables = write_results(folder, study, parts), write_failures(folder, log.failures)
-    if whole is not None:
-        columns = read_results(folder, study, parts)
-        whole(FinishedStudy(columns=columns, computing_s=log.seconds, new=True))
-    manifest = manifest.write(
-        folder,
-        finished=True,
-        tables={path.name: file_sha256(path, OutputError) for path in tables},
-        failures=len(log.failures),
-        seconds=manifest.seconds + time.perf_counter() - began,
-        computing_seconds=log.seconds,
-    )
-    store.remove_parts(folder)
-    return manifest
+def _write_tables(folder: Path, study: Study, table: FloatArray, failures: list[Failure]) -> bool:
+    """Write the tables of results and failures that are missing; return whether one was."""
+    results, failed = folder / RESULTS, folder / FAILED
+    new = not (results.exists() and failed.exists())
+    if not failed.exists():
+        write_atomically(failed, csv_bytes(("row", "controller", "error"), failures))
+    if not results.exists():
+        formats = [_PARAMETER] * len(study.parameter_names) + [_RESULT] * len(study.result_columns)
+        line = ",".join(["%d", *formats]) + "\n"
+        with open_atomically(results) as stream:
+            stream.write((",".join(study.columns) + "\n").encode())
+            for start in range(0, len(table), _ROWS_TOGETHER):
+                rows = table[start : start + _ROWS_TOGETHER].tolist()
+                stream.write("".join([line % tuple(row) for row in rows]).encode())
+    return new
 
 
 def estimate_study(
     study: Study, *, workers: int = 1, local: bool = True, evaluate: Evaluate = evaluate_samples
-) -> Estimate:
+) -> Facts:
     """Measure a batch in this process, and estimate what the whole study will cost.
 
     Parameters
@@ -324,8 +317,9 @@ def estimate_study(
 
     Returns
     -------
-    Estimate
-        The estimate.
+    Facts
+        ``measured_rows`` of the batch and ``measured_s``, its time in one process; ``seconds`` of
+        the whole study on the requested processes; ``disk_bytes`` of its directory.
 
     Examples
     --------
@@ -340,16 +334,14 @@ def estimate_study(
     evaluate(study, study.values(0, 1), 0)  # warms up
     while seconds < _LONG_ENOUGH_S and start < study.samples:
         values = study.values(start, min(start + size, study.samples))
-        before = time.perf_counter()
-        evaluate(study, values, start)
-        seconds, rows = time.perf_counter() - before, len(values)
+        rows, (_, seconds) = len(values), timed(evaluate, study, values, start)
         start, size = start + rows, _MEASURED_ROWS * size
     at_once = min(workers, os.cpu_count() or 1) if local else workers
-    table = _NUMBER_BYTES * len(study.columns)
-    parts = _PART_BYTES * len(study.result_columns)
-    return Estimate(
-        measured_rows=rows,
-        measured_s=seconds,
-        seconds=seconds / rows * study.samples / at_once,
-        disk_bytes=study.samples * (table + parts),
+    row_bytes = _NUMBER_BYTES * len(study.columns) + _PART_BYTES * len(study.result_columns)
+    space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
+    return facts(
+        measured_rows=fact(rows, "samples measured in one process"),
+        measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
+        seconds=fact(seconds / rows * study.samples / at_once),  # said in a note, in words
+        disk_bytes=fact(study.samples * row_bytes, "space on the disk, about", **space),
     )

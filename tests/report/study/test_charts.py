@@ -8,7 +8,7 @@ from support.study_pages import CONTROLLERS, page_of, results
 
 from lbt_synth.report.charts.bokeh_charts import embed_charts
 from lbt_synth.report.study.charts import distribution_chart, loss_chart
-from lbt_synth.studies.study.controller_samples import read_controller_samples
+from lbt_synth.studies.study.statistics import read_controller_samples
 
 
 def test_the_size_does_not_grow_with_the_samples():

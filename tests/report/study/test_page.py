@@ -165,7 +165,7 @@ def study():
 def test_a_page_from_a_study_file(study, tmp_path):
     values = study.values(0, 3)
     columns = dict(zip(study.parameter_names, values.T, strict=True))
-    columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
     folder = tmp_path / "a folder"
     folder.mkdir()
     files = lbt.report.write_study_page(study, columns, folder / "summary.html")

@@ -16,7 +16,7 @@ def study():
 
 def test_digests_are_of_the_matrices(study):
     first = study_info(study, directory="out")
-    other = replace(study, controllers=study.controllers[::-1])
+    other = replace(study, controllers=dict(reversed(study.controllers.items())))
     assert study_info(other, directory="out").digests == first.digests
     assert len(set(first.digests.values())) == 3
     assert first.replay.endswith("study.yaml -o out --row {row}")

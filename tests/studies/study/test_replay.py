@@ -1,11 +1,16 @@
 """Rows of a study again."""
 
 import pytest
-from support.studies import LBT_TEXT, evaluate_quickly, load_small_study, make_folder
+from support.studies import (
+    LBT_TEXT,
+    evaluate_quickly,
+    load_small_study,
+    make_folder,
+    part_rows,
+)
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.studies.study.store import list_parts
 
 
 @pytest.mark.parametrize("evaluation", ["exact", "simulation"])
@@ -71,10 +76,10 @@ def test_a_row_of_an_unfinished_study(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         lbt.studies.run_study(study, folder, evaluate=stops)
-    last = list_parts(folder)[-1].stop - 1
+    last = part_rows(folder)[-1][1] - 1
     stored = lbt.studies.replay_row(study, folder, last).stored
     values = study.values(last, last + 1)
-    assert stored["slow.strehl"] == evaluate_quickly(study, values, last).columns["slow.strehl"][0]
+    assert stored["slow.strehl"] == evaluate_quickly(study, values, last)[0]["slow.strehl"][0]
     assert lbt.studies.replay_row(study, folder, 59).stored == {}
     with pytest.raises(ProblemError, match="rows 0 to 59; got row 60"):
         lbt.studies.replay_row(study, folder, 60)
@@ -88,7 +93,7 @@ def test_a_row_whose_design_fails(tmp_path):
         parameters="{loop.delay_frames: {list: [4, 5]}}",
     )
     again = lbt.studies.replay_row(study, make_folder(tmp_path), 1)
-    assert "failed its certificate" in again.failures[0].error
+    assert "failed its certificate" in again.failures[0][2]
     assert [path.name for path in again.files] == ["row_1.yaml"]
 
 

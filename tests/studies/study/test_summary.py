@@ -49,7 +49,7 @@ def test_tables(small):
         angles = lbt.studies.summary_tables(found)[1]
     assert angles.headings[0] == "residual [mas rms]"
     assert {row[0]: row[1] for row in angles.rows if len(row) > 1}["of noise"] == "2.50"
-    worst = worst_table(found.controllers[0], ["gain"])
+    worst = worst_table(found.controllers[0], small, ["gain"])
     assert [cell_text(cell) for cell in worst.rows[0]] == ["11", "unstable", "0.6"]
     assert [cell_text(cell) for cell in worst.rows[1]] == ["12", "40.0", "0.7"]
 
