@@ -12,8 +12,14 @@ from lbt_synth.report.paper import PaperResult, write_paper
 from lbt_synth.storage.atomic_files import make_directory
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import json_record
-from lbt_synth.studies.paper.parameters import DIAMETER_M, TABLE_III, parameter_rows
-from lbt_synth.studies.paper.tables import TableEntry, rms_difference, table_iii
+from lbt_synth.studies.paper.parameters import (
+    DIAMETER_M,
+    TABLE_III,
+    TableEntry,
+    parameter_rows,
+    rms_difference,
+    table_iii,
+)
 
 
 def run(arguments: Namespace) -> Report:

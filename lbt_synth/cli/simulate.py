@@ -42,7 +42,7 @@ from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Column, Facts, columns, json_record, json_units
 from lbt_synth.storage.words import count_text
-from lbt_synth.studies.sensor_failures import run_failures
+from lbt_synth.studies.robustness import run_failures
 from lbt_synth.validation import FloatArray
 
 _DROP = re.compile(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from argparse import Namespace
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,13 +15,17 @@ from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import write_study_page
 from lbt_synth.report.page.page_files import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
-from lbt_synth.storage.rows import fact, facts
+from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
+from lbt_synth.studies.grid import timed
 from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths
 from lbt_synth.studies.study.summary import worst_table
 from lbt_synth.validation import integer
 
 _FAILURE = ("row", "controller", "error")
+_MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
+_LONG_ENOUGH_S = 1.0
+_NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -104,7 +109,6 @@ def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> Study
                 loaded,
                 folder,
                 executor=executor,
-                jobs=arguments.jobs,
                 workers=workers,
                 progress=count,
             )
@@ -120,12 +124,14 @@ def _sampling_notes(loaded: studies.Study) -> list[str]:
 
 
 def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
-    with choose_engine(arguments) as (_, workers):
-        count = workers or arguments.jobs
-    with show_spinner("measuring a batch", quiet=arguments.json):
-        cost = studies.estimate_study(loaded, workers=count, local=workers is None)
+    count, local = arguments.jobs, arguments.dask is None
     where = count_text(count, "process", "processes")
-    if workers is not None:
+    if not local:
+        with choose_engine(arguments) as (_, count):
+            pass
+    with show_spinner("measuring a batch", quiet=arguments.json):
+        cost = _estimate(loaded, min(count, os.cpu_count() or 1) if local else count)
+    if not local:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
     parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
     controllers = {name: section.text for name, section in loaded.settings.controllers.items()}
@@ -151,14 +157,33 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     return report
 
 
+def _estimate(loaded: studies.Study, at_once: int) -> Facts:
+    """Measure parts in this process until one is long enough, and say what the whole will cost."""
+    start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
+    studies.evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
+    while seconds < _LONG_ENOUGH_S and start < loaded.samples:
+        values = loaded.values(start, min(start + size, loaded.samples))
+        rows, (_, seconds) = len(values), timed(studies.evaluate_samples, loaded, values, start)
+        start, size = start + rows, _MEASURED_ROWS * size
+    row_bytes = _NUMBER_BYTES * len(loaded.columns) + _PART_BYTES * len(loaded.result_columns)
+    space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
+    return facts(
+        measured_rows=fact(rows, "samples measured in one process"),
+        measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
+        seconds=fact(seconds / rows * loaded.samples / at_once),  # said in a note, in words
+        disk_bytes=fact(loaded.samples * row_bytes, "space on the disk, about", **space),
+    )
+
+
 def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
     with show_spinner("replaying", quiet=arguments.json):
         replay = studies.replay_row(loaded, folder, arguments.row)
-    stored, fresh = replay.stored, replay.fresh
+    stored, fresh, row = replay.stored, replay.fresh, arguments.row
+    values = loaded.parameters_by_name(loaded.values(row, row + 1)[0])
     report = Report(
-        data={name: getattr(replay, name) for name in ("row", "parameters", "stored", "fresh")}
+        data={"row": row, "parameters": values, "stored": stored, "fresh": fresh}
         | {"failures": [dict(zip(_FAILURE, each, strict=True)) for each in replay.failures]},
         notes=[
             *([] if stored else ["note: the study has no result of this row yet."]),
@@ -166,7 +191,7 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
             *([f"note: {replay.unwritten}"] if replay.unwritten else []),
         ],
     )
-    report.add_table(f"Row {replay.row}", ("parameter", "value"), replay.parameters.items())
+    report.add_table(f"Row {row}", ("parameter", "value"), values.items())
     results = [(name, stored.get(name), fresh.get(name)) for name in loaded.result_columns]
     report.add_table("Results", ("result", "stored", "now"), results)
     report.note_files(replay.files)

@@ -17,8 +17,14 @@ from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import csv_rows
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
-from lbt_synth.studies.paper.parameters import TABLE_III, parameter_rows
-from lbt_synth.studies.paper.tables import TableEntry, compare_with_paper, paper_filters, table_ii
+from lbt_synth.studies.paper.parameters import (
+    TABLE_III,
+    TableEntry,
+    compare_with_paper,
+    paper_filters,
+    parameter_rows,
+    table_ii,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

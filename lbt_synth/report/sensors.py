@@ -27,7 +27,7 @@ from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import compare_in_truth
 from lbt_synth.studies.limits import TruthComparison
-from lbt_synth.studies.sensor_failures import run_failures
+from lbt_synth.studies.robustness import run_failures
 
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again
 

@@ -1,8 +1,10 @@
 from .limits import LimitRow as LimitRow
+from .limits import MirrorRow as MirrorRow
+from .limits import TradeoffPoint as TradeoffPoint
 from .limits import compare_in_truth as compare_in_truth
 from .limits import limits as limits
-from .mirror import MirrorRow as MirrorRow
-from .mirror import mirror as mirror
+from .limits import mirror as mirror
+from .limits import tradeoff as tradeoff
 from .paper.end_to_end import EndToEndEntry as EndToEndEntry
 from .paper.end_to_end import end_to_end_tables as end_to_end_tables
 from .robustness import RobustnessMap as RobustnessMap
@@ -10,13 +12,10 @@ from .robustness import RobustnessRow as RobustnessRow
 from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .study.load import load_study as load_study
-from .study.replay import replay_row as replay_row
-from .study.run import estimate_study as estimate_study
+from .study.run import replay_row as replay_row
 from .study.run import run_study as run_study
 from .study.sample import evaluate_samples as evaluate_samples
 from .study.statistics import study_statistics as study_statistics
 from .study.study import Study as Study
 from .study.summary import summary_tables as summary_tables
-from .tradeoff import TradeoffPoint as TradeoffPoint
-from .tradeoff import tradeoff as tradeoff
 from .worst_residual import guaranteed_residual as guaranteed_residual

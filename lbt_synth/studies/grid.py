@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -31,8 +30,6 @@ from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import UNFINISHED, make_directory, write_atomically
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.storage.thread_limits import limit_threads
-from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.validation import FloatArray
 
 Rows = tuple[int, int]  # the first, and the one after the last
@@ -43,7 +40,6 @@ RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what
 }
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
 _DELETE = "Delete it, and it is computed again."
-_IN_FLIGHT = 2  # parts per worker, so that none waits for the next
 
 
 def loop_columns(loop: ClosedLoop, truth: Truth, imaging: Imaging) -> dict[str, float]:
@@ -126,21 +122,15 @@ class Parts:
 
     def write(self, rows: Rows, result: Result, seconds: float) -> None:
         """Write the result of some rows, which has all of them and all columns."""
-        try:
-            columns, failures = result
-            content = np.column_stack([columns[name] for name in self.columns])
-        except (TypeError, ValueError, KeyError):
-            content = np.empty(())
-        if content.shape != (rows[1] - rows[0], len(self.columns)):
-            raise NumericalError(
-                f"the evaluation must return the columns of rows {rows[0]} to {rows[1] - 1} by "
-                "name, and its failures; got something else."
-            )
+        columns, failures = result
+        content = np.column_stack([columns[name] for name in self.columns])
+        if len(content) != rows[1] - rows[0]:
+            raise ValueError(f"{len(content)} rows")
         meta: dict[str, Any] = {"sweep": self.digest, "failures": failures, "seconds": seconds}
         meta["digest"] = array_file.digest({"RESULTS": content}, meta)
         name = "{:010d}-{:010d}.npz".format(*rows)
-        content_bytes = array_file.npz_bytes({"RESULTS": content}, json.dumps(meta))
-        write_atomically(self.folder / name, content_bytes)
+        packed = array_file.npz_bytes({"RESULTS": content}, json.dumps(meta))
+        write_atomically(self.folder / name, packed)
 
     def read(self, path: Path) -> tuple[FloatArray, list[Failure], float]:
         """Return the results of a file (b, columns), its failures and its seconds."""
@@ -164,38 +154,38 @@ class Parts:
         arguments: Callable[[Rows], tuple[Any, ...]],
         *,
         part_rows: int,
-        executor: futures.Executor | None = None,
-        jobs: int = 1,
+        executor: futures.Executor,
+        in_flight: int = 1,
         progress: Callable[[int], None] = lambda rows: None,
     ) -> None:
-        """Evaluate what is missing on an executor or in processes, a few parts in flight.
+        """Evaluate what is missing on an executor, a few parts in flight.
 
         Each part is written as it comes; if one fails as a whole, or its worker dies, the others
         are given up, and a sentence says how to go on.
         """
         if make_directory(self.folder).is_symlink():
             refuse(self.folder, "is a link; expected a directory.")
-        waiting = _cut(self.missing(), part_rows)
+        waiting = iter(
+            (first, min(first + part_rows, stop))
+            for start, stop in self.missing()
+            for first in range(start, stop, part_rows)
+        )
         running: dict[futures.Future[tuple[Result, float]], Rows] = {}
-        with _choose_executor(executor, jobs) as pool:
-            most = 1 if isinstance(pool, InlineExecutor) else _IN_FLIGHT * jobs
-            try:
-                while True:
-                    for rows in islice(waiting, most - len(running)):
-                        with _explain_failure(rows):
-                            running[pool.submit(timed, function, *arguments(rows))] = rows
-                    if not running:
-                        return
-                    done = futures.wait(running, return_when=futures.FIRST_COMPLETED).done
-                    for future in done:
-                        rows = running.pop(future)
-                        with _explain_failure(rows):
-                            result, seconds = future.result()
-                        self.write(rows, result, seconds)
-                        progress(rows[1] - rows[0])
-            finally:
-                for future in running:
-                    future.cancel()
+        try:
+            while True:
+                for rows in islice(waiting, in_flight - len(running)):
+                    with _explain_failure(rows):
+                        running[executor.submit(timed, function, *arguments(rows))] = rows
+                if not running:
+                    return
+                for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
+                    rows = running.pop(future)
+                    with _explain_failure(rows):
+                        self.write(rows, *future.result())
+                    progress(rows[1] - rows[0])
+        finally:
+            for future in running:
+                future.cancel()
 
 
 def remove_unfinished(*folders: Path) -> None:
@@ -215,29 +205,6 @@ def timed(function: Callable[..., Result], *arguments: Any) -> tuple[Result, flo
     before = time.perf_counter()
     result = function(*arguments)
     return result, time.perf_counter() - before
-
-
-def count_workers(executor: futures.Executor | None, jobs: int, workers: int | None) -> int:
-    """Return how many parts run at once."""
-    own = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
-    return jobs if executor is None else own
-
-
-def _cut(ranges: list[Rows], rows: int) -> Iterator[Rows]:
-    """Yield the parts of some ranges: a number of rows each, and less at the end of a range."""
-    for start, stop in ranges:
-        for first in range(start, stop, rows):
-            yield first, min(first + rows, stop)
-
-
-@contextlib.contextmanager
-def _choose_executor(executor: futures.Executor | None, jobs: int) -> Iterator[futures.Executor]:
-    """Provide the caller's executor, new processes with one thread each, or this process."""
-    if executor is not None or jobs == 1:
-        yield executor or InlineExecutor()
-        return
-    with limit_threads(), WorkerPool(jobs) as pool:
-        yield pool
 
 
 @contextlib.contextmanager

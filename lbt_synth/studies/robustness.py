@@ -1,4 +1,4 @@
-"""Robustness of designs: designed again at each frequency error, or fixed over a map of errors."""
+"""Robustness of designs: to frequency errors, over maps of errors, and to sensors that fail."""
 
 from __future__ import annotations
 
@@ -9,11 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.loop import Imaging, LoopEnsemble, close_loop, ensemble_residuals
+from lbt_synth.loop import (
+    Imaging,
+    LoopEnsemble,
+    Simulation,
+    close_loop,
+    ensemble_residuals,
+    residual_budget,
+)
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
+from lbt_synth.loop.simulation.failing_sensors import Drop, Segment, run_segments, simulate_sensors
+from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
@@ -234,7 +244,11 @@ def robustness_map(
     """
     for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
         require_instance(value, kind)
-    hardware = _checked_hardware(design, hardware)
+    hardware = hardware or require_hardware(design, "a map")
+    if hardware.modes > 2:
+        raise DimensionError(
+            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
+        )
     errors = _checked_axis(errors_hz, "errors_hz")
     gains = _checked_axis(sensor_gains, "sensor_gains", above=0)
     delays = _checked_axis(
@@ -297,16 +311,6 @@ def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
     return next(((band.low_hz - most_hz, band.high_hz - most_hz) for band in held), None)
 
 
-def _checked_hardware(design: Design, hardware: LoopHardware | None) -> LoopHardware:
-    """Return the loop of a design, or the other one given, which has one or two axes."""
-    hardware = hardware or require_hardware(design, "a map")
-    if hardware.modes > 2:
-        raise DimensionError(
-            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
-        )
-    return hardware
-
-
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     """Return the values of one axis of the map, each within its bounds and given once."""
     axis = real_array(values, name)
@@ -317,3 +321,73 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     if np.unique(axis).size != axis.size:
         raise ProblemError(f"{name} must hold each value once; got {axis.tolist()}.")
     return axis
+
+
+@table_row
+class SegmentRow:
+    """The residual between two events."""
+
+    start_s: float = column("from", unit="s", format="g")
+    end_s: float = column("to", unit="s", format="g")
+    sensors: str = column("sensors that fail")
+    residual_nm: float = nm_column("simulated", unit="nm rms", format=".2f")
+    exact_nm: float = nm_column(
+        "exact, once settled",
+        unit="nm rms",
+        format=".2f",
+        help="nan where the loop is unstable, a reading is frozen, or a vibration drifts",
+    )
+    strehl: float = percent_column("Strehl", help="nan where the loop is unstable")
+    stable: bool = column("stable", help="Whether the loop is stable with these sensors")
+
+
+def run_failures(
+    design: Design,
+    config: Config,
+    truth: Truth,
+    drops: Sequence[Drop],
+    *,
+    frames: int,
+    cases: int,
+    seed: int,
+) -> tuple[Simulation, list[tuple[Segment, SegmentRow]]]:
+    """Run the loop of a configuration in which sensors fail, none after the end of the run.
+
+    Between failures and returns there is a segment, with a row that has its exact residual, too.
+    """
+    filters, rate = design.controllers, config.hardware.frame_rate_hz
+    hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
+    simulation = simulate_sensors(
+        filters,
+        truth,
+        hardware=hardware,
+        frames=frames,
+        cases=cases,
+        seed=seed,
+        settle_frames=config.settings.simulation.settle_frames,
+        drops=drops,
+    )
+    rows = []
+    for segment in run_segments(drops, frames / rate):
+        loop = close_loop(
+            hardware,
+            filters[frozenset(segment.missing)],
+            sensor_gain=truth.sensor_gain,
+            blind=(*segment.missing, *segment.wrong),
+        )
+        # a frozen reading adds an offset of its own
+        exact = loop.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
+        first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
+        residual = simulation.residual_nm[:, first:last]
+        strehls = [series_strehl(case, config.imaging) for case in residual if loop.is_stable]
+        row = SegmentRow(
+            start_s=segment.start_s,
+            end_s=segment.end_s,
+            sensors=segment.text or "none",
+            residual_nm=float(np.sqrt(np.mean(np.sum(residual**2, axis=2)))),
+            exact_nm=residual_budget(loop, truth).rms_nm if exact else np.nan,
+            strehl=float(np.mean(strehls)) if strehls else np.nan,
+            stable=loop.is_stable,
+        )
+        rows.append((segment, row))
+    return simulation, rows

@@ -10,10 +10,8 @@ with the largest bound is halved until that is close to a residual that occurs.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
 
 import numpy as np
 
@@ -156,24 +154,24 @@ def _branch_and_bound(
     """Halve the box of the largest bound; return the bound, the largest value and its place."""
     ends = [(judge((end, end))[1], end) for end in start]  # the worst is often an end
     best, place = max(ends, key=lambda pair: pair[0])
-    order, halves = count(), [start]  # boxes themselves are not compared
-    boxes: list[tuple[float, int, Box]] = []
+    boxes: list[tuple[float, Box]] = []
+    halves = [start]
     while True:
         for box in halves:
             upper, value = judge(box)
-            heapq.heappush(boxes, (-upper, next(order), box))
+            boxes.append((upper, box))
             if value > best:
                 best, place = value, (box[0] + box[1]) / 2
         if not np.isfinite(best):
             return np.inf, np.inf, place
-        if -boxes[0][0] <= best * (1 + gap) or len(boxes) > _MOST_BOXES:
-            break
-        low, high = heapq.heappop(boxes)[2]
+        widest = int(np.argmax([upper for upper, _ in boxes]))
+        upper, (low, high) = boxes.pop(widest)
+        if upper <= best * (1 + gap) or len(boxes) >= _MOST_BOXES:
+            return max(upper, best), best, place
         side = int(np.argmax(high / low))
         low_half, high_half = high.copy(), low.copy()
         low_half[side] = high_half[side] = np.sqrt(low[side] * high[side])
         halves = [(low, low_half), (high_half, high)]
-    return max(-boxes[0][0], best), best, place
 
 
 def _judge_box(

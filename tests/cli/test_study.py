@@ -15,6 +15,7 @@ from support.processes import alive, wait_for
 from support.studies import TWO, assert_whole, part_rows, read_table, study_file
 
 import lbt_synth as lbt
+from lbt_synth.cli.study import _estimate as estimate
 
 PARAMETERS = (
     "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, truth.sensor_gain: {uniform: [0.5, 1]}, "
@@ -81,6 +82,20 @@ def test_the_command(tmp_path, capsys):
     status, out, error = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "200")
     assert (status, out) == (2, "")
     assert "rows 0 to 199; got row 200" in error
+
+
+def test_an_estimate(tmp_path, monkeypatch):
+    loaded = lbt.studies.load_study(study_file(tmp_path, samples="5000"))
+
+    def slow(study, values, start):
+        time.sleep(1e-3 * len(values))
+
+    monkeypatch.setattr(lbt.studies, "evaluate_samples", slow)
+    cost = estimate(loaded, 1)
+    assert 4 < cost.seconds < 9
+    assert cost.measured_rows >= 1000
+    assert cost.disk_bytes == 5000 * (13 * 8 + 8 * 6)
+    assert estimate(loaded, 100).seconds < 0.09
 
 
 def test_json(tmp_path, capsys):

@@ -7,7 +7,7 @@ import pytest
 import lbt_synth as lbt
 from lbt_synth.report import paper
 from lbt_synth.report.paper import write_paper
-from lbt_synth.studies.paper import tables as compute
+from lbt_synth.studies.paper import parameters as compute
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,9 @@ from support.studies import (
 )
 
 from lbt_synth.errors import NumericalError
+from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.grid import Parts
+from lbt_synth.studies.grid import InlineExecutor, Parts
 
 
 def test_a_sweep_knows_what_is_missing(tmp_path):
@@ -39,7 +40,7 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
         seen.append((start, stop))
         return {"a": np.arange(start, stop)}, []
 
-    parts.compute_missing(evaluate, lambda rows: rows, part_rows=2)
+    parts.compute_missing(evaluate, lambda rows: rows, part_rows=2, executor=InlineExecutor())
     assert seen == [(0, 2), (6, 8), (8, 9), (10, 12)]  # a fixed number, and less at an end
     whole = np.concatenate([parts.read(path)[0] for path in parts.paths().values()])
     assert whole.ravel().tolist() == list(range(12))
@@ -60,8 +61,8 @@ def raises(study, values, start):
 @pytest.mark.parametrize(
     ("evaluate", "message"),
     [
-        (wrong, "must return the columns of rows 0 to"),
-        (short, "must return the columns of rows 0 to"),
+        (wrong, r"rows 0 to 3 have no result \(ValueError"),
+        (short, r"rows 0 to 3 have no result \(ValueError: 3 rows\)"),
         (raises, r"rows 0 to 3 have no result \(RuntimeError: no such thing\)"),
     ],
 )
@@ -125,10 +126,12 @@ def dies_once(study, values, start):
 def test_a_dead_process_ends_the_run_and_the_next_one_goes_on(tmp_path, monkeypatch):
     monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
     study, folder = load_small_study(tmp_path, samples="80"), make_folder(tmp_path)
-    with pytest.raises(NumericalError, match="a process died.*start the study again"):
-        run_study(study, folder, jobs=2, evaluate=dies_once)
+    words = "a process died.*start the study again"
+    with pytest.raises(NumericalError, match=words), WorkerPool(2) as pool:
+        run_study(study, folder, executor=pool, evaluate=dies_once)
     kept = sum(stop - start for start, stop in part_rows(folder))
     assert 0 < kept < 80
-    again = run_study(study, folder, jobs=2, evaluate=dies_once)
+    with WorkerPool(2) as pool:
+        again = run_study(study, folder, executor=pool, evaluate=dies_once)
     assert (again.computed, again.failures) == (80 - kept, ())
     assert_whole(folder, study)

@@ -13,15 +13,17 @@ from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.study.statistics import (
     ControllerSamples,
     StudyStatistics,
-    binned_map,
-    cumulative_points,
-    histogram,
+    is_list,
     sample_losses,
-    value_shares,
 )
 from lbt_synth.validation import FloatArray
 
 _UNSTABLE_PANELS = 4
+_POINTS = 200  # of a cumulative distribution
+_BINS = 30  # of a histogram, at most
+_CELLS = 32  # along either axis of a map, at most
+_WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
+_PER_CELL = 8  # samples in a cell of a map on average, at least
 _HIGH = 40.0  # Strehl ratio [%] above which the axis need not start at 0
 Names = Mapping[str, str]  # what each parameter is called
 
@@ -223,3 +225,69 @@ def map_charts(
             )
         )
     return charts
+
+
+def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return levels (k,) and the part of the values at or below each, denser in the tails."""
+    ordered, n = np.sort(values), len(values)
+    ranks = np.arange(n)
+    if n > 2 * _POINTS:
+        tail = np.geomspace(1, n / 4, _POINTS // 4).astype(np.int64) - 1
+        even = np.linspace(0, n - 1, _POINTS).astype(np.int64)
+        ranks = np.concatenate((tail, n - 1 - tail, even))
+    level = np.unique(ordered[ranks])
+    return level, np.searchsorted(ordered, level, side="right") / n
+
+
+def histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return edges of bins (k + 1,) and the part of the values in each (k,)."""
+    bins = int(np.clip(np.sqrt(len(values)), 4, _BINS))
+    counts, edges = np.histogram(values, bins=bins)
+    return edges, counts / len(values)
+
+
+def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the distinct values of a list parameter and their parts; None if it is no list."""
+    if not is_list(np.sort(values)):
+        return None
+    distinct, counts = np.unique(values, return_counts=True)
+    return distinct, counts / len(values)
+
+
+def binned_map(
+    x: FloatArray, y: FloatArray, result: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the mean of a result (n,) over a grid of two varying parameters (n,).
+
+    It is (ny, nx), nan in a cell without samples, and comes after the centres of the cells, or
+    the values of a list, x (nx,) and y (ny,).
+    """
+    cells = len(x) / _PER_CELL
+    lists = [value_shares(x), value_shares(y)]
+    for listed in lists:
+        cells /= 1 if listed is None else len(listed[0])
+    width = int(np.clip(cells ** (1 / max(lists.count(None), 1)), 3, _CELLS))
+    (columns, x_edges), (rows, y_edges) = (
+        _cells(values, listed, width) for values, listed in zip((x, y), lists, strict=True)
+    )
+    samples = np.histogram2d(y, x, bins=(y_edges, x_edges))[0]
+    sums = np.histogram2d(y, x, bins=(y_edges, x_edges), weights=result)[0]
+    mean = np.full(samples.shape, np.nan)
+    np.divide(sums, samples, out=mean, where=samples > 0)
+    return columns, rows, mean
+
+
+def _cells(
+    values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the centres of the cells along one axis, and their edges."""
+    if listed is not None:
+        centres = listed[0]
+        inner = (centres[:-1] + centres[1:]) / 2
+    else:
+        low, high = np.percentile(values, _WITHIN)
+        if not low < high:
+            low, high = float(np.min(values)), float(np.max(values))
+        edges = np.linspace(low, high, cells + 1)
+        centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
+    return centres, np.concatenate(([-np.inf], inner, [np.inf]))

@@ -121,7 +121,7 @@ def study_sections(
     values = {
         name: read_column(columns, name, statistics.samples) for name in statistics.parameters
     }
-    names = summary.short_names(statistics.parameters)
+    names = short_names(statistics.parameters)
     sections = (
         _summary_section(info, statistics, found),
         _samples_section(info, values, names),
@@ -137,6 +137,18 @@ def study_sections(
         _origin_section(info, statistics),
     )
     return [section for section in sections if section.blocks]
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return for each path its last keys, as many as distinguish it from the others."""
+    out = {}
+    for name in names:
+        keys = name.split(".")
+        for count in range(1, len(keys) + 1):
+            out[name] = ".".join(keys[-count:])
+            if sum(f".{other}".endswith(f".{out[name]}") for other in names) == 1:
+                break
+    return out
 
 
 def _summary_section(
@@ -294,7 +306,6 @@ def _dependence_section(
     blocks = (
         *charts.sensitivity_chart(statistics, names),
         summary.sensitivity_table(statistics, names=names),
-        summary.swing_table(statistics, names=names),
         *charts.conditional_charts(statistics, names),
         *charts.map_charts(statistics, found, values, names),
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 import lbt_synth
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.load import read_mapping, validate_sections
-from lbt_synth.config.samples import Keys
+from lbt_synth.config.samples import Keys, find_number, parse_path
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, refuse_config
 from lbt_synth.files.gain_file.store import load_with_digest
@@ -23,12 +23,9 @@ from lbt_synth.studies.study.sample import Sample, close_sample_loop, make_sampl
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
     NOISE_FACTOR,
-    ParameterSection,
     Study,
     StudySection,
-    find_number,
     is_error,
-    parse_path,
     result_columns,
 )
 
@@ -172,10 +169,12 @@ def _require_places(settings: StudySection, config: Config, source: Path) -> Non
     taken: dict[Keys, str] = {}
     for name, section in settings.parameters.items():
         with refuse_config(f"{source}: parameters.{name}", f"parameters.{name}"):
-            if is_error(name):
-                _require_error(name, section)
-                continue
-            for place in (name, *section.also):
+            if is_error(name) and name not in (DELAY_ERROR, NOISE_FACTOR):
+                errors = f"{DELAY_ERROR} and {NOISE_FACTOR}"
+                raise ConfigError(f"the errors of a loop are {errors}; got {name}.")
+            if is_error(name) and section.also:
+                raise ConfigError("an error of the loop is in no configuration; leave also out.")
+            for place in () if is_error(name) else (name, *section.also):
                 if isinstance(find_number(full, place), int) and not section.values:
                     raise ConfigError(
                         "it is an integer, which takes a list of values; got a distribution of all "
@@ -185,15 +184,6 @@ def _require_places(settings: StudySection, config: Config, source: Path) -> Non
                 if keys in taken:
                     raise ConfigError(f"{place} is given twice, by {taken[keys]} and {name}.")
                 taken[keys] = name
-
-
-def _require_error(name: str, section: ParameterSection) -> None:
-    """Refuse an error of the loop that there is not, or that goes with a key."""
-    errors = DELAY_ERROR, NOISE_FACTOR
-    if name not in errors:
-        raise ConfigError(f"the errors of a loop are {' and '.join(errors)}; got {name}.")
-    if section.also:
-        raise ConfigError("an error of the loop is in no configuration; leave also out.")
 
 
 def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:

@@ -1,7 +1,8 @@
-"""Run a study, or what is missing of it, and write its results; estimate what it will cost."""
+"""Run a study, or what is missing of it, and write its results; replay a row of it."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -15,10 +16,17 @@ from typing import Any
 import numpy as np
 
 import lbt_synth
+from lbt_synth.config import save_config
+from lbt_synth.config.ensemble import EXPECTED_ERRORS
+from lbt_synth.config.load import validate_sections
+from lbt_synth.config.plant_and_truth import turbulence_sections
+from lbt_synth.config.schema import Ar2Section, FileSection
+from lbt_synth.config.write import turbulence_content
 from lbt_synth.design import Design
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.methods.request import DesignRequest
 from lbt_synth.storage.atomic_files import (
     exclusive_lock,
     open_atomically,
@@ -26,34 +34,38 @@ from lbt_synth.storage.atomic_files import (
     write_atomically,
 )
 from lbt_synth.storage.input_files import read_json
-from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.grid import (
     Failure,
+    InlineExecutor,
     Parts,
     Result,
-    count_workers,
     refuse,
     remove_unfinished,
-    timed,
 )
-from lbt_synth.studies.study.sample import are_evaluated_together, evaluate_samples
-from lbt_synth.studies.study.study import Study
+from lbt_synth.studies.study.sample import (
+    Sample,
+    are_evaluated_together,
+    design_for_sample,
+    evaluate_row,
+    evaluate_samples,
+    make_sample,
+)
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
 MANIFEST, PARTS, RESULTS, FAILED = "study.json", "parts", "results.csv", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _SCHEMA, _SCHEMA_VERSION = "lbt_synth study", 2
 _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
-_MOST_JOBS = 64
 # Rows of a part whose samples are evaluated together: some tenths of a second, of which the check
 # of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
 # each sample takes milliseconds or seconds, a killed study shall lose few of them.
 _ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
+_IN_FLIGHT = 2  # parts per worker, so that none waits for the next
 _PARTS_PER_WORKER = 4  # at least, so that none waits long for the last
-_MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
-_LONG_ENOUGH_S = 1.0
-_NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
+
+_NOISELESS = "has no noise, which no configuration takes: there is none to simulate it with."
 
 Evaluate = Callable[[Study, FloatArray, int], Result]
 
@@ -77,7 +89,6 @@ def run_study(
     directory: str | os.PathLike[str],
     *,
     executor: Executor | None = None,
-    jobs: int = 1,
     workers: int | None = None,
     evaluate: Evaluate = evaluate_samples,
     progress: Callable[[int], None] | None = None,
@@ -96,10 +107,8 @@ def run_study(
     directory : path-like
         An existing directory.
     executor : concurrent.futures.Executor, optional
-        Runs the parts; any executor, also a Dask ``Client.get_executor()``. It is left open.
-    jobs : int, optional
-        Processes, if there is no executor: at most eight per processor of the machine, or 64.
-        With 1 the study runs in this process.
+        Runs the parts, in processes or as a Dask ``Client.get_executor()``; it is left open. By
+        default they run in this process.
     workers : int, optional
         How many parts the executor runs at once, if it does not say so itself; twice as many are
         in flight.
@@ -117,8 +126,6 @@ def run_study(
 
     Raises
     ------
-    ProblemError
-        If there are too many or too few jobs.
     OutputError
         If the directory belongs to another study, is in use or cannot be written, files in it
         would be replaced, or a part or a design in it was changed.
@@ -139,18 +146,17 @@ def run_study(
     ('results.csv', 4, 0, (4,))
     """
     require_instance(study, Study)
-    jobs = integer(jobs, "jobs", at_least=1)
-    most = max(_MOST_JOBS, 8 * (os.cpu_count() or 1))
-    if jobs > most:
-        raise ProblemError(f"jobs must be at most {most} on this machine; got {jobs}.")
-    at_once = integer(count_workers(executor, jobs, workers), "workers", at_least=1)
+    at_once = 1
+    if executor is not None:
+        at_once = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
+    at_once = integer(at_once, "workers", at_least=1)
     folder = Path(directory)
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
     parts, count = study_parts(folder, study), progress or (lambda rows: None)
     with exclusive_lock(folder, "study"):
         remove_unfinished(folder, parts.folder)
-        _begin(folder, study, parts)
+        _begin(folder, study)
         for path in parts.paths().values():
             parts.read(path)  # refuses what is damaged before any work
         computed = sum(stop - start for start, stop in parts.missing())
@@ -161,12 +167,12 @@ def run_study(
                 partial(evaluate, study),
                 lambda rows: (study.values(*rows), rows[0]),
                 part_rows=_part_rows(study, at_once),
-                executor=executor,
-                jobs=at_once,
+                executor=executor or InlineExecutor(),
+                in_flight=1 if executor is None else _IN_FLIGHT * at_once,
                 progress=count,
             )
         contents = [parts.read(path) for path in parts.paths().values()]
-        failures = sorted(failure for _, failed, _ in contents for failure in failed)
+        failures = [failure for _, failed, _ in contents for failure in failed]
         results = np.concatenate([result for result, _, _ in contents])
         table = np.column_stack([np.arange(study.samples), study.values(), results])
         new = _write_tables(folder, study, table, failures)
@@ -244,28 +250,20 @@ def read_designs(folder: Path, study: Study) -> dict[str, Design]:
     return designs
 
 
-def _begin(folder: Path, study: Study, parts: Parts) -> None:
+def _begin(folder: Path, study: Study) -> None:
     """Begin a study with its manifest and its designs, or check that it was begun here."""
     manifest = read_manifest(folder, study)
     if manifest is None:
-        if parts.paths():
-            why = f"holds parts of a study without its {MANIFEST}. Name another directory, or"
-            refuse(folder, f"{why} delete {parts.folder}.")
         for path in output_paths(folder, study):
             if path.exists():
                 why = "is not of a study in this directory, and would be replaced. Name another"
                 refuse(path, f"{why} directory, or delete it.")
-        sections = study.settings
         manifest = {
             "schema": _SCHEMA,
             "schema_version": _SCHEMA_VERSION,
             "digest": study.digest,
             "version": lbt_synth.__version__,
             "source": str(study.source),
-            "samples": study.samples,
-            "evaluation": sections.evaluation,
-            "parameters": {name: section.text for name, section in sections.parameters.items()},
-            "controllers": {name: section.text for name, section in sections.controllers.items()},
             "designs": {},
         }
         _write_manifest(folder, manifest)
@@ -299,49 +297,119 @@ def _write_tables(folder: Path, study: Study, table: FloatArray, failures: list[
     return new
 
 
-def estimate_study(
-    study: Study, *, workers: int = 1, local: bool = True, evaluate: Evaluate = evaluate_samples
-) -> Facts:
-    """Measure a batch in this process, and estimate what the whole study will cost.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Replay:
+    """A row of a study, computed again."""
+
+    stored: dict[str, float]  # its results in the study; empty if it has none yet
+    # its results computed now, by the reference evaluation; without those that failed
+    fresh: dict[str, float]
+    failures: tuple[Failure, ...]  # what failed now
+    # files that were written: the configuration, and the designs for this sample
+    files: tuple[Path, ...]
+    unwritten: str = ""  # why there is no configuration; empty if there is one
+
+
+def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
+    """Compute one row of a study again, and write it as a configuration.
+
+    ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with the
+    seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs
+    for each sample, which assume the delay and the noise of ``config``, are ``row_N_NAME.fits``.
 
     Parameters
     ----------
     study : Study
         The study.
-    workers : int, optional
-        Processes that it will run on.
-    local : bool, optional
-        Whether they run on this machine, and so no more at once than it has processors.
-    evaluate : callable, optional
-        As for :func:`run_study`.
+    directory : path-like
+        Its directory, finished or not.
+    row : int
+        The number of the row.
 
     Returns
     -------
-    Facts
-        ``measured_rows`` of the batch and ``measured_s``, its time in one process; ``seconds`` of
-        the whole study on the requested processes; ``disk_bytes`` of its directory.
+    Replay
+        Parameters, stored and fresh results.
+
+    Raises
+    ------
+    ProblemError
+        If the study has no such row, or the configuration refuses its numbers.
+    OutputError
+        If the directory belongs to another study, or cannot be written.
 
     Examples
     --------
-    >>> import lbt_synth as lbt
-    >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> cost = lbt.studies.estimate_study(study, workers=2)
-    >>> cost.seconds > 0, cost.disk_bytes
-    (True, 1974272)
+    >>> import lbt_synth as lbt, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = lbt.studies.replay_row(lbt.studies.load_study("examples/study.yaml"), folder, 3)
+    >>> [path.name for path in again.files], round(again.fresh["kalman.strehl"], 3)
+    (['row_3.yaml'], 0.832)
     """
-    workers = integer(workers, "workers", at_least=1)
-    start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
-    evaluate(study, study.values(0, 1), 0)  # warms up
-    while seconds < _LONG_ENOUGH_S and start < study.samples:
-        values = study.values(start, min(start + size, study.samples))
-        rows, (_, seconds) = len(values), timed(evaluate, study, values, start)
-        start, size = start + rows, _MEASURED_ROWS * size
-    at_once = min(workers, os.cpu_count() or 1) if local else workers
-    row_bytes = _NUMBER_BYTES * len(study.columns) + _PART_BYTES * len(study.result_columns)
-    space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
-    return facts(
-        measured_rows=fact(rows, "samples measured in one process"),
-        measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
-        seconds=fact(seconds / rows * study.samples / at_once),  # said in a note, in words
-        disk_bytes=fact(study.samples * row_bytes, "space on the disk, about", **space),
+    row = integer(row, "row", at_least=0)
+    if row >= study.samples:
+        raise ProblemError(f"the study has rows 0 to {study.samples - 1}; got row {row}.")
+    folder = Path(directory)
+    stored = {}
+    if read_manifest(folder, study) is not None:
+        parts = study_parts(folder, study)
+        for (start, stop), path in parts.paths().items():
+            if start <= row < stop:
+                numbers = parts.read(path)[0][row - start]
+                stored = dict(zip(study.result_columns, numbers.tolist(), strict=True))
+    values = study.values(row, row + 1)[0]
+    fresh, failures = evaluate_row(study, values, row)
+    sample = _, _, truth = make_sample(study, values)
+    has_noise = bool(np.all(np.asarray(truth.noise_nm) > 0))
+    return Replay(
+        stored=stored,
+        fresh=fresh,
+        failures=tuple(failures),
+        files=_write_files(study, folder, row, sample, with_config=has_noise),
+        unwritten="" if has_noise else f"row {row} {_NOISELESS}",
     )
+
+
+def _write_files(
+    study: Study, folder: Path, row: int, sample: Sample, *, with_config: bool
+) -> tuple[Path, ...]:
+    """Write the configuration of a sample and its own designs, and return their paths."""
+    path = folder / f"row_{row}.yaml"
+    own = {
+        folder / f"row_{row}_{name}.fits": controller
+        for name, controller in study.controllers.items()
+        if isinstance(controller, DesignRequest)
+    }
+    refuse_replacing([path, *own], study.inputs)
+    files = []
+    if with_config:
+        settings, comments = _row_settings(study, row, sample)
+        files.append(save_config(path, settings, comments=comments))
+    for gain, controller in own.items():
+        with contextlib.suppress(*EXPECTED_ERRORS):  # they are among the failures
+            files.append(save_gain(gain, design_for_sample(controller, sample)))
+    return tuple(files)
+
+
+def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
+    """Return the configuration of the real loop of a sample, and comments on it."""
+    config, hardware, truth = sample
+    content = config.settings.model_dump(exclude_unset=True)
+    comments = {"": f"Row {row} of the study {study.source.name}: the real loop of the sample."}
+    if hardware is not config.hardware:
+        content["loop"]["delay_frames"] = hardware.delay_frames
+        assumed = config.hardware.delay_frames
+        comments["loop.delay_frames"] = f"designs assume {assumed:.12g} ({DELAY_ERROR})"
+    if truth is not config.truth:
+        sensor = content["sensor"]
+        content["sensor"] = {k: v for k, v in sensor.items() if k not in ("noise_mas", "pyramid")}
+        content["sensor"]["noise_nm"] = np.asarray(truth.noise_nm).tolist()
+        assumed_nm = ", ".join(f"{value:.12g}" for value in np.ravel(config.noise_nm))
+        comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
+        if any(isinstance(section, Ar2Section) for section in turbulence_sections(config.settings)):
+            # keep what was fitted above the noise that designs assume
+            sections = [turbulence_content(model) for model in config.plant.turbulence]
+            same = all(section == sections[0] for section in sections)
+            content["model"]["turbulence"] = sections[0] if same else sections
+    content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)
+    return validate_sections(FileSection, content, study.config.source), comments

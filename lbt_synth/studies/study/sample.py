@@ -4,30 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from lbt_synth.config import Config, ensemble
-from lbt_synth.config.ensemble import EXPECTED_ERRORS, AssumedAxis, Samples
+from lbt_synth.config.ensemble import EXPECTED_ERRORS, Samples
 from lbt_synth.config.load import build_config, validate_sections
-from lbt_synth.config.samples import Keys, Reads
+from lbt_synth.config.samples import Reads, set_number
 from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, refuse_config
-from lbt_synth.linear import solve_dare
-from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop import ClosedLoop, simulate
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest
-from lbt_synth.models import LoopHardware, PositionLoop, Truth, Vibration, tip_tilt_plant
-from lbt_synth.models.plant.readings import known_states
+from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import Failure, Result, loop_columns, stack_columns
-from lbt_synth.studies.study.study import DELAY_ERROR, EXACT_COLUMNS, NOISE_FACTOR, Study
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray, IntArray
 
 _AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
@@ -37,7 +32,9 @@ _FEWEST = 4  # samples in a group that is worth an ensemble
 Sample = tuple[Config, LoopHardware, Truth]
 
 
-def evaluate_samples(study: Study, values: FloatArray, start: int) -> Result:
+def evaluate_samples(
+    study: Study, values: FloatArray, start: int, *, together: bool = True
+) -> Result:
     """Evaluate consecutive samples.
 
     Samples whose configurations differ by numbers that its builders take as arrays are evaluated
@@ -54,6 +51,8 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> Result:
         Rows of ``Study.values``.
     start : int
         Number of the first sample.
+    together : bool, optional
+        False evaluates all of them one by one.
 
     Returns
     -------
@@ -76,24 +75,27 @@ def evaluate_samples(study: Study, values: FloatArray, start: int) -> Result:
     >>> columns["kalman.strehl"].round(3).tolist(), columns["kalman.stable"].tolist(), failures
     ([0.837, 0.821], [1.0, 1.0], [])
     """
-    together: dict[str, FloatArray] = {}  # results of ensembles, by column
+    columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
+    failures: list[Failure] = []
     remaining: dict[int, list[str]] = {}  # controllers to evaluate one by one, by sample
     for name, controller in study.controllers.items():
-        table = {column: np.full(len(values), np.nan) for column in EXACT_COLUMNS}
-        for rows, columns in _evaluate_groups(study, controller, values):
-            for column, numbers in columns.items():
-                table[column][rows] = numbers
+        for rows, results in _evaluate_groups(study, controller, values) if together else ():
+            for column, numbers in results.items():
+                columns[f"{name}.{column}"][rows] = numbers
             i = int(rows[rows.size // 2])
-            among = {f"{name}.{column}": float(table[column][i]) for column in table}
             alone = replace(study, controllers={name: controller})
+            among = {column: float(columns[column][i]) for column in alone.result_columns}
             _require_agreement(alone, values[i], start + i, among)
-        for i in np.flatnonzero(np.isnan(table["stable"])).tolist():
+        for i in np.flatnonzero(np.isnan(columns[f"{name}.stable"])).tolist():
             remaining.setdefault(i, []).append(name)
-        together |= {f"{name}.{column}": numbers for column, numbers in table.items()}
-    results, failures = evaluate_rows(study, values, start, remaining=remaining)
-    for column, numbers in results.items():
-        np.copyto(numbers, together[column], where=~np.isnan(together[column]))
-    return results, failures
+    for i, names in sorted(remaining.items()):
+        some = replace(study, controllers={name: study.controllers[name] for name in names})
+        with np.errstate(all="ignore"):  # what overflows fails its checks
+            single, failed = evaluate_row(some, values[i], start + i)
+        failures += failed
+        for column, value in single.items():
+            columns[column][i] = value
+    return columns, failures
 
 
 def are_evaluated_together(study: Study, controller: Design | DesignRequest) -> bool:
@@ -120,7 +122,7 @@ def _evaluate_groups(
     for rows in _find_groups(study, values, reads):
         try:
             config, hardware, _ = make_sample(study, values[rows[0]])
-            if fixed is None and not _has_independent_axes(config):
+            if fixed is None and not ensemble.has_independent_axes(config):
                 continue
             samples = _stack_samples(study, config, values[rows], reads)
             accepted = ensemble.accepted_samples(samples)
@@ -128,7 +130,7 @@ def _evaluate_groups(
                 continue
             samples = samples.take(accepted)
             with np.errstate(over="raise", divide="raise", invalid="raise"):
-                matrices = _design_for_samples(samples) if fixed is None else fixed
+                matrices = ensemble.kalman_matrices(samples) if fixed is None else fixed
                 loops = ensemble.build_ensemble(samples)
                 residuals = residuals_from_matrices(matrices, hardware, loops)
             columns = stack_columns(residuals, config.imaging)
@@ -179,76 +181,6 @@ def _require_agreement(
             )
 
 
-def _has_independent_axes(config: Config) -> bool:
-    """Whether the Kalman filter of a configuration separates into one per axis."""
-    hardware, settings = config.hardware, config.settings
-    return (
-        settings.sensor.matrix is None
-        and np.array_equal(hardware.influence, np.eye(hardware.modes))
-        and all(np.count_nonzero(line.direction) == 1 for line in config.plant.vibrations)
-        and all(section.spread_hz is None for section in settings.model.vibrations or ())
-    )
-
-
-def _design_for_samples(samples: Samples) -> tuple[FloatArray, ...]:
-    """Design a Kalman filter for each sample, and return their textbook matrices."""
-    first, *others = ensemble.assumed_axes(samples)
-    mirror = samples.config.hardware.mirror
-    design = _design_axis(first, mirror)
-    same = (design if axis.equals(first) else _design_axis(axis, mirror) for axis in others)
-    return _combine_axes([design, *same])
-
-
-def _design_axis(axis: AssumedAxis, mirror: PositionLoop | None) -> tuple[FloatArray, ...]:
-    """Design the Kalman filters of one axis, one per sample; their equations are solved at once.
-
-    Return the matrices A, B and C of all controllers, as :meth:`TipTiltPlant.controller` has them.
-    """
-    plants = [
-        tip_tilt_plant(
-            frame_rate_hz=axis.turbulence.frame_rate_hz,
-            turbulence=axis.turbulence.model(i),
-            noise_nm=axis.noise_nm[i],
-            vibrations=[
-                Vibration(frequency_hz=f, damping=d, rms_nm=r, direction=(1.0,))
-                for f, d, r in axis.vibrations[i].tolist()
-            ]
-            or None,
-            delay_frames=axis.delay_frames,
-            sensor_gain=axis.sensor_gain[i],
-            modes=1,
-            mirror=mirror,
-        )
-        for i in range(len(axis.noise_nm))
-    ]
-    A, C, L, Q, R = (np.stack([getattr(plant, name) for plant in plants]) for name in "ACLQR")
-    gains = transpose(solve_dare(transpose(A), transpose(C), Q, R).gain_feedback)
-    unit = replace(plants[0].hardware, sensor_matrix=None)
-    (A_known,), (B_known,), C_known, D_known = known_states(unit)
-    count, n, past = *gains.shape[:2], len(A_known)
-    sensor = axis.sensor_gain[:, None, None]
-    whole, zeros = np.zeros((count, n + past, n + past)), np.zeros((count, past, 1))
-    whole[:, :n, :n], whole[:, n:, n:] = A, A_known
-    entry = np.concatenate([gains, zeros], axis=1)
-    estimate = np.concatenate([L, transpose(zeros)], axis=2)
-    applied = np.vstack([np.zeros((n, 1)), B_known]) - entry @ (sensor * D_known)
-    seen = np.concatenate([C, sensor * C_known], axis=2)
-    return whole - entry @ seen + applied @ estimate, entry, estimate
-
-
-def _combine_axes(axes: list[tuple[FloatArray, ...]]) -> tuple[FloatArray, ...]:
-    """Combine the controllers of all axes into one for each sample, in textbook form."""
-    ends = np.cumsum([0, *(A.shape[-1] for A, *_ in axes)])
-    count = len(axes[0][0])
-    A, B = np.zeros((count, ends[-1], ends[-1])), np.zeros((count, ends[-1], len(axes)))
-    C, D = np.zeros((count, len(axes), ends[-1])), np.zeros((count, len(axes), len(axes)))
-    for axis, (a, b, c) in enumerate(axes):
-        x = slice(*ends[axis : axis + 2])
-        A[:, x, x], B[:, x, axis], C[:, axis, x] = a, b[..., 0], (c @ a)[:, 0]
-        D[:, axis, axis] = (c @ b)[:, 0, 0]
-    return A, B, C, D
-
-
 def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
     """Make the sample of a row of ``Study.values``."""
     base, parameters = study.config, study.parameters_by_name(values)
@@ -256,7 +188,7 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
     content = base.settings.model_dump(exclude_unset=True)
     for name, places in study.places.items():
         for keys in places:
-            _set_number(content, keys, parameters[name], full=full)
+            set_number(content, keys, parameters[name], full=full)
     config = build_config(validate_sections(FileSection, content, base.source), base.source)
     delay_error, factor = parameters.get(DELAY_ERROR, 0.0), parameters.get(NOISE_FACTOR, 1.0)
     hardware, truth = config.hardware, config.truth
@@ -266,49 +198,6 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
         if factor != 1:
             truth = replace(truth, noise_nm=truth.noise_nm * factor)
     return config, hardware, truth
-
-
-def _set_number(
-    content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]
-) -> None:
-    """Set a number that :func:`find_number` finds in ``full``, the content with its defaults.
-
-    Missing sections on the way are added, missing lists copied. An integer stays one if it can.
-    """
-    here: Any = content
-    whole: Any = full
-    for key in keys[:-1]:
-        whole = whole[key]
-        if isinstance(here, dict) and key not in here:
-            here[key] = deepcopy(whole) if isinstance(whole, list) else {}
-        here = here[key]
-    is_integer = isinstance(whole[keys[-1]], int) and value.is_integer()
-    here[keys[-1]] = int(value) if is_integer else value
-
-
-def evaluate_rows(
-    study: Study,
-    values: FloatArray,
-    start: int,
-    *,
-    remaining: Mapping[int, Sequence[str]] | None = None,
-) -> Result:
-    """Evaluate consecutive rows of ``Study.values``, (b, parameters), one by one.
-
-    ``remaining`` names the controllers to evaluate on each row, by its place; all by default.
-    """
-    if remaining is None:
-        remaining = dict.fromkeys(range(len(values)), tuple(study.controllers))
-    columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
-    failures: list[Failure] = []
-    for i, names in sorted(remaining.items()):
-        some = replace(study, controllers={name: study.controllers[name] for name in names})
-        with np.errstate(all="ignore"):  # what overflows fails its checks
-            results, failed = evaluate_row(some, values[i], start + i)
-        failures += failed
-        for name, value in results.items():
-            columns[name][i] = value
-    return columns, failures
 
 
 def evaluate_row(

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array, integer, number
+from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
 PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
 LEVELS = (0.3, 0.5, 0.7, 0.8)
 CONFIDENCE = 0.95
+_MOST_WORST = 10  # samples that are listed
 _PARTS = ("turbulence", "vibration", "noise")
 _EQUAL = 1e-6  # difference of Strehl ratios that is rounding: the accuracy of the evaluation
 _FEWEST = 20  # samples for an index
@@ -25,14 +26,7 @@ _CONSTANT = 1e-12  # of the largest result: a smaller scatter is rounding
 _FEW_GROUPS, _MANY_SAMPLES = 8, 4096
 _GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # of a curve: samples, and groups if there are fewer
 _MOST_GROUPS = 32
-_MIDDLE = 0.05, 0.95  # of the samples, over which a swing is taken
-_RARE = 0.01  # of the samples, too few for a value of a list
 _MOST_VALUES = 32  # a parameter with more distinct values is continuous
-_POINTS = 200  # of a cumulative distribution
-_BINS = 30  # of a histogram, at most
-_CELLS = 32  # along either axis of a map, at most
-_WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
-_PER_CELL = 8  # samples in a cell of a map on average, at least
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,11 +69,11 @@ class ControllerStatistics:
     best: Interval  # share of the samples on which no controller has a higher Strehl ratio
     loss: dict[float, Interval]  # percentiles of the highest Strehl ratio of all minus this one
     worst: tuple[int, ...]  # places of the samples on which it does worst, the worst first
-    # for each parameter: index and index_error of the variance that it explains by itself,
-    # spearman, the rank correlation, and swing and swing_error of the mean; nan for a constant
+    # for each parameter: index, the part of the variance that it explains by itself, index_error,
+    # and spearman, the rank correlation; nan for a constant
     sensitivity: dict[str, dict[str, float]]
-    # Strehl ratio in groups of each parameter that varies, (k,) each: the parameter, mean,
-    # mean_error, low, its 10th percentile, unstable, the part of the loops, and samples
+    # Strehl ratio in groups of each parameter that varies, (k,) each: the parameter, mean, low, its
+    # 10th percentile, and unstable, the part of the loops
     curves: dict[str, dict[str, FloatArray]]
 
     @property
@@ -103,8 +97,11 @@ class StudyStatistics:
     @property
     def ranked(self) -> tuple[str, ...]:
         """The parameters with an index for any controller, by falling greatest index."""
-        pairs = [(each.sensitivity[name]["index"], name) for each in self.controllers
-                 for name in each.ranked]  # fmt: skip
+        pairs = [
+            (each.sensitivity[name]["index"], name)
+            for each in self.controllers
+            for name in each.ranked
+        ]
         return tuple(dict.fromkeys(name for _, name in sorted(pairs, key=lambda pair: -pair[0])))
 
 
@@ -112,9 +109,6 @@ def study_statistics(
     columns: Mapping[str, ArrayLike],
     parameters: Sequence[str],
     controllers: Sequence[str],
-    *,
-    levels: Sequence[float] = LEVELS,
-    worst: int = 10,
 ) -> StudyStatistics:
     """Compute the statistics of a study's results.
 
@@ -129,10 +123,6 @@ def study_statistics(
         Names of the parameters.
     controllers : sequence of str
         Names of the controllers.
-    levels : sequence of float, optional
-        Strehl ratios in [0, 1]: the samples above each are counted.
-    worst : int, optional
-        Worst samples to list for each controller.
 
     Returns
     -------
@@ -143,7 +133,7 @@ def study_statistics(
     Raises
     ------
     ProblemError
-        If a column is missing or holds impossible values, or a value is out of range.
+        If a column is missing or holds impossible values.
 
     Examples
     --------
@@ -166,8 +156,6 @@ def study_statistics(
             raise ProblemError(f"{what} must be a list of different names; got {names!r}.")
     if not controllers:
         raise ProblemError("controllers must name one at least; got none.")
-    levels = [number(level, "levels", at_least=0, at_most=1) for level in levels]
-    worst = integer(worst, "worst", at_least=0)
     size = len(read_column(columns, f"{controllers[0]}.stable"))
     if not size:
         raise ProblemError("the results must have at least one sample; got none.")
@@ -181,7 +169,7 @@ def study_statistics(
         samples=size,
         parameters=tuple(parameters),
         controllers=tuple(
-            _controller_statistics(each, loss, levels, _worst(each, rows, worst), values, orders)
+            _controller_statistics(each, loss, rows, values, orders)
             for each, loss in zip(samples, sample_losses(samples), strict=True)
         ),
         comparisons={
@@ -194,8 +182,7 @@ def study_statistics(
 def _controller_statistics(
     samples: ControllerSamples,
     loss: FloatArray,
-    levels: Sequence[float],
-    worst: tuple[int, ...],
+    rows: IntArray,
     values: Mapping[str, FloatArray],
     orders: Mapping[str, IntArray],
 ) -> ControllerStatistics:
@@ -216,7 +203,7 @@ def _controller_statistics(
         mean=mean,
         mean_error=error,
         strehl=percentiles(strehl, PERCENTS),
-        above={level: share(strehl > level) for level in levels},
+        above={level: share(strehl > level) for level in LEVELS},
         residual_nm=percentiles(samples.residual_nm[samples.evaluated], PERCENTS),
         parts_nm={
             part: float(np.median(numbers[stable])) if stable.any() else np.nan
@@ -224,20 +211,17 @@ def _controller_statistics(
         },
         best=share(loss <= _EQUAL),
         loss=percentiles(loss, (50.0, 95.0, 99.0)),
-        worst=worst,
+        worst=_worst(samples, rows),
         sensitivity={name: row for name, (row, _) in dependence.items()},
         curves={name: curve for name, (_, curve) in dependence.items() if curve},
     )
 
 
-def _worst(samples: ControllerSamples, rows: IntArray, count: int) -> tuple[int, ...]:
+def _worst(samples: ControllerSamples, rows: IntArray) -> tuple[int, ...]:
     """Return the places of the samples of least Strehl ratio, the unstable ones first."""
     places = np.flatnonzero(samples.evaluated)
-    key = np.where(samples.unstable, -1.0, samples.strehl)[places]
-    if 0 < count < len(places):  # sort no more than those up to the last one wanted
-        least = key <= np.partition(key, count - 1)[count - 1]
-        places, key = places[least], key[least]
-    return tuple(places[np.lexsort((rows[places], key))[:count]].tolist())
+    order = np.lexsort((rows[places], samples.strehl[places], ~samples.unstable[places]))
+    return tuple(places[order[:_MOST_WORST]].tolist())
 
 
 def _compare(first: ControllerSamples, second: ControllerSamples) -> dict[str, float]:
@@ -379,14 +363,13 @@ def _sensitivity(
     """Return how the Strehl ratio depends on one parameter, and its curve."""
     order = order[samples.evaluated[order]]
     ordered, strehl = values[order], samples.strehl[order]
-    names = ("index", "index_error", "spearman", "swing", "swing_error")
     if len(ordered) < _FEWEST or ordered[0] == ordered[-1]:
-        return dict.fromkeys(names, np.nan), {}
-    curve, *swing = conditional_curve(ordered, strehl, samples.unstable[order])
+        return dict.fromkeys(("index", "index_error", "spearman"), np.nan), {}
+    index, error = first_order_index(ordered, strehl)
     with np.errstate(invalid="ignore"):  # nan if the Strehl ratio is constant
         spearman = float(np.corrcoef(_ranks(ordered), ranks[order])[0, 1])
-    numbers = (*first_order_index(ordered, strehl), spearman, *swing)
-    return dict(zip(names, numbers, strict=True)), curve
+    row = {"index": index, "index_error": error, "spearman": spearman}
+    return row, conditional_curve(ordered, strehl, samples.unstable[order])
 
 
 def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, float]:
@@ -399,9 +382,7 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, f
     """
     n = len(ordered)
     largest = float(np.max(np.abs(result), initial=0.0))
-    if n < _FEWEST or ordered[0] == ordered[-1] or largest == 0:
-        return np.nan, np.nan
-    spread = result / largest - np.mean(result / largest)
+    spread = result / (largest or 1.0) - np.mean(result / (largest or 1.0))
     total = float(spread @ spread)
     if total <= n * _CONSTANT**2:
         return np.nan, np.nan
@@ -446,30 +427,18 @@ def _lines(
 
 def conditional_curve(
     ordered: FloatArray, strehl: FloatArray, unstable: BoolArray
-) -> tuple[dict[str, FloatArray], float, float]:
-    """Return the Strehl ratio (n,) in groups of a parameter in rising order (n,), by column.
-
-    The swing comes with it, the range of the mean over the middle 90 % of samples, and its error;
-    of a list over all values, but for those that hardly any sample has.
-    """
-    n, listed = len(ordered), is_list(ordered)
+) -> dict[str, FloatArray]:
+    """Return the Strehl ratio (n,) in groups of a parameter in rising order (n,), by column."""
+    n = len(ordered)
     groups = next((k for limit, k in _GROUPS if n < limit), _MOST_GROUPS)
-    starts = value_starts(ordered) if listed else group_starts(ordered, groups)
+    starts = value_starts(ordered) if is_list(ordered) else group_starts(ordered, groups)
     rows = []
     for group in np.split(np.arange(n), starts[1:]):
-        size, (mean, error) = len(group), mean_and_error(strehl[group])
-        middle = 0.5 * (ordered[group[(size - 1) // 2]] + ordered[group[size // 2]])
-        low = np.percentile(strehl[group], 10)
-        rows.append((middle, mean, error, low, np.mean(unstable[group]), size))
-    names = ("parameter", "mean", "mean_error", "low", "unstable", "samples")
-    curve = dict(zip(names, np.array(rows, dtype=np.float64).T, strict=True))
-    centre = (np.cumsum(curve["samples"]) - curve["samples"] / 2) / n
-    inside = (centre >= _MIDDLE[0]) & (centre <= _MIDDLE[1])
-    if listed:
-        inside = curve["samples"] >= max(2.0, _RARE * n)
-    mean, error = curve["mean"][inside], curve["mean_error"][inside]
-    top, bottom = np.argmax(mean), np.argmin(mean)
-    return curve, float(mean[top] - mean[bottom]), float(np.hypot(error[top], error[bottom]))
+        here = strehl[group]
+        middle = 0.5 * (ordered[group[(len(group) - 1) // 2]] + ordered[group[len(group) // 2]])
+        rows.append((middle, np.mean(here), np.percentile(here, 10), np.mean(unstable[group])))
+    names = ("parameter", "mean", "low", "unstable")
+    return dict(zip(names, np.array(rows, dtype=np.float64).T, strict=True))
 
 
 def _ranks(ordered: FloatArray) -> FloatArray:
@@ -498,71 +467,3 @@ def group_starts(ordered: FloatArray, groups: int) -> IntArray:
     """
     n = len(ordered)
     return np.unique(np.searchsorted(ordered, ordered[np.arange(groups) * n // groups]))
-
-
-def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return levels (k,) and the part of the values at or below each, denser in the tails."""
-    ordered = np.sort(values)
-    n = len(ordered)
-    if n <= 2 * _POINTS:
-        ranks = np.arange(n)
-    else:
-        tail = np.unique(np.geomspace(1, n / 4, _POINTS // 4).astype(np.int64)) - 1
-        even = np.linspace(0, n - 1, _POINTS).astype(np.int64)
-        ranks = np.unique(np.concatenate((tail, n - 1 - tail, even)))
-    level = np.unique(ordered[ranks])
-    return level, np.searchsorted(ordered, level, side="right") / n
-
-
-def histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return edges of bins (k + 1,) and the part of the values in each (k,)."""
-    bins = int(np.clip(np.sqrt(len(values)), 4, _BINS))
-    counts, edges = np.histogram(values, bins=bins)
-    return edges, counts / len(values)
-
-
-def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return the distinct values of a list parameter and their parts; None if it is no list."""
-    if not is_list(np.sort(values)):
-        return None
-    distinct, counts = np.unique(values, return_counts=True)
-    return distinct, counts / len(values)
-
-
-def binned_map(
-    x: FloatArray, y: FloatArray, result: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the mean of a result (n,) over a grid of two varying parameters (n,).
-
-    It is (ny, nx), nan in a cell without samples, and comes after the centres of the cells, or
-    the values of a list, x (nx,) and y (ny,).
-    """
-    cells = len(x) / _PER_CELL
-    lists = [value_shares(x), value_shares(y)]
-    for listed in lists:
-        cells /= 1 if listed is None else len(listed[0])
-    width = int(np.clip(cells ** (1 / max(lists.count(None), 1)), 3, _CELLS))
-    (columns, x_edges), (rows, y_edges) = (
-        _cells(values, listed, width) for values, listed in zip((x, y), lists, strict=True)
-    )
-    samples = np.histogram2d(y, x, bins=(y_edges, x_edges))[0]
-    sums = np.histogram2d(y, x, bins=(y_edges, x_edges), weights=result)[0]
-    mean = np.full(samples.shape, np.nan)
-    np.divide(sums, samples, out=mean, where=samples > 0)
-    return columns, rows, mean
-
-
-def _cells(
-    values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the centres of the cells along one axis, and their edges."""
-    if listed is not None:
-        centres = listed[0]
-        inner = (centres[:-1] + centres[1:]) / 2
-    else:
-        low, high = np.percentile(values, _WITHIN)
-        if not low < high:
-            low, high = float(np.min(values)), float(np.max(values))
-        edges = np.linspace(low, high, cells + 1)
-        centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
-    return centres, np.concatenate(([-np.inf], inner, [np.inf]))

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import difflib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 from scipy.special import ndtr, ndtri
 
 from lbt_synth.config import Config
-from lbt_synth.config.samples import Keys
+from lbt_synth.config.samples import Keys, parse_path
 from lbt_synth.design import Design
-from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.request import DesignRequest
-from lbt_synth.storage.words import count_text
 from lbt_synth.studies.grid import RESIDUALS
 from lbt_synth.validation import FloatArray, IntArray, integer
 
@@ -28,9 +25,7 @@ DELAY_ERROR = "error.delay_frames"
 NOISE_FACTOR = "error.noise_factor"
 EXACT_COLUMNS = ("strehl", *RESIDUALS, "stable")
 SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
-_BLOCK = 1 << 14  # points of a Sobol sequence that are drawn together
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
-_KEY = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
 ControllerName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=100)]
 
 
@@ -336,29 +331,25 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
     The seed fixes every point. A longer Sobol sequence begins with the same points, and is
     balanced where it has 2^k of them. A Latin hypercube is made as a whole, once per process.
     """
+    from scipy.stats import qmc
+
     if dimensions == 0 or stop == start:
         return np.zeros((stop - start, dimensions))
     if settings.sampling == "latin_hypercube":
         return _hypercube(settings.samples, dimensions, settings.seed)[start:stop]
-    first, last = start // _BLOCK, (stop - 1) // _BLOCK
-    draw = _known_sobol_points if first == last else _sobol_points  # a part of one block, or more
-    points = draw(dimensions, settings.seed, first, last)
-    return points[start - first * _BLOCK : stop - first * _BLOCK]
+    engine: qmc.Sobol = _sobol(dimensions, settings.seed).reset()
+    if start > 0:
+        return np.asarray(engine.fast_forward(start).random(stop - start))
+    # a first number of points that is no power of 2 is warned of
+    return np.asarray(engine.random(1 << (stop - 1).bit_length())[:stop])
 
 
-def _sobol_points(dimensions: int, seed: int, first: int, last: int) -> FloatArray:
-    """Return the points of some blocks of a sequence, (n, dimensions)."""
+@lru_cache(maxsize=1)
+def _sobol(dimensions: int, seed: int) -> Any:
+    """Return the sequence, as its scrambling takes longer than a batch."""
     from scipy.stats import qmc
 
-    engine = qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
-    if first > 0:
-        engine.fast_forward(first * _BLOCK)
-    points = np.concatenate([engine.random(_BLOCK) for _ in range(first, last + 1)])
-    points.setflags(write=False)
-    return points
-
-
-_known_sobol_points = lru_cache(maxsize=1)(_sobol_points)  # scrambling takes longer than a batch
+    return qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
 
 
 @lru_cache(maxsize=1)
@@ -366,71 +357,9 @@ def _hypercube(samples: int, dimensions: int, seed: int) -> FloatArray:
     from scipy.stats import qmc
 
     engine = qmc.LatinHypercube(dimensions, seed=np.random.default_rng(seed))
-    points = np.asarray(engine.random(samples))
-    points.setflags(write=False)
-    return points
+    return np.asarray(engine.random(samples))
 
 
 def is_error(parameter: str) -> bool:
     """Whether a parameter is an error of the loop, which is in no configuration."""
     return parameter.split(".")[0] == "error"
-
-
-@lru_cache(maxsize=256)
-def parse_path(path: str) -> Keys:
-    """Parse a path into its keys."""
-    keys: list[str | int] = []
-    for word in path.split("."):
-        match = _KEY.fullmatch(word)
-        if match is None:
-            raise ConfigError(
-                f"{path!r} is no path in a configuration; expected one such as "
-                "truth.vibrations[0].frequency_hz."
-            )
-        keys += [match[1], *map(int, re.findall(r"[0-9]+", match[2]))]
-    return tuple(keys)
-
-
-def find_number(content: Mapping[str, Any], path: str) -> float:
-    """Return the number to which a path leads; refuse a path that leads to none."""
-    here: Any = content
-    parent: Any = {}
-    walked = ""
-    for key in parse_path(path):
-        place = walked or "the configuration"
-        listed = isinstance(key, int)
-        if not isinstance(here, list if listed else dict):
-            says = "is no list" if listed else "has no keys"
-            raise ConfigError(f"{path}: {place} {says}; {_describe(here)}.")
-        if isinstance(key, int) and key >= len(here):
-            raise ConfigError(
-                f"{path}: {place} has {count_text(len(here), 'entry', 'entries')}, "
-                f"counted from 0; got [{key}]."
-            )
-        if isinstance(key, str) and key not in here:
-            close = difflib.get_close_matches(key, list(here), n=1, cutoff=0.6)
-            hint = f"did you mean {close[0]}? " if close else ""
-            raise ConfigError(
-                f"{path}: {place} has no {key}; {hint}there are {', '.join(sorted(here))}."
-            )
-        walked += f"[{key}]" if listed else f".{key}" if walked else str(key)
-        parent = here
-        here = parent[key]
-    if here is None:
-        entries = parent.items() if isinstance(parent, dict) else ()
-        there = [k for k, v in entries if type(v) in (int, float)]
-        others = f" Numbers that are set there: {', '.join(sorted(there))}." if there else ""
-        raise ConfigError(
-            f"{path} is not set in the configuration, so it cannot be varied.{others}"
-        )
-    if type(here) not in (int, float):
-        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(here)}.")
-    return cast(float, here)
-
-
-def _describe(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"it is a section with {', '.join(sorted(value))}"
-    if isinstance(value, list):
-        return f"it is a list of {len(value)}"
-    return "it is not set" if value is None else f"it is {value!r}"

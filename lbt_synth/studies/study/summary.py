@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,7 +50,7 @@ def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
     >>> first.headings, first.rows[4]
     (('of the Strehl ratio [%]', 'a'), ('50th percentile', '50.0 (46.5 to 53.5)'))
     """
-    kinds = (strehl_table, residual_table, comparison_table, sensitivity_table, swing_table)
+    kinds = (strehl_table, residual_table, comparison_table, sensitivity_table)
     return tuple(table for kind in kinds if (table := kind(statistics)).rows)
 
 
@@ -123,36 +123,33 @@ def comparison_table(statistics: StudyStatistics) -> Table:
 def sensitivity_table(
     statistics: StudyStatistics, *, names: Mapping[str, str] | None = None
 ) -> Table:
-    """First-order indices of the parameters, one column per controller."""
-    sums, remainders = [], []
-    for controller in statistics.controllers:
+    """First-order indices of the parameters with their signs, one column per controller."""
+    controllers, words = statistics.controllers, names or {}
+    totals: list[list[str]] = [[], []]
+    for controller in controllers:
         ranked = [controller.sensitivity[name] for name in controller.ranked]
         total = float(np.sum([row["index"] for row in ranked])) if ranked else np.nan
         error = float(np.linalg.norm([row["index_error"] for row in ranked]))
-        sums.append(_with_error(total, error))
-        remainders.append(_with_error(1 - total, error))
-    rows = _rows_by_parameter(
-        statistics, lambda row: _with_error(row["index"], row["index_error"]), names
-    )
+        for texts, value in zip(totals, (total, 1 - total), strict=True):
+            texts.append(_with_error(value, error))
+    rows: list[_Row] = [
+        (words.get(name, name), *(_share_text(c.sensitivity[name]) for c in controllers))
+        for name in statistics.ranked
+    ]
     if rows:
+        labels = ("sum", "only together (interactions)")
         rows.append(("all of them",))
-        rows += [("sum", *sums), ("only together (interactions)", *remainders)]
-    caption = "Variance of the Strehl ratio that one parameter explains by itself [%]"
+        rows += [(label, *texts) for label, texts in zip(labels, totals, strict=True)]
+    caption = (
+        "Variance of the Strehl ratio that one parameter explains by itself [%] (rank correlation)"
+    )
     return _table_by_controller(caption, "parameter", statistics, rows)
 
 
-def swing_table(statistics: StudyStatistics, *, names: Mapping[str, str] | None = None) -> Table:
-    """How far the mean Strehl ratio moves over each parameter, and in which direction."""
-
-    def swing(row: Mapping[str, float]) -> str:
-        if np.isnan(row["swing"]):
-            return "-"
-        text = _with_error(row["swing"], row["swing_error"])
-        return f"{text} ({cell_text(row['spearman'], '+.2f')})"
-
-    caption = "Points of Strehl ratio over the middle 90 % of a parameter (rank correlation)"
-    rows = _rows_by_parameter(statistics, swing, names)
-    return _table_by_controller(caption, "parameter", statistics, rows)
+def _share_text(row: Mapping[str, float]) -> str:
+    """Return the part that a parameter explains, and the sign of its effect."""
+    text = _with_error(row["index"], row["index_error"])
+    return text if text == "-" else f"{text} ({cell_text(row['spearman'], '+.2f')})"
 
 
 def worst_table(
@@ -181,18 +178,6 @@ def worst_table(
     )
 
 
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return for each path its last keys, as many as distinguish it from the others."""
-    out = {}
-    for name in names:
-        keys = name.split(".")
-        for count in range(1, len(keys) + 1):
-            out[name] = ".".join(keys[-count:])
-            if sum(f".{other}".endswith(f".{out[name]}") for other in names) == 1:
-                break
-    return out
-
-
 def percent(value: float, digits: int = 1) -> str:
     """Return a part as a percentage, a dash if it is nan."""
     return cell_text(100 * value, f".{digits}f")
@@ -211,21 +196,6 @@ def _table_by_controller(
     """Return a table with a column per controller."""
     headings = (heading, *(each.controller for each in statistics.controllers))
     return Table(caption=caption, headings=headings, rows=tuple(rows))
-
-
-def _rows_by_parameter(
-    statistics: StudyStatistics,
-    text: Callable[[Mapping[str, float]], str],
-    names: Mapping[str, str] | None,
-) -> list[_Row]:
-    """Return a row per varying parameter, each cell of its sensitivity."""
-    return [
-        (
-            (names or {}).get(name, name),
-            *(text(c.sensitivity[name]) for c in statistics.controllers),
-        )
-        for name in statistics.ranked
-    ]
 
 
 def _with_error(value: float, error: float, digits: int = 1) -> str:

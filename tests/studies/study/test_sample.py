@@ -193,7 +193,7 @@ def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
     )
     values = study.values(0, count)
     columns, failures = lbt.studies.evaluate_samples(study, values, 0)
-    single, failed = evaluation.evaluate_rows(study, values, 0)
+    single, failed = lbt.studies.evaluate_samples(study, values, 0, together=False)
     assert columns.keys() == single.keys()
     for name, expected in single.items():
         assert columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
@@ -237,7 +237,7 @@ def test_filters_for_their_own_samples(tmp_path, monkeypatch):
     study = lbt.studies.load_study(
         study_file(tmp_path, base=LBT_TEXT, controllers=OWN, parameters=WEATHER)
     )
-    single, _ = evaluation.evaluate_rows(study, study.values(0, 6), 0)
+    single, _ = lbt.studies.evaluate_samples(study, study.values(0, 6), 0, together=False)
     rows = counted(monkeypatch)
     columns, _ = lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
     assert rows == [3]  # all of them at once, and one by itself
@@ -370,7 +370,7 @@ def test_samples_that_the_configuration_refuses(tmp_path):
     values[2, 0] = -5.0
     values[4, 1] = 0.0
     columns, failures = lbt.studies.evaluate_samples(study, values, 100)
-    _, failed = evaluation.evaluate_rows(study, values, 100)
+    _, failed = lbt.studies.evaluate_samples(study, values, 100, together=False)
     assert [failure[:2] for failure in failures] == [
         (102, "slow"),
         (102, "kalman"),

@@ -8,7 +8,6 @@ from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_i
 from lbt_synth.studies.study.summary import (
     comparison_table,
     sensitivity_table,
-    short_names,
     worst_table,
 )
 
@@ -76,11 +75,6 @@ def test_tables_of_one_controller_have_no_comparison():
         "sum",
         "only together (interactions)",
     ]
-    assert index.rows[0][1] == "100.0 ± 0.0"
+    assert index.rows[0][1] == "100.0 ± 0.0 (+1.00)"
     named = sensitivity_table(found, names={"p": "short"})
     assert named.rows[0][0] == "short"
-
-
-def test_short_names_are_different():
-    names = ["a.b.c", "d.b.c", "d.e", "e", "f.g"]
-    assert list(short_names(names).values()) == ["a.b.c", "d.b.c", "d.e", "e", "g"]
