@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 
@@ -18,20 +19,14 @@ from lbt_synth.config.plant_and_truth import (
     turbulence_sections,
     vibration_numbers,
 )
-from lbt_synth.config.samples import Keys, Reads, accepted_by_schema, view_samples
+from lbt_synth.config.samples import Keys, Reads, SampleView, accepted_by_schema
 from lbt_synth.config.schema import Ar1Section, FileSection
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.linear import solve_dare
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
-from lbt_synth.models import (
-    ARModel,
-    FrozenFlows,
-    ModalTurbulence,
-    TipTiltPlant,
-    Vibration,
-    tip_tilt_plant,
-)
+from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
+from lbt_synth.models import FrozenFlows, TipTiltPlant, Vibration, tip_tilt_plant
 from lbt_synth.models.plant.readings import known_states
 from lbt_synth.models.turbulence.ar_models import ar1_flows
 from lbt_synth.validation import FloatArray, IntArray
@@ -59,7 +54,7 @@ class Samples:
     @property
     def settings(self) -> FileSection:
         """Their settings, with arrays for the numbers that differ."""
-        return view_samples(self.config.settings, self.reads, self.values)
+        return cast(FileSection, SampleView(self.config.settings, self.reads, self.values))
 
     def take(self, rows: IntArray) -> Samples:
         """Return some of the samples."""
@@ -94,10 +89,7 @@ def build_ensemble(samples: Samples) -> LoopEnsemble:
             vibrations.append(EnsembleVibration(**numbers))
             continue
         whole, rate = Vibration(**numbers), config.hardware.frame_rate_hz
-        vibrations += [
-            EnsembleVibration(direction=line.direction, **{n: getattr(line, n) for n in _VIBRATION})
-            for line in spread_vibration(whole, section, rate, key)
-        ]
+        vibrations += map(ensemble_vibration, spread_vibration(whole, section, rate, key))
     return LoopEnsemble(
         sensor_gain=relative_gain(settings, config.sensor_gain),
         delay_frames=delay,
@@ -124,12 +116,10 @@ def kalman_matrices(samples: Samples) -> tuple[FloatArray, ...]:
 
     The equations of all samples are solved at once, those of equal axes once.
     """
-    designs: dict[int, tuple[FloatArray, ...]] = {}
-    axes = []
-    for plants in _assumed_plants(samples):
-        if id(plants) not in designs:
-            designs[id(plants)] = _axis_matrices(plants)
-        axes.append(designs[id(plants)])
+    assumed = _assumed_plants(samples)
+    distinct = {id(plants): plants for plants in assumed}
+    designs = {key: _axis_matrices(plants) for key, plants in distinct.items()}
+    axes = [designs[id(plants)] for plants in assumed]
     ends = np.cumsum([0, *(A.shape[-1] for A, *_ in axes)])
     A = np.zeros((samples.count, ends[-1], ends[-1]))
     B, C = np.zeros((samples.count, ends[-1], len(axes))), np.zeros_like(A[:, : len(axes)])
@@ -173,14 +163,17 @@ def _assumed_plants(samples: Samples) -> list[list[TipTiltPlant]]:
     plants: dict[tuple[bytes, ...], list[TipTiltPlant]] = {}
     for axis, section in enumerate(turbulence_sections(settings)):
         model = config.plant.turbulence[axis]
-        air = _modal_turbulence(model, flows if isinstance(section, Ar1Section) else None, count)
+        coefficients = np.tile(model.coefficients, (count, 1))
+        driving = np.full(count, model.driving_rms_nm)
+        if flows is not None and isinstance(section, Ar1Section):
+            coefficients, driving = ar1_flows(flows, frame_rate_hz=model.frame_rate_hz)
         shakes = np.stack(lines[axis], axis=1) if lines[axis] else np.empty((count, 0, 3))
-        arrays = (air.coefficients, air.driving_rms_nm, noise[:, axis], gains[:, axis], shakes)
+        arrays = (coefficients, driving, noise[:, axis], gains[:, axis], shakes)
         keys.append(tuple(array.tobytes() for array in arrays))
         plants[keys[-1]] = plants.get(keys[-1]) or [
             tip_tilt_plant(
-                frame_rate_hz=air.frame_rate_hz,
-                turbulence=air.model(i),
+                frame_rate_hz=model.frame_rate_hz,
+                turbulence=replace(model, coefficients=coefficients[i], driving_rms_nm=driving[i]),
                 noise_nm=noise[i, axis],
                 vibrations=[
                     Vibration(frequency_hz=f, damping=d, rms_nm=r, direction=(1.0,))
@@ -237,15 +230,3 @@ def _frozen_flows(samples: Samples) -> FrozenFlows | None:
     weather = {name: getattr(air.per_sample, name) for name in WEATHER}
     differing = {name: values for name, values in weather.items() if np.ndim(values)}
     return FrozenFlows(atmosphere=atmosphere, **differing) if differing else None
-
-
-def _modal_turbulence(model: ARModel, flows: FrozenFlows | None, count: int) -> ModalTurbulence:
-    """Return the models of kind ar1 of frozen flows, or the same model for each sample."""
-    if flows is None:
-        coefficients = np.tile(model.coefficients, (count, 1))
-        driving = np.full(count, model.driving_rms_nm)
-    else:
-        coefficients, driving = ar1_flows(flows, frame_rate_hz=model.frame_rate_hz)
-    return ModalTurbulence(
-        coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=model.frame_rate_hz
-    )

@@ -93,13 +93,6 @@ class SampleView:
         return value
 
 
-def view_samples(
-    settings: FileSection, reads: Reads, values: Mapping[Keys, FloatArray] | None = None
-) -> FileSection:
-    """Return the settings of samples with arrays (b,) at some keys; it records what is read."""
-    return cast(FileSection, SampleView(settings, reads, values or {}))
-
-
 def accepted_by_schema(settings: FileSection, keys: Keys, values: FloatArray) -> BoolArray:
     """Return which values (b,) the schema accepts for a number of a section."""
     here: Any = settings

@@ -28,7 +28,7 @@ from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage import array_file
-from lbt_synth.storage.atomic_files import UNFINISHED, make_directory, write_atomically
+from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray
 
@@ -186,13 +186,6 @@ class Parts:
         finally:
             for future in running:
                 future.cancel()
-
-
-def remove_unfinished(*folders: Path) -> None:
-    """Remove what a killed process left unfinished."""
-    for folder in folders:
-        for path in folder.glob(UNFINISHED):
-            path.unlink()
 
 
 def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:

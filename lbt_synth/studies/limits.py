@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,10 +66,7 @@ class LimitRow:
     design: str = column("design", help="Its name")
     method: str = column(help="How it was made")
     residual_nm: float = nm_column(
-        "residual",
-        format=".2f",
-        missing="unstable",
-        help="Residual under the truth, rms",
+        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
     )
     strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
     above_limit_percent: float = column(
@@ -176,15 +175,12 @@ def limits(
     shifts = _frequency_shifts(truth, errors)
     alone = hardware.own_sensor_alone()
     limit = limit_or_none(lambda: least_residual(alone, truth))
-    band_hz = _error_band(truth, shifts)
-    band = None
-    if band_hz is not None:
+    band = band_hz = None
+    if len(vibrations) == 1 and isinstance(vibrations[0], SinusoidalVibration) and shifts.size > 1:
         line = vibrations[0]
-        band = limit_or_none(
-            lambda: least_worst_residual(
-                alone, truth, band_hz=band_hz, rms_nm=line.rms_nm, direction=line.direction
-            )
-        )
+        band_hz = line.frequency_hz + float(shifts[0]), line.frequency_hz + float(shifts[-1])
+        least_worst = partial(least_worst_residual, alone, truth, band_hz=band_hz)
+        band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
     rows, curves = [], []
     for name, design in designs.items():
         loop = design.close(hardware, sensor_gain=truth.sensor_gain)
@@ -199,19 +195,15 @@ def limits(
         limit_nm, band_nm = (  # of the loop's own sensor
             np.nan if each is None or loop.reads_others else each.rms_nm for each in (limit, band)
         )
-        rows.append(
-            LimitRow(
-                design=name,
-                method=design.method,
-                residual_nm=residual_nm,
-                strehl=numbers["strehl"],
-                above_limit_percent=above_percent(residual_nm, limit_nm),
-                worst_nm=worst_nm,
-                above_band_limit_percent=above_percent(worst_nm, band_nm),
-                phase_margin_deg=margin_deg,
-                stable=loop.is_stable,
-            )
-        )
+        row = {
+            "design": name,
+            "above_limit_percent": above_percent(residual_nm, limit_nm),
+            "worst_nm": worst_nm,
+            "above_band_limit_percent": above_percent(worst_nm, band_nm),
+            "phase_margin_deg": margin_deg,
+            "stable": loop.is_stable,
+        }
+        rows.append(fill_row(LimitRow, SimpleNamespace(**numbers), design, **row))
         curves.append(curve)
     return LimitStudy(
         rows=tuple(rows),
@@ -232,14 +224,6 @@ def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
     grid = np.linspace(moved.min(), moved.max(), _GRID)
     inside = [0.0] if moved.min() <= 0 <= moved.max() else []
     return np.asarray(np.unique(np.concatenate([grid, moved, inside]) + 0.0))
-
-
-def _error_band(truth: Truth, shifts: FloatArray) -> tuple[float, float] | None:
-    """Return the range of the true frequency [Hz] if there is one sinusoid and a range."""
-    lines = truth.vibrations
-    if len(lines) != 1 or not isinstance(lines[0], SinusoidalVibration) or shifts.size < 2:
-        return None
-    return lines[0].frequency_hz + float(shifts[0]), lines[0].frequency_hz + float(shifts[-1])
 
 
 def _residual_curve(
@@ -359,10 +343,7 @@ class MirrorRow:
     design: str = column("design", help="Its name: for ours, what it assumes about the mirror")
     stable: bool = column(help="Whether its loop is stable")
     residual_nm: float = nm_column(
-        "residual",
-        format=".2f",
-        missing="unstable",
-        help="Residual under the truth, rms",
+        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
     )
     strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
     unsettled_nm: float = nm_column(
@@ -439,16 +420,9 @@ def mirror(
     rows = []
     for name, design in designs.items():
         loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        numbers = loop_columns(loop, truth, imaging)
-        rows.append(
-            MirrorRow(
-                design=name,
-                stable=loop.is_stable,
-                residual_nm=numbers["residual_nm"],
-                strehl=numbers["strehl"],
-                unsettled_nm=settling_error(loop, truth).rms_nm if loop.is_stable else np.nan,
-            )
-        )
+        numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
+        numbers["unsettled_nm"] = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
+        rows.append(fill_row(MirrorRow, SimpleNamespace(**numbers), design=name))
     return tuple(rows)
 
 
@@ -473,9 +447,7 @@ class TradeoffPoint:
         "norm / least", format=".4f", help="The same over the least norm of any filter"
     )
     rms: float = nm_column(
-        "rms",
-        format=".2f",
-        help="Standard deviation of its estimation error, recomputed",
+        "rms", format=".2f", help="Standard deviation of its estimation error, recomputed"
     )
     gain_low: float = column(
         "gain from", format=".3f", help="Least stable sensor gain", default=np.nan
@@ -512,9 +484,9 @@ def tradeoff(
     taps : int, optional
         Length of the mixed filters' impulse response.
 
-    Returns
-    -------
-    iterator of TradeoffPoint
+    Yields
+    ------
+    TradeoffPoint
         In the order of levels, then families; each is designed when it is requested.
 
     Raises
@@ -543,12 +515,6 @@ def tradeoff(
     length = require_taps(taps)
     for family in families:
         choice(family, "families", FAMILIES)
-    return _points(problem, count, tuple(families), length)
-
-
-def _points(
-    problem: EstimationProblem, count: int, families: tuple[str, ...], taps: int
-) -> Iterator[TradeoffPoint]:
     least, best = hinf(problem, route="riccati"), kalman(problem)
     spread = max(best.gamma / least.gamma_least, 1.0)
     for i, share in enumerate(np.linspace(0, 1, count) ** _CROWDING):
@@ -559,7 +525,7 @@ def _points(
             elif i == count - 1:
                 design = best
             elif family == MIXED.name:
-                design = mixed(problem, gamma=level, taps=taps)
+                design = mixed(problem, gamma=level, taps=length)
             else:
                 design = central_filter(problem, gamma=level)
             margins = None

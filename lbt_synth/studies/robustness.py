@@ -52,13 +52,11 @@ class RobustnessRow:
         "error", unit="Hz", format="+.2f", help="True frequency less that of the model"
     )
     method: str = column("method", help="Method of synthesis")
-    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
-    residual_nm: float = nm_column("residual", help="Residual of tip and tilt, rms", default=np.nan)
-    vibration_nm: float = nm_column("vibration", help="Its part of vibrations, rms", default=np.nan)
-    turbulence_nm: float = nm_column(
-        "turbulence", help="Its part of turbulence, rms", default=np.nan
-    )
-    noise_nm: float = nm_column("noise", help="Its part of noise, rms", default=np.nan)
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
+    residual_nm: float = nm_column("residual", help="Residual of tip and tilt, rms")
+    vibration_nm: float = nm_column("vibration", help="Its part of vibrations, rms")
+    turbulence_nm: float = nm_column("turbulence", help="Its part of turbulence, rms")
+    noise_nm: float = nm_column("noise", help="Its part of noise, rms")
     stable: bool = column("stable", help="Whether the loop is stable with the real sensor gain")
     gamma: float = column(unit="nm", help="H-infinity norm that the design achieves")
 
@@ -133,7 +131,11 @@ def robustness(
         shifts = [-truth.frequency_shift_hz(line.frequency_hz, error) for line in plant.vibrations]
         moved = retuned_plant(plant, shifts, hold=hold)
         for name in names:
-            yield _row(reference_design(name, moved, bound), truth, imaging, float(error))
+            design = reference_design(name, moved, bound)
+            hardware = require_hardware(design, "a row")
+            loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+            numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
+            yield fill_row(RobustnessRow, design, error_hz=float(error), **numbers)
 
 
 def default_methods() -> list[str]:
@@ -141,43 +143,20 @@ def default_methods() -> list[str]:
     return [method.name for method in reference_methods(estimators_only=True)]
 
 
-def _row(design: Design, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
-    hardware = require_hardware(design, "a row")
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
-    return fill_row(RobustnessRow, design, error_hz=error, **numbers)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobustnessMap:
-    """Strehl ratio of a fixed design over errors in what it assumes about the loop.
+    """Strehl ratio of a fixed design over errors in what it assumes about the loop."""
 
-    Attributes
-    ----------
-    errors_hz : (e,) ndarray
-        True frequency less that of the design [Hz], of the vibration that moves most.
-    sensor_gains : (g,) ndarray
-        Real sensor gain relative to the design's sensor matrix.
-    delay_errors_frames : (d,) ndarray
-        Real delay less that of the design [frames].
-    strehl : (d, g, e) ndarray
-        Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by more
-        than 160 times its width.
-    residual_nm : (d, g, e) ndarray
-        Residual of the modes [nm rms]; nan where the loop is unstable.
-    stable : (d, g) bool ndarray
-        Whether the loop is stable, which a frequency error does not change.
-    band_hz : tuple of float or None
-        Errors at which the vibration that moves most is within a band of the design [Hz]; None
-        for a design without a band around it.
-    """
-
-    errors_hz: FloatArray
-    sensor_gains: FloatArray
-    delay_errors_frames: FloatArray
+    errors_hz: FloatArray  # (e,): true less the design's [Hz], of the vibration that moves most
+    sensor_gains: FloatArray  # (g,): real gains relative to the design's sensor matrix
+    delay_errors_frames: FloatArray  # (d,): real delay less that of the design [frames]
+    # (d, g, e): Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by
+    # more than 160 times its width
     strehl: FloatArray
-    residual_nm: FloatArray
-    stable: BoolArray
+    residual_nm: FloatArray  # (d, g, e): of the modes [nm rms]; nan where the loop is unstable
+    stable: BoolArray  # (d, g): whether the loop is, which a frequency error does not change
+    # errors at which the vibration that moves most is within a band of the design [Hz]; None for a
+    # design without a band around it
     band_hz: tuple[float, float] | None = None
 
 

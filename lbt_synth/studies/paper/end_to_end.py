@@ -59,10 +59,7 @@ class EndToEndEntry:
     )
     strehls: tuple[float, ...] = field()
     strehl: float = column(
-        "end to end",
-        key="strehl_percent",
-        format=".1f",
-        help="Mean Strehl ratio over seeds [%]",
+        "end to end", key="strehl_percent", format=".1f", help="Mean Strehl ratio over seeds [%]"
     )
     scatter: float = column(
         "scatter",

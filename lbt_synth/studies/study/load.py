@@ -19,7 +19,7 @@ from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
 from lbt_synth.methods.request import DesignRequest, Wording, design_request
 from lbt_synth.studies.study.run import read_designs
-from lbt_synth.studies.study.sample import Sample, close_sample_loop, make_sample
+from lbt_synth.studies.study.sample import close_sample_loop, make_sample
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
     NOISE_FACTOR,
@@ -92,7 +92,16 @@ def load_study(
         digest=_digest(settings, config, {name: digest for name, (_, digest) in gains.items()}),
         inputs=(source, config_file, *files.values()),
     )
-    samples = [(where, _checked_sample(study, where, values)) for where, values in _corners(study)]
+    samples = []
+    for where, values in _corners(study):
+        with refuse_config(f"{source}: {where}", where.split(" ")[0]):
+            samples.append((where, make_sample(study, values)))
+    if config.truth.drifts and settings.evaluation == "exact":
+        raise ConfigError(
+            f"{source}: a vibration of the truth drifts, so that there is no exact answer; "
+            "set evaluation: simulation.",
+            path="evaluation",
+        )
     fixed = {name: design for name, (design, _) in gains.items()}
     if directory is not None:
         fixed |= read_designs(Path(directory), study)
@@ -118,10 +127,7 @@ def _require_names(settings: StudySection, source: Path) -> None:
         other = first.setdefault(name.casefold(), name)
         taken = [p for p in settings.parameters if p in result_columns(name, settings.evaluation)]
         if other != name:
-            why = (
-                f"its files would have the names of {other}'s; give a name that differs by more "
-                "than its case"
-            )
+            why = f"its files need a name that differs by more than its case from {other}"
         elif name.casefold().startswith("row_"):
             why = "names that begin with row_ are those of replayed samples; give another"
         elif taken:
@@ -194,15 +200,3 @@ def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
     for i, (name, section) in enumerate(parameters.items()):
         for end in section.extremes(study.samples) if section.varies else ():
             yield f"parameters.{name} at {end:g}", [*centre[:i], end, *centre[i + 1 :]]
-
-
-def _checked_sample(study: Study, where: str, values: list[float]) -> Sample:
-    with refuse_config(f"{study.source}: {where}", where.split(" ")[0]):
-        sample = _, _, truth = make_sample(study, values)
-    if truth.drifts and study.settings.evaluation == "exact":
-        raise ConfigError(
-            f"{study.source}: a vibration of the truth drifts, so that there is no exact answer; "
-            "set evaluation: simulation.",
-            path="evaluation",
-        )
-    return sample

@@ -28,6 +28,7 @@ from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods.request import DesignRequest
 from lbt_synth.storage.atomic_files import (
+    UNFINISHED,
     exclusive_lock,
     open_atomically,
     refuse_replacing,
@@ -41,7 +42,6 @@ from lbt_synth.studies.grid import (
     Parts,
     Result,
     refuse,
-    remove_unfinished,
 )
 from lbt_synth.studies.study.sample import (
     Sample,
@@ -56,7 +56,7 @@ from lbt_synth.validation import FloatArray, integer, require_instance
 
 MANIFEST, PARTS, RESULTS, FAILED = "study.json", "parts", "results.csv", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
-_SCHEMA, _SCHEMA_VERSION = "lbt_synth study", 2
+_SCHEMA = "lbt_synth study 2"
 _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 # Rows of a part whose samples are evaluated together: some tenths of a second, of which the check
 # of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
@@ -155,7 +155,8 @@ def run_study(
     began = time.perf_counter()
     parts, count = study_parts(folder, study), progress or (lambda rows: None)
     with exclusive_lock(folder, "study"):
-        remove_unfinished(folder, parts.folder)
+        for path in [*folder.glob(UNFINISHED), *parts.folder.glob(UNFINISHED)]:
+            path.unlink()  # what a killed process left
         _begin(folder, study)
         for path in parts.paths().values():
             parts.read(path)  # refuses what is damaged before any work
@@ -163,10 +164,13 @@ def run_study(
         if computed < study.samples:
             count(study.samples - computed)
         if computed:
+            controllers = study.controllers.values()
+            together = all(are_evaluated_together(study, each) for each in controllers)
+            share = -(-study.samples // (_PARTS_PER_WORKER * at_once))
             parts.compute_missing(
                 partial(evaluate, study),
                 lambda rows: (study.values(*rows), rows[0]),
-                part_rows=_part_rows(study, at_once),
+                part_rows=min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share),
                 executor=executor or InlineExecutor(),
                 in_flight=1 if executor is None else _IN_FLIGHT * at_once,
                 progress=count,
@@ -190,25 +194,14 @@ def run_study(
 
 def study_parts(folder: Path, study: Study) -> Parts:
     """Return the parts of a study in its directory."""
-    return Parts(
-        folder=folder / PARTS,
-        columns=study.result_columns,
-        rows=study.samples,
-        digest=study.digest,
-    )
+    place, columns = folder / PARTS, study.result_columns
+    return Parts(folder=place, columns=columns, rows=study.samples, digest=study.digest)
 
 
 def output_paths(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, without its parts."""
     designs = [f"{name}.fits" for name in study.designed]
     return [folder / name for name in (MANIFEST, RESULTS, FAILED, PAGE, PRINT, *designs)]
-
-
-def _part_rows(study: Study, workers: int) -> int:
-    """Return the number of rows of a part."""
-    together = all(are_evaluated_together(study, each) for each in study.controllers.values())
-    share = -(-study.samples // (_PARTS_PER_WORKER * workers))
-    return min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share)
 
 
 def read_manifest(folder: Path, study: Study) -> dict[str, Any] | None:
@@ -218,7 +211,7 @@ def read_manifest(folder: Path, study: Study) -> dict[str, Any] | None:
         return None
     try:
         manifest = dict(read_json(path, OutputError))
-        readable = (manifest["schema"], manifest["schema_version"]) == (_SCHEMA, _SCHEMA_VERSION)
+        readable = manifest["schema"] == _SCHEMA
         source, version, _ = manifest["source"], manifest["version"], dict(manifest["designs"])
     except (ValueError, KeyError, TypeError):
         readable = False
@@ -237,16 +230,13 @@ def read_manifest(folder: Path, study: Study) -> dict[str, Any] | None:
 def read_designs(folder: Path, study: Study) -> dict[str, Design]:
     """Return the designs that a study wrote for its controllers, none if it was not begun."""
     designs = {}
-    for name, expected in ((read_manifest(folder, study) or {}).get("designs", {})).items():
-        if name in study.settings.controllers:
-            path = folder / f"{name}.fits"
-            designs[name], digest = load_with_digest(path)
-            if digest != expected:
-                refuse(
-                    path,
-                    "is not the design that the study was begun with. Put that back, or name "
-                    "another directory.",
-                )
+    digests = (read_manifest(folder, study) or {}).get("designs", {})
+    for name in sorted(digests.keys() & study.settings.controllers.keys()):
+        path = folder / f"{name}.fits"
+        designs[name], digest = load_with_digest(path)
+        if digest != digests[name]:
+            why = "is not the design that the study was begun with. Put that back, or name another"
+            refuse(path, f"{why} directory.")
     return designs
 
 
@@ -260,7 +250,6 @@ def _begin(folder: Path, study: Study) -> None:
                 refuse(path, f"{why} directory, or delete it.")
         manifest = {
             "schema": _SCHEMA,
-            "schema_version": _SCHEMA_VERSION,
             "digest": study.digest,
             "version": lbt_synth.__version__,
             "source": str(study.source),

@@ -38,6 +38,9 @@ class Interval:
     high: float
 
 
+_NONE = Interval(value=np.nan, low=np.nan, high=np.nan)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerSamples:
     """One controller on n samples; all arrays (n,)."""
@@ -314,7 +317,7 @@ def percentiles(values: FloatArray, percents: Sequence[float]) -> dict[float, In
 
     n, tail = len(values), (1 - CONFIDENCE) / 2
     if n == 0:
-        return {percent: Interval(value=np.nan, low=np.nan, high=np.nan) for percent in percents}
+        return dict.fromkeys(percents, _NONE)
     ordered = np.sort(values)
     limits = np.concatenate(([np.nan], ordered, [np.nan]))  # none before the first, after the last
     table = {}
@@ -343,7 +346,7 @@ def share(where: BoolArray) -> Interval:
 
     count, total = int(np.count_nonzero(where)), len(where)
     if total == 0:
-        return Interval(value=np.nan, low=np.nan, high=np.nan)
+        return _NONE
     tail = (1 - CONFIDENCE) / 2
     low = float(betaincinv(count, total - count + 1, tail)) if count else 0.0
     high = float(betaincinv(count + 1, total - count, 1 - tail)) if count < total else 1.0
@@ -382,7 +385,8 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, f
     """
     n = len(ordered)
     largest = float(np.max(np.abs(result), initial=0.0))
-    spread = result / (largest or 1.0) - np.mean(result / (largest or 1.0))
+    scaled = result / (largest or 1.0)
+    spread = scaled - np.mean(scaled)
     total = float(spread @ spread)
     if total <= n * _CONSTANT**2:
         return np.nan, np.nan

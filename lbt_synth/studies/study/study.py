@@ -216,31 +216,17 @@ class StudySection(Section):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Study:
-    """A checked study; made by :func:`load_study`.
+    """A checked study; made by :func:`load_study`."""
 
-    Attributes
-    ----------
-    source : pathlib.Path
-        The study file.
-    settings : StudySection
-        Its values, checked.
-    config : Config
-        The configuration, unchanged.
-    controllers : mapping of str to Design or DesignRequest
-        What is evaluated, in the order of the file; a request is designed for each sample.
-    digest : str
-        SHA-256 of all that decides the results: settings, configuration, gain files, version of
-        the package.
-    inputs : tuple of pathlib.Path
-        Files that the study was read from.
-    """
-
-    source: Path
-    settings: StudySection
-    config: Config
+    source: Path  # the study file
+    settings: StudySection  # its values, checked
+    config: Config  # the configuration, unchanged
+    # what is evaluated, in the order of the file; a request is designed for each sample
     controllers: Mapping[str, Design | DesignRequest]
+    # SHA-256 of all that decides the results: settings, configuration, gain files, version of the
+    # package
     digest: str
-    inputs: tuple[Path, ...]
+    inputs: tuple[Path, ...]  # files that the study was read from
 
     @property
     def samples(self) -> int:
@@ -281,22 +267,9 @@ class Study:
         return ("row", *self.parameter_names, *self.result_columns)
 
     def values(self, start: int = 0, stop: int | None = None) -> FloatArray:
-        """Return the parameters of samples ``start`` to ``stop``.
+        """Return the parameters of samples ``start`` to ``stop``, (stop - start, parameters).
 
-        Parameters
-        ----------
-        start, stop : int, optional
-            Rows, the last not included; default all.
-
-        Returns
-        -------
-        (stop - start, parameters) ndarray
-            A row is the same whichever rows are requested with it.
-
-        Raises
-        ------
-        ProblemError
-            If there are no such rows.
+        A row is the same whichever rows are requested with it.
         """
         start = integer(start, "start", at_least=0)
         stop = self.samples if stop is None else integer(stop, "stop", at_least=start)

@@ -140,10 +140,8 @@ def sensitivity_table(
         labels = ("sum", "only together (interactions)")
         rows.append(("all of them",))
         rows += [(label, *texts) for label, texts in zip(labels, totals, strict=True)]
-    caption = (
-        "Variance of the Strehl ratio that one parameter explains by itself [%] (rank correlation)"
-    )
-    return _table_by_controller(caption, "parameter", statistics, rows)
+    caption = "Variance of the Strehl ratio that one parameter explains by itself [%]"
+    return _table_by_controller(f"{caption} (rank correlation)", "parameter", statistics, rows)
 
 
 def _share_text(row: Mapping[str, float]) -> str:
@@ -184,10 +182,8 @@ def percent(value: float, digits: int = 1) -> str:
 
 
 def ordinal(percentile: float) -> str:
-    """Return the name of a percentile."""
-    suffix = {1: "st", 2: "nd", 3: "rd"}.get(int(percentile) % 10, "th")
-    teens = 10 < percentile % 100 < 14
-    return f"{percentile:g}{'th' if teens or percentile % 1 else suffix} percentile"
+    """Return the name of one of the percentiles."""
+    return f"{percentile:g}{'st' if percentile == 1 else 'th'} percentile"
 
 
 def _table_by_controller(
