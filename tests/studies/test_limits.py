@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from support.configs import minimal_config, write_config
 from support.figures import legend
-from support.limits import RATE, ar
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.config import Config
-from lbt_synth.design.result import model_limits
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.report.figures.studies import limits_figure, tradeoff_figure
 
 
@@ -75,35 +72,6 @@ def test_bad_studies(config):
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             call()
-
-
-@pytest.mark.parametrize("delay", [1, 2, 3, 2.7])
-def test_plants_in_the_full_form(delay):
-    for plant in (lbt_axis_plant(delay_frames=delay), lbt_axis_plant(delay_frames=delay, modes=2)):
-        limit = least_model_residual(plant.full())
-        assert limit.rms_nm == pytest.approx(least_model_residual(plant).rms_nm, rel=1e-9)
-    _, found, above = model_limits(lbt.kalman(plant.full())).values()
-    assert found == pytest.approx(limit.rms_nm)
-    assert np.isnan(above) if delay == 2.7 else abs(above) < 1e-6
-
-
-def test_full_plants_that_do_not_decouple():
-    lines = [
-        lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50, direction=d)
-        for f, d in ((20, (1, 1)), (31, (1, 0)))
-    ]
-    parts = {"frame_rate_hz": RATE, "turbulence": ar(0.99, driving=10), "noise_nm": 5.0}
-    full = lbt.tip_tilt_plant(**parts, vibrations=lines).full()
-    with pytest.raises(lbt.errors.ProblemError, match="the disturbance across them"):
-        least_model_residual(full)
-    assert np.isnan([*model_limits(lbt.kalman(full)).values()][1:]).all()
-    plain = lbt.tip_tilt_plant(**parts, vibrations=lines[1:]).full()
-    entry = plain.D.copy()
-    entry[:, 0] = 1.0
-    with pytest.raises(lbt.errors.ProblemError, match="independent of the disturbance"):
-        least_model_residual(replace(plain, D=entry))
-    bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    assert not model_limits(lbt.kalman(bare))
 
 
 def test_a_design_of_another_making_keeps_its_name_beside_the_reference(config):
