@@ -1,29 +1,45 @@
-"""Robustness of designs: to frequency errors, over maps of errors, and to sensors that fail."""
+"""What designs do where the loop is another: moved lines, gains, failing sensors, a mirror."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.config import Config
-from lbt_synth.design import Design
+from lbt_synth.design import (
+    Design,
+    FilterDesign,
+    central_filter,
+    hinf,
+    kalman,
+    lqg,
+    mixed,
+    optimal_integrator,
+)
+from lbt_synth.design.mixed import require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import (
     Imaging,
     LoopEnsemble,
     Simulation,
     close_loop,
     ensemble_residuals,
+    loop_margins,
     residual_budget,
+    settling_error,
 )
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
 from lbt_synth.loop.simulation.failing_sensors import Drop, Segment, run_segments, simulate_sensors
 from lbt_synth.loop.strehl import series_strehl
+from lbt_synth.methods.mixed import METHOD as MIXED
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
@@ -35,13 +51,17 @@ from lbt_synth.validation import (
     BoolArray,
     FloatArray,
     choice,
+    integer,
     number,
     read_only,
     real_array,
     require_instance,
 )
 
-_GAINS_AT_ONCE = 64
+FAMILIES = (MIXED.name, "central")
+_MOST_POINTS = 200  # of a trade-off
+_CROWDING = 1.5  # above 1, points are denser near the least norm
+_GAINS_AT_ONCE = 64  # of a map
 
 
 @table_row
@@ -242,10 +262,7 @@ def robustness_map(
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
-    lines = [
-        (ensemble_vibration(line), frequencies)
-        for line, frequencies in moved_lines(truth, errors, hardware)
-    ]
+    lines = moved_lines(truth, errors, hardware)
     noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
     size = delays.size, gains.size, errors.size
     maps = {name: np.empty(size) for name in ("strehl", "residual_nm", "stable")}
@@ -259,7 +276,7 @@ def robustness_map(
                 noise_nm=noise_nm,
                 turbulence=truth.turbulence,
                 vibrations=tuple(
-                    replace(line, frequency_hz=np.tile(frequencies, count))
+                    replace(ensemble_vibration(line), frequency_hz=np.tile(frequencies, count))
                     for line, frequencies in lines
                 ),
             )
@@ -370,3 +387,198 @@ def run_failures(
         )
         rows.append((segment, row))
     return simulation, rows
+
+
+@table_row
+class MirrorRow:
+    """One design on the real mirror; what an unstable loop does not have is nan."""
+
+    design: str = column("design", help="Its name: for ours, what it assumes about the mirror")
+    stable: bool = column(help="Whether its loop is stable")
+    residual_nm: float = nm_column(
+        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
+    )
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
+    unsettled_nm: float = nm_column(
+        "settled less real position",
+        format=".2f",
+        help="What is left of the assumption that the mirror has settled, for the commands of "
+        "this design: settled less real position, rms",
+    )
+
+
+def mirror(
+    plant: TipTiltPlant,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    command_weight: float = 0.0,
+) -> tuple[MirrorRow, ...]:
+    """Compare designs on a moving mirror: what it costs to ignore its dynamics.
+
+    They are the integrator with the best gain on this mirror, the Kalman filter for a mirror
+    that settles at once, the same filter with the real positions taken out of its measurements,
+    and the LQG, which also commands for the dynamics. Each runs on the plant's own mirror.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant, with the real mirror in its hardware.
+    truth : Truth
+        What the loop really meets.
+    imaging : Imaging
+        The camera.
+    command_weight : float, optional
+        As for :func:`lqg`.
+
+    Returns
+    -------
+    tuple of MirrorRow
+        One per design.
+
+    Raises
+    ------
+    ProblemError
+        If the plant does not come from :func:`tip_tilt_plant`.
+    SynthesisError
+        If a design fails.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
+    ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=60
+    ... )
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5, mirror=shell)
+    >>> rows = lbt.studies.mirror(
+    ...     plant, lbt.Truth(turbulence=slow, noise_nm=15.5), lbt.Imaging(diameter_m=8.22)
+    ... )
+    >>> [(row.design, row.stable) for row in rows][1::2]
+    [('kalman, settled mirror', False), ('lqg', True)]
+    """
+    if not isinstance(plant, TipTiltPlant):
+        raise ProblemError(f"a mirror study needs a TipTiltPlant; got {type(plant).__name__}.")
+    require_instance(truth, Truth)
+    require_instance(imaging, Imaging)
+    hardware = plant.hardware
+    settled = replace(plant, hardware=replace(hardware, mirror=None))
+    regulated = lqg(plant, command_weight=command_weight)
+    designs: dict[str, Design] = {
+        "integrator, best gain": optimal_integrator(hardware, truth),
+        "kalman, settled mirror": kalman(settled),
+        "kalman, real positions": kalman(plant),
+        regulated.method: regulated,
+    }
+    rows = []
+    for name, design in designs.items():
+        loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
+        numbers["unsettled_nm"] = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
+        rows.append(fill_row(MirrorRow, SimpleNamespace(**numbers), design=name))
+    return tuple(rows)
+
+
+@table_row
+class TradeoffPoint:
+    """One filter of the trade-off, ``design``; a problem without a loop has no margins, but nan."""
+
+    family: str = column(
+        "filter",
+        help='"mixed": least variance of all filters with this norm; "central": the H-infinity '
+        "filter whose norm this is",
+    )
+    gamma: float = nm_column(
+        "norm", format=".2f", help="H-infinity norm of its estimation error, recomputed"
+    )
+    gamma_ratio: float = column(
+        "norm / least", format=".4f", help="The same over the least norm of any filter"
+    )
+    rms: float = nm_column(
+        "rms", format=".2f", help="Standard deviation of its estimation error, recomputed"
+    )
+    gain_low: float = column(
+        "gain from", format=".3f", help="Least stable sensor gain", default=np.nan
+    )
+    gain_high: float = column(
+        "gain to", format=".3f", help="Greatest stable sensor gain", default=np.nan
+    )
+    modulus: float = column(
+        "modulus margin", format=".3f", help="Modulus margin of its loop", default=np.nan
+    )
+    design: FilterDesign = field(compare=False, repr=False)
+
+
+def tradeoff(
+    problem: EstimationProblem,
+    *,
+    points: int = 9,
+    families: Sequence[str] = FAMILIES,
+    taps: int = 16,
+) -> Iterator[TradeoffPoint]:
+    """Return filters from the least norm to the least variance, and examine their loops.
+
+    The levels run from the least gamma to the norm of the Kalman filter, at which all
+    families meet.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; with a plant, each filter's loop is examined.
+    points : int, optional
+        Levels of the norm, 2 to 200.
+    families : sequence of {"mixed", "central"}, optional
+        Which filters to design at each level.
+    taps : int, optional
+        Length of the mixed filters' impulse response.
+
+    Yields
+    ------
+    TradeoffPoint
+        In the order of levels, then families; each is designed when it is requested.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+    SynthesisError
+        If a design fails.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.EstimationProblem(
+    ...     A=[[1.9, -0.99], [1.0, 0.0]],
+    ...     B=[[1.0, 0.0], [0.0, 0.0]],
+    ...     C=[[0.0, 1.0]],
+    ...     D=[[0.0, 3.0]],
+    ...     L=[[1.0, 0.0]],
+    ... )
+    >>> points = list(lbt.studies.tradeoff(line, points=3, families=["mixed"]))
+    >>> points[0].rms > points[1].rms > points[2].rms
+    True
+    """
+    require_problem(problem)
+    count = integer(points, "points", at_least=2, at_most=_MOST_POINTS)
+    length = require_taps(taps)
+    for family in families:
+        choice(family, "families", FAMILIES)
+    least, best = hinf(problem, route="riccati"), kalman(problem)
+    spread = max(best.gamma / least.gamma_least, 1.0)
+    for i, share in enumerate(np.linspace(0, 1, count) ** _CROWDING):
+        level = least.gamma_least * float(spread**share)
+        for family in families:
+            if i == 0:
+                design = least
+            elif i == count - 1:
+                design = best
+            elif family == MIXED.name:
+                design = mixed(problem, gamma=level, taps=length)
+            else:
+                design = central_filter(problem, gamma=level)
+            margins = None
+            if design.hardware is not None:
+                margins = loop_margins(close_loop(design.hardware, design.controller))
+            ratio = max(design.gamma / least.gamma_least, 1.0)
+            given = {"family": family, "gamma_ratio": ratio, "design": design}
+            yield fill_row(TradeoffPoint, design, margins, **given)

@@ -16,7 +16,8 @@ from lbt_synth.report.charts.description import Area, Axis, Curve, Mark, Panel, 
 from lbt_synth.report.charts.matplotlib_charts import Figure, OwnAxes, draw_figure
 from lbt_synth.report.figures.loop import stable_curve
 from lbt_synth.studies import TradeoffPoint
-from lbt_synth.studies.limits import FAMILIES, LimitStudy
+from lbt_synth.studies.limits import LimitStudy
+from lbt_synth.studies.robustness import FAMILIES
 from lbt_synth.validation import FloatArray, real_array, require_instance
 
 
