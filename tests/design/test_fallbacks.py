@@ -19,8 +19,7 @@ from lbt_synth.design.fallbacks import (
 )
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import kalman_riccati
-from lbt_synth.loop.budget import plant_budget
-from lbt_synth.loop.sensor_budget import model_readings
+from lbt_synth.loop.budget import model_readings, plant_budget
 
 
 def test_every_set_of_sensors_may_fail():

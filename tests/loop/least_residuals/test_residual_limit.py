@@ -356,3 +356,32 @@ def test_a_sensor_without_noise_gains_nothing():
 def test_an_exposure_that_ends_within_a_frame_has_no_bound():
     with pytest.raises(lbt.errors.ProblemError, match="ends within a frame of the loop"):
         variances_of_sensors([second(RATE / 5, 2.1, 3.0)])
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 2.7])
+def test_plants_in_the_full_form(delay):
+    for plant in (lbt_axis_plant(delay_frames=delay), lbt_axis_plant(delay_frames=delay, modes=2)):
+        limit = least_model_residual(plant.full())
+        assert limit.rms_nm == pytest.approx(least_model_residual(plant).rms_nm, rel=1e-9)
+    _, found, above = model_limits(lbt.kalman(plant.full())).values()
+    assert found == pytest.approx(limit.rms_nm)
+    assert np.isnan(above) if delay == 2.7 else abs(above) < 1e-6
+
+
+def test_full_plants_that_do_not_decouple():
+    lines = [
+        lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50, direction=d)
+        for f, d in ((20, (1, 1)), (31, (1, 0)))
+    ]
+    parts = {"frame_rate_hz": RATE, "turbulence": ar(0.99, driving=10), "noise_nm": 5.0}
+    full = lbt.tip_tilt_plant(**parts, vibrations=lines).full()
+    with pytest.raises(lbt.errors.ProblemError, match="the disturbance across them"):
+        least_model_residual(full)
+    assert np.isnan([*model_limits(lbt.kalman(full)).values()][1:]).all()
+    plain = lbt.tip_tilt_plant(**parts, vibrations=lines[1:]).full()
+    entry = plain.D.copy()
+    entry[:, 0] = 1.0
+    with pytest.raises(lbt.errors.ProblemError, match="independent of the disturbance"):
+        least_model_residual(replace(plain, D=entry))
+    bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    assert not model_limits(lbt.kalman(bare))
