@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from support.studies import (
     part_rows,
 )
 
-from lbt_synth.errors import NumericalError
+from lbt_synth.errors import NumericalError, OutputError
+from lbt_synth.storage import array_file
 from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.studies import run_study
 from lbt_synth.studies.grid import InlineExecutor, Parts
@@ -44,6 +46,18 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
     assert seen == [(0, 2), (6, 8), (8, 9), (10, 12)]  # a fixed number, and less at an end
     whole = np.concatenate([parts.read(path)[0] for path in parts.paths().values()])
     assert whole.ravel().tolist() == list(range(12))
+
+
+def test_a_part_is_believed_by_its_digest_alone(tmp_path):
+    parts = Parts(folder=tmp_path, columns=("a",), rows=2, digest="d" * 64)
+    parts.write((0, 2), ({"a": np.ones(2)}, []), 0.5)
+    (path,) = parts.paths().values()
+    arrays, text = array_file.read_npz(path.read_bytes())
+    with pytest.raises(OutputError, match="is of another study"):
+        replace(parts, digest="e" * 64).read(path)
+    path.write_bytes(array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text))
+    with pytest.raises(OutputError, match="is damaged. Delete it"):
+        parts.read(path)
 
 
 def wrong(study, values, start):

@@ -184,3 +184,17 @@ def test_lines_at_one_frequency_move_by_their_own_errors():
     upper = lbt.studies.guaranteed_residual(path, controller, truth, error_hz=3.0).upper_nm
     exact = lbt.residual_budget(lbt.close_loop(path, controller), moved).rms_nm
     assert upper >= exact * (1 - 1e-9)
+
+
+def test_the_bound_of_one_box_is_that_of_small_gain():
+    """A tolerance that is never missed leaves the first box: r0 / (1 - |N E H|)."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    controller = lbt.integrator(path, gain=0.3).controller
+    truth = lbt.Truth(turbulence=AIR, noise_nm=8.0)
+    upper = lbt.studies.guaranteed_residual(
+        path, controller, truth, sensor_gains=(0.9, 1.1), tolerance=100.0
+    ).upper_nm
+    loop = lbt.close_loop(path, controller)
+    share = 0.1 * lbt.linear.hinf_norm(loop.noise_propagation()).value
+    expected = lbt.residual_budget(loop, truth).rms_nm / (1 - share)
+    assert upper == pytest.approx(expected, rel=1e-6)
