@@ -70,7 +70,7 @@ def main() -> None:
         loops = (
             DoubleLoop(own),
             DoubleLoop(matrix),
-            InnerLoop(np.tile(matrix[:, None], LOOPS), np.zeros((1, LOOPS))),
+            InnerLoop(np.tile(matrix[:, None], LOOPS)),
         )
         ran = [residuals(loop, gain, phase, noise) for loop in loops]
         sizes = [np.sqrt(np.mean(series**2)) for series in (*ran, ran[2] - ran[1])]

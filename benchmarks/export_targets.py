@@ -159,7 +159,7 @@ def run_target(target: str, options: dict[str, str], written: Exported, *series:
         twins = [written.start(np.inf) for _ in range(LOOPS)]
         return run_steps(lambda y: np.array(list(map(step_twin, twins, y))), *series)
     rows = np.tile(np.load(files[0]), (1, LOOPS))
-    loop = InnerLoop(rows, np.zeros((1, rows.shape[1])))
+    loop = InnerLoop(rows)
     return run_steps(lambda y: loop.step(y.ravel()).reshape(y.shape), *series)
 
 

@@ -47,15 +47,17 @@ def require_exportable(design: Design, *, reads_others: bool = False) -> None:
 
 
 def require_modal(design: Design) -> int:
-    """Return the number of modes of a design whose measurements and commands are its modes."""
+    """Return the number of modes of a design whose measurements and commands are its modes.
+
+    Each measurement may have a sensor gain, which the controller counts with.
+    """
     hardware = require_hardware(design, "an export of modes")
-    identity = np.eye(hardware.modes)
-    for name in ("sensor", "influence"):
-        if not np.array_equal(getattr(hardware, name), identity):
-            raise ProblemError(
-                f"{name}_matrix must be the identity: the RTC reconstructs modes and projects them "
-                "on actuators itself. Design for the modes."
-            )
+    sensor, identity = hardware.sensor, np.eye(hardware.modes)
+    own = "the RTC reconstructs modes and projects them on actuators itself. Design for the modes."
+    if sensor.shape != identity.shape or np.any(sensor != np.diag(np.diag(sensor))):
+        raise ProblemError(f"sensor_matrix must be diagonal, a gain for each mode: {own}")
+    if not np.array_equal(hardware.influence, identity):
+        raise ProblemError(f"influence_matrix must be the identity: {own}")
     return hardware.modes
 
 

@@ -12,6 +12,7 @@ from support.written_files import ORACLES, WITHOUT_ORACLE, is_schur, judge
 
 import lbt_synth as lbt
 from lbt_synth.interop.pipeline import target_names
+from lbt_synth.loop.simulation.run import step_loop
 
 CHUNK = 100
 
@@ -137,6 +138,30 @@ def test_the_same_design_gives_the_same_files_and_a_certificate_of_them(tmp_path
         assert beside["arithmetic"]["program"] == own.arithmetic.program
         assert 0 <= written.error < 1e-3
     assert seen[0] == seen[1]
+
+
+@pytest.mark.parametrize("name", target_names())
+def test_a_sensor_gain_of_each_axis_is_in_the_numbers(tmp_path, designs, name):
+    """A record's design knows the gains of its sensor; what runs at those is the design."""
+    own, gains = designs["kalman"].problem, (0.6, 0.8)
+    hardware = replace(own.hardware, sensor_matrix=np.diag(gains))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=own.hardware.frame_rate_hz,
+        turbulence=own.turbulence,
+        vibrations=own.vibrations,
+        noise_nm=15.0,
+        sensor_matrix=np.diag(gains),
+    )
+    phase = 100 * np.cumsum(np.random.default_rng(0).standard_normal((600, 2)), axis=0) / 30
+    for design in (lbt.kalman(plant), lbt.integrator(hardware, gain=0.5)):
+        target = lbt.interop.target_named(name)
+        written = lbt.interop.export(target.path_in(tmp_path), design, name)
+        assert all(check.passed for check in written.checks)
+        runs = [
+            step_loop(run, 1.0, hardware, phase[None], np.zeros((1, 600, 2)))[0, :, :2]
+            for run in (written.start(np.inf), design.controller.start())
+        ]
+        assert np.std(runs[0] - runs[1]) < 1e-2 * np.std(runs[1])
 
 
 @pytest.mark.usefixtures("short_rehearsal")

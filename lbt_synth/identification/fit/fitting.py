@@ -108,7 +108,7 @@ class Search:
         return Component(kind, self.log_angle(frequency_hz), damping, float(np.log(power)))
 
     def priors(self, model: Model) -> Priors:
-        """Return the priors of a fit. Components but for the first of an axis stay in the band."""
+        """Return the priors of a fit; components of two axes but for the first stay in the band."""
         spectra = Spectra((model,)) if isinstance(model, SpectrumModel) else model
         gain = _GAIN_PRIOR if self.finds_gain and len(spectra.axes) == 1 else _FIXED
         corner = (self.log_angle(STARTING_CORNER_HZ), _LOOSE)
@@ -127,7 +127,7 @@ class Search:
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
         low[frequencies], high[frequencies] = self.log_angle(_LOWEST * self.data.step_hz), _HIGHEST
-        return replace(priors, bounds=(low, high))
+        return priors if len(spectra.axes) == 1 else replace(priors, bounds=(low, high))
 
     def _component_priors(self, component: Component) -> list[tuple[float, float]]:
         """Return the priors of frequency, damping and power."""
@@ -175,19 +175,19 @@ def fit(
 ) -> FittedModel | None:
     """Fit all parameters; None if no fit settles.
 
-    Components of one axis that would leave the band, from the first bin to the Nyquist frequency,
-    are dropped, and so is a drift whose damping ratio falls below 2, if another part can take its
+    Components of one axis that leave the band, from the first bin to the Nyquist frequency, are
+    dropped, and so is a drift whose damping ratio falls below 2, if another part can take its
     place; those of two axes stay at its ends. A fit is given up where its log-likelihood does not
     reach that of ``better_than`` minus a margin.
     """
-    if isinstance(start, SpectrumModel):
-        start = start.keep(search.covers)
     data, bound = search.merge(start), float("inf")
     if better_than is not None:
         bound = contrast(data, better_than.spectra) + margin
     found = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
-    if found is None or found.contrast > bound or isinstance(start, Spectra):
-        return None if found is None or found.contrast > bound else found
+    if found is None or found.contrast > bound:
+        return None
+    if isinstance(start, Spectra):
+        return found
     inside = found.spectrum.keep(search.covers)
     first = inside.components[0]
     if first.kind == "drift" and first.damping_ratio < DRIFT_DAMPING:

@@ -158,13 +158,13 @@ def segment_transforms(
     """Return frequencies (f,), scaled transforms ([n,] segments, f) and independent values of each.
 
     The series is (frames,) or (frames, n), its segments (segments, length) of frames. It is
-    differenced and tapered, and loses its mean slope where it is to be ``levelled``. The square of
-    a transform is a one-sided density.
+    differenced and tapered. Where it is to be ``levelled``, it loses its mean slope, and nothing is
+    padded. The square of a transform is a one-sided density.
     """
     from scipy.fft import next_fast_len, rfft
 
     length = rows.shape[1] - 1
-    taper, size = tukey(length), int(next_fast_len(length, real=True))
+    taper, size = tukey(length), length if levelled else int(next_fast_len(length, real=True))
     frequency: FloatArray = np.arange(1.0, (size + 1) // 2) * (frame_rate_hz / size)
     scale = np.sqrt(2 / frame_rate_hz / np.sum(taper**2))
     scale = scale / np.sqrt(half_angle_square(frequency, frame_rate_hz))

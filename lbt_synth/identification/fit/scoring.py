@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dposv, dpotrs
+from scipy.linalg.lapack import dposv
 
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -107,24 +107,15 @@ def _best_step(
     The first is that of the minimum without a radius, the second that of this step. The curvature
     (p, p) counts by its absolute value.
     """
-    _, step, info = dposv(curvature, -gradient)
-    if info:  # it is not positive definite
-        size, axes = np.linalg.eigh(curvature)
-        curvature = axes * np.maximum(np.abs(size), _LEAST_INFORMATION) @ axes.T
-        _, step, _ = dposv(curvature, -gradient)
-    gain, more = float(-0.5 * (gradient @ step)), 0.0
-    if float(np.linalg.norm(step)) <= radius:
-        return step, gain, gain
-    for _ in range(MOST_STEPS):
-        stiffer = curvature.copy()
-        stiffer.flat[:: step.size + 1] += more
-        factor, step, _ = dposv(stiffer, -gradient)
-        length = float(np.linalg.norm(step))
-        if length <= 1.001 * radius:
-            break
-        # Newton's method for 1 / length = 1 / radius, from below
-        more += length**2 / float(step @ dpotrs(factor, step)[0]) * (length / radius - 1)
-    return step, gain, -float(gradient @ step + 0.5 * step @ (curvature @ step))
+    whole, info = dposv(curvature, -gradient)[1:]
+    if info == 0 and float(np.linalg.norm(whole)) <= radius:
+        gain = -0.5 * float(gradient @ whole)
+        return whole, gain, gain
+    size, axes = np.linalg.eigh(curvature)
+    size, slope = np.maximum(np.abs(size), _LEAST_INFORMATION), gradient @ axes
+    step = _trust_step(slope, size, radius)
+    gain = 0.5 * float(np.sum(slope**2 / size))
+    return axes @ step, gain, -float(slope @ step + 0.5 * step @ (size * step))
 
 
 def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
@@ -132,3 +123,16 @@ def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
     along = float(missing @ step)
     least = _ALONG * float(np.linalg.norm(missing) * np.linalg.norm(step))
     return np.outer(missing, missing) / along if abs(along) > least else np.zeros((step.size,) * 2)
+
+
+def _trust_step(slope: FloatArray, curvature: FloatArray, radius: float) -> FloatArray:
+    """Return the step (p,) to the minimum of a quadratic form within a radius, in its axes."""
+    more = 0.0
+    for _ in range(MOST_STEPS):
+        step = -slope / (curvature + more)
+        size = float(np.linalg.norm(step))
+        if size <= 1.001 * radius:
+            break
+        # Newton's method for 1 / size = 1 / radius, from below
+        more += size**2 / float(np.sum(step**2 / (curvature + more))) * (size / radius - 1)
+    return step

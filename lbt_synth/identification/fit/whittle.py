@@ -35,6 +35,7 @@ from scipy.interpolate import CubicSpline
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, tukey
 from lbt_synth.identification.fit.scoring import EXACT, Priors, scoring_minimum
 from lbt_synth.identification.fit.spectrum_model import (
+    CORNER,
     GAIN,
     SHARED,
     Component,
@@ -392,10 +393,7 @@ def _two_axes(data: LoopPeriodogram, model: Spectra) -> _Whitened:
     parts, slopes = [], []
     for i in range(2):
         each, by_part, by_shape = densities(data, model.whole(i))
-        own, rows = (
-            int(starts[i + 1] - starts[i]),
-            log_slopes(each, by_part, by_shape, np.ones(bins)),
-        )
+        rows, own = log_slopes(each, by_part, by_shape, np.ones(bins)), starts[i + 1] - starts[i]
         straight[i, starts[i] : starts[i + 1]] = rows[:own]
         slopes.append(rows[own:].reshape(count, PARAMETERS, bins))
         parts.append(each)
@@ -409,6 +407,11 @@ def _two_axes(data: LoopPeriodogram, model: Spectra) -> _Whitened:
         logs = sum(own[k] / share[k] for own, share in zip(slopes, shares, strict=True))
         crossed[at:ratio], crossed[ratio] = 0.5 * cross * logs, 0.5 * cross
         crossed[phase] = 1j * cross
+        for start, axis in zip(starts, model.axes, strict=False):
+            if model.shared[k].kind == axis.rolling:
+                corner = float(np.exp(axis.log_corner))
+                fall = log_roll_off(corner, axis.roll_off_order, data.half_angle_square)[1]
+                crossed[start + CORNER] += 0.5 * cross * fall
     first, second = (each.sum(axis=0) for each in parts)
     cross = np.asarray(sum(crosses, np.zeros(bins, dtype=np.complex128)))
     determinant = first * second - np.abs(cross) ** 2

@@ -1,14 +1,12 @@
 """The target cacao: a controller as a filter of the pseudo-open-loop history, cut after some steps.
 
-In the loop that a design believes, the command is a stable filter Q of the pseudo-open-loop
-measurement, whatever the controller (:func:`lbt_synth.loop.youla_controller`), and every stable Q
-keeps that loop stable. At the sensor gain g, with the path L of norm 1, the commands are
-``Q w / D`` with ``D = 1 - (1 - g) L Q``. Without a part E of Q they change by ``E w / D D'``, where
-``D' = D + (1 - g) L E``: no more than a small gain, ``|1 - g| |E / D| < 1``, allows.
-
-For all gains of an interval: ``|1 - g| |1 / D|`` is one over the least singular value, over
-frequency, of ``p - L Q``, ``p = 1 / (1 - g)``. That distance changes by no more than p does, which
-bounds it between two gains.
+In a loop of sensor gain 1, the command is a stable filter Q of the pseudo-open-loop measurement,
+whatever the controller (:func:`lbt_synth.loop.youla_controller`), and every stable Q keeps that
+loop stable. Where the sensor has the gains G, a diagonal matrix that a design knows of or does not,
+the commands are ``Q w / D`` with ``D = 1 - (1 - G) L Q`` and the path L of norm 1. Without a part E
+of Q they change by ``E w / D D'``, where ``D' = D + (1 - G) L E``: no more than a small gain,
+``|1 - G| |E / D| < 1``, allows. D changes by no more than ``|G' - G| |Q|`` from one gain to the
+next, which bounds ``1 / |1 / D|`` between two gains.
 """
 
 from __future__ import annotations
@@ -114,12 +112,21 @@ class PredictiveFilter:
             x = self.system.A @ x
         return np.array(values)
 
+    def gains(self, gain: float) -> FloatArray:
+        """Return the real sensor gains at one relative to the design's, (m, m)."""
+        return np.asarray(gain * self.hardware.sensor)
+
+    def off(self, gain: float) -> float:
+        """Return how far the gains are from those that cacao counts with, ``|1 - G|``."""
+        return float(np.max(np.abs(np.diag(self.gains(gain)) - 1)))
+
     def at(self, gain: float) -> tuple[ClosedLoop, StateSpace, float]:
         """Return the loop at a sensor gain, the filter 1 / D and its norm, made once."""
         if gain not in self._steering:
             loop = close_loop(self.hardware, self.design.controller, sensor_gain=gain)
-            s, same = loop.output_sensitivity(), np.eye(self.hardware.modes)
-            inverse = replace(s, C=(1 - 1 / gain) * s.C, D=(1 - 1 / gain) * s.D + same / gain)
+            s, back = loop.output_sensitivity(), np.linalg.inv(self.gains(gain))
+            rest = np.eye(len(back)) - back
+            inverse = replace(s, C=rest @ s.C, D=rest @ s.D + back)
             self._steering[gain] = loop, inverse, float(hinf_norm(inverse))
         return self._steering[gain]
 
@@ -129,39 +136,30 @@ class PredictiveFilter:
         return proved_gains(self.design, self.hardware)
 
     def least_distance(self, enough: float) -> float:
-        """Return a lower bound on the distance of L Q from ``1 / (1 - g)`` within the interval.
+        """Return a lower bound on ``1 / |1 - G| |1 / D|`` over the interval.
 
         Where one is found that is not above ``enough``, it is returned.
         """
-        least = float("inf")
-        for end, stop in self._places():
-            own = self._distance(end)
-            if stop is None:  # beyond this place the distance is larger than at the end
-                stop = float(np.copysign(float(hinf_norm(self.system)) + own, end))
-            parts = [((end, own), (stop, self._distance(stop)))]
-            while parts:
-                (a, at_a), (b, at_b) = parts.pop()
-                least = min(least, at_a, at_b)
-                if least <= enough:
-                    return least
-                if (at_a + at_b - abs(b - a)) / 2 < _CLOSE * least:
-                    middle = (a + b) / 2
-                    between = middle, self._distance(middle)
-                    parts += [((a, at_a), between), (between, (b, at_b))]
+        steepness = float(np.max(self.hardware.sensor)) * float(hinf_norm(self.system))
+        low, high = self.interval
+        intervals, least = [(low, high)], float("inf")
+        while intervals:
+            a, b = intervals.pop()
+            off = max(self.off(a), self.off(b))  # convex: largest at an end
+            if off == 0:
+                continue
+            least = min(least, *(self._distance(gain) for gain in (a, b)))
+            if least <= enough:
+                return least
+            inverses = 1 / self.at(a)[2] + 1 / self.at(b)[2]
+            if (inverses - steepness * (b - a)) / 2 < _CLOSE * least * off:
+                middle = (a + b) / 2
+                intervals += [(a, middle), (middle, b)]
         return _CLOSE * least
 
-    def _places(self) -> list[tuple[float, float | None]]:
-        """Return the intervals of ``1 / (1 - g)``; at g = 1 one goes on without end."""
-        low, high = self.interval
-        out: list[tuple[float, float | None]] = []
-        if low < 1:
-            out.append((1 / (1 - low), 1 / (1 - high) if high < 1 else None))
-        if high > 1:
-            out.append((1 / (1 - high), 1 / (1 - low) if low > 1 else None))
-        return out
-
-    def _distance(self, place: float) -> float:
-        return abs(place) / self.at(1 - 1 / place)[2]
+    def _distance(self, gain: float) -> float:
+        off = self.off(gain)
+        return 1 / (off * self.at(gain)[2]) if off > 0 else float("inf")
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
@@ -173,7 +171,8 @@ class PredictiveFilter:
         for gain in scenario_gains(self.design):
             if self.interval[0] <= gain <= self.interval[1]:
                 loop, s, _ = self.at(gain)
-                pol = replace(s, B=np.hstack([gain * s.B, s.B]), D=np.hstack([gain * s.D, s.D]))
+                G = self.gains(gain)
+                pol = replace(s, B=np.hstack([s.B @ G, s.B]), D=np.hstack([s.D @ G, s.D]))
                 seen, left = (
                     mode_variances(self.design, one, every)
                     for one in (replace(loop, system=pol), loop)
@@ -229,7 +228,7 @@ class CutFilter:
         return norm
 
     def _gain_around(self, gain: float) -> float:
-        return abs(1 - gain) * self.whole.at(gain)[2] * self.norm
+        return self.whole.off(gain) * self.whole.at(gain)[2] * self.norm
 
     @cached_property
     def small_gain(self) -> float:
@@ -243,7 +242,8 @@ class CutFilter:
 
     def response(self, gain: float) -> float:
         """Bound the change of the sensitivities at a sensor gain."""
-        return max(gain, 1.0) * self.norm * self.whole.at(gain)[2] * self._peak(gain)
+        largest = max(float(np.max(self.whole.gains(gain))), 1.0)
+        return largest * self.norm * self.whole.at(gain)[2] * self._peak(gain)
 
     def residual_nm(self, gain: float) -> float:
         """Bound the rms of the residual's change at a sensor gain, over all modes."""
@@ -264,7 +264,7 @@ class CutFilter:
             D=np.zeros((m, m)),
             dt_s=s.dt_s,
         )
-        controller = youla_controller(hardware, parameter)
+        controller = youla_controller(replace(hardware, sensor_matrix=None), parameter)
         # noise in the product is part of the command; noise in the history comes as a measurement
         command = np.eye(controller.n_states, m, k=-n)
         entry = replace(controller, B=np.hstack([command, controller.B]), D=np.zeros((m, 2 * m)))
@@ -299,8 +299,12 @@ def predictive_filter(design: Design) -> PredictiveFilter:
             "the mirror must settle at once, with a total delay of at most "
             f"{LONGEST_DELAY} frames: cacao's history knows a delay alone. Use another target."
         )
-    loop = close_loop(hardware, design.controller)
-    loop.require_stable()
+    loop = close_loop(replace(hardware, sensor_matrix=None), design.controller)
+    if not loop.is_stable:
+        raise ProblemError(
+            "cacao counts with a sensor gain of 1, at which the loop of this design is unstable. "
+            "Divide the reconstructor by the sensor gain, and design for a gain of 1."
+        )
     s, n = loop.commanding(), hardware.modes
     system = replace(s, B=s.B[:, n:], D=s.D[:, n:]).balanced()
     return PredictiveFilter(design=design, hardware=hardware, system=system)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
 from lbt_synth.interop.modes import ModeDesign
@@ -67,7 +68,8 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
     if coupled.size:
         raise ProblemError(
             f"the modes must decouple; here measurement {coupled[0, 1] + 1} moves command "
-            f"{coupled[0, 0] + 1}. Use a target of matrices, such as c."
+            f"{coupled[0, 0] + 1}. Design with --method robust, which controls each axis alone, or "
+            "use a target of matrices, such as c."
         )
     inside = [np.flatnonzero(reached[:, mode] & shown[mode]) for mode in range(m)]
     return [_polynomials(system, mode, states) for mode, states in enumerate(inside)]
@@ -126,32 +128,18 @@ def direct_form(rows: FloatArray, dt_s: float) -> Controller:
 class InnerLoop:
     """Per mode, ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, in single precision.
 
-    The products are added one by one, in the order of the matrix's rows. The voltages are
-    ``-to_actuators u`` of a matrix (actuators, modes), by default the identity; where one exceeds
-    the limit it is clipped, and the memory holds the commands that were applied.
+    The products are added one by one, in the order of the matrix's rows. A command beyond the limit
+    is clipped, and the memory holds the commands that were applied.
     """
 
-    def __init__(
-        self, matrix: ArrayLike, to_actuators: ArrayLike | None = None, limit: float = np.inf
-    ) -> None:
+    def __init__(self, matrix: ArrayLike, limit: float = np.inf) -> None:
         self._rows = np.asarray(matrix, dtype=np.float32)
         if self._rows.ndim != 2 or len(self._rows) % 2 == 0:
             raise DimensionError(
                 "the matrix must have 2 M + 1 rows and one column per mode; got shape "
                 f"{self._rows.shape}."
             )
-        modes = self._rows.shape[1]
-        self._to_actuators = np.asarray(
-            np.eye(modes) if to_actuators is None else to_actuators, dtype=np.float32
-        )
-        if self._to_actuators.ndim != 2 or self._to_actuators.shape[1] != modes:
-            raise DimensionError(
-                f"to_actuators must have {modes} columns, one per mode; got shape "
-                f"{self._to_actuators.shape}."
-            )
-        self._to_modes = np.linalg.pinv(self._to_actuators).astype(np.float32)
-        self._limit = np.float32(limit)
-        self._past = len(self._rows) // 2  # M
+        self._limit, self._past = np.float32(limit), len(self._rows) // 2  # M
         self.reset()
 
     def reset(self) -> None:
@@ -164,9 +152,7 @@ class InnerLoop:
         memory[1:first] = memory[: first - 1].copy()
         memory[0] = y
         u = np.add.accumulate(self._rows * memory, axis=0)[-1]
-        voltages = -(self._to_actuators @ u)
-        if np.any(np.abs(voltages) > self._limit):
-            u = -(self._to_modes @ np.clip(voltages, -self._limit, self._limit))
+        u = np.clip(u, -self._limit, self._limit)
         memory[first + 1 :] = memory[first:-1].copy()
         memory[first : first + 1] = u  # nothing to write at M = 0
         return np.asarray(u, dtype=np.float64)
@@ -195,12 +181,13 @@ def _as_computed(design: Design, rounded: _Matrix) -> Written:
     added[: order + 1] = np.eye(order + 1, 1)  # an error of the sum enters as b_0 y(k) does
     controller, entry = (direct_form(matrix, dt_s) for matrix in (rows, added))
     loops: list[DirectFormLoop] = mode_loops(design, order)
+    sensors = np.diag(require_hardware(design, "dao").sensor)
 
     def variance(sensor_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
         """Add up the rounding of each product and of each partial sum."""
         if loops:
-            columns = zip(loops, rows.T, strict=True)
-            return np.array([loop.sums_nm2(column, sensor_gain) for loop, column in columns])
+            sums = [loop.sums_nm2(c, sensor_gain) for loop, c in zip(loops, rows.T, strict=True)]
+            return np.array(sums) * sensors**2
         sizes = np.where(np.arange(len(rows))[:, None] <= order, measured, commands)
         # a bound: signs and correlations are not used
         bound = sums_variance((rows * sizes).T, 0, ROUNDOFF["single"])
@@ -265,7 +252,7 @@ TARGET = Target(
     write=_write,
     read=_read,
     computed=_as_computed,
-    start=lambda matrix, limit: InnerLoop(matrix, limit=limit),
+    start=InnerLoop,
     single=lambda matrix: matrix,
     join=_join,
     split=lambda matrix, parts, _: [

@@ -31,30 +31,25 @@ from lbt_synth.validation import ComplexArray, FloatArray
 ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
 _RADIUS = 0.92  # of the roots that are added
 _ROOM = 2e-3  # of each limit, for what lies between the nodes
-_ENOUGH = 1.006  # times what the design leaves; 1.01 is proved
-# Weight of the rounding, weight of what exceeds a limit, largest squared modulus of the roots of
-# sections far from z = 1: one search each.
-_STEPS = (
-    *((0.03, 3.0, 0.92), (0.1, 3.0, 0.92), (0.3, 3.0, 0.92), (1.0, 3.0, 0.92)),
-    *((1.0, 3.0, 0.94), (1.0, 6.0, 0.96), (1.0, 10.0, 0.96)),
-    *[(1.0, 15.0, 0.96)] * 12,
-)
+_ENOUGH = 1.004  # times what the design leaves; 1.01 is proved
+_SEARCHES = 19  # at most, each with other weights of the scenarios
+_EVALUATIONS = 60  # of one search
+_HASTE = 12  # power of its residual with which a scenario gains weight
+_STEEP = 5.0  # weight of what exceeds a limit
 _FAR = -1.7  # a section with a larger first coefficient is far from z = 1
-_STIFF = 30.0  # weight of its roots beyond their modulus
+_MODULUS = 0.94  # largest squared modulus of its roots, which the loop does not see
 _UNSTABLE = 1e3  # each error of a loop that is
 _LINE = 0.3  # weight of a vibration's mean power; its largest is a limit
-_HASTE = 12  # power of its residual with which a scenario gains weight
-_EVALUATIONS = 60  # of one search
 _DAMPED = 0.5  # of the design's distance from instability, at least
 _GAINS = 25  # sensor gains at which a step must be stable
-_ORDERS = 3000  # in which the coefficients are rounded; the best one counts
+_ORDERS = 1000  # in which the coefficients are rounded; the best one counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DirectFormLoop:
     """One mode, whose controller is ``c = (b_0 .. b_M, a_1 .. a_M)``, in S scenarios.
 
-    With the path of the loop L (delay and mirror) and the polynomials in ``z^-1``
+    With the path of the loop L (sensor gain, delay and mirror) and the polynomials in ``z^-1``
     ``b = sum b_j z^-j`` and ``a = 1 - sum a_i z^-i``, the loop at the sensor gain g has the
     polynomial ``p = a + g L b``; it leaves ``a / p`` of the phase and ``L b / p`` of the noise.
     """
@@ -114,7 +109,10 @@ class DirectFormLoop:
         return variance
 
     def sums_nm2(self, c: FloatArray, sensor_gain: float) -> float:
-        """Return the variance of the rounding of the sums at a sensor gain of a scenario."""
+        """Return the variance of the rounding of the sums at a sensor gain of a scenario.
+
+        It is in units of the measurements, which the sensor gain of the path divides.
+        """
         return float(c @ self.rounding_matrix(c, self.gains.index(sensor_gain)) @ c)
 
     def radius(self, c: FloatArray) -> float:
@@ -137,12 +135,17 @@ def mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
     """Return the loop of each mode of a shaped design, made once for equal ones; none of others."""
     if not design.mode_specifications:
         return []
-    hardware, modes = require_hardware(design, "dao"), design.first_equal_modes
-    loops = {k: mode_loop(hardware, design.mode_specifications[k], order) for k in set(modes)}
-    return [loops[k] for k in modes]
+    hardware, loops = require_hardware(design, "dao"), dict[tuple[int, float], DirectFormLoop]()
+    keys = list(zip(design.first_equal_modes, np.diag(hardware.sensor).tolist(), strict=True))
+    for mode, sensor in set(keys):
+        specification = design.mode_specifications[mode]
+        loops[mode, sensor] = mode_loop(hardware, specification, order, sensor)
+    return [loops[key] for key in keys]
 
 
-def mode_loop(hardware: LoopHardware, specification: Specification, order: int) -> DirectFormLoop:
+def mode_loop(
+    hardware: LoopHardware, specification: Specification, order: int, sensor: float = 1.0
+) -> DirectFormLoop:
     """Return the loop of one mode of a shaped design, at the frequencies that it was shaped at."""
     single = hardware.single_mode()
     channel = Channel(hardware=single, basis=laguerre_basis(1, 0.0, dt_s=single.dt_s))
@@ -164,7 +167,7 @@ def mode_loop(hardware: LoopHardware, specification: Specification, order: int) 
             evenly = np.where(covered, width, 0.0)
             spread[s] += term.rms_nm**2 * evenly / np.sum(evenly)
     ranges = [d for d in specification.demands if isinstance(d, SensorGainRange)]
-    taps = np.concatenate([[0.0], single.mirror_taps])
+    taps = sensor * np.concatenate([[0.0], single.mirror_taps])
     powers = np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(max(order + 1, taps.size))))
     return DirectFormLoop(
         powers=powers[:, : order + 1],
@@ -189,14 +192,16 @@ def make_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
     """
     order, used = len(exact) // 2, np.arange(len(exact))
     rounded = exact.astype(np.float32)
-    odd, modes = order % 2, design.first_equal_modes
+    odd = order % 2
     if not exact[0].all() or (odd and exact[[order, -1]].any()):
         return rounded
     if odd:
         used = np.delete(used, [order, 2 * order])
-    loops = mode_loops(design, order - odd)
-    made = {k: round_together(loops[k], refit(loops[k], exact[used, k])) for k in set(modes)}
-    rounded[used] = np.stack([made[k] for k in modes], axis=1)
+    made: dict[DirectFormLoop, NDArray[np.float32]] = {}
+    for mode, loop in enumerate(mode_loops(design, order - odd)):
+        if loop not in made:
+            made[loop] = round_together(loop, refit(loop, exact[used, mode]))
+        rounded[used, mode] = made[loop]
     return rounded
 
 
@@ -205,18 +210,14 @@ def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
     allowed_nm, limits = loop.residuals_nm(exact), _limits(loop, exact)
     damped = 1 - _DAMPED * (1 - loop.radius(exact))
     theta, weights = _sections(_widened(exact)), np.ones(len(loop.gains))
-    c = exact
-    for rounding, steepness, modulus in _STEPS:
-        shares = np.sqrt(weights) / allowed_nm
-        theta = _search(loop, theta, damped, (shares, rounding, limits, steepness, modulus))
-        c = _coefficients(theta)
-        lost = loop.residuals_nm(c, rounding=True) / allowed_nm
-        if np.max(lost) < _ENOUGH and steepness == _STEPS[-1][1]:
+    for _ in range(_SEARCHES):
+        theta = _search(loop, theta, damped, np.sqrt(weights) / allowed_nm, limits)
+        lost = loop.residuals_nm(_coefficients(theta), rounding=True) / allowed_nm
+        if np.max(lost) < _ENOUGH:
             break
-        if rounding == 1.0:
-            weights *= lost**_HASTE
-            weights /= np.mean(weights)
-    return c
+        weights *= lost**_HASTE
+        weights /= np.mean(weights)
+    return _coefficients(theta)
 
 
 def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float32]:
@@ -276,40 +277,51 @@ def _limits(loop: DirectFormLoop, exact: FloatArray) -> dict[float, FloatArray]:
     return limits
 
 
-# weight (S,) of a nanometre of residual; that of the rounding in it; largest modulus of the
-# sensitivity at each node, by gain; weight of what exceeds it; largest squared modulus of the roots
-# far from z = 1
-_Goals = tuple[FloatArray, float, dict[float, FloatArray], float, float]
-
-
 def _search(
-    loop: DirectFormLoop, theta: FloatArray, largest_radius: float, goals: _Goals
+    loop: DirectFormLoop,
+    theta: FloatArray,
+    largest_radius: float,
+    shares: FloatArray,
+    limits: dict[float, FloatArray],
 ) -> FloatArray:
-    """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken."""
-    latest: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken.
 
-    def rows(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if x.tobytes() not in latest:
-            latest.clear()
-            latest[x.tobytes()] = _rows(loop, goals, x)
-        return latest[x.tobytes()]
+    Roots far from z = 1 stay well inside the circle.
+    """
+    M, upper = theta.size // 2, np.full(theta.size, np.inf)
+    first = np.concatenate([np.arange(0, M, 2), np.arange(M + 1, 2 * M + 1, 2)])
+    far = first[theta[first] > _FAR] + 1
+    upper[far] = np.maximum(_MODULUS, theta[far] + _ROOM)
 
     def errors(x: FloatArray) -> FloatArray:
+        rows = _rows(loop, shares, limits, x)[0]
         stable = loop.radius(_coefficients(x)) < largest_radius
-        return rows(x)[0] if stable else np.full_like(rows(x)[0], _UNSTABLE)
+        return rows if stable else np.full_like(rows, _UNSTABLE)
 
     def slopes(x: FloatArray) -> FloatArray:
-        return rows(x)[1]
+        return _rows(loop, shares, limits, x)[1]
 
     found = least_squares(
-        errors, theta, jac=slopes, x_scale="jac", max_nfev=_EVALUATIONS, ftol=1e-5, xtol=1e-12
+        errors,
+        theta,
+        jac=slopes,
+        bounds=(-np.inf, upper),
+        x_scale="jac",
+        max_nfev=_EVALUATIONS,
+        ftol=1e-5,
+        xtol=1e-12,
     )
     return np.asarray(found.x)
 
 
-def _rows(loop: DirectFormLoop, goals: _Goals, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the errors whose squares are minimised, and their Jacobian."""
-    shares, rounding, limits, steepness, modulus = goals
+def _rows(
+    loop: DirectFormLoop, shares: FloatArray, limits: dict[float, FloatArray], theta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the errors whose squares are minimised, and their Jacobian.
+
+    ``shares`` (S,) are the weights of a nanometre of residual, and ``limits`` (F,) those of the
+    sensitivity at each sensor gain.
+    """
     c, (of_a, of_b) = _coefficients(theta), loop.slopes()
     blocks: list[tuple[FloatArray, FloatArray]] = []
 
@@ -318,8 +330,7 @@ def _rows(loop: DirectFormLoop, goals: _Goals, theta: FloatArray) -> tuple[Float
 
     def below(size: FloatArray, slope: FloatArray, limit: FloatArray | float) -> None:
         over = np.maximum(size / limit - 1 + _ROOM, 0.0)
-        share = steepness * (over > 0) / limit
-        blocks.append((steepness * over, share[:, None] * slope))
+        blocks.append((_STEEP * over, (_STEEP * (over > 0) / limit)[:, None] * slope))
 
     for gain, limit in limits.items():
         a, b, p = loop.polynomials(c, gain)
@@ -337,18 +348,12 @@ def _rows(loop: DirectFormLoop, goals: _Goals, theta: FloatArray) -> tuple[Float
             small(size * T, size[:, None] * dT)
             V = loop.rounding_matrix(c, s)  # its own slopes are left out
             sums = np.sqrt(c @ V @ c)
-            entry = shares[s] * rounding * np.sqrt(loop.shares) * loop.path / p
+            entry = shares[s] * np.sqrt(loop.shares) * loop.path / p
             small(entry * sums, entry[:, None] * (V @ c / sums - sums * dp / p[:, None]))
     # slopes in theta: each coefficient is linear in each number of theta
     moved = np.array([_coefficients(theta + unit) - c for unit in np.eye(theta.size)]).T
     errors, slopes = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    # keep the roots far from z = 1 well inside the circle: the loop does not see them
-    M = theta.size // 2
-    first = np.concatenate([np.arange(0, M, 2), np.arange(M + 1, 2 * M + 1, 2)])
-    over = np.where(theta[first] > _FAR, np.maximum(theta[first + 1] - modulus, 0.0), 0.0)
-    root_slopes = np.zeros((first.size, theta.size))
-    root_slopes[np.arange(first.size), first + 1] = _STIFF * (over > 0)
-    return np.r_[errors, _STIFF * over], np.vstack([slopes @ moved, root_slopes])
+    return errors, slopes @ moved
 
 
 def _sections(c: FloatArray) -> FloatArray:

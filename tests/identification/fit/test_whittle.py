@@ -258,7 +258,14 @@ def test_axes_without_shared_resonances_are_separate(both, coupled) -> None:
     assert contrast(both, apart) == pytest.approx(sum(each))
 
 
-def test_slopes_of_two_axes_are_those_of_differences(both, coupled) -> None:
+@pytest.mark.parametrize("drift", [False, True])
+def test_slopes_of_two_axes_are_those_of_differences(both, coupled, drift) -> None:
+    """With a drift in the first place, slow components that are shared roll off on either axis."""
+    if drift:
+        first = Component("drift", np.log(0.3 * W), np.log(8.0), np.log(50.0**2))
+        axes = (dataclasses.replace(axis, components=(first,)) for axis in coupled.axes)
+        slow = Shared("slow", np.log(20 * W), 0.3, np.log(90.0**2), log_ratio=0.4)
+        coupled = Spectra(tuple(axes), (*coupled.shared, slow))
     theta = coupled.pack()
     _, slope, _ = derivatives(both, coupled)
     numeric = np.array(

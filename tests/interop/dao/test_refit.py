@@ -1,5 +1,7 @@
 """Controllers made again for single precision: their loop, the search, and the rounding."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -96,14 +98,15 @@ def test_a_common_factor_leaves_the_loop_as_it_is(case):
 def test_slopes_are_those_of_finite_differences(case):
     """Without the rounding, whose memory counts as constant."""
     loop, c = case
+    loop = replace(loop, shares=np.zeros_like(loop.shares))
     theta = refit._sections(_widened(c))
     shares = 1 / loop.residuals_nm(c)
-    goals = (shares, 0.0, refit._limits(loop, c), 3.0, 0.92)
-    before, slopes = refit._rows(loop, goals, theta)
+    limits = refit._limits(loop, c)
+    before, slopes = refit._rows(loop, shares, limits, theta)
     for k in range(0, theta.size, 5):
         step = np.zeros(theta.size)
         step[k] = 1e-5
-        up, down = (refit._rows(loop, goals, theta + s)[0] for s in (step, -step))
+        up, down = (refit._rows(loop, shares, limits, theta + s)[0] for s in (step, -step))
         scale = np.max(np.abs(slopes[:, k]))
         smooth = (up == 0) == (down == 0)  # but for limits that are passed in between
         found, expected = (up - down)[smooth] / 2e-5, slopes[smooth, k]
