@@ -25,8 +25,8 @@ def test_limits_command(tmp_path, capsys, config):
     status, out, _ = run(capsys, "limits", CONFIG, gain, "-o", table, "-o", figure, "--json")
     assert status == 0
     data = json.loads(out)
-    assert data["limit_nm"] == pytest.approx(10.8414, abs=1e-4)
-    assert data["band_limit_nm"] == pytest.approx(15.1088, abs=1e-4)
+    assert data["limit_nm"] == pytest.approx(37.7777, abs=1e-4)
+    assert data["band_limit_nm"] == pytest.approx(49.2585, abs=1e-4)
     assert data["band_hz"] == [16.5, 23.5]
     rows = {row["design"]: row for row in data["rows"]}
     assert list(rows) == ["integrator", "kalman", "hinf", "kalman (file)"]
@@ -37,7 +37,7 @@ def test_limits_command(tmp_path, capsys, config):
     status, out, _ = run(capsys, "limits", CONFIG)
     assert status == 0
     assert "above the band limit [%]" in out
-    assert "231.59" in out
+    assert "35.02" in out
 
 
 def test_limits_command_without_vibrations_and_with_coupled_modes(tmp_path, capsys):
@@ -85,13 +85,13 @@ def test_limits_command_refuses(tmp_path, monkeypatch, capsys, arguments, text):
 def test_show_and_simulate_print_the_limit(tmp_path, capsys, config):
     gain = lbt.save_gain(tmp_path / "k.fits", lbt.kalman(config.plant))
     data = json.loads(run(capsys, "show", gain, "--json")[1])
-    assert data["limit_nm"] == pytest.approx(192.619, abs=1e-3)
+    assert data["limit_nm"] == pytest.approx(205.143, abs=1e-3)
     assert abs(data["above_limit_percent"]) < 1e-4
     simulate = ("simulate", CONFIG, gain, "--frames", 200, "--cases", 1)
     data = json.loads(run(capsys, *simulate, "--json")[1])
-    assert data["limit_nm"] == pytest.approx(10.8414, abs=1e-4)
-    assert data["above_limit_percent"] == pytest.approx(231.589, abs=1e-2)
-    assert "least residual in the truth, any controller" in run(capsys, *simulate)[1]
+    assert data["limit_nm"] == pytest.approx(37.7777, abs=1e-4)
+    assert data["above_limit_percent"] == pytest.approx(35.023, abs=1e-2)
+    assert "least of any controller" in run(capsys, *simulate)[1]
 
 
 def test_show_without_a_limit(tmp_path, capsys):
