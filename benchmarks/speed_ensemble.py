@@ -10,7 +10,6 @@ import numpy as np
 from harness import Row, paired, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.studies.study import sample as point
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 FEW = 16  # loops that the peer does; its time is scaled up
@@ -80,7 +79,7 @@ def told_designs() -> dict[int, Row]:
         values = study.values(0, count)
         row = paired(
             lambda v=values: lbt.studies.evaluate_samples(study, v, 0),
-            lambda v=values: point.evaluate_rows(study, v[:FEW], 0),
+            lambda v=values: lbt.studies.evaluate_samples(study, v[:FEW], 0, together=False),
             3,
         )
         rows[count] = _scaled(row, count)

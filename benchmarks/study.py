@@ -9,11 +9,13 @@ import resource
 import sys
 import tempfile
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 
 import lbt_synth as lbt
+from lbt_synth.storage.worker_processes import WorkerPool
 
 STUDY = """
 version: 1
@@ -29,10 +31,10 @@ parameters:
 """
 
 
-def nothing(study: lbt.studies.Study, values: np.ndarray, start: int) -> lbt.studies.BatchResult:
+def nothing(study: lbt.studies.Study, values: np.ndarray, start: int) -> tuple[dict, list]:
     """Numbers of as many digits as results have."""
     columns = {n: np.abs(values[:, 0] * (i + 1) / 7) for i, n in enumerate(study.result_columns)}
-    return lbt.studies.BatchResult(start=start, columns=columns)
+    return columns, []
 
 
 def main(samples: int = 1_000_000, jobs: int = 1) -> None:
@@ -43,7 +45,8 @@ def main(samples: int = 1_000_000, jobs: int = 1) -> None:
         (folder / "lbt.yaml").write_bytes(source.read_bytes())
         study = lbt.studies.load_study(folder / "study.yaml")
         before = time.process_time()
-        run = lbt.studies.run_study(study, folder, jobs=jobs, evaluate=nothing)
+        with WorkerPool(jobs) if jobs > 1 else nullcontext() as pool:
+            run = lbt.studies.run_study(study, folder, executor=pool, evaluate=nothing)
         spent = time.process_time() - before
         memory = [
             resource.getrusage(who).ru_maxrss / 1e3

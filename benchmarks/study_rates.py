@@ -71,16 +71,19 @@ def run(folder: Path, text: str, samples: int, jobs: int) -> tuple[float, float,
     with tempfile.TemporaryDirectory(dir=folder) as out:
         command = [sys.executable, "-m", "lbt_synth.cli.main", "study", str(file), "-o", out]
         began, most = time.perf_counter(), 0
-        command += ["--jobs", str(jobs)]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=ENVIRONMENT) as it:
+        command += ["--jobs", str(jobs), "--json"]
+        said = Path(out) / "said.json"
+        with (
+            said.open("w") as stream,
+            subprocess.Popen(command, stdout=stream, env=ENVIRONMENT) as it,
+        ):
             while it.poll() is None:
                 most = max(most, proportional_memory(it.pid))
                 time.sleep(0.5)
         wall = time.perf_counter() - began
         if it.returncode:
             raise SystemExit(f"the study failed: {' '.join(command)}")
-        manifest = json.loads((Path(out) / "study.json").read_text())
-        return wall, manifest["computing_seconds"], most
+        return wall, json.loads(said.read_text())["computing_seconds"], most
 
 
 def main() -> None:

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.stats import qmc
 
 import lbt_synth as lbt
-from lbt_synth.studies.study.percentiles import percentiles
-from lbt_synth.studies.study.sensitivity import first_order_index
+from lbt_synth.studies.study.statistics import first_order_index, percentiles
 
 KINDS = ("independent", "latin hypercube", "sobol")
 
@@ -44,8 +43,7 @@ def index_errors(repeats=100):
                 y = ishigami(u)
                 orders = [np.argsort(u[:, j]) for j in range(4)]
                 found.append([first_order_index(u[o, j], y[o]) for j, o in enumerate(orders)])
-            values = np.array([[each.value for each in row] for row in found])
-            errors = np.array([[each.error for each in row] for row in found])
+            values, errors = np.moveaxis(np.array(found), 2, 0)
             rms = 100 * np.sqrt(np.mean((values - exact_indices()) ** 2, axis=0))
             print(
                 f"{n:6d}  {kind:16s}",
@@ -67,9 +65,8 @@ def pairs_of_a_sobol_sequence():
             for j in range(8):
                 order = np.argsort(u[:, j])
                 for i in set(range(8)) - {j}:
-                    found = first_order_index(u[order, j], y[order, i])
-                    worst = max(worst, found.value)
-                    ratio = max(ratio, found.value / found.error)
+                    value, error = first_order_index(u[order, j], y[order, i])
+                    worst, ratio = max(worst, value), max(ratio, value / error)
         print(f"{n:6d}  {100 * worst:5.2f}  {ratio:4.1f}")
 
 
@@ -86,7 +83,7 @@ def coverage(repeats=2000, n=512):
             found = percentiles(draw(kind, n, 3, seed) @ weights, chosen)
             held += [
                 not (each.low > value or each.high < value)
-                for each, value in zip(found, true, strict=True)
+                for each, value in zip(found.values(), true, strict=True)
             ]
         print(
             f"{kind:16s}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -12,19 +13,32 @@ from typing import Any
 import lbt_synth
 from lbt_synth.cli.streams import print_error
 from lbt_synth.errors import MissingExtraError, ProblemError
+from lbt_synth.storage.thread_limits import limit_threads
+from lbt_synth.storage.worker_processes import WorkerPool
+from lbt_synth.validation import integer
 
+_MOST_JOBS = 64  # or eight per processor
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 
 
 def choose_engine(
     arguments: Namespace,
 ) -> AbstractContextManager[tuple[Executor | None, int | None]]:
-    """Provide the executor of ``--dask`` and its workers, or None for both with ``--jobs``."""
-    if arguments.dask is None:
-        if arguments.dask_tls is not None:
-            raise ProblemError("--dask-tls goes with --dask.")
-        return nullcontext((None, None))
-    return connect_cluster(arguments.dask, tls=arguments.dask_tls)
+    """Provide the executor of ``--dask`` or of ``--jobs`` with its workers; None for one job."""
+    if arguments.dask is not None:
+        return connect_cluster(arguments.dask, tls=arguments.dask_tls)
+    if arguments.dask_tls is not None:
+        raise ProblemError("--dask-tls goes with --dask.")
+    return nullcontext((None, None)) if arguments.jobs == 1 else _start_processes(arguments.jobs)
+
+
+@contextmanager
+def _start_processes(jobs: int) -> Iterator[tuple[Executor, int]]:
+    """Provide processes with one thread each, which end at once if the block fails."""
+    most = max(_MOST_JOBS, 8 * (os.cpu_count() or 1))
+    integer(jobs, "--jobs", at_least=1, at_most=most)
+    with limit_threads(), WorkerPool(jobs) as pool:
+        yield pool, jobs
 
 
 @contextmanager

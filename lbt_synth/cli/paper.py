@@ -19,11 +19,13 @@ from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import csv_rows, json_record
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
-from lbt_synth.studies.paper.parameters import DIAMETER_M, TABLE_III, parameter_rows
-from lbt_synth.studies.paper.tables import (
+from lbt_synth.studies.paper.parameters import (
+    DIAMETER_M,
+    TABLE_III,
     TableEntry,
     compare_with_paper,
     paper_filters,
+    parameter_rows,
     rms_difference,
     table_ii,
     table_iii,

@@ -27,7 +27,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, percent_column, row_table, table_row
 from lbt_synth.studies import RobustnessMap, guaranteed_residual, robustness_map
 from lbt_synth.studies.robustness import default_methods
-from lbt_synth.studies.worst_residual import GuaranteedResidual
+from lbt_synth.studies.worst_residual import GuaranteedResidual, has_guarantee
 from lbt_synth.validation import FloatArray, agree, frozen_copy, number
 
 _MOST_VALUES = 2001  # of frequency errors or sensor gains
@@ -112,7 +112,7 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
         worst = _guarantee(designs[name], found, assumed[name], config)
         report.data["maps"][name] = asdict(found) | {
             "stable_sensor_gains": intervals,
-            "guaranteed": asdict(worst),
+            "guaranteed": worst and asdict(worst),
         }
         report.tables.append(row_table(_map_title(name, found, config.imaging), _map_lines(found)))
         report.notes += _map_notes(name, designs[name], config, found, intervals)
@@ -214,11 +214,17 @@ def _map_lines(found: RobustnessMap) -> list[MapLine]:
 
 def _guarantee(
     design: Design, found: RobustnessMap, assumed: float, config: Config
-) -> GuaranteedResidual:
-    """Bound the residual over the frequencies and sensor gains of a map, at the design's delay."""
+) -> GuaranteedResidual | None:
+    """Bound the residual over the frequencies and sensor gains of a map, at the design's delay.
+
+    There is none for a mirror with dynamics or a fractional delay.
+    """
+    hardware = require_hardware(design, "a map")
+    if not has_guarantee(hardware):
+        return None
     errors, gains = found.errors_hz, found.sensor_gains / assumed
     return guaranteed_residual(
-        require_hardware(design, "a map"),
+        hardware,
         design,
         config.truth,
         error_hz=(float(errors.min()), float(errors.max())),
@@ -226,8 +232,10 @@ def _guarantee(
     )
 
 
-def _guarantee_text(worst: GuaranteedResidual, found: RobustnessMap) -> str:
+def _guarantee_text(worst: GuaranteedResidual | None, found: RobustnessMap) -> str:
     """Return what holds between the points of a map."""
+    if worst is None:
+        return "no guarantee in the image is known but for a settled mirror and a whole delay"
     low, high = found.sensor_gains.min(), found.sensor_gains.max()
     delay = "the delay of the design, " if np.any(found.delay_errors_frames) else ""
     box = (

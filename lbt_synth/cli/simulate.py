@@ -42,7 +42,7 @@ from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Column, Facts, columns, json_record, json_units
 from lbt_synth.storage.words import count_text
-from lbt_synth.studies.sensor_failures import run_failures
+from lbt_synth.studies.robustness import run_failures
 from lbt_synth.validation import FloatArray
 
 _DROP = re.compile(
@@ -88,10 +88,10 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
             f"frames; got {sizes['frames']}."
         )
     with show_spinner("closing the loop", quiet=arguments.json):
-        found = run_failures(design, config, truth, drops, **sizes)
+        simulation, segments = run_failures(design, config, truth, drops, **sizes)
     report = Report(
         data={
-            "residual_nm": found.simulation.rms_nm,
+            "residual_nm": simulation.rms_nm,
             "frames": sizes["frames"],
             "cases": sizes["cases"],
             "seed": sizes["seed"],
@@ -100,7 +100,7 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
     )
     runs = count_text(sizes["cases"], "run")
     caption = f"{design.method} in the loop: {runs}; {config.imaging.label}"
-    report.add_rows("segments", caption, found.rows(config.imaging))
+    report.add_rows("segments", caption, [row for _, row in segments])
     if not truth.drifts:
         ratio = strehl(residual_budget(loop, truth, frame_means=True), config.imaging)
         report.data["strehl_exact"] = ratio
@@ -109,9 +109,9 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
         )
     report.notes += loop_difference_notes(config, design)
     if arguments.output is not None:
-        figure = sensor_failure_figure(
-            found.simulation, found.segments, found.exact_nm, title=design.method
-        )
+        exact_nm = [row.exact_nm for _, row in segments]
+        places = [segment for segment, _ in segments]
+        figure = sensor_failure_figure(simulation, places, exact_nm, title=design.method)
         report.note_written(save_figure(figure, arguments.output))
     return report
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from argparse import Namespace
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,15 +15,17 @@ from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import write_study_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
-from lbt_synth.storage.rows import fact, facts
+from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
-from lbt_synth.studies.study.run import FinishedStudy, StudyRun, output_paths
-from lbt_synth.studies.study.statistics import StudyStatistics
-from lbt_synth.studies.study.store import PAGE, PRINT, read_failures
+from lbt_synth.studies.grid import timed
+from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths
 from lbt_synth.studies.study.summary import worst_table
 from lbt_synth.validation import integer
 
-_COUNTS = ("samples", "computed", "failures", "seconds")
+_FAILURE = ("row", "controller", "error")
+_MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
+_LONG_ENOUGH_S = 1.0
+_NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -45,24 +47,38 @@ def run(arguments: Namespace) -> Report:
 
 
 def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
+    run = _compute(loaded, folder, arguments)
+    names, columns = loaded.parameter_names, run.columns
+    statistics = studies.study_statistics(columns, names, tuple(loaded.controllers))
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
-    draws = not all(path.exists() for path in pages)
-    found, statistics, new = _compute(loaded, folder, pages, arguments, draws=draws)
-    files = {found.results: new, found.failed: new} | dict.fromkeys(pages, new or draws)
-    varying = [p.name for p in loaded.parameters if p.distribution.varies]
-    worst = [worst_table(each, varying) for each in statistics.controllers]
-    done = f"{folder} is finished: {found.samples} samples in {found.results.name}; none computed."
-    if new:
-        done = (
-            f"{found.computed} of {found.samples} samples computed in "
-            f"{duration_text(found.computing_s)}; with tables and page "
-            f"{duration_text(found.seconds)}."
+    draws = run.computed > 0 or not all(path.exists() for path in pages)
+    if draws:
+        write_study_page(
+            loaded,
+            columns,
+            pages[0],
+            statistics=statistics,
+            failures=run.failures,
+            computing_s=run.computing_s,
+            pdf=pages[1] if arguments.pdf else None,
         )
-    failed = f"note: {found.failures} results failed, see {found.failed}."
+    files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
+    varying = [name for name, p in loaded.settings.parameters.items() if p.varies]
+    worst = [worst_table(each, columns, varying) for each in statistics.controllers]
+    done = f"{folder} is finished: {loaded.samples} samples in {run.results.name}; none computed."
+    if run.computed:
+        done = (
+            f"{run.computed} of {loaded.samples} samples computed in "
+            f"{duration_text(run.seconds)}, {duration_text(run.computing_s)} of all processes."
+        )
+    count = len(run.failures)
     return Report(
-        data={name: getattr(found, name) for name in _COUNTS}
-        | {
-            "computing_seconds": found.computing_s,
+        data={
+            "samples": loaded.samples,
+            "computed": run.computed,
+            "failures": count,
+            "seconds": run.seconds,
+            "computing_seconds": run.computing_s,
             "files": [str(path) for path in files],
             "statistics": asdict(statistics),
         },
@@ -73,41 +89,14 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
         notes=[
             done,
             *_sampling_notes(loaded),
-            *([failed] if found.failures else []),
+            *([f"note: {count} results failed, see {run.failed}."] if count else []),
             *(f"{'written' if now else 'unchanged'}: {path}" for path, now in files.items()),
         ],
     )
 
 
-def _compute(
-    loaded: studies.Study, folder: Path, files: Sequence[Path], arguments: Namespace, *, draws: bool
-) -> tuple[StudyRun, StudyStatistics, bool]:
-    """Run a study; return also whether anything was left to compute.
-
-    Its page is written where something was, or where it ``draws`` in any case.
-    """
-    found: list[tuple[StudyStatistics, bool]] = []
-    page, *pdf = files
-    names = [controller.name for controller in loaded.controllers]
-
-    def summarise(results: FinishedStudy) -> None:
-        statistics = studies.study_statistics(results.columns, loaded.parameter_names, names)
-        found.append((statistics, results.new))
-        if results.new or draws:
-            failures = [
-                studies.Failure(row=row, controller=name, error=error)
-                for row, name, error in read_failures(folder)
-            ]
-            write_study_page(
-                loaded,
-                results.columns,
-                page,
-                statistics=statistics,
-                failures=failures,
-                computing_s=results.computing_s,
-                pdf=pdf[0] if pdf else None,
-            )
-
+def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> StudyRun:
+    """Run what is missing of a study."""
     with choose_engine(arguments) as (executor, workers):
         make_directory(folder)
         with (
@@ -116,17 +105,13 @@ def _compute(
             ) as count,
             keep_finished(folder),
         ):
-            study_run = studies.run_study(
+            return studies.run_study(
                 loaded,
                 folder,
                 executor=executor,
-                jobs=arguments.jobs,
                 workers=workers,
                 progress=count,
-                whole=summarise,
             )
-    [(statistics, new)] = found
-    return study_run, statistics, new
 
 
 def _sampling_notes(loaded: studies.Study) -> list[str]:
@@ -139,17 +124,18 @@ def _sampling_notes(loaded: studies.Study) -> list[str]:
 
 
 def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
-    with choose_engine(arguments) as (_, workers):
-        count = workers or arguments.jobs
-    with show_spinner("measuring a batch", quiet=arguments.json):
-        cost = studies.estimate_study(loaded, workers=count, local=workers is None)
+    count, local = arguments.jobs, arguments.dask is None
     where = count_text(count, "process", "processes")
-    if workers is not None:
+    if not local:
+        with choose_engine(arguments) as (_, count):
+            pass
+    with show_spinner("measuring a batch", quiet=arguments.json):
+        cost = _estimate(loaded, min(count, os.cpu_count() or 1) if local else count)
+    if not local:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
-    parameters = {p.name: p.distribution.text for p in loaded.parameters}
-    controllers = {c.name: c.origin for c in loaded.controllers}
+    parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
+    controllers = {name: section.text for name, section in loaded.settings.controllers.items()}
     report = Report(data={"parameters": parameters, "controllers": controllers})
-    mb = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
     report.add_facts(
         f"Study {loaded.source}",
         facts(
@@ -158,11 +144,8 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
             seed=fact(loaded.settings.seed, "seed"),
             evaluation=fact(loaded.settings.evaluation, "evaluation"),
             workers=fact(count),
-            measured_rows=fact(cost.measured_rows, "samples measured in one process"),
-            measured_s=fact(cost.measured_s, "  their time", unit="s", format=".3g"),
-            seconds=fact(cost.seconds),  # said in a note, in words for long ones
-            disk_bytes=fact(cost.disk_bytes, "space on the disk, about", **mb),
         ),
+        cost,
     )
     report.add_table("Parameters", ("parameter", "distribution"), parameters.items())
     report.add_table("Controllers", ("controller", "what"), controllers.items())
@@ -174,22 +157,41 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     return report
 
 
+def _estimate(loaded: studies.Study, at_once: int) -> Facts:
+    """Measure parts in this process until one is long enough, and say what the whole will cost."""
+    start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
+    studies.evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
+    while seconds < _LONG_ENOUGH_S and start < loaded.samples:
+        values = loaded.values(start, min(start + size, loaded.samples))
+        rows, (_, seconds) = len(values), timed(studies.evaluate_samples, loaded, values, start)
+        start, size = start + rows, _MEASURED_ROWS * size
+    row_bytes = _NUMBER_BYTES * len(loaded.columns) + _PART_BYTES * len(loaded.result_columns)
+    space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
+    return facts(
+        measured_rows=fact(rows, "samples measured in one process"),
+        measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
+        seconds=fact(seconds / rows * loaded.samples / at_once),  # said in a note, in words
+        disk_bytes=fact(loaded.samples * row_bytes, "space on the disk, about", **space),
+    )
+
+
 def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
     with show_spinner("replaying", quiet=arguments.json):
         replay = studies.replay_row(loaded, folder, arguments.row)
-    stored, fresh = replay.stored, replay.fresh
+    stored, fresh, row = replay.stored, replay.fresh, arguments.row
+    values = loaded.parameters_by_name(loaded.values(row, row + 1)[0])
     report = Report(
-        data={name: getattr(replay, name) for name in ("row", "parameters", "stored", "fresh")}
-        | {"failures": [asdict(failure) for failure in replay.failures]},
+        data={"row": row, "parameters": values, "stored": stored, "fresh": fresh}
+        | {"failures": [dict(zip(_FAILURE, each, strict=True)) for each in replay.failures]},
         notes=[
             *([] if stored else ["note: the study has no result of this row yet."]),
-            *(f"failed: {failure.controller}: {failure.error}" for failure in replay.failures),
+            *(f"failed: {name}: {error}" for _, name, error in replay.failures),
             *([f"note: {replay.unwritten}"] if replay.unwritten else []),
         ],
     )
-    report.add_table(f"Row {replay.row}", ("parameter", "value"), replay.parameters.items())
+    report.add_table(f"Row {row}", ("parameter", "value"), values.items())
     results = [(name, stored.get(name), fresh.get(name)) for name in loaded.result_columns]
     report.add_table("Results", ("result", "stored", "now"), results)
     report.note_files(replay.files)

@@ -12,7 +12,7 @@ from lbt_synth.cli.progress import track_progress
 from lbt_synth.report.figures.studies import tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import tradeoff
-from lbt_synth.studies.tradeoff import FAMILIES
+from lbt_synth.studies.robustness import FAMILIES
 from lbt_synth.validation import integer
 
 

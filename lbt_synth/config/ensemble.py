@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 
@@ -18,11 +19,15 @@ from lbt_synth.config.plant_and_truth import (
     turbulence_sections,
     vibration_numbers,
 )
-from lbt_synth.config.samples import Keys, Reads, accepted_by_schema, view_samples
+from lbt_synth.config.samples import Keys, Reads, SampleView, accepted_by_schema
 from lbt_synth.config.schema import Ar1Section, FileSection
 from lbt_synth.errors import LbtSynthError
+from lbt_synth.linear import solve_dare
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
-from lbt_synth.models import ARModel, FrozenFlows, ModalTurbulence, Vibration
+from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
+from lbt_synth.models import FrozenFlows, TipTiltPlant, Vibration, tip_tilt_plant
+from lbt_synth.models.plant.readings import known_states
 from lbt_synth.models.turbulence.ar_models import ar1_flows
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -49,7 +54,7 @@ class Samples:
     @property
     def settings(self) -> FileSection:
         """Their settings, with arrays for the numbers that differ."""
-        return view_samples(self.config.settings, self.reads, self.values)
+        return cast(FileSection, SampleView(self.config.settings, self.reads, self.values))
 
     def take(self, rows: IntArray) -> Samples:
         """Return some of the samples."""
@@ -61,35 +66,13 @@ class Samples:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AssumedAxis:
-    """What a design assumes of one axis in each of b samples."""
-
-    delay_frames: float  # the same for all
-    turbulence: ModalTurbulence  # a process per sample
-    noise_nm: FloatArray  # (b,)
-    sensor_gain: FloatArray  # (b,)
-    vibrations: FloatArray  # frequency, damping and rms of each, (b, vibrations, 3)
-
-    def equals(self, other: AssumedAxis) -> bool:
-        """Whether all numbers are the same."""
-        pairs = (
-            (self.turbulence.coefficients, other.turbulence.coefficients),
-            (self.turbulence.driving_rms_nm, other.turbulence.driving_rms_nm),
-            (self.noise_nm, other.noise_nm),
-            (self.sensor_gain, other.sensor_gain),
-            (self.vibrations, other.vibrations),
-        )
-        return all(np.array_equal(first, second) for first, second in pairs)
-
-
 def read_config(config: Config, *, designs: bool = False) -> Reads:
-    """Return what the builders read of a configuration, with those of :func:`assumed_axes`."""
+    """Return what the builders read of a configuration, with those of designs for samples."""
     one = np.zeros(1)
     found = Samples(config=config, values={}, delay_error_frames=one, noise_factor=one)
     build_config(found.settings, config.source)
     if designs and config.settings.sensor.matrix is None:
-        assumed_axes(found)
+        _assumed_plants(found)
     return found.reads
 
 
@@ -106,10 +89,7 @@ def build_ensemble(samples: Samples) -> LoopEnsemble:
             vibrations.append(EnsembleVibration(**numbers))
             continue
         whole, rate = Vibration(**numbers), config.hardware.frame_rate_hz
-        vibrations += [
-            EnsembleVibration(direction=line.direction, **{n: getattr(line, n) for n in _VIBRATION})
-            for line in spread_vibration(whole, section, rate, key)
-        ]
+        vibrations += map(ensemble_vibration, spread_vibration(whole, section, rate, key))
     return LoopEnsemble(
         sensor_gain=relative_gain(settings, config.sensor_gain),
         delay_frames=delay,
@@ -120,8 +100,56 @@ def build_ensemble(samples: Samples) -> LoopEnsemble:
     )
 
 
-def assumed_axes(samples: Samples) -> list[AssumedAxis]:
-    """Return what designs assume of each axis, of a configuration with independent axes."""
+def has_independent_axes(config: Config) -> bool:
+    """Whether the Kalman filter of a configuration separates into one per axis."""
+    hardware, settings = config.hardware, config.settings
+    return (
+        settings.sensor.matrix is None
+        and np.array_equal(hardware.influence, np.eye(hardware.modes))
+        and all(np.count_nonzero(line.direction) == 1 for line in config.plant.vibrations)
+        and all(section.spread_hz is None for section in settings.model.vibrations or ())
+    )
+
+
+def kalman_matrices(samples: Samples) -> tuple[FloatArray, ...]:
+    """Design a Kalman filter for each sample of independent axes; A, B, C, D in textbook form.
+
+    The equations of all samples are solved at once, those of equal axes once.
+    """
+    assumed = _assumed_plants(samples)
+    distinct = {id(plants): plants for plants in assumed}
+    designs = {key: _axis_matrices(plants) for key, plants in distinct.items()}
+    axes = [designs[id(plants)] for plants in assumed]
+    ends = np.cumsum([0, *(A.shape[-1] for A, *_ in axes)])
+    A = np.zeros((samples.count, ends[-1], ends[-1]))
+    B, C = np.zeros((samples.count, ends[-1], len(axes))), np.zeros_like(A[:, : len(axes)])
+    D = np.zeros((samples.count, len(axes), len(axes)))
+    for axis, (a, b, c) in enumerate(axes):
+        x = slice(*ends[axis : axis + 2])
+        A[:, x, x], B[:, x, axis], C[:, axis, x] = a, b[..., 0], (c @ a)[:, 0]
+        D[:, axis, axis] = (c @ b)[:, 0, 0]
+    return A, B, C, D
+
+
+def _axis_matrices(plants: list[TipTiltPlant]) -> tuple[FloatArray, ...]:
+    """Return A, B and C of the filters of one axis, as :meth:`TipTiltPlant.controller` has them."""
+    A, C, L, Q, R = (np.stack([getattr(plant, name) for plant in plants]) for name in "ACLQR")
+    gains = transpose(solve_dare(transpose(A), transpose(C), Q, R).gain_feedback)
+    sensor = np.stack([plant.hardware.sensor for plant in plants])
+    unit = replace(plants[0].hardware, sensor_matrix=None)
+    (A_known,), (B_known,), C_known, D_known = known_states(unit)
+    count, n, past = *gains.shape[:2], len(A_known)
+    whole, zeros = np.zeros((count, n + past, n + past)), np.zeros((count, past, 1))
+    whole[:, :n, :n], whole[:, n:, n:] = A, A_known
+    entry = np.concatenate([gains, zeros], axis=1)
+    estimate = np.concatenate([L, transpose(zeros)], axis=2)
+    applied = np.vstack([np.zeros((n, 1)), B_known]) - entry @ (sensor * D_known)
+    seen = np.concatenate([C, sensor * C_known], axis=2)
+    return whole - entry @ seen + applied @ estimate, entry, estimate
+
+
+def _assumed_plants(samples: Samples) -> list[list[TipTiltPlant]]:
+    """Return the plants that designs assume of each axis, one per sample; equal axes share them."""
     config, settings, count = samples.config, samples.settings, samples.count
     require_one_model_turbulence(settings, but_flows=True)
     axes = config.hardware.modes
@@ -131,19 +159,35 @@ def assumed_axes(samples: Samples) -> list[AssumedAxis]:
     for _, _, numbers in vibration_numbers(settings, "model"):
         each = [np.broadcast_to(numbers[name], (count,)) for name in _VIBRATION]
         lines[int(np.argmax(np.abs(numbers["direction"])))].append(np.stack(each, axis=1))
-    flows, models = _frozen_flows(samples), config.plant.turbulence
-    return [
-        AssumedAxis(
-            delay_frames=settings.loop.delay_frames,
-            turbulence=_modal_turbulence(
-                models[axis], flows if isinstance(section, Ar1Section) else None, count
-            ),
-            noise_nm=noise[:, axis],
-            sensor_gain=gains[:, axis],
-            vibrations=np.stack(lines[axis], axis=1) if lines[axis] else np.empty((count, 0, 3)),
-        )
-        for axis, section in enumerate(turbulence_sections(settings))
-    ]
+    flows, keys = _frozen_flows(samples), []
+    plants: dict[tuple[bytes, ...], list[TipTiltPlant]] = {}
+    for axis, section in enumerate(turbulence_sections(settings)):
+        model = config.plant.turbulence[axis]
+        coefficients = np.tile(model.coefficients, (count, 1))
+        driving = np.full(count, model.driving_rms_nm)
+        if flows is not None and isinstance(section, Ar1Section):
+            coefficients, driving = ar1_flows(flows, frame_rate_hz=model.frame_rate_hz)
+        shakes = np.stack(lines[axis], axis=1) if lines[axis] else np.empty((count, 0, 3))
+        arrays = (coefficients, driving, noise[:, axis], gains[:, axis], shakes)
+        keys.append(tuple(array.tobytes() for array in arrays))
+        plants[keys[-1]] = plants.get(keys[-1]) or [
+            tip_tilt_plant(
+                frame_rate_hz=model.frame_rate_hz,
+                turbulence=replace(model, coefficients=coefficients[i], driving_rms_nm=driving[i]),
+                noise_nm=noise[i, axis],
+                vibrations=[
+                    Vibration(frequency_hz=f, damping=d, rms_nm=r, direction=(1.0,))
+                    for f, d, r in shakes[i].tolist()
+                ]
+                or None,
+                delay_frames=settings.loop.delay_frames,
+                sensor_gain=gains[i, axis],
+                modes=1,
+                mirror=config.hardware.mirror,
+            )
+            for i in range(count)
+        ]
+    return [plants[key] for key in keys]
 
 
 def accepted_samples(samples: Samples) -> IntArray:
@@ -186,15 +230,3 @@ def _frozen_flows(samples: Samples) -> FrozenFlows | None:
     weather = {name: getattr(air.per_sample, name) for name in WEATHER}
     differing = {name: values for name, values in weather.items() if np.ndim(values)}
     return FrozenFlows(atmosphere=atmosphere, **differing) if differing else None
-
-
-def _modal_turbulence(model: ARModel, flows: FrozenFlows | None, count: int) -> ModalTurbulence:
-    """Return the models of kind ar1 of frozen flows, or the same model for each sample."""
-    if flows is None:
-        coefficients = np.tile(model.coefficients, (count, 1))
-        driving = np.full(count, model.driving_rms_nm)
-    else:
-        coefficients, driving = ar1_flows(flows, frame_rate_hz=model.frame_rate_hz)
-    return ModalTurbulence(
-        coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=model.frame_rate_hz
-    )

@@ -8,7 +8,10 @@ they depend on by reading it, and :class:`Reads` says which numbers of a configu
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Collection, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Annotated, Any, cast
@@ -18,8 +21,11 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.section import Section
+from lbt_synth.errors import ConfigError
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import BoolArray, FloatArray
 
+_KEY = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
 Keys = tuple[str | int, ...]  # the path of a number, such as ("truth", "vibrations", 0, "rms_nm")
 
 
@@ -87,13 +93,6 @@ class SampleView:
         return value
 
 
-def view_samples(
-    settings: FileSection, reads: Reads, values: Mapping[Keys, FloatArray] | None = None
-) -> FileSection:
-    """Return the settings of samples with arrays (b,) at some keys; it records what is read."""
-    return cast(FileSection, SampleView(settings, reads, values or {}))
-
-
 def accepted_by_schema(settings: FileSection, keys: Keys, values: FloatArray) -> BoolArray:
     """Return which values (b,) the schema accepts for a number of a section."""
     here: Any = settings
@@ -116,3 +115,81 @@ def _list_adapter(section: type[Section], name: str) -> TypeAdapter[list[Any]]:
     rules = section.model_config
     config = ConfigDict(strict=rules["strict"], allow_inf_nan=rules["allow_inf_nan"])
     return TypeAdapter(list[kind], config=config)
+
+
+@lru_cache(maxsize=256)
+def parse_path(path: str) -> Keys:
+    """Parse a path into its keys."""
+    keys: list[str | int] = []
+    for word in path.split("."):
+        match = _KEY.fullmatch(word)
+        if match is None:
+            raise ConfigError(
+                f"{path!r} is no path in a configuration; expected one such as "
+                "truth.vibrations[0].frequency_hz."
+            )
+        keys += [match[1], *map(int, re.findall(r"[0-9]+", match[2]))]
+    return tuple(keys)
+
+
+def find_number(content: Mapping[str, Any], path: str) -> float:
+    """Return the number to which a path leads; refuse a path that leads to none."""
+    here: Any = content
+    parent: Any = {}
+    walked = ""
+    for key in parse_path(path):
+        place = walked or "the configuration"
+        listed = isinstance(key, int)
+        if not isinstance(here, list if listed else dict):
+            says = "is no list" if listed else "has no keys"
+            raise ConfigError(f"{path}: {place} {says}; {_describe(here)}.")
+        if isinstance(key, int) and key >= len(here):
+            raise ConfigError(
+                f"{path}: {place} has {count_text(len(here), 'entry', 'entries')}, "
+                f"counted from 0; got [{key}]."
+            )
+        if isinstance(key, str) and key not in here:
+            close = difflib.get_close_matches(key, list(here), n=1, cutoff=0.6)
+            hint = f"did you mean {close[0]}? " if close else ""
+            raise ConfigError(
+                f"{path}: {place} has no {key}; {hint}there are {', '.join(sorted(here))}."
+            )
+        walked += f"[{key}]" if listed else f".{key}" if walked else str(key)
+        parent = here
+        here = parent[key]
+    if here is None:
+        entries = parent.items() if isinstance(parent, dict) else ()
+        there = [k for k, v in entries if type(v) in (int, float)]
+        others = f" Numbers that are set there: {', '.join(sorted(there))}." if there else ""
+        raise ConfigError(
+            f"{path} is not set in the configuration, so it cannot be varied.{others}"
+        )
+    if type(here) not in (int, float):
+        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(here)}.")
+    return cast(float, here)
+
+
+def _describe(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"it is a section with {', '.join(sorted(value))}"
+    if isinstance(value, list):
+        return f"it is a list of {len(value)}"
+    return "it is not set" if value is None else f"it is {value!r}"
+
+
+def set_number(
+    content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]
+) -> None:
+    """Set a number that :func:`find_number` finds in ``full``, the content with its defaults.
+
+    Missing sections on the way are added, missing lists copied. An integer stays one if it can.
+    """
+    here: Any = content
+    whole: Any = full
+    for key in keys[:-1]:
+        whole = whole[key]
+        if isinstance(here, dict) and key not in here:
+            here[key] = deepcopy(whole) if isinstance(whole, list) else {}
+        here = here[key]
+    is_integer = isinstance(whole[keys[-1]], int) and value.is_integer()
+    here[keys[-1]] = int(value) if is_integer else value

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.draw import PANEL_IN, Panel, drawing
 from lbt_synth.report.page.blocks import (
@@ -34,22 +35,26 @@ from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.array_file import digest
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, duration_text, listing_text
-from lbt_synth.studies import Failure, Study, study_statistics
+from lbt_synth.studies import Study, study_statistics
+from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study import summary
-from lbt_synth.studies.study.binning import binned_map, cumulative_points, histogram, value_shares
-from lbt_synth.studies.study.controller_samples import (
-    ControllerSamples,
-    read_column,
-    read_controller_samples,
-)
 from lbt_synth.studies.study.statistics import (
+    ControllerSamples,
     ControllerStatistics,
     StudyStatistics,
+    is_list,
+    read_column,
+    read_controller_samples,
     sample_losses,
 )
 from lbt_synth.validation import FloatArray
 
 _UNSTABLE_PANELS = 4
+_POINTS = 200  # of a cumulative distribution
+_BINS = 30  # of a histogram, at most
+_CELLS = 32  # along either axis of a map, at most
+_WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
+_PER_CELL = 8  # samples in a cell of a map on average, at least
 _HIGH = 40.0  # Strehl ratio [%] above which the axis need not start at 0
 _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
@@ -86,8 +91,8 @@ def write_study_page(
         File to write, that ends in .html, in the directory of the results.
     statistics : StudyStatistics, optional
         Those of the columns, if they are known already.
-    failures : sequence of Failure, optional
-        What failed.
+    failures : sequence of (int, str, str), optional
+        Row, controller and error of what failed.
     computing_s : float, optional
         Time of all its batches, of all processes together [s].
     pdf : path-like, optional
@@ -111,7 +116,7 @@ def write_study_page(
     >>> study = lbt.studies.load_study("examples/study.yaml")
     >>> values = study.values(0, 2)
     >>> columns = dict(zip(study.parameter_names, values.T))
-    >>> columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    >>> columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     files = lbt.report.write_study_page(
     ...         study, columns, pathlib.Path(folder) / "summary.html"
@@ -121,8 +126,7 @@ def write_study_page(
     """
     require_page_names(path, pdf, inputs=study.inputs)
     if statistics is None:
-        names = [each.name for each in study.controllers]
-        statistics = study_statistics(columns, study.parameter_names, names)
+        statistics = study_statistics(columns, study.parameter_names, list(study.controllers))
     page = study_page(
         study,
         statistics,
@@ -153,7 +157,7 @@ def study_page(
     values = {
         name: read_column(columns, name, statistics.samples) for name in statistics.parameters
     }
-    names = summary.short_names(statistics.parameters)
+    names = short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
     reading = [paragraph(name) for name in ("intervals", "indices")]
     made = time_text(creation_time())
@@ -169,26 +173,38 @@ def study_page(
             _controllers_section(study, statistics, failures),
             _comparison_section(statistics, samples),
             _dependence_section(statistics, samples, values, names),
-            _worst_section(study, statistics, names, folder),
+            _worst_section(study, statistics, columns, names, folder),
             Section(key="reading", title="How to read the figures", blocks=reading),
             _origin_section(study, statistics, computing_s),
         ),
     )
 
 
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return for each path its last keys, as many as distinguish it from the others."""
+    out = {}
+    for name in names:
+        keys = name.split(".")
+        for count in range(1, len(keys) + 1):
+            out[name] = ".".join(keys[-count:])
+            if sum(f".{other}".endswith(f".{out[name]}") for other in names) == 1:
+                break
+    return out
+
+
 def _summary_section(
     study: Study, statistics: StudyStatistics, samples: Sequence[ControllerSamples]
 ) -> Section:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    unstable = [each for each in statistics.controllers if each.unstable.count]
+    unstable = [each for each in statistics.controllers if each.unstable]
     failed = [each for each in statistics.controllers if each.failed]
     warnings = []
     if statistics.samples < study.samples:
         warnings.append(paragraph("incomplete", done=statistics.samples, samples=study.samples))
     if unstable:
         parts = ", ".join(
-            f"{each.controller} in {each.unstable.count} of {each.samples} "
-            f"({summary.percent(each.unstable.value, 2)} %)"
+            f"{each.controller} in {each.unstable} of {each.samples} "
+            f"({summary.percent(each.unstable_share.value, 2)} %)"
             for each in unstable
         )
         warnings.append(f"Unstable loops: {parts}.")
@@ -219,11 +235,11 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     text = paragraph(
         "leaders",
         mean=leader(lambda each: each.mean),
-        median=leader(lambda each: each.strehl[3].value),
-        low=leader(lambda each: each.strehl[1].value),
+        median=leader(lambda each: each.strehl[50].value),
+        low=leader(lambda each: each.strehl[5].value),
     )
-    least = min(with_data, key=lambda each: each.loss.loss[1].value)
-    loss = least.loss.loss[1].value
+    least = min(with_data, key=lambda each: each.loss[95].value)
+    loss = least.loss[95].value
     if len(with_data) == 1 or not np.isfinite(loss):
         return text
     return f"{text} {paragraph('regret', name=least.controller, loss=summary.percent(loss))}"
@@ -231,7 +247,7 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
 
 def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Names) -> Section:
     """Show the parameters and their histograms."""
-    distributions = {each.name: each.distribution.text for each in study.parameters}
+    distributions = {name: section.text for name, section in study.settings.parameters.items()}
     rows = tuple(
         (
             names[name],
@@ -272,11 +288,11 @@ def _controllers_section(
     study: Study, statistics: StudyStatistics, failures: Sequence[Failure]
 ) -> Section:
     """List the controllers, with digests of what is the same for all samples, and failures."""
-    origins = {each.name: each.origin for each in study.controllers}
+    origins = {name: section.text for name, section in study.settings.controllers.items()}
     digests = {
-        each.name: digest({name: getattr(each.design.controller, name) for name in "ABCD"}, {})
-        for each in study.controllers
-        if each.design is not None
+        name: digest({matrix: getattr(each.controller, matrix) for matrix in "ABCD"}, {})
+        for name, each in study.controllers.items()
+        if isinstance(each, Design)
     }
     rows = tuple(
         (
@@ -284,7 +300,7 @@ def _controllers_section(
             origins.get(each.controller, ""),
             digests.get(each.controller, "-")[:16],
             str(each.samples),
-            _count_cell(each.unstable.count),
+            _count_cell(each.unstable),
             _count_cell(each.failed),
         )
         for each in statistics.controllers
@@ -294,7 +310,7 @@ def _controllers_section(
     if failures:
         more = len(failures) - _MOST_FAILURES
         caption = f": the first {_MOST_FAILURES}, and {more} more" if more > 0 else ""
-        listed = tuple((str(f.row), f.controller, f.error) for f in failures[:_MOST_FAILURES])
+        listed = tuple((str(row), name, error) for row, name, error in failures[:_MOST_FAILURES])
         blocks.append(
             Table(
                 caption=f"Evaluations that failed{caption}",
@@ -330,13 +346,12 @@ def _dependence_section(
     names: Names,
 ) -> Section:
     """Show what the Strehl ratio depends on."""
-    if not summary.varying_parameters(statistics):
+    if not statistics.ranked:
         blocks: tuple[Block, ...] = (Notice(text=paragraph("no-index")),)
         return Section(key="dependence", title="Dependence", blocks=blocks)
     blocks = (
         *_sensitivity_chart(statistics, names),
         summary.sensitivity_table(statistics, names=names),
-        summary.swing_table(statistics, names=names),
         *_conditional_charts(statistics, names),
         *_map_charts(statistics, samples, values, names),
     )
@@ -344,21 +359,25 @@ def _dependence_section(
 
 
 def _worst_section(
-    study: Study, statistics: StudyStatistics, names: Names, folder: Path
+    study: Study,
+    statistics: StudyStatistics,
+    columns: Mapping[str, ArrayLike],
+    names: Names,
+    folder: Path,
 ) -> Section:
     """List the worst samples, and the commands that replay them."""
     blocks: list[Block] = []
     words = ["lbt-synth", "study", os.fspath(study.source), "-o", os.fspath(folder), "--row"]
     commands = []
     most = 0
-    for each, one in zip(statistics.controllers, statistics.sensitivities, strict=True):
+    for each in statistics.controllers:
         if each.worst:
-            ranked = tuple(p.parameter for p in one.ranked)
-            others = tuple(name for name in statistics.parameters if name not in ranked)
-            shown = (ranked or others)[:_PARAMETERS]
-            most = max(most, len(ranked) - len(shown))
-            blocks.append(summary.worst_table(each, shown, names=names))
-            commands.append(shlex.join([*words, str(each.worst[0].row)]))
+            others = tuple(name for name in statistics.parameters if name not in each.ranked)
+            shown = (each.ranked or others)[:_PARAMETERS]
+            most = max(most, len(each.ranked) - len(shown))
+            table = summary.worst_table(each, columns, shown, names=names)
+            blocks.append(table)
+            commands.append(shlex.join([*words, str(table.rows[0][0])]))
     if most:
         blocks.insert(0, paragraph("worst", count=_PARAMETERS))
     if commands:
@@ -468,21 +487,20 @@ def _histogram_chart(parameters: Mapping[str, FloatArray], names: Names) -> list
 
 def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     """First-order indices as bars, one series per controller."""
-    varying = summary.varying_parameters(statistics)
+    varying = statistics.ranked
     if not varying:
         return []
     bars: dict[str, FloatArray] = {}
     intervals: dict[str, tuple[FloatArray, FloatArray]] = {}
     strongest = []
-    for one in statistics.sensitivities:
-        index = {each.parameter: each.index for each in one.parameters}
-        value = 100 * np.array([index[name].value for name in varying])
-        error = 200 * np.array([index[name].error for name in varying])
+    for one in statistics.controllers:
+        value = 100 * np.array([one.sensitivity[name]["index"] for name in varying])
+        error = 200 * np.array([one.sensitivity[name]["index_error"] for name in varying])
         bars[one.controller], low, high = np.maximum((value, value - error, value + error), 0)
         intervals[one.controller] = low, high
         strongest += [
-            f"{one.controller} depends most on {each.parameter}, {100 * each.index.value:.0f} %"
-            for each in one.ranked[:1]
+            f"{one.controller} depends most on {name}, {100 * one.sensitivity[name]['index']:.0f} %"
+            for name in one.ranked[:1]
         ] or [f"{one.controller} has none"]
     height_in = min(max(0.8, 0.24 * len(varying) * len(bars) + 0.2), 7.5)  # fits a sheet
     with drawing([height_in]) as (panel,):
@@ -498,12 +516,11 @@ def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart
     """
     curves = {
         name: [
-            (look, one.controller, each.curve)
-            for look, one in enumerate(statistics.sensitivities)
-            for each in one.parameters
-            if each.parameter == name and each.curve is not None
+            (look, one.controller, one.curves[name])
+            for look, one in enumerate(statistics.controllers)
+            if name in one.curves
         ]
-        for name in summary.varying_parameters(statistics)
+        for name in statistics.ranked
     }
     curves = {name: own for name, own in curves.items() if own}
     if not curves:
@@ -511,24 +528,27 @@ def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart
     style: dict[str, Any] = {"marker": "own", "width": 1.8}
     with drawing([PANEL_IN] * len(curves), columns=min(len(curves), 2)) as panels:
         for panel, (name, own) in zip(panels, curves.items(), strict=True):
-            least = min(100 * float(np.min(curve.low)) for *_, curve in own)
+            least = min(100 * float(np.min(curve["low"])) for *_, curve in own)
             y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0 if least < _HIGH else None}
             panel.set_axes({"label": names[name]}, y_axis)
             for look, controller, curve in own:
-                panel.curve(controller, curve.parameter, 100 * curve.mean, look=look, **style)
+                x, y = curve["parameter"], 100 * curve["mean"]
+                panel.curve(controller, x, y, look=look, **style)
             for look, controller, curve in own:
-                label, y = f"{controller}, 10th percentile", 100 * curve.low
-                panel.curve(label, curve.parameter, y, look=look, width=0.9, quiet=True)
+                label, y = f"{controller}, 10th percentile", 100 * curve["low"]
+                panel.curve(label, curve["parameter"], y, look=look, width=0.9, quiet=True)
             panel.curve("10th percentile (thin)", [], [], look=None, width=0.9)
     charts = [
         chart("curves", panels[0].figure, names=listing_text([names[name] for name in curves]))
     ]
     unstable = {
-        name: [(look, controller, curve) for look, controller, curve in own if curve.unstable.any()]
+        name: [
+            (look, controller, curve) for look, controller, curve in own if curve["unstable"].any()
+        ]
         for name, own in curves.items()
     }
     spans = {
-        name: max(float(np.ptp(curve.unstable)) for *_, curve in own)
+        name: max(float(np.ptp(curve["unstable"])) for *_, curve in own)
         for name, own in unstable.items()
         if own
     }
@@ -539,7 +559,8 @@ def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart
         for panel, name in zip(panels, most, strict=True):
             panel.set_axes({"label": names[name]}, {"label": "unstable", "unit": "%", "low": 0})
             for look, controller, curve in unstable[name]:
-                panel.curve(controller, curve.parameter, 100 * curve.unstable, look=look, **style)
+                x, y = curve["parameter"], 100 * curve["unstable"]
+                panel.curve(controller, x, y, look=look, **style)
     return [
         *charts,
         chart("unstable", panels[0].figure, names=listing_text([names[name] for name in most])),
@@ -554,19 +575,86 @@ def _map_charts(
 ) -> list[Chart]:
     """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
     charts = []
-    for place, (one, each) in enumerate(zip(statistics.sensitivities, samples, strict=True)):
+    for place, (one, each) in enumerate(zip(statistics.controllers, samples, strict=True)):
         if len(one.ranked) < 2:
             continue
-        first, second = (parameter.parameter for parameter in one.ranked[:2])
+        first, second = one.ranked[:2]
         kept = each.evaluated
-        grid = binned_map(parameters[first][kept], parameters[second][kept], each.strehl[kept])
-        low, high = (100 * float(end(grid.mean)) for end in (np.nanmin, np.nanmax))
+        places = parameters[first][kept], parameters[second][kept]
+        x, y, mean = binned_map(*places, each.strehl[kept])
+        low, high = (100 * float(end(mean)) for end in (np.nanmin, np.nanmax))
         ends = 5 * float(np.floor(low / 5)), 5 * float(np.floor(high / 5)) + 5
         with drawing([2.6]) as (panel,):
             panel.set_axes({"label": names[first]}, {"label": names[second]})
             label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
-            panel.map(grid.x, grid.y, 100 * grid.mean, ends=ends, blank="no sample", **label)
+            panel.map(x, y, 100 * mean, ends=ends, blank="no sample", **label)
         facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
         facts |= {"controller": each.controller, "low": f"{low:.1f}", "high": f"{high:.1f}"}
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
     return charts
+
+
+def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return levels (k,) and the part of the values at or below each, denser in the tails."""
+    ordered, n = np.sort(values), len(values)
+    ranks = np.arange(n)
+    if n > 2 * _POINTS:
+        tail = np.geomspace(1, n / 4, _POINTS // 4).astype(np.int64) - 1
+        even = np.linspace(0, n - 1, _POINTS).astype(np.int64)
+        ranks = np.concatenate((tail, n - 1 - tail, even))
+    level = np.unique(ordered[ranks])
+    return level, np.searchsorted(ordered, level, side="right") / n
+
+
+def histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return edges of bins (k + 1,) and the part of the values in each (k,)."""
+    bins = int(np.clip(np.sqrt(len(values)), 4, _BINS))
+    counts, edges = np.histogram(values, bins=bins)
+    return edges, counts / len(values)
+
+
+def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the distinct values of a list parameter and their parts; None if it is no list."""
+    if not is_list(np.sort(values)):
+        return None
+    distinct, counts = np.unique(values, return_counts=True)
+    return distinct, counts / len(values)
+
+
+def binned_map(
+    x: FloatArray, y: FloatArray, result: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the mean of a result (n,) over a grid of two varying parameters (n,).
+
+    It is (ny, nx), nan in a cell without samples, and comes after the centres of the cells, or
+    the values of a list, x (nx,) and y (ny,).
+    """
+    cells = len(x) / _PER_CELL
+    lists = [value_shares(x), value_shares(y)]
+    for listed in lists:
+        cells /= 1 if listed is None else len(listed[0])
+    width = int(np.clip(cells ** (1 / max(lists.count(None), 1)), 3, _CELLS))
+    (columns, x_edges), (rows, y_edges) = (
+        _cells(values, listed, width) for values, listed in zip((x, y), lists, strict=True)
+    )
+    samples = np.histogram2d(y, x, bins=(y_edges, x_edges))[0]
+    sums = np.histogram2d(y, x, bins=(y_edges, x_edges), weights=result)[0]
+    mean = np.full(samples.shape, np.nan)
+    np.divide(sums, samples, out=mean, where=samples > 0)
+    return columns, rows, mean
+
+
+def _cells(
+    values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the centres of the cells along one axis, and their edges."""
+    if listed is not None:
+        centres = listed[0]
+        inner = (centres[:-1] + centres[1:]) / 2
+    else:
+        low, high = np.percentile(values, _WITHIN)
+        if not low < high:
+            low, high = float(np.min(values)), float(np.max(values))
+        edges = np.linspace(low, high, cells + 1)
+        centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
+    return centres, np.concatenate(([-np.inf], inner, [np.inf]))

@@ -1,15 +1,20 @@
-"""How far designs are from the limits of performance."""
+"""How far designs are from the limits of performance, and from reference designs in the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
+from lbt_synth.config import Config
+from lbt_synth.design import (
+    Design,
+)
+from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.loop import (
     ClosedLoop,
     Imaging,
@@ -17,13 +22,15 @@ from lbt_synth.loop import (
     least_residual,
     least_worst_residual,
     residual_budget,
-    strehl,
 )
 from lbt_synth.loop.broken_loops import phase_margin_deg
 from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_none
+from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
+from lbt_synth.studies.grid import loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 if TYPE_CHECKING:
@@ -31,6 +38,11 @@ if TYPE_CHECKING:
     from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 
 _GRID = 65  # shifts over the range of errors, at least
+_SAME = 1e-6  # relative difference of residuals of one design
+_CLEAR = 0.01  # of the residual's variance by which a reference has to be better
+# Residual in the truth over what the design expects: at least twice the variance. A mirror that is
+# slower than a Kalman filter believes stays below (1.2 in examples/lbt_slow_mirror.yaml).
+_SURPRISING = 1.5
 
 
 @table_row
@@ -40,10 +52,7 @@ class LimitRow:
     design: str = column("design", help="Its name")
     method: str = column(help="How it was made")
     residual_nm: float = nm_column(
-        "residual",
-        format=".2f",
-        missing="unstable",
-        help="Residual under the truth, rms",
+        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
     )
     strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
     above_limit_percent: float = column(
@@ -152,34 +161,34 @@ def limits(
     shifts = _frequency_shifts(truth, errors)
     alone = hardware.own_sensor_alone()
     limit = limit_or_none(lambda: least_residual(alone, truth))
-    band_hz = _error_band(truth, shifts)
-    band = None
-    if band_hz is not None:
+    band = band_hz = None
+    if len(vibrations) == 1 and isinstance(vibrations[0], SinusoidalVibration) and shifts.size > 1:
         line = vibrations[0]
-        band = limit_or_none(
-            lambda: least_worst_residual(
-                alone, truth, band_hz=band_hz, rms_nm=line.rms_nm, direction=line.direction
-            )
-        )
+        band_hz = line.frequency_hz + float(shifts[0]), line.frequency_hz + float(shifts[-1])
+        least_worst = partial(least_worst_residual, alone, truth, band_hz=band_hz)
+        band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
     rows, curves = [], []
     for name, design in designs.items():
         loop = design.close(hardware, sensor_gain=truth.sensor_gain)
-        residual_nm, ratio, curve = _evaluate_loop(loop, truth, imaging, shifts)
+        numbers = loop_columns(loop, truth, imaging)
+        residual_nm = numbers["residual_nm"]
+        curve = _residual_curve(loop, truth, shifts, residual_nm)
         worst_nm = float(np.max(curve)) if shifts.size else residual_nm
-        limit_nm, band_nm = (_limit_nm(loop, found) for found in (limit, band))
-        rows.append(
-            LimitRow(
-                design=name,
-                method=design.method,
-                residual_nm=residual_nm,
-                strehl=ratio,
-                above_limit_percent=above_percent(residual_nm, limit_nm),
-                worst_nm=worst_nm,
-                above_band_limit_percent=above_percent(worst_nm, band_nm),
-                phase_margin_deg=_phase_margin_deg(loop),
-                stable=loop.is_stable,
-            )
+        margin_deg = np.nan
+        if loop.is_stable and not loop.reads_others:
+            margin_deg = phase_margin_deg(broken_loops(loop))
+        limit_nm, band_nm = (  # of the loop's own sensor
+            np.nan if each is None or loop.reads_others else each.rms_nm for each in (limit, band)
         )
+        row = {
+            "design": name,
+            "above_limit_percent": above_percent(residual_nm, limit_nm),
+            "worst_nm": worst_nm,
+            "above_band_limit_percent": above_percent(worst_nm, band_nm),
+            "phase_margin_deg": margin_deg,
+            "stable": loop.is_stable,
+        }
+        rows.append(fill_row(LimitRow, SimpleNamespace(**numbers), design, **row))
         curves.append(curve)
     return LimitStudy(
         rows=tuple(rows),
@@ -192,18 +201,6 @@ def limits(
     )
 
 
-def _limit_nm(loop: ClosedLoop, limit: ResidualLimit | BandLimit | None) -> float:
-    """Return a limit of the loop's own sensor; nan where a loop reads others, or there is none."""
-    return limit.rms_nm if limit is not None and not loop.reads_others else np.nan
-
-
-def _phase_margin_deg(loop: ClosedLoop) -> float:
-    """Return the least phase margin; nan if the loop is unstable, or of several sensors."""
-    if not loop.is_stable or loop.reads_others:
-        return np.nan
-    return phase_margin_deg(broken_loops(loop))
-
-
 def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
     """Return the shifts over the range of errors, the errors and 0 among them."""
     if not truth.vibrations:
@@ -214,27 +211,121 @@ def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
     return np.asarray(np.unique(np.concatenate([grid, moved, inside]) + 0.0))
 
 
-def _error_band(truth: Truth, shifts: FloatArray) -> tuple[float, float] | None:
-    """Return the range of the true frequency [Hz] if there is one sinusoid and a range."""
-    lines = truth.vibrations
-    if len(lines) != 1 or not isinstance(lines[0], SinusoidalVibration) or shifts.size < 2:
-        return None
-    return lines[0].frequency_hz + float(shifts[0]), lines[0].frequency_hz + float(shifts[-1])
-
-
-def _evaluate_loop(
-    loop: ClosedLoop, truth: Truth, imaging: Imaging, shifts: FloatArray
-) -> tuple[float, float, FloatArray]:
-    """Return residual [nm], Strehl ratio and residual at each shift [nm]; nan if unstable."""
-    if not loop.is_stable:
-        return np.nan, np.nan, np.full(shifts.size, np.nan)
-    budget = residual_budget(loop, truth)
-    if not np.any(shifts):
-        return budget.rms_nm, strehl(budget, imaging), np.full(shifts.size, budget.rms_nm)
+def _residual_curve(
+    loop: ClosedLoop, truth: Truth, shifts: FloatArray, residual_nm: float
+) -> FloatArray:
+    """Return the residual at each shift [nm rms], (s,), of which only vibrations move."""
+    if not (loop.is_stable and np.any(shifts)):
+        return np.full(shifts.size, residual_nm)
     still = replace(truth, turbulence=None, noise_nm=0.0)
-    shaken = [
-        residual_budget(loop, still.with_frequency_error(float(shift))) for shift in [0.0, *shifts]
-    ]
-    first, *others = (np.trace(one.total_nm2) for one in shaken)
-    variance = np.array([np.trace(budget.total_nm2) - first + other for other in others])
-    return budget.rms_nm, strehl(budget, imaging), np.sqrt(variance)
+    moved = [still.with_frequency_error(float(shift)) for shift in (0.0, *shifts)]
+    first, *others = (np.trace(residual_budget(loop, each).total_nm2) for each in moved)
+    return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TruthComparison:
+    """Designs in the truth of a configuration."""
+
+    rows: tuple[LimitRow, ...]  # the designs, then the reference designs that are none of them
+    # the least residual of any linear controller; None where the modes do not decouple
+    limit: ResidualLimit | None
+    # what is wrong with a design in this truth: an unstable loop, a residual far above what the
+    # design expects, and demands that cost residual
+    warnings: Mapping[str, tuple[str, ...]]
+    notes: tuple[str, ...]  # why reference designs are missing
+
+
+def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComparison:
+    """Compare designs in the truth of a configuration with its reference designs.
+
+    The reference designs are made for the configuration: the best integrator, the Kalman filter
+    and the H-infinity filter.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        Designs by name.
+    config : Config
+        The configuration; its truth must be stationary.
+
+    Returns
+    -------
+    TruthComparison
+        Exact residuals, the limit, and warnings.
+
+    Raises
+    ------
+    ProblemError
+        If a design or a vibration does not fit the loop, or a vibration drifts.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> slow = config.design("integrator", gain=0.2)
+    >>> found = lbt.studies.compare_in_truth({"slow": slow}, config)
+    >>> [row.design for row in found.rows], round(found.limit.rms_nm, 2)
+    (['slow', 'integrator', 'kalman', 'hinf'], 37.78)
+    """
+    references: dict[str, Design] = {}
+    notes = []
+    for method in reference_methods():
+        name = f"{method.name} (reference)" if method.name in designs else method.name
+        try:
+            references[name] = config.design(method.name, **method.reference_options)
+        except LbtSynthError as error:
+            notes.append(f"{method.name} is left out: {error}")
+    study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
+    means_nm = {name: _means_nm(design, config) for name, design in designs.items()}
+    ours, theirs = study.rows[: len(designs)], study.rows[len(designs) :]
+    there = np.array([row.residual_nm for row in ours])
+    others = [row for row in theirs if not np.any(np.abs(row.residual_nm - there) <= _SAME * there)]
+    better = {row.design: (references[row.design], row.residual_nm) for row in others}
+    return TruthComparison(
+        rows=(*ours, *others),
+        limit=study.limit,
+        warnings={
+            row.design: tuple(_warnings(designs[row.design], row, means_nm[row.design], better))
+            for row in ours
+        },
+        notes=tuple(notes),
+    )
+
+
+def _means_nm(design: Design, config: Config) -> float:
+    """Return what a design leaves in means over frames, as it expects it; nan if unstable."""
+    loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
+    if not loop.is_stable:
+        return np.nan
+    return residual_budget(loop, config.truth, frame_means=True).rms_nm
+
+
+def _warnings(
+    design: Design, row: LimitRow, means_nm: float, others: Mapping[str, tuple[Design, float]]
+) -> Iterator[str]:
+    """Yield what is wrong with a design in the truth, where it leaves some mean over frames."""
+    if not row.stable:
+        yield "the loop is unstable in the truth"
+        return
+    expected_nm = design.expected_residual_nm
+    surprises = False
+    if expected_nm is not None and means_nm > _SURPRISING * expected_nm:
+        surprises = True
+        yield (
+            f"the truth leaves {nm_text(means_nm)} in means over frames, where the design expects "
+            f"{nm_text(expected_nm)}: it has power that the design was not made for"
+        )
+    for name, (other, residual_nm) in others.items():
+        if not residual_nm**2 < (1 - _CLEAR) * row.residual_nm**2:
+            continue
+        violated = design.violated_demands(other.controller)
+        if violated is None:
+            return
+        if violated:
+            yield f"{name} leaves less in the truth; it violates: {'; '.join(violated)}"
+        elif not surprises:
+            yield (
+                f"{name} leaves less in the truth, where each vibration is at one frequency; "
+                "this design is for all frequencies of its bands"
+            )

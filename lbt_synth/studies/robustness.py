@@ -1,43 +1,67 @@
-"""Robustness of designs: designed again at each frequency error, or fixed over a map of errors."""
+"""What designs do where the loop is another: moved lines, gains, failing sensors, a mirror."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design
+from lbt_synth.config import Config
+from lbt_synth.design import (
+    Design,
+    FilterDesign,
+    central_filter,
+    hinf,
+    kalman,
+    lqg,
+    mixed,
+    optimal_integrator,
+)
+from lbt_synth.design.mixed import require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import (
-    EnsembleVibration,
     Imaging,
     LoopEnsemble,
+    Simulation,
     close_loop,
     ensemble_residuals,
+    loop_margins,
     residual_budget,
-    strehl,
+    settling_error,
 )
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
+from lbt_synth.loop.simulation.failing_sensors import Drop, Segment, run_segments, simulate_sensors
+from lbt_synth.loop.strehl import series_strehl
+from lbt_synth.methods.mixed import METHOD as MIXED
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
+from lbt_synth.studies.grid import loop_columns, moved_lines, stack_columns
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
     choice,
+    integer,
     number,
     read_only,
     real_array,
     require_instance,
 )
+
+FAMILIES = (MIXED.name, "central")
+_MOST_POINTS = 200  # of a trade-off
+_CROWDING = 1.5  # above 1, points are denser near the least norm
+_GAINS_AT_ONCE = 64  # of a map
 
 
 @table_row
@@ -48,13 +72,11 @@ class RobustnessRow:
         "error", unit="Hz", format="+.2f", help="True frequency less that of the model"
     )
     method: str = column("method", help="Method of synthesis")
-    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]", default=np.nan)
-    residual_nm: float = nm_column("residual", help="Residual of tip and tilt, rms", default=np.nan)
-    vibration_nm: float = nm_column("vibration", help="Its part of vibrations, rms", default=np.nan)
-    turbulence_nm: float = nm_column(
-        "turbulence", help="Its part of turbulence, rms", default=np.nan
-    )
-    noise_nm: float = nm_column("noise", help="Its part of noise, rms", default=np.nan)
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
+    residual_nm: float = nm_column("residual", help="Residual of tip and tilt, rms")
+    vibration_nm: float = nm_column("vibration", help="Its part of vibrations, rms")
+    turbulence_nm: float = nm_column("turbulence", help="Its part of turbulence, rms")
+    noise_nm: float = nm_column("noise", help="Its part of noise, rms")
     stable: bool = column("stable", help="Whether the loop is stable with the real sensor gain")
     gamma: float = column(unit="nm", help="H-infinity norm that the design achieves")
 
@@ -69,6 +91,7 @@ def robustness(
     gamma_ratio: float = 1.2,
     gamma: float | None = None,
     hold: str = "driving",
+    frame_means: bool = False,
 ) -> Iterator[RobustnessRow]:
     """Design at each frequency error and evaluate exactly against the same truth.
 
@@ -92,6 +115,8 @@ def robustness(
         One H-infinity bound for all rows, instead of the ratio.
     hold : {"driving", "rms"}, optional
         What the model keeps of a vibration when its frequency moves.
+    frame_means : bool, optional
+        As in :func:`residual_budget`.
 
     Yields
     ------
@@ -129,7 +154,12 @@ def robustness(
         shifts = [-truth.frequency_shift_hz(line.frequency_hz, error) for line in plant.vibrations]
         moved = retuned_plant(plant, shifts, hold=hold)
         for name in names:
-            yield _row(reference_design(name, moved, bound), truth, imaging, float(error))
+            design = reference_design(name, moved, bound)
+            hardware = require_hardware(design, "a row")
+            loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+            numbers = loop_columns(loop, truth, imaging, frame_means=frame_means)
+            numbers["stable"] = loop.is_stable
+            yield fill_row(RobustnessRow, design, error_hz=float(error), **numbers)
 
 
 def default_methods() -> list[str]:
@@ -137,56 +167,20 @@ def default_methods() -> list[str]:
     return [method.name for method in reference_methods(estimators_only=True)]
 
 
-def _row(design: Design, truth: Truth, imaging: Imaging, error: float) -> RobustnessRow:
-    hardware = require_hardware(design, "a row")
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    known = {"error_hz": error, "stable": loop.is_stable}
-    if not loop.is_stable:
-        return fill_row(RobustnessRow, design, **known)
-    budget = residual_budget(loop, truth)
-    return fill_row(
-        RobustnessRow,
-        budget,
-        design,
-        **known,
-        strehl=strehl(budget, imaging),
-        residual_nm=budget.rms_nm,
-    )
-
-
-_GAINS_AT_ONCE = 64
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobustnessMap:
-    """Strehl ratio of a fixed design over errors in what it assumes about the loop.
+    """Strehl ratio of a fixed design over errors in what it assumes about the loop."""
 
-    Attributes
-    ----------
-    errors_hz : (e,) ndarray
-        True frequency less that of the design [Hz], of the vibration that moves most.
-    sensor_gains : (g,) ndarray
-        Real sensor gain relative to the design's sensor matrix.
-    delay_errors_frames : (d,) ndarray
-        Real delay less that of the design [frames].
-    strehl : (d, g, e) ndarray
-        Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by more
-        than 160 times its width.
-    residual_nm : (d, g, e) ndarray
-        Residual of the modes [nm rms]; nan where the loop is unstable.
-    stable : (d, g) bool ndarray
-        Whether the loop is stable, which a frequency error does not change.
-    band_hz : tuple of float or None
-        Errors at which the vibration that moves most is within a band of the design [Hz]; None
-        for a design without a band around it.
-    """
-
-    errors_hz: FloatArray
-    sensor_gains: FloatArray
-    delay_errors_frames: FloatArray
+    errors_hz: FloatArray  # (e,): true less the design's [Hz], of the vibration that moves most
+    sensor_gains: FloatArray  # (g,): real gains relative to the design's sensor matrix
+    delay_errors_frames: FloatArray  # (d,): real delay less that of the design [frames]
+    # (d, g, e): Strehl ratio in [0, 1]; nan where the loop is unstable, 0 where the image moves by
+    # more than 160 times its width
     strehl: FloatArray
-    residual_nm: FloatArray
-    stable: BoolArray
+    residual_nm: FloatArray  # (d, g, e): of the modes [nm rms]; nan where the loop is unstable
+    stable: BoolArray  # (d, g): whether the loop is, which a frequency error does not change
+    # errors at which the vibration that moves most is within a band of the design [Hz]; None for a
+    # design without a band around it
     band_hz: tuple[float, float] | None = None
 
 
@@ -253,7 +247,11 @@ def robustness_map(
     """
     for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
         require_instance(value, kind)
-    hardware = _checked_hardware(design, hardware)
+    hardware = hardware or require_hardware(design, "a map")
+    if hardware.modes > 2:
+        raise DimensionError(
+            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
+        )
     errors = _checked_axis(errors_hz, "errors_hz")
     gains = _checked_axis(sensor_gains, "sensor_gains", above=0)
     delays = _checked_axis(
@@ -264,43 +262,41 @@ def robustness_map(
         hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
         f"lie between 1 and {LONGEST_DELAY}.",
     )
-    lines = _shift_vibrations(truth, errors, hardware)
+    if not truth.vibrations and np.any(errors != 0):
+        raise ProblemError(
+            "a frequency error needs a vibration in the truth; got a truth without any."
+        )
+    lines = moved_lines(truth, errors, hardware)
     noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
-
-    def evaluate(delay: float, some: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return Strehl ratio, residual and stability for some gains and all errors."""
-        ensemble = LoopEnsemble(
-            sensor_gain=np.repeat(some, errors.size),
-            delay_frames=hardware.delay_frames + delay,
-            noise_nm=noise_nm,
-            turbulence=truth.turbulence,
-            vibrations=tuple(
-                replace(line, frequency_hz=np.tile(line.frequency_hz, some.size)) for line in lines
-            ),
-        )
-        found = ensemble_residuals(design.controller, hardware, ensemble)
-        if advance is not None:
-            advance(some.size * errors.size)
-        shape = (some.size, errors.size)
-        return (
-            found.strehl(imaging).reshape(shape),
-            found.rms_nm.reshape(shape),
-            found.stable.reshape(shape),
-        )
-
-    parts = np.split(gains, range(_GAINS_AT_ONCE, gains.size, _GAINS_AT_ONCE))
-    found = [[evaluate(delay, some) for some in parts] for delay in delays]
-    strehls, residuals, stable = (
-        np.stack([np.concatenate([part[kind] for part in row]) for row in found])
-        for kind in range(3)
-    )
+    size = delays.size, gains.size, errors.size
+    maps = {name: np.empty(size) for name in ("strehl", "residual_nm", "stable")}
+    for d, delay in enumerate(delays):
+        for start in range(0, gains.size, _GAINS_AT_ONCE):
+            some = slice(start, start + _GAINS_AT_ONCE)
+            count = gains[some].size
+            ensemble = LoopEnsemble(
+                sensor_gain=np.repeat(gains[some], errors.size),
+                delay_frames=hardware.delay_frames + delay,
+                noise_nm=noise_nm,
+                turbulence=truth.turbulence,
+                vibrations=tuple(
+                    replace(ensemble_vibration(line), frequency_hz=np.tile(frequencies, count))
+                    for line, frequencies in lines
+                ),
+            )
+            loops = ensemble_residuals(design.controller, hardware, ensemble)
+            columns = stack_columns(loops, imaging)
+            for name, numbers in maps.items():
+                numbers[d, some] = columns[name].reshape(count, errors.size)
+            if advance is not None:
+                advance(count * errors.size)
     return RobustnessMap(
         errors_hz=errors,
         sensor_gains=gains,
         delay_errors_frames=delays,
-        strehl=read_only(strehls),
-        residual_nm=read_only(residuals),
-        stable=read_only(stable[..., 0]),
+        strehl=read_only(maps["strehl"]),
+        residual_nm=read_only(maps["residual_nm"]),
+        stable=read_only(maps["stable"][..., 0] == 1),
         band_hz=_errors_in_band(design, truth),
     )
 
@@ -315,16 +311,6 @@ def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
     return next(((band.low_hz - most_hz, band.high_hz - most_hz) for band in held), None)
 
 
-def _checked_hardware(design: Design, hardware: LoopHardware | None) -> LoopHardware:
-    """Return the loop of a design, or the other one given, which has one or two axes."""
-    hardware = hardware or require_hardware(design, "a map")
-    if hardware.modes > 2:
-        raise DimensionError(
-            f"a Strehl ratio of jitter takes 1 or 2 axes; got a loop of {hardware.modes} modes."
-        )
-    return hardware
-
-
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     """Return the values of one axis of the map, each within its bounds and given once."""
     axis = real_array(values, name)
@@ -337,26 +323,265 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     return axis
 
 
-def _shift_vibrations(
-    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
-) -> list[EnsembleVibration]:
-    """Return the true vibrations, each at its frequency under every error."""
-    if not truth.vibrations and np.any(errors_hz != 0):
-        raise ProblemError(
-            "a frequency error needs a vibration in the truth; got a truth without any."
+@table_row
+class SegmentRow:
+    """The residual between two events."""
+
+    start_s: float = column("from", unit="s", format="g")
+    end_s: float = column("to", unit="s", format="g")
+    sensors: str = column("sensors that fail")
+    residual_nm: float = nm_column("simulated", unit="nm rms", format=".2f")
+    exact_nm: float = nm_column(
+        "exact, once settled",
+        unit="nm rms",
+        format=".2f",
+        help="nan where the loop is unstable, a reading is frozen, or a vibration drifts",
+    )
+    strehl: float = percent_column("Strehl", help="nan where the loop is unstable")
+    stable: bool = column("stable", help="Whether the loop is stable with these sensors")
+
+
+def run_failures(
+    design: Design,
+    config: Config,
+    truth: Truth,
+    drops: Sequence[Drop],
+    *,
+    frames: int,
+    cases: int,
+    seed: int,
+) -> tuple[Simulation, list[tuple[Segment, SegmentRow]]]:
+    """Run the loop of a configuration in which sensors fail, none after the end of the run.
+
+    Between failures and returns there is a segment, with a row that has its exact residual, too.
+    """
+    filters, rate = design.controllers, config.hardware.frame_rate_hz
+    hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
+    simulation = simulate_sensors(
+        filters,
+        truth,
+        hardware=hardware,
+        frames=frames,
+        cases=cases,
+        seed=seed,
+        settle_frames=config.settings.simulation.settle_frames,
+        drops=drops,
+    )
+    rows = []
+    for segment in run_segments(drops, frames / rate):
+        loop = close_loop(
+            hardware,
+            filters[frozenset(segment.missing)],
+            sensor_gain=truth.sensor_gain,
+            blind=(*segment.missing, *segment.wrong),
         )
-    nyquist = hardware.frame_rate_hz / 2
-    moved = []
-    for vibration in stationary_vibrations(truth.vibrations):
-        checked_direction(vibration, hardware)
-        place_hz = vibration.frequency_hz
-        frequencies = place_hz + truth.frequency_shift_hz(place_hz, 1.0) * errors_hz
-        wrong = ~((frequencies > 0) & (frequencies < nyquist))
-        if np.any(wrong):
-            raise ProblemError(
-                f"errors_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
-                f"of {errors_hz[wrong][0]:.6g} Hz, which moves the one at {place_hz:.6g} Hz to "
-                f"{frequencies[wrong][0]:.6g} Hz."
-            )
-        moved.append(replace(ensemble_vibration(vibration), frequency_hz=frequencies))
-    return moved
+        # a frozen reading adds an offset of its own
+        exact = loop.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
+        first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
+        residual = simulation.residual_nm[:, first:last]
+        strehls = [series_strehl(case, config.imaging) for case in residual if loop.is_stable]
+        row = SegmentRow(
+            start_s=segment.start_s,
+            end_s=segment.end_s,
+            sensors=segment.text or "none",
+            residual_nm=float(np.sqrt(np.mean(np.sum(residual**2, axis=2)))),
+            exact_nm=residual_budget(loop, truth, frame_means=True).rms_nm if exact else np.nan,
+            strehl=float(np.mean(strehls)) if strehls else np.nan,
+            stable=loop.is_stable,
+        )
+        rows.append((segment, row))
+    return simulation, rows
+
+
+@table_row
+class MirrorRow:
+    """One design on the real mirror; what an unstable loop does not have is nan."""
+
+    design: str = column("design", help="Its name: for ours, what it assumes about the mirror")
+    stable: bool = column(help="Whether its loop is stable")
+    residual_nm: float = nm_column(
+        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
+    )
+    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
+    unsettled_nm: float = nm_column(
+        "settled less real position",
+        format=".2f",
+        help="What is left of the assumption that the mirror has settled, for the commands of "
+        "this design: settled less real position, rms",
+    )
+
+
+def mirror(
+    plant: TipTiltPlant,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    command_weight: float = 0.0,
+) -> tuple[MirrorRow, ...]:
+    """Compare designs on a moving mirror: what it costs to ignore its dynamics.
+
+    They are the integrator with the best gain on this mirror, the Kalman filter for a mirror
+    that settles at once, the same filter with the real positions taken out of its measurements,
+    and the LQG, which also commands for the dynamics. Each runs on the plant's own mirror.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant, with the real mirror in its hardware.
+    truth : Truth
+        What the loop really meets.
+    imaging : Imaging
+        The camera.
+    command_weight : float, optional
+        As for :func:`lqg`.
+
+    Returns
+    -------
+    tuple of MirrorRow
+        One per design.
+
+    Raises
+    ------
+    ProblemError
+        If the plant does not come from :func:`tip_tilt_plant`.
+    SynthesisError
+        If a design fails.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> shell = lbt.models.PositionLoop.from_bandwidth(
+    ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=60
+    ... )
+    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5, mirror=shell)
+    >>> rows = lbt.studies.mirror(
+    ...     plant, lbt.Truth(turbulence=slow, noise_nm=15.5), lbt.Imaging(diameter_m=8.22)
+    ... )
+    >>> [(row.design, row.stable) for row in rows][1::2]
+    [('kalman, settled mirror', False), ('lqg', True)]
+    """
+    require_instance(plant, TipTiltPlant, "plant")
+    require_instance(truth, Truth)
+    require_instance(imaging, Imaging)
+    hardware = plant.hardware
+    settled = replace(plant, hardware=replace(hardware, mirror=None))
+    regulated = lqg(plant, command_weight=command_weight)
+    designs: dict[str, Design] = {
+        "integrator, best gain": optimal_integrator(hardware, truth),
+        "kalman, settled mirror": kalman(settled),
+        "kalman, real positions": kalman(plant),
+        regulated.method: regulated,
+    }
+    rows = []
+    for name, design in designs.items():
+        loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
+        numbers["unsettled_nm"] = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
+        rows.append(fill_row(MirrorRow, SimpleNamespace(**numbers), design=name))
+    return tuple(rows)
+
+
+@table_row
+class TradeoffPoint:
+    """One filter of the trade-off, ``design``; a problem without a loop has no margins, but nan."""
+
+    family: str = column(
+        "filter",
+        help='"mixed": least variance of all filters with this norm; "central": the H-infinity '
+        "filter whose norm this is",
+    )
+    gamma: float = nm_column(
+        "norm", format=".2f", help="H-infinity norm of its estimation error, recomputed"
+    )
+    gamma_ratio: float = column(
+        "norm / least", format=".4f", help="The same over the least norm of any filter"
+    )
+    rms: float = nm_column(
+        "rms", format=".2f", help="Standard deviation of its estimation error, recomputed"
+    )
+    gain_low: float = column(
+        "gain from", format=".3f", help="Least stable sensor gain", default=np.nan
+    )
+    gain_high: float = column(
+        "gain to", format=".3f", help="Greatest stable sensor gain", default=np.nan
+    )
+    modulus: float = column(
+        "modulus margin", format=".3f", help="Modulus margin of its loop", default=np.nan
+    )
+    design: FilterDesign = field(compare=False, repr=False)
+
+
+def tradeoff(
+    problem: EstimationProblem,
+    *,
+    points: int = 9,
+    families: Sequence[str] = FAMILIES,
+    taps: int = 16,
+) -> Iterator[TradeoffPoint]:
+    """Return filters from the least norm to the least variance, and examine their loops.
+
+    The levels run from the least gamma to the norm of the Kalman filter, at which all
+    families meet.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        The problem; with a plant, each filter's loop is examined.
+    points : int, optional
+        Levels of the norm, 2 to 200.
+    families : sequence of {"mixed", "central"}, optional
+        Which filters to design at each level.
+    taps : int, optional
+        Length of the mixed filters' impulse response.
+
+    Yields
+    ------
+    TradeoffPoint
+        In the order of levels, then families; each is designed when it is requested.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its range.
+    SynthesisError
+        If a design fails.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> line = lbt.EstimationProblem(
+    ...     A=[[1.9, -0.99], [1.0, 0.0]],
+    ...     B=[[1.0, 0.0], [0.0, 0.0]],
+    ...     C=[[0.0, 1.0]],
+    ...     D=[[0.0, 3.0]],
+    ...     L=[[1.0, 0.0]],
+    ... )
+    >>> points = list(lbt.studies.tradeoff(line, points=3, families=["mixed"]))
+    >>> points[0].rms > points[1].rms > points[2].rms
+    True
+    """
+    require_problem(problem)
+    count = integer(points, "points", at_least=2, at_most=_MOST_POINTS)
+    length = require_taps(taps)
+    for family in families:
+        choice(family, "families", FAMILIES)
+    least, best = hinf(problem, route="riccati"), kalman(problem)
+    spread = max(best.gamma / least.gamma_least, 1.0)
+    for i, share in enumerate(np.linspace(0, 1, count) ** _CROWDING):
+        level = least.gamma_least * float(spread**share)
+        for family in families:
+            if i == 0:
+                design = least
+            elif i == count - 1:
+                design = best
+            elif family == MIXED.name:
+                design = mixed(problem, gamma=level, taps=length)
+            else:
+                design = central_filter(problem, gamma=level)
+            margins = None
+            if design.hardware is not None:
+                margins = loop_margins(close_loop(design.hardware, design.controller))
+            ratio = max(design.gamma / least.gamma_least, 1.0)
+            given = {"family": family, "gamma_ratio": ratio, "design": design}
+            yield fill_row(TradeoffPoint, design, margins, **given)

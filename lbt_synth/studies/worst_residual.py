@@ -6,43 +6,37 @@ becomes ``(I + E) H`` with a diagonal E, one entry per measurement. With the tra
 to residual, the residual r0 of ``E = 0`` becomes ``(I + N E H)^-1 r0``: if ``|N E H| <= k < 1`` for
 all E of a box, the loop is stable in the whole box and leaves at most ``|r0| / (1 - k)``. The box
 with the largest bound is halved until that is close to a residual that occurs.
+
+That is the residual of means over frames. With a settled mirror and a whole delay, what moves
+within frames is added: no command and no gain changes it.
 """
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
 
 import numpy as np
 
 from lbt_synth.design.shaping.objectives import Skirts
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.held_controller import HasController
 from lbt_synth.linear.norms import band_norm
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
 from lbt_synth.loop.budget import resonance_edges
+from lbt_synth.loop.ensemble.spectral_covariances import power_within_frames
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
-from lbt_synth.models.vibration import checked_direction, stationary_vibrations
+from lbt_synth.studies.grid import moved_lines
 from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_BOXES = 120  # halved
+_PLACES = 17  # of a resonance in its band
 _COUPLED = 1e-9  # of the largest transfer between axes; less is rounding
 
-Box = tuple[FloatArray, FloatArray]  # least and largest gain of each measurement
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Line:
-    """A vibration, and the band in which it may be."""
-
-    vibration: Vibration | SinusoidalVibration
-    direction: FloatArray
-    low_hz: float
-    high_hz: float
+Box = tuple[FloatArray, FloatArray]  # least and largest gain of each measurement, (q,)
+Line = Vibration | SinusoidalVibration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,8 +46,8 @@ class GuaranteedResidual:
     # no point of the box leaves more [nm rms]; inf if the loop is unstable at one, or if halving
     # 120 boxes of gains is too little for any bound
     upper_nm: float
-    # the largest found at one set of gains [nm rms]. It occurs where all lines are sinusoids along
-    # one axis; for other lines it is a bound at these gains
+    # the largest found at one set of gains [nm rms]. It occurs where all lines are sinusoids at
+    # their own frequencies along one axis; for other lines it is a bound at these gains
     value_nm: float
     # the gains of that, one per measurement, relative to the sensor matrix
     sensor_gains: tuple[float, ...]
@@ -99,7 +93,8 @@ def guaranteed_residual(
     Raises
     ------
     ProblemError
-        If the intervals are empty, a vibration drifts, or a line would leave the band.
+        If the intervals are empty, a vibration drifts, a line would leave the band, or the loop
+        has a mirror with dynamics or a fractional delay.
 
     Notes
     -----
@@ -123,30 +118,41 @@ def guaranteed_residual(
     """
     require_instance(hardware, LoopHardware, "hardware")
     require_instance(truth, Truth, "truth")
+    if not has_guarantee(hardware):
+        mirror = "one with dynamics" if hardware.mirror else "a settled one"
+        raise ProblemError(
+            "the guarantee in the image is known for a settled mirror and a whole delay; got "
+            f"{mirror} and {hardware.delay_frames:g} frames."
+        )
     low, high = (number(gain, "sensor_gains", above=0) for gain in sensor_gains)
     if low > high:
         raise ProblemError(f"sensor_gains must be (low, high); got {sensor_gains!r}.")
     close = number(tolerance, "tolerance", at_least=1e-6)
-    lines = _moving_lines(truth, error_hz, hardware)
+    ends = error_hz if isinstance(error_hz, tuple) else (-number(error_hz, "error_hz"), error_hz)
+    first, last = (number(end, "error_hz") for end in ends)
+    if first > last:
+        raise ProblemError(f"error_hz must be at least 0, or (low, high); got {error_hz!r}.")
+    lines = moved_lines(truth, (first, last), hardware, "error_hz")
     rest = replace(truth, vibrations=(), frequency_errors_hz=None, sensor_gain=1.0)
-    q = hardware.n_measurements
-    centre = _close(hardware, controller, np.full(q, np.sqrt(low * high)))
+    middle = np.full(hardware.n_measurements, np.sqrt(low * high))
+    centre = _close(hardware, controller, middle)
     if not centre.is_stable:
-        gains = (float(np.sqrt(low * high)),) * q
-        return GuaranteedResidual(upper_nm=np.inf, value_nm=np.inf, sensor_gains=gains)
+        return GuaranteedResidual(
+            upper_nm=np.inf, value_nm=np.inf, sensor_gains=tuple(middle.tolist())
+        )
     upper = value = 0.0
-    worst = np.empty(q)
-    for rows in _independent_axes(centre):
-        size = 1 if len(rows) < q else q
+    worst = middle.copy()
+    for axes, measurements in _independent_axes(centre):
 
-        def judge(box: Box, rows: list[int] = rows) -> tuple[float, float]:
-            gains = np.broadcast_to((box[0] + box[1]) / 2, (q,))
-            return _judge_box(_close(hardware, controller, gains), rows, box, rest, lines)
+        def judge(box: Box, axes: list[int] = axes) -> tuple[float, float]:
+            loop = _close(hardware, controller, (box[0] + box[1]) / 2)
+            return _judge_box(loop, axes, box, rest, lines)
 
-        start = np.full(size, low), np.full(size, high)
-        part = _branch_and_bound(judge, start, 2 * close)
-        upper, value = upper + part[0], value + part[1]
-        worst[rows if size == 1 else slice(None)] = part[2]
+        start = middle.copy(), middle.copy()
+        start[0][measurements], start[1][measurements] = low, high
+        bound, largest, gains = _branch_and_bound(judge, start, 2 * close)
+        upper, value = upper + bound, value + largest
+        worst[measurements] = gains[measurements]
     return GuaranteedResidual(
         upper_nm=float(np.sqrt(upper)),
         value_nm=float(np.sqrt(value)),
@@ -154,91 +160,105 @@ def guaranteed_residual(
     )
 
 
+def has_guarantee(hardware: LoopHardware) -> bool:
+    """Whether a guarantee in the image is known for a loop: a settled mirror, a whole delay."""
+    return hardware.mirror is None and hardware.delay_frames % 1 == 0
+
+
 def _branch_and_bound(
     judge: Callable[[Box], tuple[float, float]], start: Box, gap: float
 ) -> tuple[float, float, FloatArray]:
     """Halve the box of the largest bound; return the bound, the largest value and its place."""
-    corners = [(start[0], start[0]), (start[1], start[1])]  # the worst is often an end
-    best, place = max(((judge(box)[1], box[0]) for box in corners), key=lambda found: found[0])
-    order = count()  # boxes themselves are not compared
-    upper, value = judge(start)
-    boxes = [(-upper, next(order), start)]
-    for _ in range(_MOST_BOXES):
-        if not np.isfinite(best):
-            return np.inf, np.inf, place
-        upper, (low, high) = -boxes[0][0], boxes[0][2]
-        if upper <= best * (1 + gap):
-            break
-        heapq.heappop(boxes)
-        side = int(np.argmax(high / low))
-        middle = np.sqrt(low[side] * high[side])
-        for end, its in ((high, high.copy()), (low, low.copy())):
-            its[side] = middle
-            box = (low, its) if end is high else (its, high)
+    ends = [(judge((end, end))[1], end) for end in start]  # the worst is often an end
+    best, place = max(ends, key=lambda pair: pair[0])
+    boxes: list[tuple[float, Box]] = []
+    halves = [start]
+    while True:
+        for box in halves:
             upper, value = judge(box)
-            heapq.heappush(boxes, (-upper, next(order), box))
+            boxes.append((upper, box))
             if value > best:
                 best, place = value, (box[0] + box[1]) / 2
-    return max(-boxes[0][0], best), best, place
+        if not np.isfinite(best):
+            return np.inf, np.inf, place
+        widest = int(np.argmax([upper for upper, _ in boxes]))
+        upper, (low, high) = boxes.pop(widest)
+        if upper <= best * (1 + gap) or len(boxes) >= _MOST_BOXES:
+            return max(upper, best), best, place
+        side = int(np.argmax(high / low))
+        low_half, high_half = high.copy(), low.copy()
+        low_half[side] = high_half[side] = np.sqrt(low[side] * high[side])
+        halves = [(low, low_half), (high_half, high)]
 
 
 def _judge_box(
-    loop: ClosedLoop, rows: list[int], box: Box, rest: Truth, lines: list[_Line]
+    loop: ClosedLoop, axes: list[int], box: Box, rest: Truth, lines: list[tuple[Line, FloatArray]]
 ) -> tuple[float, float]:
     """Return a bound over a box of gains and the value at its centre, of some axes [nm^2]."""
     if not loop.is_stable:
         return np.inf, np.inf
-    low, high = box
-    relative = np.broadcast_to((high - low) / (high + low), (loop.hardware.n_measurements,))
-    noise = loop.noise_propagation()
-    # of one axis alone, its own measurement
-    own = rows if low.size < relative.size else list(range(relative.size))
-    reach = replace(
-        noise,
-        B=noise.B[:, own] * relative[own],
-        C=noise.C[rows],
-        D=noise.D[np.ix_(rows, own)] * relative[own],
-    )
+    relative = (box[1] - box[0]) / (box[1] + box[0])
+    moving, noise = np.flatnonzero(relative).tolist(), loop.noise_propagation()
     share = 0.0
-    if np.any(relative > 0):
-        share = hinf_norm(reach).upper * float(np.linalg.norm(loop.hardware.sensor[own], 2))
-    budget = residual_budget(loop, rest, frame_means=True)
-    value = float(np.trace((budget.turbulence_nm2 + budget.noise_nm2)[np.ix_(rows, rows)]))
-    # a line across leaves rounding alone, on which no quadrature settles
-    felt = (line for line in lines if np.any(line.direction[rows]))
-    value += sum(_worst_of_line(loop, rows, line) for line in felt)
-    return (value / (1 - share) ** 2 if share < 1 else np.inf), value
+    if moving:
+        reach = replace(
+            noise,
+            B=noise.B[:, moving] * relative[moving],
+            C=noise.C[axes],
+            D=noise.D[np.ix_(axes, moving)] * relative[moving],
+        )
+        share = hinf_norm(reach).upper * float(np.linalg.norm(loop.hardware.sensor[moving], 2))
+    budget, own = residual_budget(loop, rest), np.ix_(axes, axes)
+    means = float(np.trace((budget.turbulence_nm2 + budget.noise_nm2)[own]))
+    within, rate = float(np.trace(budget.within_nm2[own])), loop.hardware.frame_rate_hz
+    for line, (low_hz, high_hz) in lines:
+        along = np.asarray(line.direction)[axes]
+        if np.any(along):  # a line across leaves rounding alone, on which no quadrature settles
+            sampled = replace(line, rms_nm=line.rms_nm * float(np.sinc(low_hz / rate)))
+            means += _worst_of_line(loop, axes, sampled, float(low_hz), float(high_hz))
+            within += float(along @ along) * _most_within(line, low_hz, high_hz, rate)
+    return (means / (1 - share) ** 2 if share < 1 else np.inf) + within, means + within
 
 
-def _worst_of_line(loop: ClosedLoop, rows: list[int], line: _Line) -> float:
-    """Return the worst variance of a line in its band, with its skirts outside [nm^2]."""
-    whole = loop.rejection()
+def _most_within(line: Line, low_hz: float, high_hz: float, rate_hz: float) -> float:
+    """Return the most of a line in its band that moves within frames [nm^2]."""
+    if isinstance(line, SinusoidalVibration):
+        return float(line.rms_nm**2 * (1 - np.sinc(high_hz / rate_hz) ** 2))
+    places = np.linspace(low_hz, high_hz, _PLACES if low_hz < high_hz else 1)
+    rms_nm = line.rms_nm * np.sinc(places / rate_hz)
+    models = [
+        replace(line, frequency_hz=place, rms_nm=rms).ar_model(rate_hz)
+        for place, rms in zip(places.tolist(), rms_nm.tolist(), strict=True)
+    ]
+    coefficients = np.array([model.coefficients for model in models])
+    driving_nm = np.array([model.driving_rms_nm for model in models])
+    return float(np.max(power_within_frames(coefficients, driving_nm, rate_hz)))
+
+
+def _worst_of_line(
+    loop: ClosedLoop, axes: list[int], line: Line, low_hz: float, high_hz: float
+) -> float:
+    """Return the worst variance of a line in its band, with its skirts outside [nm^2].
+
+    Means over frames count, and the rms is theirs.
+    """
+    rejection, along = loop.rejection(), np.asarray(line.direction)[:, None]
     response = replace(
-        whole,
-        B=whole.B @ line.direction[:, None],
-        C=whole.C[rows],
-        D=(whole.D @ line.direction[:, None])[rows],
+        rejection, B=rejection.B @ along, C=rejection.C[axes], D=(rejection.D @ along)[axes]
     )
-    peak = band_norm(response, line.low_hz, line.high_hz).upper
-    found = (line.vibration.rms_nm * peak) ** 2
-    return found + _left_of_skirts(loop, response, line)
-
-
-def _left_of_skirts(loop: ClosedLoop, response: StateSpace, line: _Line) -> float:
-    """Return what is left of a resonance outside its band, at most [nm^2]; 0 for a sinusoid."""
-    if not isinstance(line.vibration, Vibration):
-        return 0.0
-    low, high, rate = line.low_hz, line.high_hz, loop.hardware.frame_rate_hz
-    size = {"rms_nm": line.vibration.rms_nm, "damping": line.vibration.damping}
-    skirts = Skirts(low_hz=low, high_hz=high, frame_rate_hz=rate, **size)
+    worst = (line.rms_nm * band_norm(response, low_hz, high_hz).upper) ** 2
+    if not isinstance(line, Vibration):
+        return worst
+    rate = loop.hardware.frame_rate_hz
+    size = {"rms_nm": line.rms_nm, "damping": line.damping}
+    skirts = Skirts(low_hz=low_hz, high_hz=high_hz, frame_rate_hz=rate, **size)
 
     def density(f: FloatArray) -> FloatArray:
         power = np.sum(np.abs(response.frequency_response(f)[:, :, 0]) ** 2, axis=1)
         return np.asarray((skirts.psd(f) * power)[:, None, None])
 
-    nyquist = rate / 2
-    edges = np.concatenate([resonance_edges(loop), np.clip(skirts.breakpoints_hz, 0, nyquist)])
-    return float(adaptive_integral(density, np.unique(edges))[0, 0])
+    edges = np.concatenate([resonance_edges(loop), np.clip(skirts.breakpoints_hz, 0, rate / 2)])
+    return worst + float(adaptive_integral(density, np.unique(edges))[0, 0])
 
 
 def _close(
@@ -248,10 +268,10 @@ def _close(
     return close_loop(replace(hardware, sensor_matrix=gains[:, None] * hardware.sensor), controller)
 
 
-def _independent_axes(loop: ClosedLoop) -> list[list[int]]:
-    """Return the axes that no gain of another one touches; all of them together if one does."""
+def _independent_axes(loop: ClosedLoop) -> list[tuple[list[int], list[int]]]:
+    """Return axes and measurements that no gain of others touches; all if one axis is touched."""
     modes, q = loop.hardware.modes, loop.hardware.n_measurements
-    together = [list(range(modes))]
+    together = [(list(range(modes)), list(range(q)))]
     if modes != q:
         return together
     noise, sensor = loop.noise_propagation(), loop.hardware.sensor
@@ -262,30 +282,4 @@ def _independent_axes(loop: ClosedLoop) -> list[list[int]]:
         between = float(np.abs(sensor[i, others]).max(initial=0.0))
         if others and max(hinf_norm(across).value, between) > _COUPLED * largest:
             return together
-    return [[i] for i in range(modes)]
-
-
-def _moving_lines(
-    truth: Truth, error_hz: float | tuple[float, float], hardware: LoopHardware
-) -> list[_Line]:
-    """Return the vibrations with the bands in which they may be."""
-    if isinstance(error_hz, tuple):
-        first, last = (number(end, "error_hz") for end in error_hz)
-    else:
-        last = number(error_hz, "error_hz", at_least=0)
-        first = -last
-    if first > last:
-        raise ProblemError(f"error_hz must be one number, or (low, high); got {error_hz!r}.")
-    lines, nyquist = [], hardware.frame_rate_hz / 2
-    shifts = zip(*(truth.frequency_shifts_hz(end) for end in (first, last)), strict=True)
-    for vibration, moved in zip(stationary_vibrations(truth.vibrations), shifts, strict=True):
-        f = vibration.frequency_hz
-        low, high = (f + float(shift) for shift in moved)
-        if not 0 < low <= high < nyquist:
-            raise ProblemError(
-                f"error_hz must leave each vibration between 0 and {nyquist:.6g} Hz; got the one "
-                f"at {f:.6g} Hz in {low:.6g} to {high:.6g} Hz. Try a smaller error."
-            )
-        direction = checked_direction(vibration, hardware)
-        lines.append(_Line(vibration=vibration, direction=direction, low_hz=low, high_hz=high))
-    return lines
+    return [([i], [i]) for i in range(modes)]

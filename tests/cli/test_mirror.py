@@ -2,7 +2,6 @@
 
 import json
 
-import pytest
 from support.plants import ROOT
 
 from lbt_synth.cli.main import main
@@ -20,7 +19,8 @@ def test_commands(tmp_path, capsys):
     gain = tmp_path / "lqg.fits"
     status, data, _ = run(capsys, "design", SLOW_YAML, "--method", "lqg", "-o", gain)
     assert status == 0
-    assert data["rms"] == pytest.approx(data["limit_nm"], rel=1e-6)
+    assert data["rms"] > 0
+    assert data["limit_nm"] is None  # of a mirror with dynamics, in the image
     assert data["mirror"]["settling_s"] > 3e-3
     assert run(capsys, "verify", gain)[0] == 0
     assert run(capsys, "show", gain, "--matrices")[0] == 0

@@ -8,7 +8,7 @@ from support.commands import run
 
 import lbt_synth as lbt
 from lbt_synth.cli import paper
-from lbt_synth.studies.paper.tables import table_iii
+from lbt_synth.studies.paper.parameters import table_iii
 
 
 def test_paper(tmp_path, capsys):

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.processes import alive, wait_for
-from support.studies import TWO, assert_whole, read_table, study_file
+from support.studies import TWO, assert_whole, part_rows, read_table, study_file
 
 import lbt_synth as lbt
-from lbt_synth.studies.study.store import list_parts
+from lbt_synth.cli.study import _estimate as estimate
 
 PARAMETERS = (
     "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, truth.sensor_gain: {uniform: [0.5, 1]}, "
@@ -84,6 +84,20 @@ def test_the_command(tmp_path, capsys):
     assert "rows 0 to 199; got row 200" in error
 
 
+def test_an_estimate(tmp_path, monkeypatch):
+    loaded = lbt.studies.load_study(study_file(tmp_path, samples="5000"))
+
+    def slow(study, values, start):
+        time.sleep(1e-3 * len(values))
+
+    monkeypatch.setattr(lbt.studies, "evaluate_samples", slow)
+    cost = estimate(loaded, 1)
+    assert 4 < cost.seconds < 9
+    assert cost.measured_rows >= 1000
+    assert cost.disk_bytes == 5000 * (13 * 8 + 8 * 6)
+    assert estimate(loaded, 100).seconds < 0.09
+
+
 def test_json(tmp_path, capsys):
     path = study_file(tmp_path, samples="20", parameters=PARAMETERS)
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--dry-run", "--json")
@@ -137,7 +151,7 @@ def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
     study = lbt.studies.load_study(study_file(folder, samples="600", parameters=PARAMETERS))
     done = lbt.studies.run_study(study, folder)
-    assert (done.computed, done.failures) == (600, 0)
+    assert (done.computed, done.failures) == (600, ())
     return read_table(done.results)
 
 
@@ -146,11 +160,11 @@ def test_killed_it_goes_on_where_it_was(tmp_path, capsys, undisturbed, jobs):
     path = study_file(tmp_path, samples="600", parameters=PARAMETERS)
     folder = tmp_path / "out"
     first = started(path, "-o", folder, "--jobs", jobs)
-    wait_for(lambda: len(list_parts(folder)) >= 2, seconds=120)
+    wait_for(lambda: len(part_rows(folder)) >= 2, seconds=120)
     workers = children(first.pid)
     first.send_signal(signal.SIGKILL)
     first.communicate()
-    kept = {(part.start, part.stop): part.path.stat().st_mtime_ns for part in list_parts(folder)}
+    kept = part_rows(folder)
     assert sum(stop - start for start, stop in kept) < 600
     wait_for(lambda: not any(alive(pid) for pid in workers))  # none is left behind
     status, out, error = run(capsys, "study", path, "-o", folder)
@@ -167,7 +181,7 @@ def test_an_interrupt_ends_it_at_once(tmp_path):
     path = study_file(tmp_path, samples="300000", parameters=PARAMETERS)
     folder = tmp_path / "out"
     first = started(path, "-o", folder, "--jobs", "2")
-    wait_for(lambda: len(list_parts(folder)) >= 2, seconds=120)
+    wait_for(lambda: len(part_rows(folder)) >= 2, seconds=120)
     workers = children(first.pid)
     before = time.monotonic()
     first.send_signal(signal.SIGINT)
@@ -177,7 +191,7 @@ def test_an_interrupt_ends_it_at_once(tmp_path):
     kept = f"lbt-synth: what is finished is kept in {folder}; start it again to continue"
     assert error.splitlines() == [kept, "lbt-synth: interrupted"]
     wait_for(lambda: not any(alive(pid) for pid in workers))
-    assert len(list_parts(folder)) >= 2
+    assert len(part_rows(folder)) >= 2
     assert not list(folder.rglob(".*.npz*"))
 
 
@@ -186,7 +200,7 @@ def test_two_in_one_directory(tmp_path, capsys):
     folder = tmp_path / "out"
     first = started(path, "-o", folder)
     try:
-        wait_for(lambda: len(list_parts(folder)) >= 1, seconds=120)
+        wait_for(lambda: len(part_rows(folder)) >= 1, seconds=120)
         status, _, error = run(capsys, "study", path, "-o", folder)
         assert status == 2
         assert "another study is running in" in error

@@ -4,13 +4,13 @@ import numpy as np
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-from lbt_synth.config.samples import Reads, accepted_by_schema, view_samples
+from lbt_synth.config.samples import Reads, SampleView, accepted_by_schema
 from lbt_synth.config.schema import ModelSection
 
 
 def view(values=None):
     reads = Reads()
-    return view_samples(lbt.load_config(LBT_YAML).settings, reads, values), reads
+    return SampleView(lbt.load_config(LBT_YAML).settings, reads, values or {}), reads
 
 
 def test_a_number_that_one_builder_needs_alone_takes_no_arrays():

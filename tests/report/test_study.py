@@ -164,7 +164,7 @@ def study():
 def test_a_page_from_a_study_file(study, tmp_path):
     values = study.values(0, 3)
     columns = dict(zip(study.parameter_names, values.T, strict=True))
-    columns |= lbt.studies.evaluate_samples(study, values, 0).columns
+    columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
     folder = tmp_path / "a folder"
     folder.mkdir()
     files = lbt.report.write_study_page(study, columns, folder / "summary.html")
@@ -183,14 +183,14 @@ def test_a_page_from_a_study_file(study, tmp_path):
 
 
 def test_digests_are_of_the_matrices(study):
-    names = [each.name for each in study.controllers]
+    names = list(study.controllers)
     columns = {f"{name}.{what}": np.ones(2) for name in names for what in ("strehl", "stable")}
     columns |= {f"{name}.residual_nm": np.ones(2) for name in names} | {"fixed": np.ones(2)}
     first, other = (
         {text(row[0]): text(row[2]) for row in table(page, "Controllers").rows}
         for page in (
             page_of(columns, names, ("fixed",), replace(study, controllers=order))
-            for order in (study.controllers, study.controllers[::-1])
+            for order in (study.controllers, dict(reversed(study.controllers.items())))
         )
     )
     assert first == other

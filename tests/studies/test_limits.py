@@ -1,12 +1,14 @@
-"""The study of limits: designs against the least residuals."""
+"""Designs against the least residuals, and beside reference designs in the truth."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.configs import minimal_config, write_config
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.config import Config
 from lbt_synth.design.result import model_limits
 from lbt_synth.report.figures.studies import limits_figure
 
@@ -79,3 +81,88 @@ def test_designs_of_the_full_form_have_the_limits_of_their_plant(delay):
     assert [*model_limits(lbt.kalman(plant.full())).values()] == pytest.approx([*values], rel=1e-7)
     bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     assert not model_limits(lbt.kalman(bare))
+
+
+def test_a_design_of_another_making_keeps_its_name_beside_the_reference(config):
+    slow = config.design("integrator", gain=0.1)
+    found = lbt.studies.compare_in_truth({"kalman": slow, "best": config.design("kalman")}, config)
+    assert [row.design for row in found.rows] == ["kalman", "best", "integrator", "hinf"]
+    found = lbt.studies.compare_in_truth({"kalman": slow}, config)
+    assert [row.design for row in found.rows][1:] == ["integrator", "kalman (reference)", "hinf"]
+    assert found.rows[2].residual_nm == pytest.approx(51.0087, abs=1e-3)
+    assert found.limit.rms_nm == pytest.approx(37.7777, abs=1e-4)
+
+
+def test_an_unstable_loop_is_a_warning(config):
+    wild = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, delay_frames=1), gain=1.5)
+    found = lbt.studies.compare_in_truth({"wild": wild}, config)
+    assert found.warnings == {"wild": ("the loop is unstable in the truth",)}
+    assert not found.rows[0].stable
+
+
+def test_a_reference_that_cannot_be_designed_is_a_note(tmp_path, monkeypatch):
+    config = lbt.load_config(write_config(tmp_path, minimal_config()))
+    slow = config.design("integrator", gain=0.3)
+    design = Config.design
+
+    def refuse(self, method, **options):
+        if method == "hinf":
+            raise lbt.errors.NumericalError("no convergence.")
+        return design(self, method, **options)
+
+    monkeypatch.setattr(Config, "design", refuse)
+    found = lbt.studies.compare_in_truth({"slow": slow}, config)
+    assert found.notes == ("hinf is left out: no convergence.",)
+    assert [row.design for row in found.rows] == ["slow", "integrator", "kalman"]
+
+
+def wind_shake(folder, damping: float) -> Config:
+    """Return the configuration of a telescope of 39 m whose bands leave out its wind shake."""
+    lines = [
+        {"axis": axis, "frequency_hz": f, "damping": ratio, "rms_nm": rms}
+        for axis, f, ratio, rms in (("both", 0.3, damping, 4700.0), ("tip", 18.0, 0.005, 140.0))
+    ]
+    content = minimal_config(
+        loop={"frame_rate_hz": 1000.0},
+        model={"turbulence": {"kind": "ar2"}, "vibrations": lines},
+        truth={"vibrations": [{"kind": "resonance", **line} for line in lines]},
+        design={
+            "robust": {
+                "bands": [{"low_hz": 16.0, "high_hz": 20.0, "rms_nm": 140.0, "axis": "tip"}],
+                "functions": 16,
+                "states": None,
+            }
+        },
+    ) | {
+        "telescope": {"diameter_m": 39.0},
+        "atmosphere": {"seeing_arcsec": 0.65, "outer_scale_m": 25.0, "wind_speed_m_s": 10.0},
+    }
+    return lbt.load_config(write_config(folder, content))
+
+
+def test_wind_shake_that_a_robust_design_is_not_told_of(tmp_path):
+    """Certified at some 20 nm, and a multiple of that in its truth."""
+    config = wind_shake(tmp_path, 0.09)
+    design = config.design("robust")
+    found = lbt.studies.compare_in_truth({"robust": design}, config)
+    rows = {row.design: row for row in found.rows}
+    robust, kalman = rows["robust"], rows["kalman"]
+    promised_nm = max(design.objective_nm) * 2**0.5
+    assert robust.residual_nm > 3 * promised_nm
+    assert kalman.residual_nm < 1.1 * found.limit.rms_nm
+    squares_nm2 = [nm**2 for nm in design.objective_nm]
+    assert design.expected_residual_nm == pytest.approx(sum(squares_nm2) ** 0.5)
+    (text, *_) = found.warnings["robust"]
+    assert text.startswith(
+        "the truth leaves 63.1 nm in means over frames, where the design expects"
+    )
+    assert text.endswith("it has power that the design was not made for")
+
+
+def test_wind_shake_that_is_wide_is_part_of_a_robust_design(tmp_path):
+    config = wind_shake(tmp_path, 0.3)
+    design = config.design("robust")
+    found = lbt.studies.compare_in_truth({"robust": design}, config)
+    (robust,) = [row for row in found.rows if row.design == "robust"]
+    assert not any("not made for" in text for text in found.warnings["robust"])
+    assert robust.residual_nm < max(design.objective_nm) * 2**0.5

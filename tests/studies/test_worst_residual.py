@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.models import ARModel, SinusoidalVibration
+from lbt_synth.models import ARModel, PositionLoop, SinusoidalVibration
 
 RATE = 500.0
+SLOW = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 200}
 TURNED = np.array([[0.9, -0.3], [0.2, 1.1]])  # of the mirror, which couples the axes
 AIR = ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=RATE)
 
@@ -74,7 +75,8 @@ def test_no_point_of_the_box_leaves_more(coupled: bool, sinusoids: bool) -> None
     assert all(0.7 <= gain <= 1.25 for gain in found.sensor_gains)
 
 
-def test_it_is_attained_by_sinusoids_of_one_axis() -> None:
+def test_sinusoids_of_one_axis_nearly_attain_it() -> None:
+    """But for what moves within frames, which counts at the upper end of the band."""
     hardware, controller, truth = setting(coupled=False, sinusoids=True)
     lines = tuple(replace(line, direction=(0.0, 1.0)) for line in truth.vibrations)
     truth = replace(truth, vibrations=lines)
@@ -89,8 +91,8 @@ def test_it_is_attained_by_sinusoids_of_one_axis() -> None:
         size_of = np.linalg.norm(response(grid) @ np.array(line.direction), axis=1)
         places.append(grid[np.argmax(size_of)] - line.frequency_hz)
     at = left_nm(hardware, controller, truth, found.sensor_gains, places)
-    assert at == pytest.approx(found.value_nm, rel=1e-5)
-    assert found.upper_nm == pytest.approx(at, rel=0.031)
+    assert at <= found.value_nm == pytest.approx(at, rel=5e-4)
+    assert found.upper_nm == pytest.approx(at, rel=0.0315)
 
 
 def test_without_errors_it_is_the_residual() -> None:
@@ -128,6 +130,29 @@ def test_what_is_refused(options, message) -> None:
         lbt.studies.guaranteed_residual(hardware, controller, truth, **options)
 
 
+@pytest.mark.parametrize(
+    "other", [{"delay_frames": 2.4}, {"mirror": PositionLoop.from_bandwidth(**SLOW)}]
+)
+def test_other_holds_than_frames_have_no_guarantee(other) -> None:
+    hardware, controller, truth = setting(coupled=False, sinusoids=True)
+    with pytest.raises(lbt.errors.ProblemError, match="settled mirror and a whole delay; got"):
+        lbt.studies.guaranteed_residual(replace(hardware, **other), controller, truth)
+
+
+@pytest.mark.parametrize("damping", [0.01, 0.3])
+def test_what_moves_within_frames_is_that_of_the_budget(damping) -> None:
+    """A command that is always 0 leaves all of a line, wherever it is."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / RATE)
+    line = lbt.Vibration(frequency_hz=70.0, damping=damping, rms_nm=40.0, direction=(1.0,))
+    truth = lbt.Truth(turbulence=AIR, noise_nm=1.0, vibrations=(line,))
+    upper = lbt.studies.guaranteed_residual(path, idle, truth, error_hz=30.0).upper_nm
+    loop = lbt.close_loop(path, idle)
+    for shift in (-30.0, -10.0, 0.0, 30.0):
+        exact = lbt.residual_budget(loop, truth.with_frequency_error(shift))
+        assert exact.within_nm < exact.rms_nm <= upper
+
+
 @pytest.mark.parametrize(("frequency_hz", "damping"), [(60.0, 1e-3), (281.3, 0.0258)])
 def test_a_resonance_is_sampled(frequency_hz, damping):
     """Its spectrum falls less steeply near half the frame rate than one in continuous time."""
@@ -159,3 +184,19 @@ def test_lines_at_one_frequency_move_by_their_own_errors():
     upper = lbt.studies.guaranteed_residual(path, controller, truth, error_hz=3.0).upper_nm
     exact = lbt.residual_budget(lbt.close_loop(path, controller), moved).rms_nm
     assert upper >= exact * (1 - 1e-9)
+
+
+def test_the_bound_of_one_box_is_that_of_small_gain():
+    """A tolerance that is never missed leaves the first box: r0 / (1 - |N E H|)."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    controller = lbt.integrator(path, gain=0.3).controller
+    truth = lbt.Truth(turbulence=AIR, noise_nm=8.0)
+    upper = lbt.studies.guaranteed_residual(
+        path, controller, truth, sensor_gains=(0.9, 1.1), tolerance=100.0
+    ).upper_nm
+    loop = lbt.close_loop(path, controller)
+    share = 0.1 * lbt.linear.hinf_norm(loop.noise_propagation()).value
+    budget = lbt.residual_budget(loop, truth)
+    means_nm = lbt.residual_budget(loop, truth, frame_means=True).rms_nm
+    expected = np.hypot(means_nm / (1 - share), budget.within_nm)
+    assert upper == pytest.approx(expected, rel=1e-6)

@@ -10,6 +10,7 @@ import numpy as np
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
+from lbt_synth.studies.grid import Parts
 
 # cheap to evaluate: turbulence of the model, one integrator
 BASE = """
@@ -55,7 +56,12 @@ def evaluate_quickly(study, values, start):
     """Columns that tell which row they are of."""
     rows = start + np.arange(len(values))
     columns = {name: rows + values[:, 0] / 7 + i for i, name in enumerate(study.result_columns)}
-    return lbt.studies.BatchResult(start=start, columns=columns)
+    return columns, []
+
+
+def part_rows(folder):
+    """The rows of each part in the directory of a study."""
+    return list(Parts(folder=folder / "parts", columns=(), rows=0, digest="").paths())
 
 
 def make_folder(tmp_path, name="out"):
@@ -79,9 +85,9 @@ def assert_whole(folder, study, evaluate=evaluate_quickly):
     values = study.values()
     for name, column in zip(study.parameter_names, values.T, strict=True):
         np.testing.assert_allclose(found[name], column, rtol=1e-11)
-    expected = evaluate(study, values, 0).columns
+    expected, _ = evaluate(study, values, 0)
     for name in study.result_columns:
         # which samples are in a batch moves what is below the accuracy of the evaluation
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-6, err_msg=name)
-    assert not (folder / "parts").exists()
-    assert json.loads((folder / "study.json").read_text())["finished"]
+    assert sum(stop - start for start, stop in part_rows(folder)) == study.samples
+    assert set(json.loads((folder / "study.json").read_text())["designs"]) == set(study.designed)

@@ -42,10 +42,7 @@ def results(n=300, seed=0):
 
 
 CONTROLLERS = ("steady", "sharp", "frail")
-FAILURES = [
-    lbt.studies.Failure(row=row, controller="frail", error=f"<b>no</b> design in row {row}")
-    for row in range(0, 300, 20)
-]
+FAILURES = [(row, "frail", f"<b>no</b> design in row {row}") for row in range(0, 300, 20)]
 
 
 @cache

@@ -64,8 +64,8 @@ from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import compare_in_truth
-from lbt_synth.studies.sensor_failures import run_failures
-from lbt_synth.studies.truth_comparison import TruthComparison
+from lbt_synth.studies.limits import TruthComparison
+from lbt_synth.studies.robustness import run_failures
 
 _PANELS = 6  # of one figure that has a panel per design: they fit a sheet
 _STEP_NM = 100.0
@@ -497,15 +497,18 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
     ]
     seconds = (2 * len(units) + 1) * _AWAY_S
     frames, seed = int(seconds * config.hardware.frame_rate_hz), config.settings.simulation.seed
-    run = run_failures(design, config, config.truth, drops, frames=frames, cases=1, seed=seed)
+    simulation, rows = run_failures(
+        design, config, config.truth, drops, frames=frames, cases=1, seed=seed
+    )
     left = [
-        f"without {segment.text} {nm_text(exact, '.1f', unit='nm rms')}"
-        for segment, exact in zip(run.segments, run.exact_nm, strict=True)
+        f"without {segment.text} {nm_text(row.exact_nm, '.1f', unit='nm rms')}"
+        for segment, row in rows
         if segment.text
     ]
+    exact_nm = [row.exact_nm for _, row in rows]
     return chart(
         key,
-        sensor_failure_figure(run.simulation, run.segments, run.exact_nm),
+        sensor_failure_figure(simulation, [segment for segment, _ in rows], exact_nm),
         group="sensor-failures",
         name=name,
         away=f"{_AWAY_S:g}",

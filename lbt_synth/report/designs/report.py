@@ -43,8 +43,7 @@ from lbt_synth.report.page.blocks import (
     require_letters,
 )
 from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
-from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.truth_comparison import TruthComparison
+from lbt_synth.studies.limits import LimitStudy, TruthComparison
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")

@@ -19,7 +19,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import EndToEndEntry, RobustnessMap, RobustnessRow, TradeoffPoint
 from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.tradeoff import FAMILIES
+from lbt_synth.studies.robustness import FAMILIES
 from lbt_synth.validation import FloatArray, real_array, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}

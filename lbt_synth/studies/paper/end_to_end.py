@@ -12,19 +12,20 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design, integrator
-from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop import EndToEndSetup, calibrate
 from lbt_synth.interop.specula.simulation import run_case
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
+from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import SinusoidalVibration, Truth
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.storage import run_cases
 from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.studies.grid import loop_columns
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.parameters import TABLE_II, TABLE_III, VIBRATION_HZ, PublishedRow
-from lbt_synth.validation import choice, set_fields
+from lbt_synth.validation import choice
 
 CLASSICAL_GAIN = 0.5
 # "by increasing the integrator's gain"; this times the optical gain of the loop, 0.55, is the
@@ -58,20 +59,15 @@ class EndToEndEntry:
     )
     strehls: tuple[float, ...] = field()
     strehl: float = column(
-        "end to end",
-        key="strehl_percent",
-        format=".1f",
-        help="Mean Strehl ratio over seeds [%]",
-        init=False,
+        "end to end", key="strehl_percent", format=".1f", help="Mean Strehl ratio over seeds [%]"
     )
     scatter: float = column(
         "scatter",
         key="scatter_points",
         format=".1f",
         help="Standard deviation over seeds [points]; nan for one",
-        init=False,
     )
-    seeds: int = column("seeds", help="How many there are", init=False)
+    seeds: int = column("seeds", help="How many there are")
     paper: float = column(
         "paper", key="paper_strehl_percent", format=".1f", help="The paper's [%], or nan"
     )
@@ -95,15 +91,6 @@ class EndToEndEntry:
         help="Strehl ratio without tip and tilt, mean over seeds",
     )
 
-    def __post_init__(self) -> None:
-        strehls = np.array(self.strehls)
-        set_fields(
-            self,
-            strehl=float(np.mean(strehls)),
-            scatter=float(np.std(strehls, ddof=1)) if strehls.size > 1 else np.nan,
-            seeds=strehls.size,
-        )
-
 
 def plan_tables(
     setup: EndToEndSetup,
@@ -115,7 +102,7 @@ def plan_tables(
 ) -> list[PlannedRow]:
     """Plan the rows and cases of both tables for a system.
 
-    The filters are those of :func:`~lbt_synth.studies.paper.tables.paper_filters`, designed
+    The filters are those of :func:`~lbt_synth.studies.paper.parameters.paper_filters`, designed
     for each frequency of Table III. Further designs are fixed: for them the vibration moves
     instead of the model, by the same error.
     """
@@ -152,55 +139,42 @@ def _plan_line(
 
     The paper's filters follow the frequency of the model; under the others the vibration moves.
     """
-    plan = functools.partial(_plan_row, setup, line, seeds)
     true_hz = moved_hz = None
     if line.error_hz is not None:
         true_hz, moved_hz = VIBRATION_HZ, VIBRATION_HZ + line.error_hz
+    plans: list[tuple[str, str, Design, float | None, float]] = []  # cases, method, paper's ratio
     if line.table == "II":
         gain = CLASSICAL_GAIN_VIBRATION if line.vibration else CLASSICAL_GAIN
-        classical = integrator(setup.system.hardware, gain=gain).controller
-        yield plan("classical", classical, moved_hz, paper=line.classical)
+        classical = integrator(setup.system.hardware, gain=gain)
+        plans.append(("classical", "classical", classical, moved_hz, line.classical))
     for method, (plant, bound) in given.filter_problems().items():
         plant = retuned_plant(plant, line.model_hz - VIBRATION_HZ, hold="driving")
         design = reference_design(method, plant, bound)
-        name, paper = f"{method}-{line.model_hz:g}hz", getattr(line, method)
-        yield plan(method, design.controller, true_hz, name=name, paper=paper)
-    for method, fixed in designs.items():
-        yield plan(method, fixed.controller, moved_hz)
-
-
-def _plan_row(
-    setup: EndToEndSetup,
-    line: PublishedRow,
-    seeds: Sequence[int],
-    method: str,
-    controller: Controller,
-    true_hz: float | None,
-    *,
-    name: str = "",
-    paper: float = np.nan,
-) -> PlannedRow:
-    shakes = tuple(
-        replace(shake, frequency_hz=true_hz)
-        for shake in given.PAPER_TRUTH.vibrations
-        if true_hz is not None and isinstance(shake, SinusoidalVibration)
-    )
-    vibration = "none" if true_hz is None else f"{true_hz:g}hz"
-    return PlannedRow(
-        table=line.table,
-        label=line.label,
-        method=method,
-        error_hz=line.error_hz,
-        paper=paper,
-        controller=controller,
-        truth=replace(given.PAPER_TRUTH, vibrations=shakes),
-        cases={
-            f"{name or method}-vibration-{vibration}-seed-{seed}": setup.case(
-                controller, vibrations=shakes, seed=seed
-            )
-            for seed in seeds
-        },
-    )
+        name = f"{method}-{line.model_hz:g}hz"
+        plans.append((name, method, design, true_hz, getattr(line, method)))
+    plans += [(method, method, fixed, moved_hz, np.nan) for method, fixed in designs.items()]
+    for name, method, design, frequency_hz, paper in plans:
+        shakes = tuple(
+            replace(shake, frequency_hz=frequency_hz)
+            for shake in given.PAPER_TRUTH.vibrations
+            if frequency_hz is not None and isinstance(shake, SinusoidalVibration)
+        )
+        vibration = "none" if frequency_hz is None else f"{frequency_hz:g}hz"
+        yield PlannedRow(
+            table=line.table,
+            label=line.label,
+            method=method,
+            error_hz=line.error_hz,
+            paper=paper,
+            controller=design.controller,
+            truth=replace(given.PAPER_TRUTH, vibrations=shakes),
+            cases={
+                f"{name}-vibration-{vibration}-seed-{seed}": setup.case(
+                    design.controller, vibrations=shakes, seed=seed
+                )
+                for seed in seeds
+            },
+        )
 
 
 def end_to_end_tables(
@@ -303,26 +277,26 @@ def make_entries(
     rows: Iterable[PlannedRow], results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
 ) -> list[EndToEndEntry]:
     """Make the entries of the tables from the results of their cases."""
-    return [_make_entry(row, [results[name] for name in row.cases], setup) for row in rows]
-
-
-def _make_entry(
-    row: PlannedRow, found: Sequence[Mapping[str, Any]], setup: EndToEndSetup
-) -> EndToEndEntry:
-    strehls, gain, tip, tilt, others = (
-        np.array([one[name] for one in found])
-        for name in ("strehl", "tip_tilt_gain", "tip_rms_nm", "tilt_rms_nm", "other_modes_strehl")
-    )
-    return fill_row(
-        EndToEndEntry,
-        row,
-        strehls=tuple(100 * float(one) for one in strehls),
-        modal=float(np.mean([_predict_strehl(row, one, setup) for one in found])),
-        optical_gain=float(np.mean(gain)),
-        tip_rms_nm=float(np.mean(tip**2) ** 0.5),
-        tilt_rms_nm=float(np.mean(tilt**2) ** 0.5),
-        other_modes=100 * float(np.mean(others)),
-    )
+    names = ("strehl", "tip_tilt_gain", "tip_rms_nm", "tilt_rms_nm", "other_modes_strehl")
+    entries = []
+    for row in rows:
+        runs = [results[name] for name in row.cases]
+        strehls, gain, tip, tilt, others = (np.array([run[n] for run in runs]) for n in names)
+        entry = fill_row(
+            EndToEndEntry,
+            row,
+            strehls=tuple((100 * strehls).tolist()),
+            strehl=100 * float(np.mean(strehls)),
+            scatter=100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else np.nan,
+            seeds=strehls.size,
+            modal=float(np.mean([_predict_strehl(row, run, setup) for run in runs])),
+            optical_gain=float(np.mean(gain)),
+            tip_rms_nm=float(np.mean(tip**2) ** 0.5),
+            tilt_rms_nm=float(np.mean(tilt**2) ** 0.5),
+            other_modes=100 * float(np.mean(others)),
+        )
+        entries.append(entry)
+    return entries
 
 
 def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndSetup) -> float:
@@ -338,11 +312,9 @@ def _predict_strehl(row: PlannedRow, result: Mapping[str, Any], setup: EndToEndS
         wavelength_um=system.imaging_wavelength_um,
         other_modes=result["other_modes_strehl"],
     )
-    try:
-        loop = close_loop(system.hardware, row.controller, sensor_gain=gain)
-        return 100 * strehl(residual_budget(loop, truth, frame_means=True), imaging)
-    except UnstableLoopError:
-        return 0.0
+    loop = close_loop(system.hardware, row.controller, sensor_gain=gain)
+    numbers = loop_columns(loop, truth, imaging, frame_means=True)
+    return 100 * numbers["strehl"] if loop.is_stable else 0.0
 
 
 def rms_modal_difference(table: Iterable[EndToEndEntry], method: str) -> float:

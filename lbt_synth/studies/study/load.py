@@ -8,27 +8,26 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import lbt_synth
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.load import read_mapping, validate_sections
-from lbt_synth.config.samples import Keys
+from lbt_synth.config.samples import Keys, find_number, parse_path
 from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, refuse_config
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
-from lbt_synth.methods.request import Wording, design_request
-from lbt_synth.studies.study.sample import (
-    Sample,
-    close_sample_loop,
-    find_number,
-    make_sample,
-    parse_path,
+from lbt_synth.methods.request import DesignRequest, Wording, design_request
+from lbt_synth.studies.study.run import read_designs
+from lbt_synth.studies.study.sample import close_sample_loop, make_sample
+from lbt_synth.studies.study.study import (
+    DELAY_ERROR,
+    NOISE_FACTOR,
+    Study,
+    StudySection,
+    is_error,
+    result_columns,
 )
-from lbt_synth.studies.study.schema import ParameterSection, StudySection
-from lbt_synth.studies.study.store import read_designs, read_manifest
-from lbt_synth.studies.study.study import ERRORS, Parameter, Study, StudyController, result_columns
 
 
 def load_study(
@@ -81,37 +80,44 @@ def load_study(
         raise ConfigError(
             f"{config_file}: a study is of one or two axes; got a loop of {config.hardware.modes}."
         )
-    files = {
-        name: source.parent / section.file
-        for name, section in settings.controllers.items()
-        if section.file is not None
-    }
+    sections = settings.controllers.items()
+    files = {name: source.parent / s.file for name, s in sections if s.file is not None}
     gains = {name: load_with_digest(file) for name, file in files.items()}
+    _require_places(settings, config, source)
     study = Study(
         source=source,
         settings=settings,
         config=config,
-        parameters=_parameters(settings, config, source),
-        controllers=(),
+        controllers={},
         digest=_digest(settings, config, {name: digest for name, (_, digest) in gains.items()}),
         inputs=(source, config_file, *files.values()),
     )
-    samples = [(where, _checked_sample(study, where, values)) for where, values in _corners(study)]
+    samples = []
+    for where, values in _corners(study):
+        with refuse_config(f"{source}: {where}", where.split(" ")[0]):
+            samples.append((where, make_sample(study, values)))
+    if config.truth.drifts and settings.evaluation == "exact":
+        raise ConfigError(
+            f"{source}: a vibration of the truth drifts, so that there is no exact answer; "
+            "set evaluation: simulation.",
+            path="evaluation",
+        )
     fixed = {name: design for name, (design, _) in gains.items()}
-    if directory is not None and (manifest := read_manifest(Path(directory), study.digest)):
-        fixed |= read_designs(Path(directory), manifest)
-    controllers = tuple(
-        StudyController(name=name, request=None, design=fixed[name], origin=str(files[name]))
-        if name in files
-        else _designed_controller(study, name, fixed.get(name))
-        for name in settings.controllers
+    if directory is not None:
+        fixed |= read_designs(Path(directory), study)
+    study = replace(
+        study,
+        controllers={
+            name: fixed[name] if name in files else _make_controller(study, name, fixed.get(name))
+            for name in settings.controllers
+        },
     )
-    for controller in controllers:
-        if controller.design is not None:
+    for name, controller in study.controllers.items():
+        if isinstance(controller, Design):
             for where, sample in samples:
-                with refuse_config(f"{source}: controllers.{controller.name}, {where}"):
-                    close_sample_loop(sample, controller.design)
-    return replace(study, controllers=controllers)
+                with refuse_config(f"{source}: controllers.{name}, {where}"):
+                    close_sample_loop(sample, controller)
+    return study
 
 
 def _require_names(settings: StudySection, source: Path) -> None:
@@ -121,10 +127,7 @@ def _require_names(settings: StudySection, source: Path) -> None:
         other = first.setdefault(name.casefold(), name)
         taken = [p for p in settings.parameters if p in result_columns(name, settings.evaluation)]
         if other != name:
-            why = (
-                f"its files would have the names of {other}'s; give a name that differs by more "
-                "than its case"
-            )
+            why = f"its files need a name that differs by more than its case from {other}"
         elif name.casefold().startswith("row_"):
             why = "names that begin with row_ are those of replayed samples; give another"
         elif taken:
@@ -134,26 +137,22 @@ def _require_names(settings: StudySection, source: Path) -> None:
         raise ConfigError(f"{source}: controllers.{name}: {why}.", path=f"controllers.{name}")
 
 
-def _designed_controller(study: Study, name: str, stored: Design | None) -> StudyController:
+def _make_controller(study: Study, name: str, stored: Design | None) -> Design | DesignRequest:
     """Return a controller that the study designs, once unless each sample has its own."""
-    section = study.settings.controllers[name]
-    assert section.design is not None  # the schema requires a file or a design
-    with name_file(study.source), name_key(f"controllers.{name}.design"):
-        method_named(section.design)
-    place = f"controllers.{name}"
+    section, place = study.settings.controllers[name], f"controllers.{name}"
+    method = str(section.design)
+    with name_file(study.source), name_key(f"{place}.design"):
+        method_named(method)
     with refuse_config(f"{study.source}", place):
         words = Wording(method="design: {}", place=place)
-        request = design_request(section.design, section.options, words)
+        request = design_request(method, section.options, words)
     if section.for_ == "sample":
-        origin = f"{request.text} for each sample"
-        return StudyController(name=name, request=request, design=None, origin=origin)
+        return request
     try:
-        design = stored or study.config.design(request)
+        return stored or study.config.design(request)
     except LbtSynthError as error:
-        error.args = (f"{study.source}: controllers.{name}: {error}",)
+        error.args = (f"{study.source}: {place}: {error}",)
         raise
-    origin = f"{request.text} for the configuration"
-    return StudyController(name=name, request=request, design=design, origin=origin)
 
 
 def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> str:
@@ -170,60 +169,34 @@ def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> st
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _parameters(settings: StudySection, config: Config, source: Path) -> tuple[Parameter, ...]:
+def _require_places(settings: StudySection, config: Config, source: Path) -> None:
+    """Refuse parameters that are no numbers of the configuration, or are given twice."""
     full = config.settings.model_dump()
     taken: dict[Keys, str] = {}
-    out = []
     for name, section in settings.parameters.items():
-        key = f"parameters.{name}"
-        with refuse_config(f"{source}: {key}", key):
-            places = _places(name, section, full)
-            for keys, place in places.items():
-                if (other := taken.setdefault(keys, name)) != name:
-                    raise ConfigError(f"{place} is given twice, by {other} and {name}.")
-        out.append(Parameter(name=name, places=tuple(places), distribution=section))
-    return tuple(out)
-
-
-def _places(name: str, section: ParameterSection, full: dict[str, Any]) -> dict[Keys, str]:
-    """Return the keys and the path of each number of the configuration that a parameter sets."""
-    if name.split(".")[0] == "error":
-        if name not in ERRORS:
-            raise ConfigError(f"the errors of a loop are {' and '.join(ERRORS)}; got {name}.")
-        if section.also:
-            raise ConfigError("an error of the loop is in no configuration; leave also out.")
-        return {}
-    places: dict[Keys, str] = {}
-    for place in (name, *section.also):
-        if isinstance(find_number(full, place), int) and not section.values:
-            raise ConfigError(
-                "it is an integer, which takes a list of values; got a distribution of all numbers."
-            )
-        keys = parse_path(place)
-        if keys in places:
-            raise ConfigError(f"{place} is given twice, by {name} and {name}.")
-        places[keys] = place
-    return places
+        with refuse_config(f"{source}: parameters.{name}", f"parameters.{name}"):
+            if is_error(name) and name not in (DELAY_ERROR, NOISE_FACTOR):
+                errors = f"{DELAY_ERROR} and {NOISE_FACTOR}"
+                raise ConfigError(f"the errors of a loop are {errors}; got {name}.")
+            if is_error(name) and section.also:
+                raise ConfigError("an error of the loop is in no configuration; leave also out.")
+            for place in () if is_error(name) else (name, *section.also):
+                if isinstance(find_number(full, place), int) and not section.values:
+                    raise ConfigError(
+                        "it is an integer, which takes a list of values; got a distribution of all "
+                        "numbers."
+                    )
+                keys = parse_path(place)
+                if keys in taken:
+                    raise ConfigError(f"{place} is given twice, by {taken[keys]} and {name}.")
+                taken[keys] = name
 
 
 def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
     """Yield the medians, then the ends of each parameter with the others at their medians."""
-    centre = [parameter.distribution.median() for parameter in study.parameters]
+    parameters = study.settings.parameters
+    centre = [section.median() for section in parameters.values()]
     yield "parameters in the middle", centre
-    for i, parameter in enumerate(study.parameters):
-        if parameter.distribution.varies:
-            for end in parameter.distribution.extremes(study.samples):
-                values = [*centre[:i], end, *centre[i + 1 :]]
-                yield f"parameters.{parameter.name} at {end:g}", values
-
-
-def _checked_sample(study: Study, where: str, values: list[float]) -> Sample:
-    with refuse_config(f"{study.source}: {where}", where.split(" ")[0]):
-        sample = make_sample(study, values)
-    if sample.truth.drifts and study.settings.evaluation == "exact":
-        raise ConfigError(
-            f"{study.source}: a vibration of the truth drifts, so that there is no exact answer; "
-            "set evaluation: simulation.",
-            path="evaluation",
-        )
-    return sample
+    for i, (name, section) in enumerate(parameters.items()):
+        for end in section.extremes(study.samples) if section.varies else ():
+            yield f"parameters.{name} at {end:g}", [*centre[:i], end, *centre[i + 1 :]]

@@ -1,77 +1,87 @@
-"""Run a study, or what is missing of it, and write its results; estimate what it will cost."""
+"""Run a study, or what is missing of it, and write its results; replay a row of it."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+import lbt_synth
+from lbt_synth.config import save_config
+from lbt_synth.config.ensemble import EXPECTED_ERRORS
+from lbt_synth.config.load import validate_sections
+from lbt_synth.config.plant_and_truth import turbulence_sections
+from lbt_synth.config.schema import Ar2Section, FileSection
+from lbt_synth.config.write import turbulence_content
+from lbt_synth.design import Design
 from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.storage.atomic_files import exclusive_lock, make_directory, refuse_replacing
-from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.thread_limits import limit_threads
-from lbt_synth.storage.worker_processes import WorkerPool
-from lbt_synth.studies.study import store
-from lbt_synth.studies.study.batch_evaluation import are_evaluated_together, evaluate_samples
-from lbt_synth.studies.study.engine import (
-    Evaluate,
-    InlineExecutor,
-    TimedBatch,
-    cut_parts,
-    evaluate_parts,
+from lbt_synth.files import save_gain
+from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.methods.request import DesignRequest
+from lbt_synth.storage.atomic_files import (
+    UNFINISHED,
+    exclusive_lock,
+    open_atomically,
+    refuse_replacing,
+    write_atomically,
 )
-from lbt_synth.studies.study.store import read_results, write_failures, write_results
-from lbt_synth.studies.study.study import Failure, Study
+from lbt_synth.storage.input_files import read_json
+from lbt_synth.storage.tables import csv_bytes
+from lbt_synth.studies.grid import (
+    Failure,
+    InlineExecutor,
+    Parts,
+    Result,
+    refuse,
+)
+from lbt_synth.studies.study.sample import (
+    Sample,
+    are_evaluated_together,
+    design_for_sample,
+    evaluate_row,
+    evaluate_samples,
+    make_sample,
+)
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
-_MOST_JOBS = 64
+MANIFEST, PARTS, RESULTS, FAILED = "study.json", "parts", "results.csv", "failed.csv"
+PAGE, PRINT = "summary.html", "summary.pdf"
+_SCHEMA = "lbt_synth study 2"
+_PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 # Rows of a part whose samples are evaluated together: some tenths of a second, of which the check
 # of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
 # each sample takes milliseconds or seconds, a killed study shall lose few of them.
 _ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
-_PARTS_PER_WORKER = 4  # at least, so that none waits long for the last
 _IN_FLIGHT = 2  # parts per worker, so that none waits for the next
-_MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
-_LONG_ENOUGH_S = 1.0
-_NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
+_PARTS_PER_WORKER = 4  # at least, so that none waits long for the last
+
+_NOISELESS = "has no noise, which no configuration takes: there is none to simulate it with."
+
+Evaluate = Callable[[Study, FloatArray, int], Result]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FinishedStudy:
-    """All results of a finished study."""
-
-    columns: dict[str, FloatArray]  # by name, (n,) each
-    computing_s: float  # time of all batches, summed over processes [s]
-    new: bool  # whether some were computed now; else all were read from the table
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class StudyRun:
-    """What a run of a study did."""
+    """What a run of a study did, and all results."""
 
-    directory: Path  # directory, table of results and table of failures
-    results: Path
+    results: Path  # the table of results, and that of failures
     failed: Path
-    samples: int  # rows of the results
-    computed: int  # how many of them this run computed
-    failures: int  # controllers of samples that have no result
-    computing_s: float  # time of this run until the last row was computed, and to its end [s]
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
-    """What a study will cost."""
-
-    measured_rows: int  # rows of the batch that was measured
-    measured_s: float  # time that it took in one process [s]
-    seconds: float  # time of the whole study on the requested processes [s]
-    disk_bytes: int  # largest size of its directory, while it holds both results and parts
+    columns: dict[str, FloatArray]  # row, parameters and results by name, (n,) each
+    failures: tuple[Failure, ...]  # row, controller and error, in the order of the rows
+    computed: int  # how many rows this run computed
+    computing_s: float  # time of all parts, summed over processes [s]
+    seconds: float  # time of this run [s]
+    new: bool  # whether this run wrote the table of results
 
 
 def run_study(
@@ -79,18 +89,16 @@ def run_study(
     directory: str | os.PathLike[str],
     *,
     executor: Executor | None = None,
-    jobs: int = 1,
     workers: int | None = None,
     evaluate: Evaluate = evaluate_samples,
     progress: Callable[[int], None] | None = None,
-    whole: Callable[[FinishedStudy], None] | None = None,
 ) -> StudyRun:
     """Run what is missing of a study, and write its results.
 
     Every part, a fixed number of rows, is a file in ``parts`` as soon as it is computed, written
     completely or not at all: a study that is killed at any moment, or whose worker died, resumes
     where it was. When all rows are computed, ``results.csv`` is written with one row per sample in
-    order, and ``failed.csv`` with the failures; then the parts are removed.
+    order, and ``failed.csv`` with the failures.
 
     Parameters
     ----------
@@ -99,35 +107,28 @@ def run_study(
     directory : path-like
         An existing directory.
     executor : concurrent.futures.Executor, optional
-        Runs the parts; any executor, also a Dask ``Client.get_executor()``. It is left open.
-    jobs : int, optional
-        Processes, if there is no executor: at most eight per processor of the machine, or 64.
-        With 1 the study runs in this process.
+        Runs the parts, in processes or as a Dask ``Client.get_executor()``; it is left open. By
+        default they run in this process.
     workers : int, optional
         How many parts the executor runs at once, if it does not say so itself; twice as many are
         in flight.
     evaluate : callable, optional
-        ``evaluate(study, values, start)`` returns the :class:`BatchResult` of rows of
-        ``study.values``. Other processes must be able to import it by name.
+        ``evaluate(study, values, start)`` returns columns and failures of rows of
+        ``study.values``, as :func:`evaluate_samples` does. Other processes must be able to import
+        it by name.
     progress : callable, optional
         Called with the number of rows that were found or finished since its last call.
-    whole : callable, optional
-        Called with all results when all rows are computed. The manifest records the end of the
-        study only after it, so that a call that fails is repeated. A study that was finished
-        before calls it, too.
 
     Returns
     -------
     StudyRun
-        What was done. A finished study is not run again.
+        What was done, and all results. A finished study is not run again.
 
     Raises
     ------
-    ProblemError
-        If there are too many or too few jobs.
     OutputError
         If the directory belongs to another study, is in use or cannot be written, files in it
-        would be replaced, or its results were changed.
+        would be replaced, or a part or a design in it was changed.
     NumericalError
         If a worker dies, or an executor breaks; what is finished is kept.
 
@@ -141,215 +142,263 @@ def run_study(
     ...     _ = (folder / "lbt.yaml").write_bytes(pathlib.Path("examples/lbt.yaml").read_bytes())
     ...     run = lbt.studies.run_study(lbt.studies.load_study(folder / "small.yaml"), folder)
     ...     again = lbt.studies.run_study(lbt.studies.load_study(folder / "small.yaml"), folder)
-    >>> run.results.name, run.computed, again.computed
-    ('results.csv', 4, 0)
+    >>> run.results.name, run.computed, again.computed, run.columns["kalman.strehl"].shape
+    ('results.csv', 4, 0, (4,))
     """
     require_instance(study, Study)
-    jobs = integer(jobs, "jobs", at_least=1)
-    most = max(_MOST_JOBS, 8 * (os.cpu_count() or 1))
-    if jobs > most:
-        raise ProblemError(f"jobs must be at most {most} on this machine; got {jobs}.")
+    at_once = 1
     if executor is not None:
         at_once = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
-        jobs = integer(at_once, "workers", at_least=1)
+    at_once = integer(at_once, "workers", at_least=1)
     folder = Path(directory)
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
-    computed, computing_s = 0, 0.0
-    count = progress or (lambda rows: None)
+    parts, count = study_parts(folder, study), progress or (lambda rows: None)
     with exclusive_lock(folder, "study"):
-        store.remove_unfinished(folder)
-        manifest = _begin(folder, study)
-        if manifest.finished:
-            store.remove_parts(folder)  # a run was killed while it removed them
-            count(study.samples)
-            if whole is not None:
-                columns, spent = read_results(folder, study), manifest.computing_seconds
-                whole(FinishedStudy(columns=columns, computing_s=spent, new=False))
-        else:
-            log, missing = _read_parts(study, folder)
-            computed = sum(stop - start for start, stop in missing)
-            if computed < study.samples:
-                count(study.samples - computed)
-            if missing:
-                with _choose_executor(executor, jobs) as chosen:
-                    parts = cut_parts(missing, _part_rows(study, jobs))
-                    in_flight = 1 if isinstance(chosen, InlineExecutor) else _IN_FLIGHT * jobs
-                    batches = evaluate_parts(study, parts, evaluate, chosen, in_flight=in_flight)
-                    _write_parts(study, folder, batches, log, count)
-            computing_s = time.perf_counter() - began
-            manifest = _write_tables(folder, study, manifest, log, began, whole)
+        for path in [*folder.glob(UNFINISHED), *parts.folder.glob(UNFINISHED)]:
+            path.unlink()  # what a killed process left
+        _begin(folder, study)
+        for path in parts.paths().values():
+            parts.read(path)  # refuses what is damaged before any work
+        computed = sum(stop - start for start, stop in parts.missing())
+        if computed < study.samples:
+            count(study.samples - computed)
+        if computed:
+            controllers = study.controllers.values()
+            together = all(are_evaluated_together(study, each) for each in controllers)
+            share = -(-study.samples // (_PARTS_PER_WORKER * at_once))
+            parts.compute_missing(
+                partial(evaluate, study),
+                lambda rows: (study.values(*rows), rows[0]),
+                part_rows=min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share),
+                executor=executor or InlineExecutor(),
+                in_flight=1 if executor is None else _IN_FLIGHT * at_once,
+                progress=count,
+            )
+        contents = [parts.read(path) for path in parts.paths().values()]
+        failures = [failure for _, failed, _ in contents for failure in failed]
+        results = np.concatenate([result for result, _, _ in contents])
+        table = np.column_stack([np.arange(study.samples), study.values(), results])
+        new = _write_tables(folder, study, table, failures)
     return StudyRun(
-        directory=folder,
-        results=folder / store.RESULTS,
-        failed=folder / store.FAILED,
-        samples=study.samples,
+        results=folder / RESULTS,
+        failed=folder / FAILED,
+        columns=dict(zip(study.columns, np.ascontiguousarray(table.T), strict=True)),
+        failures=tuple(failures),
         computed=computed,
-        failures=manifest.failures,
-        computing_s=computing_s,
+        computing_s=sum(seconds for _, _, seconds in contents),
         seconds=time.perf_counter() - began,
+        new=new,
     )
 
 
-@contextlib.contextmanager
-def _choose_executor(executor: Executor | None, jobs: int) -> Iterator[Executor]:
-    """Provide the caller's executor, new processes with one thread each, or this process."""
-    with ExitStack() as environment:
-        if executor is None and jobs > 1:
-            environment.enter_context(limit_threads())
-            executor = environment.enter_context(WorkerPool(jobs))
-        yield executor or InlineExecutor()
-
-
-def _part_rows(study: Study, workers: int) -> int:
-    """Return the number of rows of a part."""
-    together = all(are_evaluated_together(study, each) for each in study.controllers)
-    share = -(-study.samples // (_PARTS_PER_WORKER * workers))
-    return min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share)
+def study_parts(folder: Path, study: Study) -> Parts:
+    """Return the parts of a study in its directory."""
+    place, columns = folder / PARTS, study.result_columns
+    return Parts(folder=place, columns=columns, rows=study.samples, digest=study.digest)
 
 
 def output_paths(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, without its parts."""
-    designs = [f"{c.name}.fits" for c in study.controllers if c.is_designed]
-    tables = [store.RESULTS, store.FAILED, store.PAGE, store.PRINT]
-    return [folder / name for name in (store.MANIFEST, *tables, *designs)]
+    designs = [f"{name}.fits" for name in study.designed]
+    return [folder / name for name in (MANIFEST, RESULTS, FAILED, PAGE, PRINT, *designs)]
 
 
-def _begin(folder: Path, study: Study) -> store.Manifest:
-    """Return the manifest of a directory; begin the study if there is none."""
-    manifest = store.read_manifest(folder, study.digest)
-    if manifest is not None:
-        store.read_designs(folder, manifest)
-        if manifest.finished:
-            if all((folder / name).exists() for name in (store.RESULTS, store.FAILED)):
-                store.require_unchanged(folder, manifest)
-            else:
-                manifest = manifest.write(folder, finished=False, tables={})
-    else:
-        if store.list_parts(folder):
-            why = f"holds parts of a study without its {store.MANIFEST}. Name another directory, or"
-            store.refuse(folder, f"{why} delete {folder / store.PARTS}.")
+def read_manifest(folder: Path, study: Study) -> dict[str, Any] | None:
+    """Return the manifest of a study in its directory, None if it was not begun there."""
+    path = folder / MANIFEST
+    if not path.exists():
+        return None
+    try:
+        manifest = dict(read_json(path, OutputError))
+        readable = manifest["schema"] == _SCHEMA
+        source, version, _ = manifest["source"], manifest["version"], dict(manifest["designs"])
+    except (ValueError, KeyError, TypeError):
+        readable = False
+    if not readable:
+        refuse(path, "is no manifest of a study that this version reads. Name another directory.")
+    if manifest["digest"] != study.digest:
+        why = (
+            f"was made by lbt_synth {version}; this is {lbt_synth.__version__}"
+            if version != lbt_synth.__version__
+            else f"is of another study: {source} as it was, with its configuration and gain files"
+        )
+        refuse(folder, f"{why}. Name another directory, or delete it.")
+    return manifest
+
+
+def read_designs(folder: Path, study: Study) -> dict[str, Design]:
+    """Return the designs that a study wrote for its controllers, none if it was not begun."""
+    designs = {}
+    digests = (read_manifest(folder, study) or {}).get("designs", {})
+    for name in sorted(digests.keys() & study.settings.controllers.keys()):
+        path = folder / f"{name}.fits"
+        designs[name], digest = load_with_digest(path)
+        if digest != digests[name]:
+            why = "is not the design that the study was begun with. Put that back, or name another"
+            refuse(path, f"{why} directory.")
+    return designs
+
+
+def _begin(folder: Path, study: Study) -> None:
+    """Begin a study with its manifest and its designs, or check that it was begun here."""
+    manifest = read_manifest(folder, study)
+    if manifest is None:
         for path in output_paths(folder, study):
             if path.exists():
                 why = "is not of a study in this directory, and would be replaced. Name another"
-                store.refuse(path, f"{why} directory, or delete it.")
-        manifest = store.new_manifest(study).write(folder)
-    if set(manifest.designs) != {c.name for c in study.controllers if c.is_designed}:
-        # begun now, or killed before they were written
-        manifest = manifest.write(folder, designs=store.write_designs(folder, study))
-    return manifest
+                refuse(path, f"{why} directory, or delete it.")
+        manifest = {
+            "schema": _SCHEMA,
+            "digest": study.digest,
+            "version": lbt_synth.__version__,
+            "source": str(study.source),
+            "designs": {},
+        }
+        _write_manifest(folder, manifest)
+    if manifest["designs"].keys() == study.designed.keys():
+        read_designs(folder, study)
+        return
+    # begun now, or killed before they were written
+    saved = {n: save_gain(folder / f"{n}.fits", design) for n, design in study.designed.items()}
+    digests = {name: load_with_digest(path)[1] for name, path in saved.items()}
+    _write_manifest(folder, manifest | {"designs": digests})
 
 
-@dataclass(slots=True)
-class _Log:
-    """What all parts say of their results."""
-
-    failures: list[Failure] = field(default_factory=list)
-    seconds: float = 0.0  # of their batches
-
-    def add(self, failures: Sequence[Failure], seconds: float) -> None:
-        """Add what one part says."""
-        self.failures.extend(failures)
-        self.seconds += seconds
+def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode() + b"\n")
 
 
-def _read_parts(study: Study, folder: Path) -> tuple[_Log, list[store.RowRange]]:
-    """Return what the parts of earlier runs say, and the rows that none of them has."""
-    log, parts = _Log(), store.list_parts(folder)
-    for part in parts:
-        _, failures, seconds = store.read_part(part, study)
-        log.add(failures, seconds)
-    return log, store.missing_rows(parts, study.samples)
+def _write_tables(folder: Path, study: Study, table: FloatArray, failures: list[Failure]) -> bool:
+    """Write the tables of results and failures that are missing; return whether one was."""
+    results, failed = folder / RESULTS, folder / FAILED
+    new = not (results.exists() and failed.exists())
+    if not failed.exists():
+        write_atomically(failed, csv_bytes(("row", "controller", "error"), failures))
+    if not results.exists():
+        formats = [_PARAMETER] * len(study.parameter_names) + [_RESULT] * len(study.result_columns)
+        line = ",".join(["%d", *formats]) + "\n"
+        with open_atomically(results) as stream:
+            stream.write((",".join(study.columns) + "\n").encode())
+            for start in range(0, len(table), _ROWS_TOGETHER):
+                rows = table[start : start + _ROWS_TOGETHER].tolist()
+                stream.write("".join([line % tuple(row) for row in rows]).encode())
+    return new
 
 
-def _write_parts(
-    study: Study,
-    folder: Path,
-    batches: Generator[TimedBatch, None, None],
-    log: _Log,
-    progress: Callable[[int], None],
-) -> None:
-    """Write each part as it comes."""
-    if make_directory(folder / store.PARTS).is_symlink():
-        path = folder / store.PARTS
-        raise OutputError(f"cannot make the directory {path}: it is a link.", path=folder)
-    with contextlib.closing(batches):
-        for batch, seconds in batches:
-            part = store.write_part(folder, study, batch, seconds)
-            log.add(batch.failures, seconds)
-            progress(part.stop - part.start)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Replay:
+    """A row of a study, computed again."""
+
+    stored: dict[str, float]  # its results in the study; empty if it has none yet
+    # its results computed now, by the reference evaluation; without those that failed
+    fresh: dict[str, float]
+    failures: tuple[Failure, ...]  # what failed now
+    # files that were written: the configuration, and the designs for this sample
+    files: tuple[Path, ...]
+    unwritten: str = ""  # why there is no configuration; empty if there is one
 
 
-def _write_tables(
-    folder: Path,
-    study: Study,
-    manifest: store.Manifest,
-    log: _Log,
-    began: float,
-    whole: Callable[[FinishedStudy], None] | None,
-) -> store.Manifest:
-    """Write the results of all parts, then the manifest, then remove the parts."""
-    parts = store.list_parts(folder)
-    tables = write_results(folder, study, parts), write_failures(folder, log.failures)
-    if whole is not None:
-        columns = read_results(folder, study, parts)
-        whole(FinishedStudy(columns=columns, computing_s=log.seconds, new=True))
-    manifest = manifest.write(
-        folder,
-        finished=True,
-        tables={path.name: file_sha256(path, OutputError) for path in tables},
-        failures=len(log.failures),
-        seconds=manifest.seconds + time.perf_counter() - began,
-        computing_seconds=log.seconds,
-    )
-    store.remove_parts(folder)
-    return manifest
+def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
+    """Compute one row of a study again, and write it as a configuration.
 
-
-def estimate_study(
-    study: Study, *, workers: int = 1, local: bool = True, evaluate: Evaluate = evaluate_samples
-) -> Estimate:
-    """Measure a batch in this process, and estimate what the whole study will cost.
+    ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with the
+    seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs
+    for each sample, which assume the delay and the noise of ``config``, are ``row_N_NAME.fits``.
 
     Parameters
     ----------
     study : Study
         The study.
-    workers : int, optional
-        Processes that it will run on.
-    local : bool, optional
-        Whether they run on this machine, and so no more at once than it has processors.
-    evaluate : callable, optional
-        As for :func:`run_study`.
+    directory : path-like
+        Its directory, finished or not.
+    row : int
+        The number of the row.
 
     Returns
     -------
-    Estimate
-        The estimate.
+    Replay
+        Parameters, stored and fresh results.
+
+    Raises
+    ------
+    ProblemError
+        If the study has no such row, or the configuration refuses its numbers.
+    OutputError
+        If the directory belongs to another study, or cannot be written.
 
     Examples
     --------
-    >>> import lbt_synth as lbt
-    >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> cost = lbt.studies.estimate_study(study, workers=2)
-    >>> cost.seconds > 0, cost.disk_bytes
-    (True, 1974272)
+    >>> import lbt_synth as lbt, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = lbt.studies.replay_row(lbt.studies.load_study("examples/study.yaml"), folder, 3)
+    >>> [path.name for path in again.files], round(again.fresh["kalman.strehl"], 3)
+    (['row_3.yaml'], 0.832)
     """
-    workers = integer(workers, "workers", at_least=1)
-    start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
-    evaluate(study, study.values(0, 1), 0)  # warms up
-    while seconds < _LONG_ENOUGH_S and start < study.samples:
-        values = study.values(start, min(start + size, study.samples))
-        before = time.perf_counter()
-        evaluate(study, values, start)
-        seconds, rows = time.perf_counter() - before, len(values)
-        start, size = start + rows, _MEASURED_ROWS * size
-    at_once = min(workers, os.cpu_count() or 1) if local else workers
-    table = _NUMBER_BYTES * len(study.columns)
-    parts = _PART_BYTES * len(study.result_columns)
-    return Estimate(
-        measured_rows=rows,
-        measured_s=seconds,
-        seconds=seconds / rows * study.samples / at_once,
-        disk_bytes=study.samples * (table + parts),
+    row = integer(row, "row", at_least=0)
+    if row >= study.samples:
+        raise ProblemError(f"the study has rows 0 to {study.samples - 1}; got row {row}.")
+    folder = Path(directory)
+    stored = {}
+    if read_manifest(folder, study) is not None:
+        parts = study_parts(folder, study)
+        for (start, stop), path in parts.paths().items():
+            if start <= row < stop:
+                numbers = parts.read(path)[0][row - start]
+                stored = dict(zip(study.result_columns, numbers.tolist(), strict=True))
+    values = study.values(row, row + 1)[0]
+    fresh, failures = evaluate_row(study, values, row)
+    sample = _, _, truth = make_sample(study, values)
+    has_noise = bool(np.all(np.asarray(truth.noise_nm) > 0))
+    return Replay(
+        stored=stored,
+        fresh=fresh,
+        failures=tuple(failures),
+        files=_write_files(study, folder, row, sample, with_config=has_noise),
+        unwritten="" if has_noise else f"row {row} {_NOISELESS}",
     )
+
+
+def _write_files(
+    study: Study, folder: Path, row: int, sample: Sample, *, with_config: bool
+) -> tuple[Path, ...]:
+    """Write the configuration of a sample and its own designs, and return their paths."""
+    path = folder / f"row_{row}.yaml"
+    own = {
+        folder / f"row_{row}_{name}.fits": controller
+        for name, controller in study.controllers.items()
+        if isinstance(controller, DesignRequest)
+    }
+    refuse_replacing([path, *own], study.inputs)
+    files = []
+    if with_config:
+        settings, comments = _row_settings(study, row, sample)
+        files.append(save_config(path, settings, comments=comments))
+    for gain, controller in own.items():
+        with contextlib.suppress(*EXPECTED_ERRORS):  # they are among the failures
+            files.append(save_gain(gain, design_for_sample(controller, sample)))
+    return tuple(files)
+
+
+def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:
+    """Return the configuration of the real loop of a sample, and comments on it."""
+    config, hardware, truth = sample
+    content = config.settings.model_dump(exclude_unset=True)
+    comments = {"": f"Row {row} of the study {study.source.name}: the real loop of the sample."}
+    if hardware is not config.hardware:
+        content["loop"]["delay_frames"] = hardware.delay_frames
+        assumed = config.hardware.delay_frames
+        comments["loop.delay_frames"] = f"designs assume {assumed:.12g} ({DELAY_ERROR})"
+    if truth is not config.truth:
+        sensor = content["sensor"]
+        content["sensor"] = {k: v for k, v in sensor.items() if k not in ("noise_mas", "pyramid")}
+        content["sensor"]["noise_nm"] = np.asarray(truth.noise_nm).tolist()
+        assumed_nm = ", ".join(f"{value:.12g}" for value in np.ravel(config.noise_nm))
+        comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
+        if any(isinstance(section, Ar2Section) for section in turbulence_sections(config.settings)):
+            # keep what was fitted above the noise that designs assume
+            sections = [turbulence_content(model) for model in config.plant.turbulence]
+            same = all(section == sections[0] for section in sections)
+            content["model"]["turbulence"] = sections[0] if same else sections
+    content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)
+    return validate_sections(FileSection, content, study.config.source), comments

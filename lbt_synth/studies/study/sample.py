@@ -1,63 +1,195 @@
-"""One sample of a study: its loop, its disturbances, and its slow reference evaluation."""
+"""Evaluate samples of a study: many at once, and one by one where that is not possible."""
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import replace
 
 import numpy as np
 
-from lbt_synth.config import Config
-from lbt_synth.config.ensemble import EXPECTED_ERRORS
+from lbt_synth.config import Config, ensemble
+from lbt_synth.config.ensemble import EXPECTED_ERRORS, Samples
 from lbt_synth.config.load import build_config, validate_sections
-from lbt_synth.config.samples import Keys
+from lbt_synth.config.samples import Reads, set_number
 from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
-from lbt_synth.errors import ConfigError, refuse_config
-from lbt_synth.loop import ClosedLoop, residual_budget, simulate, strehl
+from lbt_synth.errors import CertificateError, refuse_config
+from lbt_synth.loop import ClosedLoop, simulate
+from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 from lbt_synth.loop.simulation.run import settling_frames
-from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
+from lbt_synth.methods.request import DesignRequest
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.storage.words import count_text
-from lbt_synth.studies.study.study import (
-    DELAY_ERROR,
-    NOISE_FACTOR,
-    RESIDUALS,
-    BatchResult,
-    Failure,
-    Study,
-    StudyController,
-)
-from lbt_synth.validation import FloatArray
+from lbt_synth.studies.grid import Failure, Result, loop_columns, stack_columns
+from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
+from lbt_synth.validation import FloatArray, IntArray
 
-_PART = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
+_AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
+_FEWEST = 4  # samples in a group that is worth an ensemble
+
+# of one sample: what designs assume, the real loop, and what that really meets
+Sample = tuple[Config, LoopHardware, Truth]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sample:
-    """One sample of a study."""
+def evaluate_samples(
+    study: Study, values: FloatArray, start: int, *, together: bool = True
+) -> Result:
+    """Evaluate consecutive samples.
 
-    config: Config  # what designs assume
-    hardware: LoopHardware  # the real loop: that of ``config`` with the delay error
-    truth: Truth  # what it really meets: that of ``config`` with the real noise
+    Samples whose configurations differ by numbers that its builders take as arrays are evaluated
+    together by :func:`ensemble_residuals`; the equations of Kalman filters for samples are solved
+    together. Other designs, simulations, and samples that the configuration refuses
+    are evaluated one by one. So is one sample of each group that is evaluated together, and the
+    two answers must agree.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    values : (b, parameters) ndarray
+        Rows of ``Study.values``.
+    start : int
+        Number of the first sample.
+    together : bool, optional
+        False evaluates all of them one by one.
+
+    Returns
+    -------
+    columns : dict of str to (b,) ndarray
+        Each of ``study.result_columns`` for each sample; a controller without a result has nan,
+        an unstable loop ``stable`` 0 and nan otherwise.
+    failures : list of (int, str, str)
+        The row, the controller without a result on it, and why; in the order of the rows.
+
+    Raises
+    ------
+    CertificateError
+        If a sample that is evaluated both ways has two answers.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> columns, failures = lbt.studies.evaluate_samples(study, study.values(0, 2), 0)
+    >>> columns["kalman.strehl"].round(3).tolist(), columns["kalman.stable"].tolist(), failures
+    ([0.837, 0.821], [1.0, 1.0], [])
+    """
+    columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
+    failures: list[Failure] = []
+    remaining: dict[int, list[str]] = {}  # controllers to evaluate one by one, by sample
+    for name, controller in study.controllers.items():
+        for rows, results in _evaluate_groups(study, controller, values) if together else ():
+            for column, numbers in results.items():
+                columns[f"{name}.{column}"][rows] = numbers
+            i = int(rows[rows.size // 2])
+            alone = replace(study, controllers={name: controller})
+            among = {column: float(columns[column][i]) for column in alone.result_columns}
+            _require_agreement(alone, values[i], start + i, among)
+        for i in np.flatnonzero(np.isnan(columns[f"{name}.stable"])).tolist():
+            remaining.setdefault(i, []).append(name)
+    for i, names in sorted(remaining.items()):
+        some = replace(study, controllers={name: study.controllers[name] for name in names})
+        with np.errstate(all="ignore"):  # what overflows fails its checks
+            single, failed = evaluate_row(some, values[i], start + i)
+        failures += failed
+        for column, value in single.items():
+            columns[column][i] = value
+    return columns, failures
+
+
+def are_evaluated_together(study: Study, controller: Design | DesignRequest) -> bool:
+    """Whether many samples of a controller can be evaluated at once."""
+    if study.settings.evaluation != "exact":
+        return False
+    if isinstance(controller, Design):
+        return not controller.other_sensors
+    # a Kalman filter without options, designed for each sample
+    plain = controller.method.batched and not controller.given
+    return plain and not study.config.hardware.suite.sensors
+
+
+def _evaluate_groups(
+    study: Study, controller: Design | DesignRequest, values: FloatArray
+) -> Iterator[tuple[IntArray, dict[str, FloatArray]]]:
+    """Yield what could be evaluated together: rows, and their columns."""
+    if not are_evaluated_together(study, controller):
+        return
+    fixed = None  # the matrices of one design for all
+    if isinstance(controller, Design):
+        fixed = textbook_matrices([controller.controller])
+    reads = ensemble.read_config(study.config, designs=fixed is None)
+    for rows in _find_groups(study, values, reads):
+        try:
+            config, hardware, _ = make_sample(study, values[rows[0]])
+            if fixed is None and not ensemble.has_independent_axes(config):
+                continue
+            samples = _stack_samples(study, config, values[rows], reads)
+            accepted = ensemble.accepted_samples(samples)
+            if not accepted.size:
+                continue
+            samples = samples.take(accepted)
+            with np.errstate(over="raise", divide="raise", invalid="raise"):
+                matrices = ensemble.kalman_matrices(samples) if fixed is None else fixed
+                loops = ensemble.build_ensemble(samples)
+                residuals = residuals_from_matrices(matrices, hardware, loops, in_image=True)
+            columns = stack_columns(residuals, config.imaging)
+        except EXPECTED_ERRORS:
+            continue  # one of them fails; evaluating them one by one finds which
+        yield rows[accepted], columns
+
+
+def _find_groups(study: Study, values: FloatArray, reads: Reads) -> Iterator[IntArray]:
+    """Yield the indices of samples that differ by numbers that builders take as arrays only."""
+    apart = [
+        i
+        for i, places in enumerate(study.places.values())
+        if not all(map(reads.take_arrays_at, places))
+    ]
+    _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
+    for group in np.flatnonzero(counts >= min(_FEWEST, len(values))):
+        yield np.flatnonzero(which.reshape(-1) == group)
+
+
+def _stack_samples(study: Study, config: Config, values: FloatArray, reads: Reads) -> Samples:
+    """Return the samples of a group of rows of ``Study.values``; one configuration is given."""
+    by_name = dict(zip(study.parameter_names, values.T, strict=True))
+    places = [(keys, by_name[name]) for name, each in study.places.items() for keys in each]
+    return Samples(
+        config=config,
+        values={keys: numbers for keys, numbers in places if reads.take_arrays_at(keys)},
+        delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
+        noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
+    )
+
+
+def _require_agreement(
+    study: Study, values: FloatArray, row: int, among: Mapping[str, float]
+) -> None:
+    """Refuse a batch in which a sample differs from its evaluation by itself."""
+    single, failures = evaluate_row(study, values, row)
+    fault = "This is a fault of the program; please report it with the study file."
+    if failures:
+        raise CertificateError(
+            f"row {row} has a result among others, and fails by itself: {failures[0][2]} {fault}"
+        )
+    for name, expected in single.items():
+        if not abs(among[name] - expected) <= _AGREEMENT * max(abs(expected), 1.0):
+            raise CertificateError(
+                f"row {row} has {name} {among[name]:.9g} among others, and {expected:.9g} by "
+                f"itself: one of the two is wrong. {fault}"
+            )
 
 
 def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
     """Make the sample of a row of ``Study.values``."""
-    base = study.config
+    base, parameters = study.config, study.parameters_by_name(values)
     full = base.settings.model_dump()
     content = base.settings.model_dump(exclude_unset=True)
-    for parameter, value in zip(study.parameters, values, strict=True):
-        for keys in parameter.places:
-            set_number(content, keys, float(value), full=full)
+    for name, places in study.places.items():
+        for keys in places:
+            set_number(content, keys, parameters[name], full=full)
     config = build_config(validate_sections(FileSection, content, base.source), base.source)
-    parameters = study.parameters_by_name(values)
     delay_error, factor = parameters.get(DELAY_ERROR, 0.0), parameters.get(NOISE_FACTOR, 1.0)
     hardware, truth = config.hardware, config.truth
     with refuse_config(f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}"):
@@ -65,190 +197,71 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
             hardware = replace(hardware, delay_frames=hardware.delay_frames + delay_error)
         if factor != 1:
             truth = replace(truth, noise_nm=truth.noise_nm * factor)
-    return Sample(config=config, hardware=hardware, truth=truth)
-
-
-def parse_path(path: str) -> Keys:
-    """Parse a path into its keys."""
-    keys: list[str | int] = []
-    for part in path.split("."):
-        found = _PART.fullmatch(part)
-        if found is None:
-            raise ConfigError(
-                f"{path!r} is no path in a configuration; expected one such as "
-                "truth.vibrations[0].frequency_hz."
-            )
-        keys.append(found[1])
-        keys += [int(index) for index in re.findall(r"[0-9]+", found[2])]
-    return tuple(keys)
-
-
-def find_number(content: Mapping[str, Any], path: str) -> float:
-    """Return the number to which a path leads; refuse a path that leads to none."""
-    here: Any = content
-    parent: Any = {}
-    walked = ""
-    for key in parse_path(path):
-        place = walked or "the configuration"
-        kind: Any = list if isinstance(key, int) else dict
-        if not isinstance(here, kind):
-            says = "is no list" if kind is list else "has no keys"
-            raise ConfigError(f"{path}: {place} {says}; {_describe(here)}.")
-        if isinstance(key, int):
-            if key >= len(here):
-                raise ConfigError(
-                    f"{path}: {place} has {count_text(len(here), 'entry', 'entries')}, "
-                    f"counted from 0; got [{key}]."
-                )
-            walked += f"[{key}]"
-        else:
-            if key not in here:
-                close = difflib.get_close_matches(key, list(here), n=1, cutoff=0.6)
-                hint = f"did you mean {close[0]}? " if close else ""
-                raise ConfigError(
-                    f"{path}: {place} has no {key}; {hint}there are {', '.join(sorted(here))}."
-                )
-            walked += f".{key}" if walked else key
-        parent, here = here, here[key]
-    if here is None:
-        entries = parent.items() if isinstance(parent, dict) else ()
-        there = [k for k, v in entries if type(v) in (int, float)]
-        others = f" Numbers that are set there: {', '.join(sorted(there))}." if there else ""
-        raise ConfigError(
-            f"{path} is not set in the configuration, so it cannot be varied.{others}"
-        )
-    if type(here) not in (int, float):
-        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(here)}.")
-    return cast(float, here)
-
-
-def _describe(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"it is a section with {', '.join(sorted(value))}"
-    if isinstance(value, list):
-        return f"it is a list of {len(value)}"
-    return "it is not set" if value is None else f"it is {value!r}"
-
-
-def set_number(
-    content: dict[str, Any], keys: Keys, value: float, *, full: Mapping[str, Any]
-) -> None:
-    """Set a number that :func:`find_number` finds in ``full``, the content with its defaults.
-
-    Missing sections on the way are added, missing lists copied. An integer stays one if it can.
-    """
-    here: Any = content
-    whole: Any = full
-    for key in keys[:-1]:
-        whole = whole[key]
-        if isinstance(here, dict) and key not in here:
-            here[key] = deepcopy(whole) if isinstance(whole, list) else {}
-        here = here[key]
-    whole_number = isinstance(whole[keys[-1]], int) and float(value).is_integer()
-    here[keys[-1]] = int(value) if whole_number else float(value)
-
-
-def evaluate_rows(
-    study: Study,
-    values: FloatArray,
-    start: int,
-    *,
-    left: Mapping[int, Sequence[StudyController]] | None = None,
-) -> BatchResult:
-    """Evaluate consecutive rows of ``Study.values``, (b, parameters), one by one.
-
-    ``left`` names the controllers to evaluate on each row, by its place; all of them by default.
-    """
-    if left is None:
-        left = dict.fromkeys(range(len(values)), study.controllers)
-    columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
-    failures: list[Failure] = []
-    for i, controllers in sorted(left.items()):
-        some = replace(study, controllers=tuple(controllers))
-        with np.errstate(all="ignore"):  # what overflows fails its checks
-            row, failed = evaluate_row(some, values[i], start + i)
-        failures += failed
-        for name, value in row.items():
-            columns[name][i] = value
-    return BatchResult(start=start, columns=columns, failures=tuple(failures))
+    return config, hardware, truth
 
 
 def evaluate_row(
     study: Study, values: FloatArray, row: int
-) -> tuple[dict[str, float], tuple[Failure, ...]]:
+) -> tuple[dict[str, float], list[Failure]]:
     """Evaluate one sample, and return its results by column and its failures."""
     failures: list[Failure] = []
     loops: dict[str, ClosedLoop] = {}
-    out: dict[str, float] = {}
+    results: dict[str, float] = {}
     with _note_failure(failures, row, study.controllers):
-        sample = make_sample(study, values)
-        for controller in study.controllers:
-            with _note_failure(failures, row, [controller]):
-                design = design_for_sample(controller, sample)
-                loops[controller.name] = close_sample_loop(sample, design)
+        sample = config, _, truth = make_sample(study, values)
+        for name, controller in study.controllers.items():
+            with _note_failure(failures, row, [name]):
+                loops[name] = close_sample_loop(sample, design_for_sample(controller, sample))
         # frames to drop: the same for all controllers, which meet the same disturbances
         radii = [loop.radius_per_frame for loop in loops.values() if loop.is_stable]
         least = study.config.settings.simulation.settle_frames
         settle = max([least, *map(settling_frames, radii)])
-        for controller in study.controllers:
-            if (loop := loops.get(controller.name)) is None:
-                continue
-            with _note_failure(failures, row, [controller]):
-                found = {"stable": float(loop.is_stable)}
-                if loop.is_stable and study.settings.evaluation == "exact":
-                    found |= _evaluate_exactly(loop, sample)
-                elif loop.is_stable:
+        for name, loop in loops.items():
+            with _note_failure(failures, row, [name]):
+                if not loop.is_stable:
+                    columns = {"stable": 0.0}
+                elif study.settings.evaluation == "exact":
+                    columns = loop_columns(loop, truth, config.imaging)
+                else:
                     seed = study.simulation_seed(row)
-                    found |= _simulate(loop, sample, seed=seed, settle=settle)
-                out |= {f"{controller.name}.{column}": value for column, value in found.items()}
-    return out, tuple(failures)
+                    columns = _simulate(loop, sample, seed=seed, settle=settle)
+                results |= {f"{name}.{column}": value for column, value in columns.items()}
+    return results, failures
 
 
 @contextmanager
-def _note_failure(
-    failures: list[Failure], row: int, controllers: Sequence[StudyController]
-) -> Iterator[None]:
+def _note_failure(failures: list[Failure], row: int, controllers: Iterable[str]) -> Iterator[None]:
     """Note an error that fails controllers on a sample, and not the study."""
     try:
         yield
     except EXPECTED_ERRORS as error:
         text = " ".join(str(error).split()) or type(error).__name__
-        failures += [Failure(row=row, controller=each.name, error=text) for each in controllers]
+        failures += [(row, name, text) for name in controllers]
 
 
-def design_for_sample(controller: StudyController, sample: Sample) -> Design:
+def design_for_sample(controller: Design | DesignRequest, sample: Sample) -> Design:
     """Return a controller's design, made for the sample if it has none for all."""
-    if controller.design is not None:
-        return controller.design
-    assert controller.request is not None  # only a gain file has none
-    return sample.config.design(controller.request)
+    return controller if isinstance(controller, Design) else sample[0].design(controller)
 
 
 def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
     """Close the real loop of a sample with a design."""
-    return design.close(sample.hardware, sensor_gain=sample.truth.sensor_gain)
-
-
-def _evaluate_exactly(loop: ClosedLoop, sample: Sample) -> dict[str, float]:
-    """Return the exact residual of a stable loop by origin, and its Strehl ratio."""
-    budget, imaging = residual_budget(loop, sample.truth), sample.config.imaging
-    spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
-    # 0 beyond the widest jitter that is integrated, as in EnsembleResiduals.strehl
-    ratio = strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0
-    return {"strehl": ratio} | {name: getattr(budget, part) for name, part in RESIDUALS.items()}
+    _, hardware, truth = sample
+    return design.close(hardware, sensor_gain=truth.sensor_gain)
 
 
 def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:
     """Return the mean Strehl ratio and the residual of a stable loop, simulated as configured."""
-    section = sample.config.settings.simulation
+    config, _, truth = sample
+    section, hardware = config.settings.simulation, loop.hardware
     sizes = {"frames": section.frames, "cases": section.cases, "settle_frames": settle}
-    truth, hardware = sample.truth, loop.hardware
     if loop.reads_others:
         filters = {frozenset[str](): loop.controller}
         run = simulate_sensors(filters, truth, hardware=hardware, seed=seed, drops=(), **sizes)
     else:
         run = simulate(loop.controller, truth, hardware=hardware, seed=seed, **sizes)
     return {
-        "strehl": float(np.mean(run.strehl(sample.config.imaging))),
+        "stable": 1.0,
+        "strehl": float(np.mean(run.strehl(config.imaging))),
         "residual_nm": float(np.sqrt(np.mean(run.rms_nm**2))),
     }

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.storage.display_unit import shown_format, shown_unit
 from lbt_synth.storage.rows import cell_text
 from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.studies.study.percentiles import Percentile, Share
-from lbt_synth.studies.study.sensitivity import ControllerSensitivity
-from lbt_synth.studies.study.statistics import ControllerStatistics, StudyStatistics
+from lbt_synth.studies.study.statistics import (
+    PERCENTS,
+    ControllerStatistics,
+    Interval,
+    StudyStatistics,
+)
 
-_Row = tuple[str, Callable[[Any], str | Cell] | None]  # a label, and the text of a controller
+_Row = tuple[str | Cell, ...]  # a label and a cell for each controller, or a heading alone
 
 
 def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
@@ -48,44 +50,41 @@ def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
     >>> first.headings, first.rows[4]
     (('of the Strehl ratio [%]', 'a'), ('50th percentile', '50.0 (46.5 to 53.5)'))
     """
-    kinds = (strehl_table, residual_table, comparison_table, sensitivity_table, swing_table)
+    kinds = (strehl_table, residual_table, comparison_table, sensitivity_table)
     return tuple(table for kind in kinds if (table := kind(statistics)).rows)
 
 
 def strehl_table(statistics: StudyStatistics) -> Table:
     """Strehl ratio of each controller: mean, percentiles, parts of the samples."""
-    first = statistics.controllers[0]
-    return _table_by_controller(
-        "Strehl ratio over the samples, with 95 % intervals for independent samples",
-        "of the Strehl ratio [%]",
-        statistics.controllers,
+    controllers = statistics.controllers
+    rows: list[_Row] = [
         (
-            ("mean ± standard error", lambda c: _with_error(c.mean, c.mean_error, digits=2)),
-            *(
-                (ordinal(each.percent), lambda c, i=i: _interval(c.strehl[i]))
-                for i, each in enumerate(first.strehl)
-            ),
-            ("part of the samples [%]", None),
-            *(
-                (f"above {100 * level:g} %", lambda c, level=level: _interval(c.above[level]))
-                for level in first.above
-            ),
-            (
-                "unstable, counted as 0",
-                lambda c: _bad_if(c.unstable.count, _interval(c.unstable, digits=2)),
-            ),
-            ("best of all controllers", lambda c: _interval(c.loss.best)),
-            ("samples", None),
-            ("evaluated", lambda c: str(c.samples)),
-            ("failed", lambda c: _bad_if(c.failed, str(c.failed))),
+            "mean ± standard error",
+            *(_with_error(c.mean, c.mean_error, digits=2) for c in controllers),
         ),
-    )
+        *((ordinal(p), *(_interval(c.strehl[p]) for c in controllers)) for p in PERCENTS),
+        ("part of the samples [%]",),
+        *(
+            (f"above {100 * level:g} %", *(_interval(c.above[level]) for c in controllers))
+            for level in controllers[0].above
+        ),
+        (
+            "unstable, counted as 0",
+            *(_bad_if(c.unstable, _interval(c.unstable_share, digits=2)) for c in controllers),
+        ),
+        ("best of all controllers", *(_interval(c.best) for c in controllers)),
+        ("samples",),
+        ("evaluated", *(str(c.samples) for c in controllers)),
+        ("failed", *(_bad_if(c.failed, str(c.failed)) for c in controllers)),
+    ]
+    caption = "Strehl ratio over the samples, with 95 % intervals for independent samples"
+    return _table_by_controller(caption, "of the Strehl ratio [%]", statistics, rows)
 
 
 def residual_table(statistics: StudyStatistics) -> Table:
     """Residual of each controller, and the medians of its parts."""
-    found = statistics.controllers
-    parts = dict.fromkeys(part for c in found for part in c.parts_nm)
+    controllers = statistics.controllers
+    parts = dict.fromkeys(part for c in controllers for part in c.parts_nm)
     unit, factor = shown_unit("nm rms")
 
     def text(residual_nm: float) -> str:
@@ -93,49 +92,30 @@ def residual_table(statistics: StudyStatistics) -> Table:
             return "unstable"
         return cell_text(residual_nm * factor, shown_format(".1f", factor))
 
-    return _table_by_controller(
-        "Residual of tip and tilt over the samples",
-        f"residual [{unit}]",
-        found,
-        (
-            *(
-                (ordinal(each.percent), lambda c, i=i: text(c.residual_nm[i].value))
-                for i, each in enumerate(found[0].residual_nm)
-            ),
-            *([("median over the stable loops", None)] if parts else []),
-            *(
-                (f"of {part}", lambda c, part=part: text(c.parts_nm.get(part, np.nan)))
-                for part in parts
-            ),
-        ),
-    )
+    rows: list[_Row] = [
+        *((ordinal(p), *(text(c.residual_nm[p].value) for c in controllers)) for p in PERCENTS),
+        *([("median over the stable loops",)] if parts else []),
+        *((f"of {p}", *(text(c.parts_nm.get(p, np.nan)) for c in controllers)) for p in parts),
+    ]
+    caption = "Residual of tip and tilt over the samples"
+    return _table_by_controller(caption, f"residual [{unit}]", statistics, rows)
 
 
 def comparison_table(statistics: StudyStatistics) -> Table:
     """Compare controllers with each other on the same samples."""
-    percents = (5, 50, 95)
+    points = ("5th percentile", "median", "95th percentile")
     return Table(
         caption="Strehl ratio on the same samples: first less second [points]",
-        headings=(
-            "pair",
-            "first better [%]",
-            "equal [%]",
-            "mean",
-            *("median" if each == 50 else ordinal(each) for each in percents),
-        ),
+        headings=("pair", "first better [%]", "equal [%]", "mean", *points),
         rows=tuple(
             (
-                f"{pair.first} less {pair.second}",
-                percent(pair.better.value),
-                percent(pair.equal.value),
-                _with_error(pair.mean, pair.mean_error, digits=2),
-                *(
-                    cell_text(100 * each.value, "+.1f")
-                    for each in pair.difference
-                    if each.percent in percents
-                ),
+                pair,
+                percent(row["better"]),
+                percent(row["equal"]),
+                _with_error(row["mean"], row["mean_error"], digits=2),
+                *(cell_text(100 * row[point], "+.1f") for point in points),
             )
-            for pair in statistics.comparisons
+            for pair, row in statistics.comparisons.items()
         ),
     )
 
@@ -143,69 +123,57 @@ def comparison_table(statistics: StudyStatistics) -> Table:
 def sensitivity_table(
     statistics: StudyStatistics, *, names: Mapping[str, str] | None = None
 ) -> Table:
-    """First-order indices of the parameters, one column per controller."""
-    indices = list(_rows_by_parameter(statistics, _index_text, names))
-    totals: list[_Row] = [
-        ("all of them", None),
-        ("sum", lambda s: _with_error(s.sum, s.sum_error)),
-        ("only together (interactions)", lambda s: _with_error(s.interactions, s.sum_error)),
+    """First-order indices of the parameters with their signs, one column per controller."""
+    controllers, words = statistics.controllers, names or {}
+    totals: list[list[str]] = [[], []]
+    for controller in controllers:
+        ranked = [controller.sensitivity[name] for name in controller.ranked]
+        total = float(np.sum([row["index"] for row in ranked])) if ranked else np.nan
+        error = float(np.linalg.norm([row["index_error"] for row in ranked]))
+        for texts, value in zip(totals, (total, 1 - total), strict=True):
+            texts.append(_with_error(value, error))
+    rows: list[_Row] = [
+        (words.get(name, name), *(_share_text(c.sensitivity[name]) for c in controllers))
+        for name in statistics.ranked
     ]
-    return _table_by_controller(
-        "Variance of the Strehl ratio that one parameter explains by itself [%]",
-        "parameter",
-        statistics.sensitivities,
-        [*indices, *totals] if indices else [],
-    )
+    if rows:
+        labels = ("sum", "only together (interactions)")
+        rows.append(("all of them",))
+        rows += [(label, *texts) for label, texts in zip(labels, totals, strict=True)]
+    caption = "Variance of the Strehl ratio that one parameter explains by itself [%]"
+    return _table_by_controller(f"{caption} (rank correlation)", "parameter", statistics, rows)
 
 
-def swing_table(statistics: StudyStatistics, *, names: Mapping[str, str] | None = None) -> Table:
-    """How far the mean Strehl ratio moves over each parameter, and in which direction."""
-    return _table_by_controller(
-        "Points of Strehl ratio over the middle 90 % of a parameter (rank correlation)",
-        "parameter",
-        statistics.sensitivities,
-        _rows_by_parameter(statistics, _swing_text, names),
-    )
+def _share_text(row: Mapping[str, float]) -> str:
+    """Return the part that a parameter explains, and the sign of its effect."""
+    text = _with_error(row["index"], row["index_error"])
+    return text if text == "-" else f"{text} ({cell_text(row['spearman'], '+.2f')})"
 
 
 def worst_table(
     controller: ControllerStatistics,
+    columns: Mapping[str, ArrayLike],
     parameters: Sequence[str],
     *,
     names: Mapping[str, str] | None = None,
 ) -> Table:
-    """List the samples on which a controller does worst."""
+    """List the samples on which a controller does worst, from the columns of the results."""
+    places, name = list(controller.worst), controller.controller
+
+    def at(column: str) -> list[float]:
+        return [float(value) for value in np.asarray(columns[column], dtype=np.float64)[places]]
+
+    rows = [f"{row:.0f}" for row in at("row")] if "row" in columns else [str(i) for i in places]
+    strehls: list[str | Cell] = [
+        percent(strehl) if stable else Cell(text="unstable", tone="bad")
+        for strehl, stable in zip(at(f"{name}.strehl"), at(f"{name}.stable"), strict=True)
+    ]
+    values = [[f"{value:.5g}" for value in at(parameter)] for parameter in parameters]
     return Table(
-        caption=f"Worst samples of {controller.controller}",
-        headings=("row", "Strehl [%]", *((names or {}).get(name, name) for name in parameters)),
-        rows=tuple(
-            (
-                str(each.row),
-                percent(each.strehl) if each.stable else Cell(text="unstable", tone="bad"),
-                *(f"{each.parameters[name]:.5g}" for name in parameters),
-            )
-            for each in controller.worst
-        ),
+        caption=f"Worst samples of {name}",
+        headings=("row", "Strehl [%]", *((names or {}).get(each, each) for each in parameters)),
+        rows=tuple(zip(rows, strehls, *values, strict=True)),
     )
-
-
-def varying_parameters(statistics: StudyStatistics) -> tuple[str, ...]:
-    """Return the parameters with an index for any controller, by falling greatest index."""
-    found = [each for one in statistics.sensitivities for each in one.ranked]
-    found.sort(key=lambda each: -each.index.value)
-    return tuple(dict.fromkeys(each.parameter for each in found))
-
-
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return for each path its last keys, as many as distinguish it from the others."""
-    out = {}
-    for name in names:
-        keys = name.split(".")
-        for count in range(1, len(keys) + 1):
-            out[name] = ".".join(keys[-count:])
-            if sum(f".{other}".endswith(f".{out[name]}") for other in names) == 1:
-                break
-    return out
 
 
 def percent(value: float, digits: int = 1) -> str:
@@ -214,44 +182,16 @@ def percent(value: float, digits: int = 1) -> str:
 
 
 def ordinal(percentile: float) -> str:
-    """Return the name of a percentile."""
-    suffix = {1: "st", 2: "nd", 3: "rd"}.get(int(percentile) % 10, "th")
-    teens = 10 < percentile % 100 < 14
-    return f"{percentile:g}{'th' if teens or percentile % 1 else suffix} percentile"
+    """Return the name of one of the percentiles."""
+    return f"{percentile:g}{'st' if percentile == 1 else 'th'} percentile"
 
 
 def _table_by_controller(
-    caption: str,
-    heading: str,
-    found: Sequence[ControllerStatistics | ControllerSensitivity],
-    rows: Iterable[_Row],
+    caption: str, heading: str, statistics: StudyStatistics, rows: Sequence[_Row]
 ) -> Table:
-    """Return a table with a column per controller; a row without texts is a heading."""
-    headings = (heading, *(each.controller for each in found))
-    lines = tuple((label, *(map(text, found) if text else ())) for label, text in rows)
-    return Table(caption=caption, headings=headings, rows=lines)
-
-
-def _rows_by_parameter(
-    statistics: StudyStatistics,
-    text: Callable[[str, ControllerSensitivity], str],
-    names: Mapping[str, str] | None,
-) -> Iterator[_Row]:
-    """Yield a row per varying parameter."""
-    for name in varying_parameters(statistics):
-        yield (names or {}).get(name, name), partial(text, name)
-
-
-def _index_text(name: str, one: ControllerSensitivity) -> str:
-    index = one.find(name).index
-    return _with_error(index.value, index.error)
-
-
-def _swing_text(name: str, one: ControllerSensitivity) -> str:
-    found = one.find(name)
-    if np.isnan(found.swing):
-        return "-"
-    return f"{_with_error(found.swing, found.swing_error)} ({cell_text(found.spearman, '+.2f')})"
+    """Return a table with a column per controller."""
+    headings = (heading, *(each.controller for each in statistics.controllers))
+    return Table(caption=caption, headings=headings, rows=tuple(rows))
 
 
 def _with_error(value: float, error: float, digits: int = 1) -> str:
@@ -260,9 +200,10 @@ def _with_error(value: float, error: float, digits: int = 1) -> str:
     return text if text == "-" or np.isnan(error) else f"{text} ± {percent(error, digits)}"
 
 
-def _interval(found: Percentile | Share, digits: int = 1) -> str:
+def _interval(interval: Interval, digits: int = 1) -> str:
     """Return a percentage and the limits of its interval that there are."""
-    text, low, high = (percent(each, digits) for each in (found.value, found.low, found.high))
+    numbers = interval.value, interval.low, interval.high
+    text, low, high = (percent(number, digits) for number in numbers)
     if low == high == "-":
         return text
     if "-" in (low, high):

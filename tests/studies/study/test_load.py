@@ -20,11 +20,18 @@ def test_controllers(tmp_path):
         controllers="{a: {file: gains/a.fits}, b: {design: kalman}, c: {design: hinf, gamma_ratio: "
         "1.5, for: sample}, d: {design: integrator}}",
     )
-    a, b, c, d = study.controllers
-    assert a.design.gain == 0.4
-    assert b.design.certificate.passed
-    assert (c.design, c.for_sample, c.request.given) == (None, True, {"gamma_ratio": 1.5})
-    assert d.design.gain == optimal_integrator(study.config.hardware, study.config.truth).gain
+    a, b, c, d = study.controllers.values()
+    assert a.gain == 0.4
+    assert b.certificate.passed
+    assert (c.method.name, c.given) == ("hinf", {"gamma_ratio": 1.5})
+    assert list(study.designed) == ["b", "d"]
+    origins = [section.text for section in study.settings.controllers.values()]
+    assert origins[0] == "gains/a.fits"
+    assert origins[1:3] == [
+        "kalman for the configuration",
+        "hinf (gamma_ratio 1.5) for each sample",
+    ]
+    assert d.gain == optimal_integrator(study.config.hardware, study.config.truth).gain
     assert study.result_columns[:6] == (
         "a.strehl",
         "a.residual_nm",

@@ -3,24 +3,26 @@
 import errno
 import json
 import os
-import time
 
 import numpy as np
 import pytest
 from support.studies import (
+    LBT_TEXT,
     TWO,
     assert_whole,
     evaluate_quickly,
     load_small_study,
     make_folder,
+    part_rows,
     read_table,
 )
 
 import lbt_synth as lbt
 from lbt_synth.errors import OutputError, ProblemError
-from lbt_synth.studies.study.store import list_parts
 
-ONE = "truth.vibrations[0].rms_nm"
+
+def part_path(folder, place):
+    return sorted((folder / "parts").glob("*.npz"))[place]
 
 
 def test_a_run_and_its_results(tmp_path):
@@ -30,7 +32,8 @@ def test_a_run_and_its_results(tmp_path):
         [],
     )
     run = lbt.studies.run_study(study, folder, progress=counts.append)
-    assert (run.samples, run.computed, run.failures) == (50, 50, 0)
+    assert (run.computed, run.failures, run.new) == (50, (), True)
+    np.testing.assert_array_equal(run.columns["row"], np.arange(50))
     assert sum(counts) == 50
     assert_whole(folder, study, lbt.studies.evaluate_samples)
     assert (folder / "failed.csv").read_text() == "row,controller,error\n"
@@ -42,28 +45,15 @@ def test_a_run_and_its_results(tmp_path):
 
 def test_a_finished_study_is_not_run_again(tmp_path):
     study, folder, counts = load_small_study(tmp_path), make_folder(tmp_path), []
-    lbt.studies.run_study(study, folder)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    first = lbt.studies.run_study(study, folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     again = lbt.studies.run_study(study, folder, evaluate=None, progress=counts.append)
-    assert (again.computed, sum(counts)) == (0, 16)
-    seen = []
-    lbt.studies.run_study(study, folder, evaluate=None, whole=seen.append)
-    assert not seen[0].new
-    assert seen[0].computing_s == json.loads(before["study.json"])["computing_seconds"] > 0
-    np.testing.assert_array_equal(seen[0].columns["row"], np.arange(16))
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_a_call_that_fails_is_repeated(tmp_path):
-    study, folder = load_small_study(tmp_path, samples="60000"), make_folder(tmp_path)
-
-    def fail(results):
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        lbt.studies.run_study(study, folder, jobs=2, evaluate=evaluate_quickly, whole=fail)
-    assert not [path for path in folder.rglob("*") if path.suffix == ".tmp"]
-    assert lbt.studies.run_study(study, folder, evaluate=None).computed == 0
+    assert (again.computed, sum(counts), again.new) == (0, 16, False)
+    assert again.computing_s == first.computing_s > 0
+    assert again.columns.keys() == first.columns.keys()
+    for name, column in first.columns.items():
+        np.testing.assert_array_equal(again.columns[name], column)
+    assert {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()} == before
 
 
 def test_failures_are_listed_and_their_rows_are_there(tmp_path):
@@ -82,7 +72,7 @@ def test_failures_are_listed_and_their_rows_are_there(tmp_path):
     lines = (folder / "failed.csv").read_text().splitlines()[1:]
     assert [line.split(",")[:2] for line in lines] == [[str(row), "tight"] for row in noisy]
     assert all("failed its certificate" in line for line in lines)
-    assert run.failures == 4
+    assert [failure[:2] for failure in run.failures] == [(row, "tight") for row in noisy]
     assert np.all(np.isnan(found["tight.strehl"][noisy]))
     assert not np.any(np.isnan(found["a.strehl"]))
 
@@ -100,9 +90,9 @@ def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         lbt.studies.run_study(study, folder, evaluate=stops)
-    parts = [(part.start, part.stop) for part in list_parts(folder)]
+    parts = part_rows(folder)
     assert parts == seen[:3]
-    list_parts(folder)[1].path.unlink()  # a hole
+    part_path(folder, 1).unlink()  # a hole
     seen.clear()
 
     def watches(study, values, start):
@@ -148,15 +138,14 @@ def test_other_studies_and_damage_are_refused(tmp_path):
         json.dumps({"schema": "lbt_synth study", "schema_version": 1}),
         "{",
         "[" * 100_000,
-        manifest.replace('"designs": {', '"designs": {"../x": "0",'),
-        manifest.replace('"tables": {', '"tables": {"/dev/zero": "0"'),
+        manifest.replace('"designs": {', '"designs": 3, "others": {'),
     ):
         path.write_text(damage)
         refused("no manifest of a study")
     path.unlink()
-    refused(r"parts of a study without its study\.json")
+    refused("is not of a study in this directory")  # its designs
     path.write_text(manifest)
-    part = list_parts(folder)[0].path
+    part = part_path(folder, 0)
     content = part.read_bytes()
     for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
         part.write_bytes(damage)
@@ -179,8 +168,9 @@ def test_designs_are_read_where_a_study_was_begun(tmp_path, monkeypatch):
     lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
     monkeypatch.setattr(lbt.config.Config, "design", None)  # nothing is designed
     again = lbt.studies.load_study(study.source, directory=folder)
-    for one, other in zip(study.controllers, again.controllers, strict=True):
-        np.testing.assert_array_equal(one.design.controller.A, other.design.controller.A)
+    assert again.controllers.keys() == study.controllers.keys()
+    for name, design in study.controllers.items():
+        np.testing.assert_array_equal(again.controllers[name].controller.A, design.controller.A)
     assert again.digest == study.digest
 
 
@@ -214,7 +204,7 @@ def test_killed_before_the_designs_were_written(tmp_path, monkeypatch):
         return lbt.save_gain(path, design)
 
     with monkeypatch.context() as patch:
-        patch.setattr("lbt_synth.studies.study.store.save_gain", interrupted)
+        patch.setattr("lbt_synth.studies.study.run.save_gain", interrupted)
         with pytest.raises(KeyboardInterrupt):
             lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
     assert (folder / "a.fits").exists()
@@ -241,12 +231,6 @@ def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
     assert (folder / ".mine.csv.tmp").exists()
 
 
-def test_jobs_without_number(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 10)
-    with pytest.raises(ProblemError, match="jobs must be at most 80 on this machine; got 81"):
-        lbt.studies.run_study(load_small_study(tmp_path), make_folder(tmp_path), jobs=81)
-
-
 @pytest.mark.usefixtures("small_parts")
 @pytest.mark.parametrize("calls", [1, 5, 9])
 def test_a_full_disk(tmp_path, monkeypatch, calls):
@@ -269,37 +253,120 @@ def test_a_full_disk(tmp_path, monkeypatch, calls):
     assert_whole(folder, study)
 
 
-def test_a_table_of_results_that_was_changed(tmp_path):
+def test_tables_are_written_from_the_parts(tmp_path):
+    """A table that was changed is not read, and one that was deleted is written again."""
     study, folder = load_small_study(tmp_path), make_folder(tmp_path)
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    lines = (folder / "results.csv").read_text().splitlines()
-    (folder / "results.csv").write_text("\n".join(lines[:8]) + "\n")
-    with pytest.raises(OutputError, match="is not as the study wrote it"):
-        lbt.studies.replay_row(study, folder, 9)
-    (folder / "results.csv").write_text("\n".join([*lines[:8], lines[8].replace("7", "8")]))
-    with pytest.raises(OutputError, match="is not as the study wrote it"):
-        lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    (folder / "results.csv").unlink()
-    assert lbt.studies.run_study(study, folder, evaluate=evaluate_quickly).computed == 16
-    (folder / "failed.csv").write_text("row,controller,error\n3,slow,made up\n")
-    with pytest.raises(OutputError, match=r"failed\.csv is not as the study wrote it"):
-        lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    (folder / "failed.csv").unlink()
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    first = lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    content = (folder / "results.csv").read_bytes()
+    (folder / "results.csv").write_bytes(content[:100])
+    again = lbt.studies.run_study(study, folder, evaluate=None)
+    np.testing.assert_array_equal(again.columns["slow.strehl"], first.columns["slow.strehl"])
+    stored = lbt.studies.replay_row(study, folder, 9).stored
+    assert stored["slow.strehl"] == first.columns["slow.strehl"][9]
+    assert (folder / "results.csv").read_bytes() == content[:100]
+    for name in ("results.csv", "failed.csv"):
+        (folder / name).unlink()
+        again = lbt.studies.run_study(study, folder, evaluate=None)
+        assert (again.computed, again.new) == (0, True)
+    assert (folder / "results.csv").read_bytes() == content
+    part_path(folder, 0).unlink()
+    again = lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
+    assert again.computed == 4
     assert_whole(folder, study)
 
 
-def test_an_estimate(tmp_path):
-    study = load_small_study(tmp_path, samples="5000")
+@pytest.mark.parametrize("evaluation", ["exact", "simulation"])
+@pytest.mark.parametrize("turbulence", ["ar1", "ar2"])
+def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
+    base = LBT_TEXT.replace("kind: ar1", f"kind: {turbulence}").replace(
+        "turbulence: frozen_flow", "turbulence: model"
+    )
+    base = base.replace("frames: 8000", "frames: 300").replace("cases: 4", "cases: 2")
+    study = load_small_study(
+        tmp_path,
+        base=base,
+        evaluation=evaluation,
+        samples="4",
+        controllers="{a: {design: integrator, gain: 0.4}, own: {design: kalman, for: sample}}",
+        parameters="{atmosphere.seeing_arcsec: {uniform: [0.6, 1]}, error.delay_frames: {uniform: "
+        "[0.1, 0.3]}, error.noise_factor: {uniform: [1.2, 1.6]}, truth.sensor_gain: 0.8}",
+    )
+    folder = make_folder(tmp_path)
+    lbt.studies.run_study(study, folder)
+    again = lbt.studies.replay_row(study, folder, 2)
+    assert [path.name for path in again.files] == ["row_2.yaml", "row_2_own.fits"]
+    assert set(again.fresh) == set(again.stored) == set(study.result_columns)
+    for name, value in again.stored.items():
+        assert again.fresh[name] == pytest.approx(value, rel=1e-6)
+    real = lbt.load_config(folder / "row_2.yaml")
+    parameters = study.parameters_by_name(study.values(2, 3)[0])
+    assert real.hardware.delay_frames == 2 + parameters["error.delay_frames"]
+    text = (folder / "row_2.yaml").read_text()
+    assert "designs assume 2 (error.delay_frames)" in text
+    assert "(error.noise_factor)" in text
+    for name, path in (("a", folder / "a.fits"), ("own", folder / "row_2_own.fits")):
+        design = lbt.load_gain(path)
+        loop = lbt.close_loop(real.hardware, design.controller, sensor_gain=real.truth.sensor_gain)
+        if evaluation == "exact":
+            found = lbt.strehl(lbt.residual_budget(loop, real.truth), real.imaging)
+        else:
+            section = real.settings.simulation
+            found = (
+                lbt.simulate(
+                    design.controller,
+                    real.truth,
+                    hardware=real.hardware,
+                    frames=300,
+                    cases=2,
+                    seed=section.seed,
+                    settle_frames=section.settle_frames,
+                )
+                .strehl(real.imaging)
+                .mean()
+            )
+        assert found == pytest.approx(again.fresh[f"{name}.strehl"], rel=1e-9)
 
-    def slow(study, values, start):
-        time.sleep(1e-3 * len(values))
+
+@pytest.mark.usefixtures("small_parts")
+def test_a_row_of_an_unfinished_study(tmp_path):
+    study, folder = load_small_study(tmp_path, samples="60"), make_folder(tmp_path)
+    assert lbt.studies.replay_row(study, folder, 3).stored == {}
+
+    def stops(study, values, start):
+        if start >= 40:
+            raise KeyboardInterrupt
         return evaluate_quickly(study, values, start)
 
-    cost = lbt.studies.estimate_study(study, workers=1, evaluate=slow)
-    assert 4 < cost.seconds < 9
-    assert cost.measured_rows >= 1000
-    far = lbt.studies.estimate_study(study, workers=100, local=False, evaluate=slow)
-    assert far.seconds < 0.09
-    with pytest.raises(ProblemError, match="workers must be at least 1"):
-        lbt.studies.estimate_study(study, workers=0)
+    with pytest.raises(KeyboardInterrupt):
+        lbt.studies.run_study(study, folder, evaluate=stops)
+    last = part_rows(folder)[-1][1] - 1
+    stored = lbt.studies.replay_row(study, folder, last).stored
+    values = study.values(last, last + 1)
+    assert stored["slow.strehl"] == evaluate_quickly(study, values, last)[0]["slow.strehl"][0]
+    assert lbt.studies.replay_row(study, folder, 59).stored == {}
+    with pytest.raises(ProblemError, match="rows 0 to 59; got row 60"):
+        lbt.studies.replay_row(study, folder, 60)
+
+
+def test_a_row_whose_design_fails(tmp_path):
+    study = load_small_study(
+        tmp_path,
+        samples="2",
+        controllers="{tight: {design: integrator, gain: 0.7, for: sample}}",
+        parameters="{loop.delay_frames: {list: [4, 5]}}",
+    )
+    again = lbt.studies.replay_row(study, make_folder(tmp_path), 1)
+    assert "failed its certificate" in again.failures[0][2]
+    assert [path.name for path in again.files] == ["row_1.yaml"]
+
+
+def test_a_row_without_noise(tmp_path):
+    study, folder = (
+        load_small_study(tmp_path, parameters="{error.noise_factor: 0}"),
+        make_folder(tmp_path),
+    )
+    again = lbt.studies.replay_row(study, folder, 1)
+    assert again.fresh["slow.noise_nm"] == 0
+    assert again.fresh["slow.strehl"] > 0.1
+    assert again.files == ()
+    assert "row 1 has no noise, which no configuration takes" in again.unwritten

@@ -1,15 +1,19 @@
-"""Samples of a study, and their evaluation one by one."""
+"""Samples of a study: one by one, and evaluated at once against each on its own."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.plants import ROOT
-from support.studies import LBT_TEXT, load_small_study
+from pydantic import PositiveFloat
+from support.plants import LBT_YAML
+from support.studies import BASE, LBT_TEXT, load_small_study, study_file
 
 import lbt_synth as lbt
+from lbt_synth.config.plant_and_truth import measurement_noise_nm
+from lbt_synth.config.schema import FileSection, SensorSection
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import SinusoidalVibration
+from lbt_synth.studies.study import sample as evaluation
 from lbt_synth.studies.study.sample import make_sample
 
 
@@ -25,21 +29,18 @@ def test_a_sample_is_a_configuration(tmp_path):
     )
     for values in study.values(0, 4):
         named = study.parameters_by_name(values)
-        sample = make_sample(study, values)
-        settings = sample.config.settings
+        config, hardware, truth = make_sample(study, values)
+        settings = config.settings
         assert settings.atmosphere.seeing_arcsec == named["atmosphere.seeing_arcsec"]
         assert settings.imaging.wavelength_um == 1.65
         assert settings.robustness.errors_hz[:2] == [-4, -3]
         assert settings.sensor.pyramid.subapertures_across in (20, 30)
         rms = named["truth.vibrations[0].rms_mas"]
         assert settings.model.vibrations[0].rms_mas == settings.truth.vibrations[0].rms_mas == rms
-        assumed = sample.config
-        assert sample.truth.sensor_gain == 0.8
-        assert assumed.hardware.delay_frames == 2.0
-        assert sample.hardware.delay_frames == 2.0 + named["error.delay_frames"]
-        assert sample.truth.noise_nm == pytest.approx(
-            assumed.noise_nm * named["error.noise_factor"]
-        )
+        assert truth.sensor_gain == 0.8
+        assert config.hardware.delay_frames == 2.0
+        assert hardware.delay_frames == 2.0 + named["error.delay_frames"]
+        assert truth.noise_nm == pytest.approx(config.noise_nm * named["error.noise_factor"])
         # the same from a file: the independent way
         content = text.replace(
             "seeing_arcsec: 0.8", f"seeing_arcsec: {settings.atmosphere.seeing_arcsec!r}"
@@ -51,9 +52,9 @@ def test_a_sample_is_a_configuration(tmp_path):
         )
         (tmp_path / "same.yaml").write_text(content)
         same = lbt.load_config(tmp_path / "same.yaml")
-        np.testing.assert_array_equal(same.plant.A, assumed.plant.A)
-        np.testing.assert_array_equal(same.plant.B, assumed.plant.B)
-        assert same.truth.noise_nm == assumed.truth.noise_nm
+        np.testing.assert_array_equal(same.plant.A, config.plant.A)
+        np.testing.assert_array_equal(same.plant.B, config.plant.B)
+        assert same.truth.noise_nm == config.truth.noise_nm
     assert study.config.settings.atmosphere.seeing_arcsec == 0.8  # the base is as it was
 
 
@@ -68,9 +69,9 @@ def test_a_point_is_what_the_library_says(tmp_path):
         "error.noise_factor: 1.5, truth.sensor_gain: 0.7}",
     )
     values = study.values()
-    batch = lbt.studies.evaluate_samples(study, values[1:], 1)
-    assert (batch.start, batch.failures) == (1, ())
-    assert tuple(batch.columns) == study.result_columns
+    columns, failures = lbt.studies.evaluate_samples(study, values[1:], 1)
+    assert failures == []
+    assert tuple(columns) == study.result_columns
     config = study.config
     fixed = lbt.kalman(config.plant)
     for i, (frequency, delay, _, _) in enumerate(values[1:]):
@@ -94,11 +95,11 @@ def test_a_point_is_what_the_library_says(tmp_path):
             budget = lbt.residual_budget(loop, truth)
             for column in ("residual_nm", "turbulence_nm", "vibration_nm", "noise_nm"):
                 expected = getattr(budget, column.replace("residual", "rms"))
-                assert batch.columns[f"{name}.{column}"][i] == pytest.approx(expected, rel=1e-9)
+                assert columns[f"{name}.{column}"][i] == pytest.approx(expected, rel=1e-9)
             expected = lbt.strehl(budget, config.imaging)
-            assert batch.columns[f"{name}.strehl"][i] == pytest.approx(expected, rel=1e-9)
-            assert batch.columns[f"{name}.stable"][i] == 1
-    assert np.all(batch.columns["own.residual_nm"] < 1.05 * batch.columns["fixed.residual_nm"])
+            assert columns[f"{name}.strehl"][i] == pytest.approx(expected, rel=1e-9)
+            assert columns[f"{name}.stable"][i] == 1
+    assert np.all(columns["own.residual_nm"] < 1.05 * columns["fixed.residual_nm"])
 
 
 def test_unstable_loops_and_samples_that_fail(tmp_path):
@@ -110,29 +111,19 @@ def test_unstable_loops_and_samples_that_fail(tmp_path):
         parameters="{truth.sensor_gain: {list: [0.3, 1.4]}, loop.delay_frames: {list: [2, 4]}}",
     )
     values = study.values()
-    batch = lbt.studies.evaluate_samples(study, values, 0)
+    columns, failures = lbt.studies.evaluate_samples(study, values, 0)
     unstable = values[:, 0] == 1.4
-    stable, strehl = batch.columns["wild.stable"], batch.columns["wild.strehl"]
+    stable, strehl = columns["wild.stable"], columns["wild.strehl"]
     assert np.all(stable[unstable] == 0)
     assert np.all(stable[~unstable] == 1)
     np.testing.assert_array_equal(np.isnan(strehl), unstable)
     slow = values[:, 1] == 4
-    assert [failure.row for failure in batch.failures] == np.flatnonzero(slow).tolist()
-    assert {failure.controller for failure in batch.failures} == {"tight"}
-    assert "failed its certificate" in batch.failures[0].error
-    np.testing.assert_array_equal(np.isnan(batch.columns["tight.stable"]), slow)
-    lost = slow | (batch.columns["tight.stable"] == 0)
-    np.testing.assert_array_equal(np.isnan(batch.columns["tight.strehl"]), lost)
-
-
-def test_a_sample_that_is_no_configuration_fails_alone(tmp_path):
-    study = load_small_study(tmp_path, controllers="{a: {design: kalman}, b: {design: integrator}}")
-    values = study.values(0, 3)
-    values[1] = -5.0
-    batch = lbt.studies.evaluate_samples(study, values, 10)
-    assert [(f.row, f.controller) for f in batch.failures] == [(11, "a"), (11, "b")]
-    assert "greater than" in batch.failures[0].error
-    assert np.isnan(batch.columns["a.stable"]).tolist() == [False, True, False]
+    assert [row for row, _, _ in failures] == np.flatnonzero(slow).tolist()
+    assert {name for _, name, _ in failures} == {"tight"}
+    assert "failed its certificate" in failures[0][2]
+    np.testing.assert_array_equal(np.isnan(columns["tight.stable"]), slow)
+    lost = slow | (columns["tight.stable"] == 0)
+    np.testing.assert_array_equal(np.isnan(columns["tight.strehl"]), lost)
 
 
 def test_simulated_samples(tmp_path):
@@ -144,33 +135,337 @@ def test_simulated_samples(tmp_path):
         parameters="{truth.sensor_gain: {uniform: [1.2, 1.3]}}",
     )
     assert study.result_columns[:3] == ("a.strehl", "a.residual_nm", "a.stable")
-    batch = lbt.studies.evaluate_samples(study, study.values(3, 5), 3)
-    assert batch.columns["c.stable"].tolist() == [0, 0]
+    columns, _ = lbt.studies.evaluate_samples(study, study.values(3, 5), 3)
+    assert columns["c.stable"].tolist() == [0, 0]
     for i, row in enumerate((3, 4)):
-        sample = make_sample(study, study.values(row, row + 1)[0])
+        _, hardware, truth = make_sample(study, study.values(row, row + 1)[0])
         loops = [
             lbt.close_loop(
-                sample.hardware, c.design.controller, sensor_gain=sample.truth.sensor_gain
+                hardware, study.controllers[name].controller, sensor_gain=truth.sensor_gain
             )
-            for c in study.controllers[:2]
+            for name in "ab"
         ]
         settle = max(100, *(settling_frames(x.spectral_radius) for x in loops))
         for loop, name in zip(loops, "ab", strict=True):
             run = lbt.simulate(
                 loop.controller,
-                sample.truth,
-                hardware=sample.hardware,
+                truth,
+                hardware=hardware,
                 frames=400,
                 cases=1,
                 seed=study.simulation_seed(row),
                 settle_frames=settle,
             )
-            assert batch.columns[f"{name}.strehl"][i] == run.strehl(study.config.imaging).mean()
+            assert columns[f"{name}.strehl"][i] == run.strehl(study.config.imaging).mean()
     assert study.simulation_seed(3) != study.simulation_seed(4)
 
 
-def test_the_example():
-    study = lbt.studies.load_study(ROOT / "examples" / "study.yaml")
-    batch = lbt.studies.evaluate_samples(study, study.values(0, 1), 0)
-    assert not batch.failures
-    assert 0.2 < batch.columns["kalman.strehl"][0] < 0.845
+COUNT = 8
+NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
+GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
+FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
+OWN = "{own: {design: kalman, for: sample}}"
+BOTH = "{kalman: {design: kalman}, own: {design: kalman, for: sample}}"
+
+
+def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
+    """Hold each column against the evaluation one by one; return the columns and failures."""
+    study = lbt.studies.load_study(
+        study_file(tmp_path, base=base, controllers=controllers, parameters=parameters, **more)
+    )
+    values = study.values(0, count)
+    columns, failures = lbt.studies.evaluate_samples(study, values, 0)
+    single, failed = lbt.studies.evaluate_samples(study, values, 0, together=False)
+    assert columns.keys() == single.keys()
+    for name, expected in single.items():
+        assert columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
+    assert failures == failed
+    return study, columns, failures
+
+
+def counted(monkeypatch):
+    """Count the samples that are evaluated one by one."""
+    rows = []
+    real = evaluation.evaluate_row
+
+    def spy(study, values, row):
+        rows.append(row)
+        return real(study, values, row)
+
+    monkeypatch.setattr(evaluation, "evaluate_row", spy)
+    return rows
+
+
+WEATHER = """{
+  atmosphere.seeing_arcsec: {uniform: [0.5, 1.2]},
+  atmosphere.wind_speed_m_s: {list: [10, 20]},
+  atmosphere.outer_scale_m: {list: [15, 25]},
+  'truth.vibrations[0].frequency_hz': {normal: {mean: 20, deviation: 0.5}},
+  'truth.vibrations[0].rms_mas': {uniform: [40, 100], also: ['model.vibrations[0].rms_mas']},
+  'model.vibrations[0].damping': {uniform: [0.002, 0.02]},
+  sensor.pyramid.photons: {uniform: [20, 100]},
+  truth.sensor_gain: {uniform: [0.3, 1.3]},
+  error.delay_frames: {uniform: [-0.5, 1.5]},
+  error.noise_factor: {uniform: [0.5, 2]}
+}"""
+
+
+def test_filters_for_their_own_samples(tmp_path, monkeypatch):
+    own = {"base": LBT_TEXT, "controllers": OWN, "parameters": WEATHER}
+    study, columns, _ = agree(tmp_path, count=6, **own)
+    rows = counted(monkeypatch)
+    lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
+    assert rows == [3]  # all of them at once, and one by itself
+    strehl = columns["own.strehl"]
+    assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
+
+
+def test_the_sensor_gain_that_designs_assume(tmp_path, monkeypatch):
+    """A fixed controller does not notice; a filter for the sample does, and so does the loop not."""
+    parameters = """{
+      model.sensor_gain: {uniform: [0.6, 1.2]},
+      truth.sensor_gain: {uniform: [0.5, 1.1]}
+    }"""
+    study, *_ = agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=6)
+    rows = counted(monkeypatch)
+    lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
+    assert rows == [3, 3]  # all at once, one by itself for each controller
+    one = "{model.sensor_gain: {uniform: [0.6, 1.2]}}"
+    agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=one, count=5)
+
+
+LOOP = "truth.sensor_gain: {uniform: [0.4, 1.1]}"
+DELAY = "error.delay_frames: {list: [0, 0.25]}"
+TIP = "\n    - {kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}"
+MIRROR = "mirror:\n  local_loop: {natural_frequency_hz: 50, damping: 0.5, bandwidth_hz: 400}\n"
+SPREAD = BASE.replace("rms_nm: 500.0}]", "rms_nm: 500.0, spread_hz: 1.0, lines: 3}]", 1)
+SINUSOID = "[{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]"
+CHANGED = {  # a configuration, what is put in place of what, parameters, samples
+    "the telescope of the paper": (LBT_TEXT, {}, WEATHER, COUNT),
+    "the same with turbulence of kind ar2": (LBT_TEXT, {"kind: ar1": "kind: ar2"}, WEATHER, COUNT),
+    "one axis and the turbulence of the model": (
+        BASE,
+        {},
+        "'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, 'model.vibrations[0].frequency_hz': "
+        f"{{uniform: [18, 22]}}, sensor.noise_nm: {{uniform: [5, 30]}}, {LOOP}",
+        COUNT,
+    ),
+    "resonances and vibrations of the model, which both move": (
+        LBT_TEXT,
+        {TIP: " model"},
+        "'model.vibrations[0].frequency_hz': {uniform: [18, 22]}, 'model.vibrations[0].rms_mas': "
+        "{uniform: [40, 100]}, 'model.vibrations[0].damping': {uniform: [0.002, 0.02]}, " + DELAY,
+        5,
+    ),
+    "vibrations of the model that are several lines": (
+        SPREAD,
+        {SINUSOID: "model"},
+        f"sensor.noise_nm: {{uniform: [5, 30]}}, {LOOP}",
+        5,
+    ),
+    "a mirror with dynamics": (LBT_TEXT, {"mirror:\n": MIRROR}, f"{LOOP}, {DELAY}", 5),
+    "a diagonal vibration, without a filter per axis": (
+        LBT_TEXT,
+        {"axis: tip,": "direction_deg: 30,", "axis: both,": "direction_deg: 30,"},
+        "'truth.vibrations[0].frequency_hz': {uniform: [19, 21]}",
+        4,
+    ),
+    "the delay that designs assume": (
+        LBT_TEXT,
+        {},
+        "loop.delay_frames: {list: [1, 2, 2.5]}, truth.sensor_gain: {uniform: [0.4, 1]}",
+        12,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_changed_configurations(tmp_path, name):
+    base, changes, parameters, count = CHANGED[name]
+    for old, new in changes.items():
+        assert old in base
+        base = base.replace(old, new)
+    parameters = parameters if parameters is WEATHER else f"{{{parameters}}}"
+    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=count)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "path", "values"),
+    [
+        ("axis: both,", "direction_deg: 0,", "model.vibrations[0].direction_deg", "[30, 0]"),
+        *(
+            ("mirror:\n", "mirror:\n  influence_matrix: [[1.0, 0.0], [0.0, 1.0]]\n", path, values)
+            for path, values in (
+                ("mirror.influence_matrix[0][1]", "[0.3, 0]"),
+                ("mirror.influence_matrix[1][1]", "[1, 1.3]"),
+            )
+        ),
+    ],
+)
+def test_samples_whose_axes_are_no_longer_independent(tmp_path, old, new, path, values):
+    """The configuration has a filter per axis, and some of its samples do not."""
+    assert old in LBT_TEXT
+    parameters = f"{{'{path}': {{list: {values}}}, truth.sensor_gain: {{uniform: [0.5, 1]}}}}"
+    agree(tmp_path, base=LBT_TEXT.replace(old, new), controllers=OWN, parameters=parameters)
+
+
+def test_an_image_that_is_gone(tmp_path):
+    """A jitter of more than the Strehl ratio is integrated for leaves none, either way."""
+    parameters = """{
+      'truth.vibrations[0].rms_mas': {list: [40, 1.0e+5]},
+      truth.sensor_gain: {uniform: [0.5, 1]}
+    }"""
+    _, columns, failures = agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters)
+    assert not failures
+    strehl = columns["slow.strehl"]
+    assert (strehl == 0).sum() == COUNT / 2 == (strehl > 0).sum()
+    assert (columns["slow.stable"] == 1).all()
+
+
+def test_groups_of_what_makes_another_configuration(tmp_path, monkeypatch):
+    """Telescopes of two diameters: two groups, each at once; the camera goes with them."""
+    rows = counted(monkeypatch)
+    parameters = """{
+      telescope.diameter_m: {list: [6, 8.22]},
+      imaging.wavelength_um: {list: [1.65]},
+      truth.sensor_gain: {uniform: [0.4, 1]}
+    }"""
+    agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, samples="16", count=16)
+    # one of each group and controller, then those of the evaluation that it is held against
+    assert len(rows) == 4 + 16
+
+
+def test_samples_that_the_configuration_refuses(tmp_path):
+    """A tail of the normal distribution below 0: those fail as they do on their own."""
+    parameters = """{
+      'truth.vibrations[0].rms_nm': {normal: {mean: 300, deviation: 100, high: 900}},
+      truth.sensor_gain: {normal: {mean: 0.8, deviation: 0.1, low: 0.5}}
+    }"""
+    study, *_ = agree(tmp_path, base=BASE, controllers=FIXED, parameters=parameters)
+    values = study.values(0, COUNT)
+    values[2, 0] = -5.0
+    values[4, 1] = 0.0
+    columns, failures = lbt.studies.evaluate_samples(study, values, 100)
+    _, failed = lbt.studies.evaluate_samples(study, values, 100, together=False)
+    lost = [(row, name) for row in (102, 104) for name in ("slow", "kalman")]
+    assert [failure[:2] for failure in failures] == lost
+    assert "greater than" in failures[0][2]
+    assert failures == failed
+    assert np.flatnonzero(np.isnan(columns["slow.stable"])).tolist() == [2, 4]
+
+
+def test_a_filter_that_cannot_be_designed(tmp_path):
+    """The others of its batch are designed all the same."""
+    parameters = """{
+      sensor.noise_nm: {uniform: [5, 30]},
+      'model.vibrations[0].rms_nm': {uniform: [100, 900]}
+    }"""
+    study, *_ = agree(tmp_path, base=BASE, controllers=OWN, parameters=parameters)
+    values = study.values(0, COUNT)
+    values[3, 1] = 1e170  # its variance overflows
+    columns, failures = lbt.studies.evaluate_samples(study, values, 0)
+    assert {row for row, _, _ in failures} == {3}
+    assert np.isfinite(columns["own.strehl"]).sum() == COUNT - 1
+
+
+UNREAD = ("version", "design", "simulation", "robustness", "end_to_end")
+
+
+def numbers_of(section, path=""):
+    """Yield the path and the value of each number."""
+    if isinstance(section, dict):
+        for key, value in section.items():
+            yield from numbers_of(value, f"{path}.{key}" if path else key)
+    elif isinstance(section, list):
+        for i, value in enumerate(section):
+            yield from numbers_of(value, f"{path}[{i}]")
+    elif isinstance(section, int | float):
+        yield path, section
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        number
+        for number in numbers_of(lbt.load_config(LBT_YAML).settings.model_dump())
+        if not number[0].startswith(UNREAD) and number[0] != "loop.frame_rate_hz"
+    ],
+)
+def test_every_number_of_a_configuration(tmp_path, path, value):
+    """Whether it is one value for all or an array, the answers are those of each by itself."""
+    other = value + 1 if isinstance(value, int) else 0.96 * value
+    agree(
+        tmp_path,
+        base=LBT_TEXT,
+        controllers=BOTH,
+        parameters=f"{{'{path}': {{list: [{value!r}, {other!r}]}}, {NOISE}}}",
+        count=COUNT,
+    )
+
+
+class NewSensor(SensorSection):
+    """A sensor with a key that this package does not know."""
+
+    excess: PositiveFloat = 1.0
+
+
+class NewFile(FileSection):
+    """A configuration with that sensor."""
+
+    sensor: NewSensor
+
+
+@pytest.mark.parametrize(
+    ("excess", "singles"),
+    [
+        (lambda sensor: sensor.excess, 2),  # one value at once: a group for each of two
+        (lambda sensor: sensor.per_sample.excess, 1),  # an array: one group
+        (lambda sensor: 1.0, 2),  # which no builder reads
+    ],
+)
+@pytest.mark.parametrize("controllers", ["{kalman: {design: kalman}}", OWN])
+def test_a_new_key_takes_the_way_that_its_builder_declares(
+    tmp_path, monkeypatch, excess, singles, controllers
+):
+    """No line of a study knows the key: how its builder reads it is all that says."""
+
+    def noise(settings):
+        return measurement_noise_nm(settings) * excess(settings.sensor)
+
+    for module in ("config.load", "studies.study.sample"):
+        monkeypatch.setattr(f"lbt_synth.{module}.FileSection", NewFile)
+    for module in ("config.load", "config.ensemble"):
+        monkeypatch.setattr(f"lbt_synth.{module}.measurement_noise_nm", noise)
+    study, columns, _ = agree(
+        tmp_path,
+        base=LBT_TEXT.replace("sensor:\n", "sensor:\n  excess: 1.0\n"),
+        controllers=controllers,
+        parameters=f"{{sensor.excess: {{list: [1.5, 3.0]}}, {GAIN}}}",
+    )
+    name = f"{next(iter(study.controllers))}.noise_nm"
+    groups = [columns[name][study.values(0, COUNT)[:, 0] == value] for value in (1.5, 3.0)]
+    if excess(NewSensor(noise_nm=1.0, excess=2.0)) > 1:  # it is read
+        assert np.mean(groups[0]) < 0.7 * np.mean(groups[1])
+    rows = counted(monkeypatch)
+    lbt.studies.evaluate_samples(study, study.values(0, COUNT), 0)
+    assert len(rows) == singles
+
+
+def test_two_answers_stop_a_study(tmp_path, monkeypatch):
+    study = lbt.studies.load_study(
+        study_file(
+            tmp_path,
+            base=BASE,
+            controllers=FIXED,
+            parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}",
+        )
+    )
+    real = evaluation.residuals_from_matrices
+
+    def wrong(matrices, hardware, ensemble, *, in_image):
+        residuals = real(matrices, hardware, ensemble, in_image=in_image)
+        return replace(residuals, noise_nm2=1.001 * residuals.noise_nm2)
+
+    monkeypatch.setattr(evaluation, "residuals_from_matrices", wrong)
+    with pytest.raises(lbt.errors.CertificateError, match="row 14 has slow.*by itself"):
+        lbt.studies.evaluate_samples(study, study.values(10, 16)[:8], 11)

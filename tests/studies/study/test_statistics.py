@@ -1,58 +1,58 @@
-"""Statistics of studies."""
+"""Statistics of studies: percentiles, shares, comparisons, indices, bins."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.study_results import make_columns
+from scipy import stats
+from support.study_results import draw_points, make_columns
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.studies import study_statistics, summary_tables
+from lbt_synth.studies.study.statistics import (
+    conditional_curve,
+    first_order_index,
+    percentiles,
+    share,
+)
 
 NAN = float("nan")
 
 
 def test_unstable_counts_as_zero_and_failed_is_left_out(small):
-    found = study_statistics(small, ["gain"], ["a", "b"], levels=[0.5])
+    found = study_statistics(small, ["gain"], ["a", "b"])
     a, b = found.controllers
-    assert (a.samples, a.failed, a.unstable.count) == (4, 1, 1)
-    assert (b.samples, b.failed, b.unstable.count) == (5, 0, 2)
+    assert (a.samples, a.failed, a.unstable, a.unstable_share.value) == (4, 1, 1, 0.25)
+    assert (b.samples, b.failed, b.unstable, b.unstable_share.value) == (5, 0, 2, 0.4)
     assert a.mean == pytest.approx((0.8 + 0 + 0.4 + 0.6) / 4)
     assert a.mean_error == pytest.approx(np.std([0.8, 0, 0.4, 0.6], ddof=1) / 2)
-    assert a.strehl[3].value == pytest.approx(0.5)
-    assert a.above[0.5].count == 2
-    assert b.above[0.5].count == 2  # 0.5 is not above 0.5
-    assert a.residual_nm[3].value == pytest.approx(80)
-    assert a.residual_nm[-1].value == np.inf
+    assert a.strehl[50].value == pytest.approx(0.5)
+    assert a.above[0.5].value == 0.5
+    assert b.above[0.5].value == 0.4  # 0.5 is not above 0.5
+    assert a.residual_nm[50].value == pytest.approx(80)
+    assert a.residual_nm[99].value == np.inf
     assert a.parts_nm == {"noise": 20.0}
     assert b.parts_nm == {}
 
 
 def test_comparison_is_of_the_samples_on_which_neither_failed(small):
-    pair = study_statistics(small, ["gain"], ["a", "b"]).comparisons[0]
-    assert (pair.first, pair.second) == ("a", "b")
-    assert pair.better.total == 4
-    assert pair.better.count == 2  # rows 10 and 12
-    assert pair.equal.count == 2  # both unstable in row 11, the same in row 14
-    assert pair.mean == pytest.approx((0.1 + 0 + 0.4 + 0) / 4)
-    assert pair.difference[2].value == pytest.approx(0.05)
+    ((name, pair),) = study_statistics(small, ["gain"], ["a", "b"]).comparisons.items()
+    assert name == "a less b"
+    assert pair["better"] == 0.5  # rows 10 and 12 of 4
+    assert pair["equal"] == 0.5  # both unstable in row 11, the same in row 14
+    assert pair["mean"] == pytest.approx((0.1 + 0 + 0.4 + 0) / 4)
+    assert pair["median"] == pytest.approx(0.05)
 
 
 def test_loss_is_against_the_best_of_each_sample(small):
     a, b = study_statistics(small, ["gain"], ["a", "b"]).controllers
-    assert (a.loss.best.count, a.loss.best.total) == (4, 4)
-    assert b.loss.best.count == 2
-    assert b.loss.loss[0].value == pytest.approx(0.05)
+    assert (a.best.value, b.best.value) == (1, 0.5)
+    assert b.loss[50].value == pytest.approx(0.05)
 
 
 def test_worst_rows_are_the_unstable_then_those_of_least_strehl(small):
-    a, b = study_statistics(small, ["gain"], ["a", "b"], worst=3).controllers
-    assert [each.row for each in a.worst] == [11, 12, 14]
-    assert [each.stable for each in a.worst] == [False, True, True]
-    assert a.worst[1].parameters == {"gain": 0.7}
-    assert [each.row for each in b.worst] == [11, 12, 13]
-    none = study_statistics(small, ["gain"], ["a"], worst=0).controllers[0]
-    assert none.worst == ()
+    a, b = study_statistics(small, ["gain"], ["a", "b"]).controllers
+    assert (a.worst, b.worst) == ((1, 2, 4, 0), (1, 2, 3, 4, 0))
 
 
 def test_a_stable_loop_without_light_comes_after_unstable_ones_and_ties_by_row():
@@ -60,9 +60,8 @@ def test_a_stable_loop_without_light_comes_after_unstable_ones_and_ties_by_row()
     columns = make_columns(
         {}, {"a": strehl}, row=np.array([4, 9, 2, 8, 1]), **{"a.stable": [1, 1, 1, 0, 1]}
     )
-    for count in (4, 10):
-        worst = study_statistics(columns, [], ["a"], worst=count).controllers[0].worst
-        assert [each.row for each in worst] == [8, 4, 1, 2, 9][:count]
+    worst = study_statistics(columns, [], ["a"]).controllers[0].worst
+    assert [columns["row"][place] for place in worst] == [8, 4, 1, 2, 9]
 
 
 @given(seed=st.integers(0, 10_000))
@@ -82,7 +81,7 @@ def test_the_order_of_samples_is_of_no_matter(seed):
     )
     assert [t.rows for t in summary_tables(here)] == [t.rows for t in summary_tables(there)]
     for one, other in zip(here.controllers, there.controllers, strict=True):
-        assert [w.row for w in one.worst] == [w.row for w in other.worst]
+        assert list(one.worst) == order[list(other.worst)].tolist()
 
 
 @pytest.mark.parametrize(
@@ -107,21 +106,18 @@ def test_columns_that_cannot_be_are_refused(small, change, error, says):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "says"),
+    ("parameters", "controllers", "says"),
     [
-        ((["gain"], ["c"]), {}, "must have a column 'c.stable'"),
-        ((["wind"], ["a"]), {}, "must have a column 'wind'"),
-        ((["gain"], []), {}, "must name one at least"),
-        ((["gain"], ["a", "a"]), {}, "different names"),
-        (("gain", ["a"]), {}, "parameters must be a list"),
-        ((["gain"], ["a"]), {"levels": [1.5]}, "levels must be at most 1"),
-        ((["gain"], ["a"]), {"worst": -1}, "worst must be at least 0"),
-        ((["gain"], ["a"]), {"worst": 1.5}, "worst must be an integer"),
+        (["gain"], ["c"], "must have a column 'c.stable'"),
+        (["wind"], ["a"], "must have a column 'wind'"),
+        (["gain"], [], "must name one at least"),
+        (["gain"], ["a", "a"], "different names"),
+        ("gain", ["a"], "parameters must be a list"),
     ],
 )
-def test_arguments_that_cannot_be_are_refused(small, arguments, options, says):
+def test_arguments_that_cannot_be_are_refused(small, parameters, controllers, says):
     with pytest.raises(ProblemError, match=says):
-        study_statistics(small, *arguments, **options)
+        study_statistics(small, parameters, controllers)
 
 
 def test_rounding_is_neither_better_nor_worse() -> None:
@@ -129,8 +125,245 @@ def test_rounding_is_neither_better_nor_worse() -> None:
     strehl = np.random.default_rng(0).random(200)
     columns = make_columns({}, {"a": strehl, "b": strehl + 1e-8, "c": strehl + 1e-4})
     found = study_statistics(columns, [], ["a", "b", "c"])
-    first = found.comparisons[0]
-    assert (first.better.count, first.equal.count) == (0, 200)
-    assert [each.loss.best.count for each in found.controllers] == [0, 0, 200]
+    first = found.comparisons["a less b"]
+    assert (first["better"], first["equal"]) == (0, 1)
+    assert [each.best.value for each in found.controllers] == [0, 0, 1]
     both = study_statistics(columns, [], ["a", "b"])
-    assert [each.loss.best.count for each in both.controllers] == [200, 200]
+    assert [each.best.value for each in both.controllers] == [1, 1]
+
+
+@pytest.mark.parametrize("n", [1, 7, 200])
+def test_percentiles_are_numpys_and_intervals_are_scipys(n):
+    values = np.random.default_rng(n).normal(size=n)
+    for percent, each in percentiles(values, (0, 1, 5, 50, 95, 99, 100)).items():
+        assert each.value == pytest.approx(np.percentile(values, percent))
+        if 0 < percent < 100:
+            test = stats.quantile_test(values, q=0, p=percent / 100)
+            expected = test.confidence_interval(0.95)
+            np.testing.assert_allclose([each.low, each.high], [expected.low, expected.high])
+
+
+def test_percentiles_of_residuals_that_are_infinite():
+    values = np.array([1.0, 2.0, 3.0, np.inf, np.inf])
+    found = percentiles(values, (0, 50, 60, 75, 100))
+    assert [each.value for each in found.values()] == [1, 3, np.inf, np.inf, np.inf]
+
+
+@pytest.mark.parametrize(("count", "total"), [(0, 50), (50, 50), (3, 50), (40, 4000)])
+def test_intervals_of_parts_are_scipys(count, total):
+    found = share(np.arange(total) < count)
+    expected = stats.binomtest(count, total).proportion_ci(0.95, method="exact")
+    np.testing.assert_allclose([found.low, found.high], [expected.low, expected.high], rtol=1e-9)
+    assert found.value == count / total
+
+
+def index(parameter, result):
+    order = np.argsort(parameter, kind="stable")
+    return first_order_index(parameter[order], result[order])
+
+
+def ishigami(u, a=7.0, b=0.1):
+    x = np.pi * (2 * u - 1)
+    return np.sin(x[:, 0]) + a * np.sin(x[:, 1]) ** 2 + b * x[:, 2] ** 4 * np.sin(x[:, 0])
+
+
+def ishigami_indices(a=7.0, b=0.1):
+    """T. Ishigami and T. Homma, Proc. ISUMA 1990, 398: the variances are integrals of powers."""
+    first = (1 + b * np.pi**4 / 5) ** 2 / 2
+    second = a**2 / 8
+    first_and_third = b**2 * np.pi**8 * (1 / 18 - 1 / 50)
+    return np.array([first, second, 0.0, 0.0]) / (first + second + first_and_third)
+
+
+def test_the_oracle_has_the_published_indices():
+    np.testing.assert_allclose(ishigami_indices()[:3], [0.3139, 0.4424, 0], atol=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "n", "limit"),
+    [
+        ("independent", 1000, 0.06),
+        ("independent", 20_000, 0.015),
+        ("latin", 4000, 0.03),
+        ("sobol", 1024, 0.02),
+        ("sobol", 4096, 0.006),
+        ("sobol", 2**16, 0.001),
+    ],
+)
+def test_ishigami(kind, n, limit):
+    u = draw_points(kind, n, 4, seed=5)
+    found = [index(column, ishigami(u)) for column in u.T]
+    values, errors = np.transpose(found)
+    np.testing.assert_allclose(values, ishigami_indices(), atol=limit)
+    assert np.all(np.abs(values - ishigami_indices()) < 4 * errors)
+
+
+def test_standard_errors_are_those_of_repeated_samples():
+    """Mean error, spread over 200 samples, and the mean of the standard errors."""
+    n = 1000
+    values, errors = np.empty((200, 4)), np.empty((200, 4))
+    for seed in range(200):
+        u = draw_points("independent", n, 4, seed)
+        found = [index(column, ishigami(u)) for column in u.T]
+        values[seed], errors[seed] = np.transpose(found)
+    spread = values.std(axis=0)
+    ratio = errors.mean(axis=0) / spread
+    assert np.all(ratio[:2] > 0.9)
+    assert np.all(ratio[:2] < 1.25)
+    assert np.all(ratio[2:] > 1)  # of no effect: on the safe side
+    assert np.all(ratio[2:] < 2)
+    bias = values.mean(axis=0) - ishigami_indices()
+    assert np.all(np.abs(bias) < 0.8 * errors.mean(axis=0))
+
+
+def test_even_samples_are_not_corrected_as_if_they_were_independent():
+    """The correction of independent samples is 31 / 4064 of the unexplained part."""
+    u = draw_points("sobol", 4096, 3, seed=3)
+    assert abs(index(u[:, 2], ishigami(u))[0]) < 1e-3
+
+
+def test_a_parameter_without_effect_has_no_index():
+    u = draw_points("independent", 3000, 2, seed=2)
+    value, error = index(u[:, 1], np.sin(7 * u[:, 0]))
+    assert abs(value) < 2.5 * error
+    assert error < 0.01
+
+
+def test_a_list_has_its_values_as_groups():
+    rng = np.random.default_rng(0)
+    values = rng.choice([10.0, 20.0, 30.0], size=6000, p=[0.5, 0.3, 0.2])
+    means = {10.0: 0.2, 20.0: 0.8, 30.0: 0.5}
+    exact = np.array([means[v] for v in values])
+    result = exact + rng.normal(scale=0.1, size=values.size)
+    value, error = index(values, result)
+    mean = 0.5 * 0.2 + 0.3 * 0.8 + 0.2 * 0.5
+    between = 0.5 * (0.2 - mean) ** 2 + 0.3 * (0.8 - mean) ** 2 + 0.2 * (0.5 - mean) ** 2
+    assert value == pytest.approx(between / (between + 0.01), abs=4 * error)
+    ordered = np.argsort(values, kind="stable")
+    curve = conditional_curve(values[ordered], exact[ordered], exact[ordered] < 0)
+    np.testing.assert_array_equal(curve["parameter"], [10, 20, 30])
+    np.testing.assert_allclose(curve["mean"], [0.2, 0.8, 0.5])
+
+
+def test_the_index_of_a_list_is_epsilon_squared():
+    """Kelley's estimator, from scipy's analysis of variance."""
+    rng = np.random.default_rng(1)
+    values = rng.integers(0, 4, 400).astype(float)
+    result = values**2 + rng.normal(scale=5, size=400)
+    f = stats.f_oneway(*(result[values == v] for v in range(4))).statistic
+    between, within = 3, 400 - 4
+    epsilon = between * (f - 1) / (between * f + within)
+    assert index(values, result)[0] == pytest.approx(epsilon, rel=1e-9)
+
+
+@given(shift=st.floats(-5, 5), scale=st.sampled_from([-3.0, 0.01, 7.0]), seed=st.integers(0, 1000))
+def test_the_index_knows_no_units(shift, scale, seed):
+    u = draw_points("independent", 150, 2, seed)
+    result = u[:, 0] ** 2 + 0.3 * u[:, 1]
+    here = index(u[:, 0], result)
+    there = index(np.exp(3 * u[:, 0]), shift + scale * result)
+    assert there == pytest.approx(here, abs=1e-9)
+
+
+@pytest.mark.parametrize("weights", [(1.0, 2.0, 3.0), (5.0, 0.1, 1.0)])
+def test_an_additive_model_has_the_shares_of_its_terms(weights):
+    u = draw_points("sobol", 4096, 3, seed=1)
+    columns = make_columns({f"p{i}": u[:, i] for i in range(3)}, {"a": u @ np.array(weights) / 10})
+    found = study_statistics(columns, ["p0", "p1", "p2"], ["a"]).controllers[0]
+    expected = np.square(weights) / np.sum(np.square(weights))
+    rows = found.sensitivity.values()
+    np.testing.assert_allclose([row["index"] for row in rows], expected, atol=2e-3)
+
+
+def test_what_only_two_together_do_is_in_no_index():
+    u = draw_points("independent", 5000, 2, seed=4)
+    result = (u[:, 0] - 0.5) * (u[:, 1] - 0.5) + 0.5
+    columns = make_columns({"p": u[:, 0], "q": u[:, 1]}, {"a": result})
+    found = study_statistics(columns, ["p", "q"], ["a"])
+    for row in found.controllers[0].sensitivity.values():
+        assert abs(row["index"]) < 4 * row["index_error"]
+        assert row["index"] < 0.02
+    interactions = summary_tables(found)[-1].rows[-1]
+    assert float(interactions[1].split()[0]) > 97
+
+
+def test_constants_have_no_index():
+    u = draw_points("independent", 200, 1, seed=0)
+    columns = make_columns(
+        {"p": u[:, 0], "fixed": np.full(200, 0.9)}, {"a": u[:, 0], "b": 0 * u[:, 0]}
+    )
+    found = study_statistics(columns, ["p", "fixed"], ["a", "b"])
+    first, flat = found.controllers
+    assert first.sensitivity["p"]["index"] == pytest.approx(1, abs=1e-3)
+    assert np.isnan([*first.sensitivity["fixed"].values()]).all()
+    assert first.curves.keys() == {"p"}
+    assert flat.ranked == ()
+    assert np.isnan(flat.sensitivity["p"]["index"])
+    assert found.ranked == ("p",)
+    table = next(t for t in summary_tables(found) if t.caption.startswith("Variance"))
+    assert [row[2] for row in table.rows if len(row) > 1] == ["-", "-", "-"]
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_rank_correlation_is_scipys(ties):
+    rng = np.random.default_rng(3)
+    p = rng.normal(size=500)
+    strehl = 1 / (1 + np.exp(-2 * p + rng.normal(size=500)))
+    if ties:
+        p, strehl = np.round(p, 1), np.round(strehl, 1)
+    columns = make_columns({"p": p}, {"a": strehl})
+    row = study_statistics(columns, ["p"], ["a"]).controllers[0].sensitivity["p"]
+    assert row["spearman"] == pytest.approx(stats.spearmanr(p, strehl).statistic, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["independent", "latin", "sobol"])
+@pytest.mark.parametrize("n", [512, 4096])
+def test_an_edge_is_blurred_within_its_group_alone(kind, n):
+    """A loop that is unstable beyond 0.9 has a Strehl ratio of 0 there."""
+    u = draw_points(kind, n, 2, seed=2)
+    x, y = u.T
+    value, error = index(x, np.where(x > 0.9, 0.0, 0.8 - 0.2 * y))
+    between, within = 0.09 * 0.7**2, 0.9 * 0.2**2 / 12
+    blurred = (
+        0.7**2 / 4 / (16 if n == 4096 else 8)
+    )  # a step in the middle of a group, without a line
+    missing = between / (between + within) - value
+    assert -3 * error < missing < blurred / (between + within) + 3 * error
+
+
+def test_one_odd_sample_makes_no_index():
+    """One unstable loop of 1000 gave a parameter without effect an index of 0.8."""
+    rng = np.random.default_rng(0)
+    quiet = 0.82 + 0.005 * rng.normal(size=1000)
+    found = []
+    for place in rng.integers(0, 1000, 60):
+        result = quiet.copy()
+        result[place] = 0.0
+        found.append(first_order_index(np.arange(1000.0), result)[0])
+    assert np.max(np.abs(found)) < 0.05
+
+
+def test_a_list_of_independent_samples_keeps_its_correction():
+    rng = np.random.default_rng(1)
+    found = [
+        first_order_index(np.sort(rng.integers(0, 10, 1024) * 1.0), rng.normal(size=1024))[0]
+        for _ in range(100)
+    ]
+    assert abs(np.mean(found)) < 0.003
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_the_order_of_tied_samples_makes_no_index(shuffled):
+    """A grid of 64 x 64 gave the parameter without effect 0.32."""
+    one, other = (each.ravel() for each in np.meshgrid(np.arange(64.0), np.arange(64.0)))
+    order = np.random.default_rng(1).permutation(4096) if shuffled else np.arange(4096)
+    columns = make_columns({"a": other[order], "b": one[order]}, {"k": one[order] / 64})
+    rows = study_statistics(columns, ["a", "b"], ["k"]).controllers[0].sensitivity
+    assert abs(rows["a"]["index"]) < 0.01
+    assert rows["b"]["index"] == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-170, 1.0, 1e300])
+def test_the_index_knows_no_scale(scale):
+    x = np.linspace(0, 1, 100)
+    assert first_order_index(x, scale * x)[0] == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""Parts of a study on executors, and processes that die."""
+"""Parts of a sweep on executors, and processes that die."""
 
 from __future__ import annotations
 
@@ -6,20 +6,58 @@ import os
 import signal
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from support.studies import assert_whole, evaluate_quickly, load_small_study, make_folder
+from support.studies import (
+    assert_whole,
+    evaluate_quickly,
+    load_small_study,
+    make_folder,
+    part_rows,
+)
 
-from lbt_synth.errors import NumericalError
+from lbt_synth.errors import NumericalError, OutputError
+from lbt_synth.storage import array_file
+from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.study.engine import cut_parts
-from lbt_synth.studies.study.store import list_parts
+from lbt_synth.studies.grid import InlineExecutor, Parts
 
 
-def test_parts_have_a_fixed_number_of_rows():
-    parts = list(cut_parts([(0, 10), (20, 24)], 4))
-    assert parts == [(0, 4), (4, 8), (8, 10), (20, 24)]
+def test_a_sweep_knows_what_is_missing(tmp_path):
+    parts = Parts(folder=tmp_path / "parts", columns=("a",), rows=12, digest="d" * 64)
+    assert parts.missing() == [(0, 12)]
+    parts.folder.mkdir()
+    for start, stop in [(2, 4), (4, 6), (9, 10)]:
+        parts.write((start, stop), ({"a": np.arange(start, stop)}, [(start, "a", "why")]), 0.5)
+    assert list(parts.paths()) == [(2, 4), (4, 6), (9, 10)]
+    assert parts.missing() == [(0, 2), (6, 9), (10, 12)]
+    results, failures, seconds = parts.read(parts.paths()[4, 6])
+    assert (results.tolist(), failures, seconds) == ([[4], [5]], [(4, "a", "why")], 0.5)
+    seen = []
+
+    def evaluate(start, stop):
+        seen.append((start, stop))
+        return {"a": np.arange(start, stop)}, []
+
+    parts.compute_missing(evaluate, lambda rows: rows, part_rows=2, executor=InlineExecutor())
+    assert seen == [(0, 2), (6, 8), (8, 9), (10, 12)]  # a fixed number, and less at an end
+    whole = np.concatenate([parts.read(path)[0] for path in parts.paths().values()])
+    assert whole.ravel().tolist() == list(range(12))
+
+
+def test_a_part_is_believed_by_its_digest_alone(tmp_path):
+    parts = Parts(folder=tmp_path, columns=("a",), rows=2, digest="d" * 64)
+    parts.write((0, 2), ({"a": np.ones(2)}, []), 0.5)
+    (path,) = parts.paths().values()
+    arrays, text = array_file.read_npz(path.read_bytes())
+    with pytest.raises(OutputError, match="is of another study"):
+        replace(parts, digest="e" * 64).read(path)
+    path.write_bytes(array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text))
+    with pytest.raises(OutputError, match="is damaged. Delete it"):
+        parts.read(path)
 
 
 def wrong(study, values, start):
@@ -37,8 +75,8 @@ def raises(study, values, start):
 @pytest.mark.parametrize(
     ("evaluate", "message"),
     [
-        (wrong, "must return a BatchResult of rows 0 to"),
-        (short, "must return a BatchResult of rows 0 to"),
+        (wrong, r"rows 0 to 3 have no result \(ValueError"),
+        (short, r"rows 0 to 3 have no result \(ValueError: 3 rows\)"),
         (raises, r"rows 0 to 3 have no result \(RuntimeError: no such thing\)"),
     ],
 )
@@ -83,7 +121,7 @@ def test_an_executor_that_breaks_keeps_what_is_finished(tmp_path, kind, message)
     words = f"{message}.*start the study again.*it goes on from there"
     with Breaks(1) as pool, pytest.raises(NumericalError, match=words):
         run_study(study, folder, executor=pool, evaluate=evaluate_quickly)
-    assert 1 <= len(list_parts(folder)) <= 3
+    assert 1 <= len(part_rows(folder)) <= 3
     run_study(study, folder, evaluate=evaluate_quickly)
     assert_whole(folder, study)
 
@@ -92,7 +130,7 @@ def dies_once(study, values, start):
     """Row 30 ends its process, when others are written; the second time it does not."""
     once = Path(os.environ["STUDY_DIED"])
     if start <= 30 < start + len(values) and not once.exists():
-        while not list_parts(once.parent / "out"):
+        while not part_rows(once.parent / "out"):
             time.sleep(0.01)
         once.write_text("")
         os.kill(os.getpid(), signal.SIGKILL)
@@ -102,10 +140,12 @@ def dies_once(study, values, start):
 def test_a_dead_process_ends_the_run_and_the_next_one_goes_on(tmp_path, monkeypatch):
     monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
     study, folder = load_small_study(tmp_path, samples="80"), make_folder(tmp_path)
-    with pytest.raises(NumericalError, match="a process died.*start the study again"):
-        run_study(study, folder, jobs=2, evaluate=dies_once)
-    kept = sum(part.stop - part.start for part in list_parts(folder))
+    words = "a process died.*start the study again"
+    with pytest.raises(NumericalError, match=words), WorkerPool(2) as pool:
+        run_study(study, folder, executor=pool, evaluate=dies_once)
+    kept = sum(stop - start for start, stop in part_rows(folder))
     assert 0 < kept < 80
-    again = run_study(study, folder, jobs=2, evaluate=dies_once)
-    assert (again.computed, again.failures) == (80 - kept, 0)
+    with WorkerPool(2) as pool:
+        again = run_study(study, folder, executor=pool, evaluate=dies_once)
+    assert (again.computed, again.failures) == (80 - kept, ())
     assert_whole(folder, study)
