@@ -14,20 +14,20 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4919,
-    "config": 2222,
-    "design": 8361,
-    "files": 1678,
-    "identification": 14999,
-    "interop": 5576,
-    "linear": 6068,
-    "loop": 4555,
+    "cli": 4993,
+    "config": 2331,
+    "design": 8382,
+    "files": 1676,
+    "identification": 14397,
+    "interop": 4940,
+    "linear": 6078,
+    "loop": 5039,
     "methods": 1109,
-    "models": 4465,
-    "report": 7083,
-    "storage": 1262,
-    "studies": 5259,
-    "errors, validation": 640,
+    "models": 4550,
+    "report": 5793,
+    "storage": 1263,
+    "studies": 3947,
+    "errors, validation": 642,
 }
 COUNTS = {
     "files of the package": 399,

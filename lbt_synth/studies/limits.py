@@ -165,7 +165,9 @@ def limits(
     if len(vibrations) == 1 and isinstance(vibrations[0], SinusoidalVibration) and shifts.size > 1:
         line = vibrations[0]
         band_hz = line.frequency_hz + float(shifts[0]), line.frequency_hz + float(shifts[-1])
-        least_worst = partial(least_worst_residual, alone, truth, band_hz=band_hz)
+        # that of the band stands for it
+        rest = replace(truth, vibrations=(), motions=(), frequency_errors_hz=None)
+        least_worst = partial(least_worst_residual, alone, rest, band_hz=band_hz)
         band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
     rows, curves = [], []
     for name, design in designs.items():
