@@ -19,8 +19,7 @@ from lbt_synth.cli.argument_kinds import (
     add_switch,
     option_name,
 )
-from lbt_synth.identification.accelerometers.readings import M_S2
-from lbt_synth.storage.display_unit import UNITS
+from lbt_synth.storage.display_unit import M_S2, UNITS
 
 if TYPE_CHECKING:  # slow to import for --help
     from pydantic.fields import FieldInfo

@@ -289,7 +289,7 @@ def optimal_integrator(
         vibrations=tuple(map(ensemble_vibration, stationary_vibrations(truth.vibrations))),
     )
 
-    variances = _ensemble_variances(hardware, law, ensemble, in_image=True)
+    variances = _ensemble_variances(hardware, law, ensemble)
     return _least_residual(hardware, law, variances, truth.sensor_gain)
 
 
@@ -327,9 +327,13 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     """
     require_instance(plant, TipTiltPlant)
     hardware, factor = plant.hardware, plant.D[:, -plant.hardware.n_measurements :]
-    lines = tuple(map(ensemble_vibration, plant.vibrations))
-    conditions = LoopEnsemble(turbulence=plant.turbulence, vibrations=lines)
-    disturbed = _ensemble_variances(hardware, law, conditions, in_image=False)
+    lines = [  # those of a plant are means over frames
+        replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / hardware.frame_rate_hz))
+        for line in plant.vibrations
+    ]
+    moving = tuple(map(ensemble_vibration, lines))
+    conditions = LoopEnsemble(turbulence=plant.turbulence, vibrations=moving)
+    disturbed = _ensemble_variances(hardware, law, conditions)
 
     def from_noise(gain: float) -> float:
         loop = close_loop(hardware, law.controller(hardware, gain))
@@ -342,16 +346,16 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
 
 
 def _ensemble_variances(
-    hardware: LoopHardware, law: IntegratorLaw, ensemble: LoopEnsemble, *, in_image: bool
+    hardware: LoopHardware, law: IntegratorLaw, ensemble: LoopEnsemble
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the residual variance of loops under the same conditions, by their gains (k,)."""
+    """Return what loops under the same conditions leave in the image, by their gains (k,)."""
     A, B, C, D = textbook_matrices([law.controller(hardware, 1.0)])
 
     def variances(gains: FloatArray) -> FloatArray:
         factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
         scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
         loops = replace(ensemble, loops=gains.size)
-        return residuals_from_matrices(scaled, hardware, loops, in_image=in_image).rms_nm ** 2
+        return residuals_from_matrices(scaled, hardware, loops, in_image=True).rms_nm ** 2
 
     return variances
 

@@ -37,7 +37,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.mirror.frame_rate_system import Hold
 from lbt_synth.models.plant.seen_vibration import seen_vibration
-from lbt_synth.models.sensor_suite import Motion, checked_motions
+from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
@@ -99,7 +99,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth, *, frame_means: bool = False
             turbulence += view.of_spectrum(spectrum, _entry(loop, mode))
     lines = stationary_vibrations(truth.vibrations)
     amplitudes: list[ComplexArray] = []
-    moving = checked_motions(truth.motions, loop.hardware.suite, len(lines))
+    moving = _motions(loop, truth.motions, len(lines))
     for line, motion in zip(lines, moving, strict=True):
         if isinstance(line, Vibration):
             vibration += view.of_line(line, motion, of_means=frame_means)
@@ -176,7 +176,7 @@ def plant_budget(
     turbulence, vibration = np.zeros((2, 2, loop.hardware.modes, loop.hardware.modes))
     for mode, model in enumerate(plant.turbulence):
         turbulence += view.of_spectrum(model, _entry(loop, mode))
-    moving = checked_motions(plant.motions, loop.hardware.suite, len(plant.vibrations))
+    moving = _motions(loop, plant.motions, len(plant.vibrations))
     for line, motion in zip(plant.vibrations, moving, strict=True):
         vibration += view.of_line(line, motion, of_means=True)
     return _make_budget(turbulence, vibration, view.of_noise(plant.own_noise_factor), [])
@@ -300,6 +300,9 @@ class _View:
         pieces, rest = self._residuals(np.array([line.frequency_hz]), entry)
         within = line.rms_nm**2 * self._powers(pieces[..., None], rest, entry)[0, 1]
         mean = np.einsum("g,tgi->ti", self._weights, pieces[0])
+        if self.pieces is not None:  # with the phase that it has in its own hold
+            turn = line.frequency_hz / self.loop.hardware.frame_rate_hz * self.pieces.start
+            mean = mean * np.exp(-2j * np.pi * turn)
         return line.amplitude_nm * np.fft.fft(mean, axis=0) / len(mean), within
 
     def of_noise(self, factor: FloatArray) -> FloatArray:
@@ -369,7 +372,7 @@ def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
     hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
     if frame_means or (hardware.mirror is None and hardware.delay_frames % 1 == 0):
         rows = replace(s, C=s.C[..., :n, :], D=s.D[..., :n, :])
-        return _View(loop, rows, None, not frame_means)
+        return _View(loop, _balanced(rows), None, not frame_means)
     mirror, m = hardware.mirror_system, hardware.n_commands
     command = slice(n, n + m)
     first = loop.controller.n_states  # the states of the mirror follow those of the controller
@@ -380,12 +383,24 @@ def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
     D = np.einsum("g,im,...mw->...giw", pieces.D, N, s.D[..., command, :])
     shape = len(pieces.D) * n
     C, D = C.reshape(*s.C.shape[:-2], shape, -1), D.reshape(*s.D.shape[:-2], shape, s.D.shape[-1])
-    return _View(loop, replace(s, C=C, D=D), pieces, True)
+    return _View(loop, _balanced(replace(s, C=C, D=D)), pieces, True)
+
+
+def _balanced(system: StateSpace) -> StateSpace:
+    """Return a system in states of comparable units, in which its response keeps its digits."""
+    return system.balanced() if system.period == 1 else system
 
 
 def _entry(loop: ClosedLoop, mode: int) -> FloatArray:
     """Return how the phase of a mode enters a loop, (n + q, 1)."""
     return np.eye(loop.system.B.shape[-1], 1, -mode)
+
+
+def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:
+    """Return which channels each line moves: none where the loop reads its own sensor alone."""
+    if not loop.reads_others:
+        return ({},) * lines
+    return checked_motions(motions, loop.hardware.suite, lines)
 
 
 def _moved_rows(loop: ClosedLoop, motion: Mapping[str, Motion]) -> list[tuple[int, str]]:

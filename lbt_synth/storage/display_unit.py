@@ -16,6 +16,7 @@ from dataclasses import dataclass
 LENGTHS = {"nm": 1.0, "um": 1000.0}  # of wavefront, in nm
 UNITS = (*LENGTHS, "mas", "urad")
 _NM = re.compile(r"\Anm(?=\Z|[ ²^/])")
+M_S2 = {"m/s2": 1.0, "mm/s2": 1e-3, "um/s2": 1e-6, "g": 9.80665, "mg": 9.80665e-3}  # accelerations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

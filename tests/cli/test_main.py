@@ -280,10 +280,10 @@ def test_every_command_runs(tmp_path, capsys, model, ending):
     assert "telescope" not in checked_output(capsys, "telemetry", tmp_path / "t.fits")
 
     limits = answer(capsys, "limits", config, integrator, "-o", tmp_path / "l.csv")
-    assert limits["limit_nm"] == pytest.approx(made["rms"], rel=1e-6)
+    assert limits["limit_nm"] > made["rms"]  # that is of means over frames
     rows = answer(capsys, "robustness", config, "-o", tmp_path / "r.csv")
     best = {row["method"]: row for row in rows["rows"] if row["error_hz"] == 0}
-    assert best["kalman"]["residual_nm"] == pytest.approx(made["rms"], rel=1e-6)
+    assert 1 <= best["kalman"]["residual_nm"] / limits["limit_nm"] < 1.001
     mapped = answer(
         capsys,
         "robustness",

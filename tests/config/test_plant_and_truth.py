@@ -98,7 +98,7 @@ def test_one_axis(tmp_path, direction):
     truth = lbt.Truth(
         turbulence=both.plant.turbulence, vibrations=both.plant.vibrations, noise_nm=15.5
     )
-    limit = lbt.loop.least_residual(both.hardware, truth)
+    limit = lbt.loop.least_residual(both.hardware, truth, frame_means=True)
     assert lbt.kalman(config.plant).rms ** 2 == pytest.approx(limit.variance_nm2[0], rel=1e-6)
 
 

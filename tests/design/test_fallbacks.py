@@ -72,7 +72,7 @@ def test_readings_are_residual_and_noise():
     plant = example_plant((FAST,))
     loop = failed_loop(plant, kalman_riccati(plant).gain_predictor, ())
     readings = model_readings(loop, plant)
-    left = plant_budget(loop, plant).total_nm2
+    left = plant_budget(loop, plant, frame_means=True).total_nm2
     np.testing.assert_allclose(readings[:2, :2], left + 75**2 * np.eye(2), rtol=1e-9)
     power = np.diag(FAST.noise_m_s2).copy()
     for line, motion in zip(plant.vibrations, plant.motions, strict=True):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
-from support.predictions import a_plant, a_truth
+from support.predictions import SHELL, a_plant, truth_of_all_moments
 from support.uneven_axes import LOOPS, QUICK, RATE, SLOW
 
 import lbt_synth as lbt
@@ -74,17 +74,19 @@ def test_an_undisturbed_loop_has_no_best_gain():
         )
 
 
-def test_the_integrator_of_a_plant_is_that_of_its_truth():
-    plant = a_plant()
+@pytest.mark.parametrize(("delay", "mirror"), [(2.0, None), (2.49, None), (2.25, SHELL)])
+def test_the_integrator_of_a_plant_is_that_of_its_truth(delay, mirror):
+    plant = a_plant(delay=delay, mirror=mirror)
     own, other = (
         lbt.design.model_integrator(plant),
-        lbt.design.optimal_integrator(plant.hardware, a_truth()),
+        lbt.design.optimal_integrator(plant.hardware, truth_of_all_moments()),
     )
     assert own.gain == pytest.approx(other.gain, rel=1e-5)
     assert own.certificate.passed
 
 
-def test_the_integrator_of_a_plant_leaves_the_least_of_its_budget():
+@pytest.mark.parametrize("delay", [2.0, 2.49])
+def test_the_integrator_of_a_plant_leaves_the_least_of_its_budget(delay):
     lines = [
         lbt.Vibration(frequency_hz=f, damping=0.02, rms_nm=60.0, direction=way)
         for f, way in ((12.0, (1.0, 0.0)), (31.0, (0.6, 0.8)))
@@ -95,6 +97,7 @@ def test_the_integrator_of_a_plant_leaves_the_least_of_its_budget():
         vibrations=lines,
         noise_nm=[[225.0, 80.0], [80.0, 400.0]],
         sensor_matrix=[[0.8, 0.3], [-0.1, 0.6]],
+        delay_frames=delay,
     )
 
     def left(gain: float) -> float:

@@ -1,4 +1,4 @@
-"""The exact residual of a loop against closed forms and brute force."""
+"""The exact residual of a loop against closed forms, brute force and runs of the loop."""
 
 from functools import partial
 
@@ -8,20 +8,71 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from support import predictions
+from support.continuous_loops import noise_covariance, power_of_two_sensors, sinusoid_powers
 from support.plants import lbt_axis_plant
+from support.sensor_loops import (
+    AIR,
+    FAST,
+    MOTIONS,
+    RATE_HZ,
+    example_plant,
+    impulse,
+    run_loop,
+    simulated_covariances,
+)
+from support.sensor_loops import LINES as SHAKES
+from support.sensor_loops import SLOW as OTHER
 from support.uneven_axes import LINES, LOOPS, QUICK, RATE, SLOW, TABLE, one_axis
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
+from lbt_synth.linear import kalman_riccati
+from lbt_synth.loop.budget import plant_budget
+from lbt_synth.loop.closed_loop import radii_by_gain
+from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
+
+AGELESS = Accelerometer(
+    name="mirror", rate_hz=RATE_HZ, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-3
+)
+SELDOM = WavefrontSensor(name="seldom", rate_hz=50, delay_frames=1.3, noise_nm=4)
+THIRD = Accelerometer(
+    name="third", rate_hz=RATE_HZ / 3, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-3
+)
+HALF = Accelerometer(
+    name="half", rate_hz=RATE_HZ / 2, delay_frames=1.625, channels=("m2",), noise_m_s2=2e-3
+)
+SLEEPY = Accelerometer(  # its exposures wait, and end within a frame
+    name="sleepy", rate_hz=RATE_HZ / 3, delay_frames=2.875, channels=("m1", "m2"), noise_m_s2=2e-3
+)
+SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=500)
+AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, frame_rate_hz=RATE_HZ)
 
 
 class Anonymous:
-    """A spectrum that hides that it is an AR model, so that it goes through quadrature."""
+    """A spectrum that hides that it is an AR model, so that it goes through quadrature.
 
-    def __init__(self, model):
-        self.model = model
+    It is that of the means over frames, or of the phase that has them.
+    """
+
+    def __init__(self, model, *, of_means=True):
+        self.model, self.of_means = model, of_means
 
     def psd(self, frequency_hz):
-        return self.model.psd(frequency_hz)
+        share = 1.0 if self.of_means else np.sinc(frequency_hz / self.model.frame_rate_hz) ** 2
+        return self.model.psd(frequency_hz) / share
+
+
+class Broad:
+    """A smooth spectrum of no model."""
+
+    def psd(self, frequency_hz):
+        return 30 / (1 + (np.asarray(frequency_hz) / 40) ** 2)
+
+
+def sinusoid(frequency_hz, rms_nm, direction=(1, 0)):
+    return lbt.models.SinusoidalVibration(
+        frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction
+    )
 
 
 def test_noise_of_an_integrator_has_a_closed_form():
@@ -29,7 +80,7 @@ def test_noise_of_an_integrator_has_a_closed_form():
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
     for g in (0.1, 0.7, 1.6):
         loop = lbt.close_loop(path, lbt.integrator(path, gain=g).controller)
-        budget = lbt.residual_budget(loop, lbt.Truth(turbulence=None, noise_nm=2.0))
+        budget = lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=2.0))
         assert budget.noise_nm**2 == pytest.approx(4 * g / (2 - g), rel=1e-9)
 
 
@@ -47,11 +98,16 @@ def test_noise_of_an_integrator_has_a_closed_form():
 def test_quadrature_agrees_with_the_lyapunov_equation(gain, model):
     plant = lbt_axis_plant(modes=2)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller, sensor_gain=gain)
-    exact, quadrature = (
-        lbt.residual_budget(loop, lbt.Truth(turbulence=source, sensor_gain=gain)).turbulence_nm2
-        for source in (model, Anonymous(model))
-    )
-    assert np.allclose(quadrature, exact, rtol=2e-4, atol=1e-9 * exact.max())
+    for frame_means in (True, False):
+        exact, quadrature = (
+            lbt.residual_budget(
+                loop, Truth(turbulence=source, sensor_gain=gain), frame_means=frame_means
+            )
+            for source in (model, Anonymous(model, of_means=frame_means))
+        )
+        for name in ("turbulence_nm2", "within_nm2"):
+            one, other = getattr(exact, name), getattr(quadrature, name)
+            assert np.allclose(other, one, rtol=2e-4, atol=1e-9 * one.max())
 
 
 @pytest.mark.parametrize("half_width", [0.3, 0.03, 0.003])
@@ -63,9 +119,10 @@ def test_narrow_lines_of_a_table_are_not_missed(half_width):
     )
     plant = lbt_axis_plant()
     loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
-    budget = lbt.residual_budget(loop, lbt.Truth(turbulence=table))
-    gain = abs(loop.sensitivity([37.3])[0, 0, 0])
-    assert budget.turbulence_nm == pytest.approx(10 * gain, rel=1e-3)
+    budget = lbt.residual_budget(loop, Truth(turbulence=table))
+    gain, share = abs(loop.sensitivity([37.3])[0, 0, 0]), np.sinc(37.3 / 800)
+    assert budget.turbulence_nm == pytest.approx(10 * gain * share, rel=1e-3)
+    assert budget.within_nm == pytest.approx(10 * np.sqrt(1 - share**2), rel=1e-3)
 
 
 def test_a_measured_spectrum_against_brute_force():
@@ -79,17 +136,20 @@ def test_a_measured_spectrum_against_brute_force():
     loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
     fine = np.linspace(5, 100, 3392 * 20 + 1)
     power = np.abs(loop.sensitivity(fine)[:, 0, 0]) ** 2
-    expected = trapezoid(table.psd(fine) * power, fine)
-    budget = lbt.residual_budget(loop, lbt.Truth(turbulence=table))
+    share = np.sinc(fine / 800) ** 2
+    budget = lbt.residual_budget(loop, Truth(turbulence=table))
+    expected = trapezoid(table.psd(fine) * power * share, fine)
     assert budget.turbulence_nm**2 == pytest.approx(expected, rel=1e-5)
+    expected = trapezoid(table.psd(fine) * (1 - share), fine)
+    assert budget.within_nm**2 == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_narrow_resonance_tends_to_the_sinusoid():
     plant = lbt_axis_plant(modes=2)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
     along = {"frequency_hz": 18.0, "rms_nm": 100.0, "direction": (0.6, 0.8)}
-    line = lbt.Truth(turbulence=None, vibrations=(lbt.models.SinusoidalVibration(**along),))
-    narrow = lbt.Truth(turbulence=None, vibrations=(lbt.Vibration(**along, damping=1e-6),))
+    line = Truth(turbulence=None, vibrations=(lbt.models.SinusoidalVibration(**along),))
+    narrow = Truth(turbulence=None, vibrations=(lbt.Vibration(**along, damping=1e-6),))
     exact, limit = (lbt.residual_budget(loop, t).vibration_nm2 for t in (line, narrow))
     assert np.allclose(limit, exact, rtol=1e-3)
 
@@ -97,7 +157,7 @@ def test_a_narrow_resonance_tends_to_the_sinusoid():
 def test_parts_of_the_budget_add_up():
     plant = lbt_axis_plant(modes=2)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    truth = lbt.Truth(
+    truth = Truth(
         turbulence=plant.turbulence[0],
         noise_nm=15.5,
         vibrations=(
@@ -106,8 +166,11 @@ def test_parts_of_the_budget_add_up():
         ),
     )
     b = lbt.residual_budget(loop, truth)
-    assert b.rms_nm**2 == pytest.approx(b.turbulence_nm**2 + b.vibration_nm**2 + b.noise_nm**2)
-    assert np.allclose(b.total_nm2, b.turbulence_nm2 + b.vibration_nm2 + b.noise_nm2)
+    names = ("turbulence", "vibration", "noise", "within")
+    assert b.rms_nm**2 == pytest.approx(sum(getattr(b, f"{name}_nm") ** 2 for name in names))
+    assert np.allclose(b.total_nm2, sum(getattr(b, f"{name}_nm2") for name in names))
+    lines = sum(np.real(np.outer(a, a.conj())) / 2 for a in b.line_amplitudes_nm)
+    assert np.allclose(b.gaussian_nm2, b.total_nm2 - lines)
 
 
 @given(angle=st.floats(0, np.pi))
@@ -117,38 +180,36 @@ def test_a_decoupled_loop_treats_all_directions_alike(angle):
     line = lbt.models.SinusoidalVibration(
         frequency_hz=18, rms_nm=100, direction=(np.cos(angle), np.sin(angle))
     )
-    budget = lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(line,)))
+    budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
     other = lbt.models.SinusoidalVibration(frequency_hz=18, rms_nm=100)
-    same = lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(other,)))
+    same = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(other,)))
     assert budget.rms_nm == pytest.approx(same.rms_nm, rel=1e-6)
 
 
 def test_loops_refuse_what_does_not_fit():
     path = lbt.LoopHardware(frame_rate_hz=800)
     lazy = lbt.integrator(path, gain=0.3).controller
-    with pytest.raises(
-        lbt.errors.DimensionError, match="map 1 measurements to 1 commands; got 2 to 2"
-    ):
+    with pytest.raises(DimensionError, match="map 1 measurements to 1 commands; got 2 to 2"):
         lbt.close_loop(lbt.LoopHardware(frame_rate_hz=800, modes=1), lazy)
     with pytest.raises(
-        lbt.errors.ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"
+        ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"
     ):
         lbt.close_loop(lbt.LoopHardware(frame_rate_hz=500), lazy)
     loop = lbt.close_loop(path, lazy)
-    with pytest.raises(lbt.errors.ProblemError, match="truth's sensor gain 0.5; got 1"):
-        lbt.residual_budget(loop, lbt.Truth(turbulence=None, sensor_gain=0.5))
+    with pytest.raises(ProblemError, match="truth's sensor gain 0.5; got 1"):
+        lbt.residual_budget(loop, Truth(turbulence=None, sensor_gain=0.5))
     line = lbt.models.SinusoidalVibration(frequency_hz=10, rms_nm=1, direction=(1, 0, 0))
-    with pytest.raises(lbt.errors.DimensionError, match="must have 2 components"):
-        lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(line,)))
+    with pytest.raises(DimensionError, match="must have 2 components"):
+        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
     fast = lbt.models.SinusoidalVibration(frequency_hz=600, rms_nm=1)
-    with pytest.raises(lbt.errors.ProblemError, match="below the Nyquist"):
-        lbt.residual_budget(loop, lbt.Truth(turbulence=None, vibrations=(fast,)))
+    with pytest.raises(ProblemError, match="below the Nyquist"):
+        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(fast,)))
     other_rate = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
-    with pytest.raises(lbt.errors.ProblemError, match="must be sampled at the loop's 800 Hz"):
-        lbt.residual_budget(loop, lbt.Truth(turbulence=other_rate))
+    with pytest.raises(ProblemError, match="must be sampled at the loop's 800 Hz"):
+        lbt.residual_budget(loop, Truth(turbulence=other_rate))
 
 
-uneven = partial(lbt.Truth, noise_nm=(15.5, 6.0), sensor_gain=0.8)
+uneven = partial(Truth, noise_nm=(15.5, 6.0), sensor_gain=0.8)
 
 
 @pytest.mark.parametrize("spectra", [(SLOW, QUICK), (SLOW, TABLE), (None, QUICK), (TABLE, None)])
@@ -178,8 +239,8 @@ def test_axes_without_coupling_are_loops_of_their_own(spectra):
 def test_equal_axes_are_one_truth_for_all(noise, spectrum):
     path = lbt.LoopHardware(frame_rate_hz=RATE)
     loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
-    one = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum, noise_nm=noise))
-    each = lbt.residual_budget(loop, lbt.Truth(turbulence=[spectrum] * 2, noise_nm=[noise] * 2))
+    one = lbt.residual_budget(loop, Truth(turbulence=spectrum, noise_nm=noise))
+    each = lbt.residual_budget(loop, Truth(turbulence=[spectrum] * 2, noise_nm=[noise] * 2))
     np.testing.assert_allclose(each.total_nm2, one.total_nm2, rtol=1e-12, atol=1e-12)
 
 
@@ -190,16 +251,21 @@ def test_coupled_axes_against_the_frequency_response():
     )
     controller = lbt.integrator(lbt.LoopHardware(frame_rate_hz=RATE), gain=0.3).controller
     loop = lbt.close_loop(path, controller)
-    truth = lbt.Truth(turbulence=[SLOW, TABLE], noise_nm=[3.0, 9.0])
-    f = (np.arange(400_000) + 0.5) * RATE / 2 / 400_000
+    truth = Truth(turbulence=[SLOW, TABLE], noise_nm=[3.0, 9.0])
+    f = (np.arange(100_000) + 0.5) * RATE / 2 / 100_000
     S, N = loop.sensitivity(f), loop.noise_transfer(f)
     density = np.stack([SLOW.psd(f), TABLE.psd(f)], axis=-1)
     white = np.array([3.0, 9.0]) ** 2 / (RATE / 2)
-    want = np.einsum("fij,fj,fkj->ik", S, density, S.conj()).real * (f[1] - f[0])
+    share = np.sinc(f / RATE)[:, None] ** np.array([0, 2])  # a process is one of means
+    seen = density * share
+    want = np.einsum("fij,fj,fkj->ik", S, seen, S.conj()).real * (f[1] - f[0])
     noise = np.einsum("fij,j,fkj->ik", N, white, N.conj()).real * (f[1] - f[0])
     budget = lbt.residual_budget(loop, truth)
     np.testing.assert_allclose(budget.turbulence_nm2, want, rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(budget.noise_nm2, noise, rtol=1e-5, atol=1e-4)
+    moving = density * (np.sinc(f / RATE)[:, None] ** np.array([-2, 0]) - share)
+    within = np.diag(moving.sum(axis=0) * (f[1] - f[0]))
+    np.testing.assert_allclose(budget.within_nm2, within, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), predictions.CASES)
@@ -207,15 +273,19 @@ def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor)
     plant = predictions.a_plant(delay=delay, gain=gain, mirror=mirror, sensor=sensor)
     controller = lbt.integrator(plant.hardware, gain=0.2).controller
     loop = lbt.close_loop(plant.hardware, controller)
-    own, other = (
-        lbt.loop.model_budget(loop, plant),
-        lbt.residual_budget(loop, predictions.a_truth()),
-    )
-    for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "total_nm2"):
-        np.testing.assert_allclose(getattr(own, name), getattr(other, name), rtol=1e-9, atol=1e-9)
     bare = predictions.a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
-    again = lbt.loop.model_budget(lbt.close_loop(bare, controller, sensor_gain=gain), plant)
-    np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
+    scaled = lbt.close_loop(bare, controller, sensor_gain=gain)
+    for met, frame_means in (
+        (predictions.a_truth(), True),
+        (predictions.truth_of_all_moments(), False),
+    ):
+        own = lbt.loop.model_budget(loop, plant, frame_means=frame_means)
+        other = lbt.residual_budget(loop, met, frame_means=frame_means)
+        for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "total_nm2"):
+            one, two = getattr(own, name), getattr(other, name)
+            np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)
+        again = lbt.loop.model_budget(scaled, plant, frame_means=frame_means)
+        np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
 
 
 def test_noise_that_is_correlated_between_axes():
@@ -224,7 +294,8 @@ def test_noise_that_is_correlated_between_axes():
         frame_rate_hz=predictions.RATE, turbulence=predictions.SLOW, noise_nm=noise
     )
     design = lbt.kalman(plant)
-    budget = lbt.loop.model_budget(lbt.close_loop(plant.hardware, design.controller), plant)
+    loop = lbt.close_loop(plant.hardware, design.controller)
+    budget = lbt.loop.model_budget(loop, plant, frame_means=True)
     assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
 
 
@@ -236,9 +307,7 @@ def test_a_budget_of_another_loop_is_refused():
         predictions.a_plant(mirror=predictions.SHELL),
     ):
         loop = lbt.close_loop(other.hardware, lbt.integrator(other.hardware, gain=0.1).controller)
-        with pytest.raises(
-            lbt.errors.ProblemError, match="plant's sensor, mirror and delay; got another"
-        ):
+        with pytest.raises(ProblemError, match="plant's sensor, mirror and delay; got another"):
             lbt.loop.model_budget(loop, plant)
     unstable = lbt.close_loop(
         plant.hardware, lbt.integrator(plant.hardware, gain=0.9).controller, sensor_gain=1.0
@@ -247,13 +316,13 @@ def test_a_budget_of_another_loop_is_refused():
         A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / predictions.RATE
     )
     assert unstable.is_stable
-    with pytest.raises(lbt.errors.UnstableLoopError):
+    with pytest.raises(UnstableLoopError):
         lbt.loop.model_budget(lbt.close_loop(plant.hardware, wild), plant)
-    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+    with pytest.raises(ProblemError, match="expected a TipTiltPlant"):
         lbt.loop.model_budget(unstable, predictions.a_truth())
-    with pytest.raises(lbt.errors.ProblemError, match="expected a ClosedLoop"):
+    with pytest.raises(ProblemError, match="expected a ClosedLoop"):
         lbt.loop.model_budget(unstable.system, plant)
-    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+    with pytest.raises(ProblemError, match="expected a TipTiltPlant"):
         lbt.design.model_integrator(predictions.a_truth())
 
 
@@ -267,10 +336,12 @@ def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=4000, turbulence=air, noise_nm=0.03, vibrations=lines, modes=1
     )
-    truth = lbt.Truth(turbulence=air, vibrations=lines, noise_nm=0.03)
-    found = lbt.residual_budget(lbt.close_loop(plant.hardware, lbt.kalman(plant)), truth)
-    limit = lbt.loop.least_residual(plant.hardware, truth)
-    assert found.rms_nm == pytest.approx(limit.rms_nm, rel=1e-9)
+    truth = Truth(turbulence=air, vibrations=lines, noise_nm=0.03)
+    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant))
+    for frame_means, apart in ((True, 1e-9), (False, 1e-6)):
+        found = lbt.residual_budget(loop, truth, frame_means=frame_means)
+        limit = lbt.loop.least_residual(plant.hardware, truth, frame_means=frame_means)
+        assert found.rms_nm == pytest.approx(limit.rms_nm, rel=apart)
     assert lbt.lqg(plant).certificate.passed
 
 
@@ -282,10 +353,363 @@ def test_a_spectrum_that_is_none_is_refused(density):
 
     path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
     loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3))
-    truth = lbt.Truth(turbulence=Odd(), noise_nm=1.0)
+    truth = Truth(turbulence=Odd(), noise_nm=1.0)
     for compute in (
         lambda: lbt.residual_budget(loop, truth),
         lambda: lbt.loop.least_residual(path, truth),
     ):
-        with pytest.raises(lbt.errors.ProblemError, match="one finite number of at least 0"):
+        with pytest.raises(ProblemError, match="one finite number of at least 0"):
             compute()
+
+
+def closed(plant, **facts):
+    """Return the controller of the Kalman filter, and its loop."""
+    controller = plant.controller(kalman_riccati(plant).gain_predictor)
+    return controller, lbt.close_loop(plant.hardware, controller, **facts)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+@pytest.mark.parametrize("sensors", [(FAST,), (OTHER,), (FAST, OTHER), (SELDOM,)])
+def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
+    plant = example_plant(sensors, delay_frames=delay)
+    P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
+    _, loop = closed(plant)
+    rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
+    budget = plant_budget(loop, plant, frame_means=True)
+    assert budget.rms_nm == pytest.approx(rms, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "loop"),
+    [
+        ({}, {}),
+        ({}, {"sensor_gain": 0.6}),
+        ({}, {"blind": ("truth",)}),
+        ({}, {"blind": ("m1",)}),
+        ({"delay_frames": 1.5, "turbulence": AR3}, {}),
+        ({"delay_frames": 3, "sensors": (HALF, OTHER)}, {}),
+        ({"sensors": (AGELESS,)}, {}),
+        ({"sensors": (SLEEPY,)}, {}),
+        ({"mirror": SHELL, "influence_matrix": [[2.0, 0.1], [0.3, 1.0]]}, {}),
+        ({"sensor_matrix": [[1, 0], [0, 1], [0.5, 0.5]], "noise_nm": [30, 30, 40]}, {}),
+    ],
+)
+def test_budgets_are_what_impulses_leave(changes, loop):
+    plant = example_plant(**changes)
+    controller, own = closed(plant, **loop)
+    budget = plant_budget(own, plant, frame_means=True)
+    exact = budget.turbulence_nm2, budget.random_vibration_nm2, budget.noise_nm2
+    for one, simulated in zip(exact, simulated_covariances(plant, controller, **loop), strict=True):
+        assert np.abs(one - simulated).max() < 1e-8 * np.trace(one)
+
+
+def test_rates_that_do_not_divide_each_other():
+    plant = example_plant((THIRD, SELDOM), lines=SHAKES[:1], motions=MOTIONS[:1])
+    assert plant.period == 60
+    controller, loop = closed(plant)
+    budget = plant_budget(loop, plant)
+    *_, noise = simulated_covariances(plant, controller, frames=200)
+    assert np.abs(budget.noise_nm2 - noise).max() < 1e-8 * np.trace(noise)
+
+
+@pytest.mark.parametrize(("age", "period"), [(0, 1), (1, 1), (1.4, 1), (2.4, 2)])
+def test_a_sinusoid_leaves_what_a_run_leaves(age, period):
+    fast = Accelerometer(
+        name="mirror",
+        rate_hz=RATE_HZ / period,
+        delay_frames=(1 + age) / period,
+        channels=("m1",),
+        noise_m_s2=2e-3,
+        highpass_hz=5.0,
+    )
+    plant = example_plant((fast, OTHER), motions=({"m1": MOTIONS[0]["m2"]}, {}))
+    controller, loop = closed(plant)
+    hertz, frames = 62.5, 400
+    line = lbt.models.SinusoidalVibration(frequency_hz=hertz, rms_nm=200, direction=(3, 4))
+    truth = Truth(turbulence=None, vibrations=(line,), motions=plant.motions[:1])
+    budget = lbt.residual_budget(loop, truth, frame_means=True)
+    # an accelerometer reads -w^2 times the mean position, turned and weakened, some frames ago
+    wave = 200 * np.sqrt(2) * np.exp(2j * np.pi * hertz / RATE_HZ * np.arange(frames))
+    angle = 2 * np.pi * hertz / RATE_HZ
+    late = np.mean(np.exp(-1j * angle * (age - np.arange(period)))) / (1 + 5.0 / (1j * hertz))
+    read = -1e-9 * (2 * np.pi * hertz) ** 2 * MOTIONS[0]["m2"].factor * late * wave
+    total, added = np.zeros((frames, 2, 2)), np.zeros((frames, 2, 5))
+    for run, part in enumerate((np.real, np.imag)):
+        total[:, run] = part(wave)[:, None] * np.array([0.6, 0.8])
+        added[:, run, 4] = part(read)
+    left = run_loop(plant, controller, total, added)[-16:]  # a period of the line and the sensors
+    covariance = np.einsum("fri,frj->ij", left, left) / 32
+    np.testing.assert_allclose(budget.vibration_nm2, covariance, rtol=1e-8)
+    # what is left is a sum of sinusoids: the line, and what the period mixes it to
+    complex_left = left[:, 0] + 1j * left[:, 1]
+    amplitudes = np.abs(np.fft.fft(complex_left, axis=0)) / 16
+    strongest = np.sort(np.abs(budget.line_amplitudes_nm), axis=0)
+    np.testing.assert_allclose(strongest, np.sort(amplitudes, axis=0)[-4:], rtol=1e-6, atol=1e-6)
+
+
+def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
+    plant = example_plant()
+    controller, loop = closed(plant)
+    truth = Truth(turbulence=[Broad(), None], noise_nm=0.0)
+    budget = lbt.residual_budget(loop, truth, frame_means=True)
+    N, frames, first = 4, 512, 16
+    entries = [(t, first + t, 0) for t in range(N)]
+    total = impulse(first + N + frames, N, 2, entries)
+    left = run_loop(plant, controller, total, np.zeros((len(total), N, 6)))
+    hertz = (np.arange(1000) + 0.5) * RATE_HZ / 2 / 1000
+    powers = np.zeros((len(hertz), 2, 2))
+    for phase in range(N):  # of the residual: at lag j it answers an impulse at phase - j
+        response = np.zeros((len(hertz), 2), dtype=complex)
+        for j in range(frames - N):
+            run = (phase - j) % N
+            response += left[first + run + j, run] * np.exp(
+                -2j * np.pi * hertz[:, None] * j / RATE_HZ
+            )
+        powers += np.real(response[:, :, None] * response.conj()[:, None, :]) / N
+    expected = np.sum(Broad().psd(hertz)[:, None, None] * powers, axis=0) * RATE_HZ / 2 / 1000
+    np.testing.assert_allclose(budget.turbulence_nm2, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_spectra_and_their_ar_models_agree():
+    plant = example_plant()
+    _, loop = closed(plant)
+    for frame_means in (True, False):
+        one, other = (
+            lbt.residual_budget(loop, Truth(turbulence=source), frame_means=frame_means)
+            for source in (Anonymous(AIR, of_means=frame_means), AIR)
+        )
+        for name in ("turbulence_nm2", "within_nm2"):
+            quadrature, exact = getattr(one, name), getattr(other, name)
+            np.testing.assert_allclose(quadrature, exact, rtol=1e-7, atol=1e-6)
+
+
+def test_the_truth_may_have_another_noise_and_gain():
+    plant = example_plant()
+    controller, loop = closed(plant, sensor_gain=0.8)
+    noisy, calm = (
+        lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=noise, sensor_gain=0.8)).noise_nm2
+        for noise in (75.0, 0.0)
+    )
+    *_, whole = simulated_covariances(plant, controller, sensor_gain=0.8)
+    np.testing.assert_allclose(noisy, whole, rtol=1e-7)
+    assert 0 < np.trace(calm) < np.trace(noisy)
+    assert lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.8)).rms_nm > 0
+
+
+def test_an_unstable_loop_has_no_budget():
+    _, loop = closed(example_plant(), sensor_gain=8.0)
+    assert not loop.is_stable
+    with pytest.raises(UnstableLoopError, match=r"an unstable one .* at sensor gain 8\)"):
+        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
+
+
+def test_refusals():
+    plant = example_plant()
+    _, loop = closed(plant)
+    with pytest.raises(ProblemError, match="truth's sensor gain 0.9; got 1"):
+        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.9))
+    with pytest.raises(ProblemError, match="no sensor or channel is called 'm9'"):
+        closed(plant, blind=("m9",))
+    other, _ = closed(example_plant((FAST,)))
+    with pytest.raises(ProblemError, match="6 measurements to 2 commands in a period of 4"):
+        lbt.close_loop(plant.hardware, other)
+    with pytest.raises(ProblemError, match="sensor_gain"):
+        closed(plant, sensor_gain=0.0)
+    drifting = lbt.models.DriftingVibration(
+        start_hz=20, end_hz=30, duration_s=1, damping=0.01, rms_nm=100
+    )
+    with pytest.raises(ProblemError, match="stationary"):
+        lbt.residual_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
+
+
+def test_radii_of_many_gains_are_those_of_their_loops():
+    plant = example_plant(influence_matrix=[[2.0, 0.1], [0.3, 1.0]])
+    controller, _ = closed(plant)
+    gains = np.array([0.2, 0.7, 1.0, 1.7])
+    found = radii_by_gain(plant.hardware, controller)(gains)
+    loops = [closed(plant, sensor_gain=gain)[1].spectral_radius for gain in gains]
+    np.testing.assert_allclose(found, loops, rtol=1e-9)
+
+
+def a_shell(**changes):
+    facts = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 150}
+    return PositionLoop.from_bandwidth(**(facts | {"sampling_hz": 8000.0} | changes))
+
+
+MIRRORS = {"settled": None, "shell": a_shell(), "ramp": a_shell(ramp_samples=4, delay_samples=0)}
+
+
+@pytest.mark.parametrize("delay", [1, 2, 2.25, 2.49, 2.9, 3])
+@pytest.mark.parametrize("mirror", MIRRORS)
+def test_the_image_has_what_a_run_in_small_steps_leaves(mirror, delay):
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
+    controller, hertz = lbt.integrator(path, gain=0.2).controller, np.array([3, 20, 62, 150, 390])
+    powers = sinusoid_powers(path, controller, hertz, (1.0,), frames=150)[:, 0, 0]
+    loop, rms_nm = lbt.close_loop(path, controller), np.array([500.0, 100.0, 50.0, 20.0, 10.0])
+    lines = [sinusoid(f, rms, (1,)) for f, rms in zip(hertz, rms_nm, strict=True)]
+    for line, power in zip(lines, powers, strict=True):
+        budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
+        assert budget.rms_nm**2 == pytest.approx(line.rms_nm**2 * power, rel=1e-4)
+    noise = noise_covariance(path, controller, [15.5], frames=150)[0, 0]
+    whole = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=lines, noise_nm=15.5))
+    assert whole.rms_nm**2 == pytest.approx(rms_nm**2 @ powers + noise, rel=1e-4)
+    assert whole.noise_nm**2 <= noise * (1 + 1e-4)
+    calm = lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=15.5))
+    assert calm.rms_nm**2 == pytest.approx(noise, rel=1e-4)
+    if mirror == "settled":
+        assert calm.within_nm == pytest.approx(0, abs=1e-6)
+        assert whole.within_nm**2 == pytest.approx(
+            rms_nm**2 @ (1 - np.sinc(hertz / 800) ** 2), rel=1e-9
+        )
+
+
+@pytest.mark.parametrize("delay", [2, 2.49])
+@pytest.mark.parametrize("mirror", ["settled", "shell"])
+def test_coupled_modes_have_what_a_run_in_small_steps_leaves(mirror, delay):
+    path = lbt.LoopHardware(
+        frame_rate_hz=800,
+        delay_frames=delay,
+        sensor_matrix=[[1.0, 0.2], [-0.1, 0.7], [0.3, 0.3]],
+        influence_matrix=[[1.0, 0.1], [0.3, 0.8]],
+        mirror=MIRRORS[mirror],
+    )
+    B = 0.3 * np.linalg.pinv(path.sensor @ path.influence) + [[0, 0.05, 0], [0.02, 0, 0]]
+    controller = lbt.Controller(A=np.eye(2), B=B, C=np.eye(2), D=np.zeros((2, 3)), dt_s=1 / 800)
+    along, noise_nm = np.array([0.6, 0.8]), [5.0, 9.0, 15.0]
+    left = 100**2 * sinusoid_powers(path, controller, [62.0], along, frames=150, sensor_gain=0.8)
+    white = noise_covariance(path, controller, noise_nm, frames=150, sensor_gain=0.8)
+    loop = lbt.close_loop(path, controller, sensor_gain=0.8)
+    line = sinusoid(62.0, 100.0, tuple(along))
+    for lines, noise, expected in (((line,), 0.0, left[0]), ((), noise_nm, white)):
+        truth = Truth(turbulence=None, vibrations=lines, noise_nm=noise, sensor_gain=0.8)
+        budget = lbt.residual_budget(loop, truth)
+        assert np.abs(budget.total_nm2 - expected).max() < 1e-4 * np.trace(expected)
+
+
+@pytest.mark.parametrize(("mirror", "delay"), [("settled", 2), ("settled", 2.49), ("shell", 2.25)])
+def test_processes_and_spectra_are_sums_of_waves_in_the_image(mirror, delay):
+    """Of a process each frame has the mean: in the phase there is ``1 / sinc^2`` as much."""
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
+    controller = lbt.integrator(path, gain=0.2).controller
+    x, weight = np.polynomial.legendre.leggauss(60)
+    hertz = 200 * (1 + x)
+    powers = sinusoid_powers(path, controller, hertz, (1.0,), frames=150)[:, 0, 0]
+    share = np.sinc(hertz / 800) ** 2
+    model = lbt.models.ARModel(coefficients=[0.7], driving_rms_nm=30, frame_rate_hz=800)
+    line = lbt.Vibration(frequency_hz=60, damping=0.3, rms_nm=100, direction=(1,))
+    loop, shaken = lbt.close_loop(path, controller), line.ar_model(800).psd(hertz)
+    for truth, density in (
+        (Truth(turbulence=model), model.psd(hertz) / share),
+        (Truth(turbulence=Anonymous(model)), model.psd(hertz)),
+        (
+            Truth(turbulence=None, vibrations=(line,)),
+            shaken * np.sinc(60 / 800) ** 2 / share,
+        ),
+    ):
+        expected = 200 * weight @ (density * powers)
+        assert lbt.residual_budget(loop, truth).rms_nm ** 2 == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("delay", [1, 1.5, 2, 2.25, 2.49, 2.9, 3])
+def test_no_command_follows_a_line_within_a_frame(delay):
+    plant = lbt_axis_plant(delay_frames=delay)
+    line = sinusoid(20, 797, (1,))
+    for gain in (0.05, 0.3):
+        loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=gain).controller)
+        budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
+        floor = 797**2 * (1 - np.sinc(20 / 800) ** 2)
+        assert budget.within_nm**2 == pytest.approx(floor, rel=1e-9)
+        assert budget.rms_nm**2 > floor
+        means = lbt.residual_budget(
+            loop, Truth(turbulence=None, vibrations=(line,)), frame_means=True
+        )
+        assert means.within_nm == 0.0
+
+
+@pytest.mark.parametrize("sensors", [(FAST, OTHER), (OTHER,)])
+def test_a_loop_of_several_sensors_in_the_image(sensors):
+    """At a whole delay: a run in frames leaves the means, and the rest moves within them."""
+    plant = example_plant(sensors)
+    controller, loop = closed(plant)
+    line = sinusoid(62.5, 200, (3, 4))
+    share, frames = np.sinc(62.5 / RATE_HZ), 400
+    wave = share * np.sqrt(2) * 200 * np.exp(2j * np.pi * 62.5 / RATE_HZ * np.arange(frames))
+    total = np.stack([wave.real, wave.imag], axis=1)[:, :, None] * np.array([0.6, 0.8])
+    left = run_loop(plant, controller, total, np.zeros((frames, 2, plant.hardware.n_readings)))
+    means = np.einsum("fri,frj->ij", left[-16:], left[-16:]) / 32
+    budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
+    floor = 200**2 * (1 - share**2) * np.outer([0.6, 0.8], [0.6, 0.8])
+    np.testing.assert_allclose(budget.vibration_nm2, means, rtol=1e-8)
+    np.testing.assert_allclose(budget.within_nm2, floor, rtol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [2, 2.25, 2.49])
+def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
+    plant = example_plant((OTHER,), delay_frames=delay)
+    controller, loop = closed(plant)
+    truth = Truth(turbulence=None, vibrations=(sinusoid(62.5, 100, (3, 4)),))
+    budget = lbt.residual_budget(loop, truth)
+    expected = 100**2 * power_of_two_sensors(plant, controller, 62.5, (0.6, 0.8))
+    np.testing.assert_allclose(budget.vibration_nm2 + budget.within_nm2, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 2.25, 2.49, 2.9])
+@pytest.mark.parametrize("mirror", MIRRORS)
+@pytest.mark.parametrize("frame_means", [False, True])
+def test_an_ensemble_leaves_what_its_loops_leave(mirror, delay, frame_means):
+    sensor = [[1.0, 0.2], [-0.1, 0.7]]
+    path = lbt.LoopHardware(
+        frame_rate_hz=800, delay_frames=delay, mirror=MIRRORS[mirror], sensor_matrix=sensor
+    )
+    B = 0.3 * np.linalg.inv(path.sensor @ path.influence) + [[0, 0.05], [0.02, 0]]
+    controller = lbt.Controller(A=np.eye(2), B=B, C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
+    spectra = [(Broad(), None), (None, SLOW), (QUICK, QUICK), (TABLE, SLOW), None]
+    drawn = [{"damping": 0.01}, {"damping": None}]
+    for spectrum, damped in zip([*spectra, None], [None, None, None, *drawn, None], strict=True):
+        facts = {"frequency_hz": 31.0, "rms_nm": 200.0, "direction": (1, 0.5)}
+        lines, own = [], ()
+        if damped is not None:
+            lines = [lbt.loop.EnsembleVibration(**facts, **damped)]
+            kind = lbt.Vibration if damped["damping"] else lbt.models.SinusoidalVibration
+            own = (kind(**facts, **({k: v for k, v in damped.items() if v})),)
+        gains = [0.7, 1.0]
+        ensemble = lbt.loop.LoopEnsemble(
+            sensor_gain=gains, turbulence=spectrum, noise_nm=9.0, vibrations=lines
+        )
+        found = lbt.loop.ensemble_residuals(controller, path, ensemble, frame_means=frame_means)
+        for i, gain in enumerate(gains):
+            truth = Truth(turbulence=spectrum, noise_nm=9.0, vibrations=own, sensor_gain=gain)
+            loop = lbt.close_loop(path, controller, sensor_gain=gain)
+            budget = lbt.residual_budget(loop, truth, frame_means=frame_means)
+            assert found.rms_nm[i] == pytest.approx(budget.rms_nm, rel=1e-6)
+            for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "within_nm2"):
+                one, other = getattr(found, name)[i], getattr(budget, name)
+                assert np.abs(one - other).max() < 2e-6 * max(np.trace(other), 1e-3), name
+
+
+@pytest.mark.parametrize("mirror", ["settled", "shell"])
+@pytest.mark.parametrize("whole", [2, 3])
+def test_a_fraction_of_a_frame_tends_to_the_whole_delay(whole, mirror):
+    line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1,))
+    slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    truths = [
+        Truth(turbulence=slow),
+        Truth(turbulence=Anonymous(slow)),
+        Truth(turbulence=None, vibrations=(line,)),
+        Truth(turbulence=None, vibrations=(sinusoid(20, 300, (1,)),)),
+        Truth(turbulence=None, noise_nm=15.5),
+    ]
+    controller = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.3).controller
+
+    def budgets(delay):
+        path = lbt.LoopHardware(
+            frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror]
+        )
+        loop = lbt.close_loop(path, controller)
+        return [lbt.residual_budget(loop, truth) for truth in truths]
+
+    here = budgets(whole)
+    for delay in (whole - 1e-7, whole + 1e-7):
+        for one, exact in zip(budgets(delay), here, strict=True):
+            assert one.rms_nm == pytest.approx(exact.rms_nm, rel=2e-6)
+            assert one.within_nm == pytest.approx(exact.within_nm, rel=1e-5, abs=1e-4)

@@ -1,5 +1,7 @@
 """Loops and records that the tests of predictions share."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,16 @@ def a_plant(*, delay=2.0, gain=1.0, mirror=None, sensor=None):
 
 def a_truth(gain=1.0, noise_nm=15.5):
     return lbt.Truth(turbulence=SLOW, vibrations=LINES, noise_nm=noise_nm, sensor_gain=gain)
+
+
+def truth_of_all_moments(**facts):
+    """Return the truth whose lines have, as means over frames, the rms of the plant's."""
+    truth = a_truth(**facts)
+    lines = [
+        replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / RATE))
+        for line in truth.vibrations
+    ]
+    return replace(truth, vibrations=lines)
 
 
 def pseudo_open_loop(y, u, hardware, gain=1.0):

@@ -20,6 +20,7 @@ from lbt_synth.identification.records.columns import Column, seconds_per
 from lbt_synth.identification.records.contents import CLOCKS, Contents, read_contents
 from lbt_synth.identification.records.faults import fill, find_outliers, find_stuck, mark, runs
 from lbt_synth.identification.records.record import BRIDGED_FRAMES
+from lbt_synth.storage.display_unit import M_S2
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
@@ -28,7 +29,6 @@ _NAME = re.compile(r"\w[\w .+-]*$")
 _SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
 _SAME = 1e-7  # relative, between rates that are one
 _FEWEST_READINGS = 4  # that a spline needs
-M_S2 = {"m/s2": 1.0, "mm/s2": 1e-3, "um/s2": 1e-6, "g": 9.80665, "mg": 9.80665e-3}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

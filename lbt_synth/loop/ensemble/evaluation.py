@@ -161,7 +161,7 @@ def ensemble_residuals(
     ... )
     >>> found = lbt.loop.ensemble_residuals(lbt.kalman(plant).controller, plant.hardware, ensemble)
     >>> found.rms_nm.round(1).tolist()
-    [195.4, 181.9, nan]
+    [204.2, 191.7, nan]
     """
     require_instance(hardware, LoopHardware)
     require_instance(ensemble, LoopEnsemble)
@@ -317,13 +317,15 @@ def _sinusoid_nm(
             out[:, modes] = rejected[..., 0]
         rest = np.asarray(1 - share**2)[..., None] / 2
         return out, np.broadcast_to(rest * peak[:, :, None] * peak[:, None], within.shape)
-    for stack, modes in _reached(stacks, peak):
-        pieces, weights, rest = stack.pieces_at(2 * np.pi * f)
-        left = (pieces @ peak[:, None, modes, None])[..., 0]
-        out[:, modes] = mean = np.einsum("g,kgi->ki", weights, left)
-        apart = left - mean[:, None]
-        moved = np.real(np.einsum("g,kgi,kgj->kij", weights, apart, apart.conj())) / 2
-        within[:, modes[:, None], modes] += moved
+    reached = [(stack.pieces_at(2 * np.pi * f), modes) for stack, modes in _reached(stacks, peak)]
+    (_, weights, rest), _ = reached[0]
+    left = np.zeros((len(peak), weights.size, n), dtype=np.complex128)
+    for (pieces, *_), modes in reached:
+        left[..., modes] = (pieces @ peak[:, None, modes, None])[..., 0]
+    left *= np.exp(-2j * np.pi * f * stacks[0].start)[:, None, None]  # the phase in the own hold
+    out = np.einsum("g,kgi->ki", weights, left)
+    apart = left - out[:, None]
+    within += np.real(np.einsum("g,kgi,kgj->kij", weights, apart, apart.conj())) / 2
     within += rest[:, None, None] * peak[:, :, None] * peak[:, None] / 2
     return out, within
 

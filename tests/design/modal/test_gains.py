@@ -15,6 +15,23 @@ from lbt_synth.design.modal.gains import _minimise
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,))
 
 
+def best_of_means(path, truth):
+    """Return the gain, and the residual, of the integrator that leaves least in means of frames."""
+
+    def left(gain):
+        controller = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=path.dt_s)
+        loop = lbt.close_loop(path, controller, sensor_gain=truth.sensor_gain)
+        if not loop.is_stable:
+            return 1e6 * gain
+        return lbt.residual_budget(loop, truth, frame_means=True).rms_nm
+
+    grid = np.geomspace(0.001, 2, 40) / truth.sensor_gain
+    place = int(np.argmin([left(gain) for gain in grid]))  # there may be two minima
+    bounds = grid[place - 1], grid[place + 1]
+    best = minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-9})
+    return best.x, best.fun
+
+
 @pytest.mark.parametrize(
     ("delay", "noise", "sensor_gain"), [(1, 15.5, 1.0), (2, 60.0, 0.6), (2.5, 2.0, 1.3)]
 )
@@ -36,12 +53,11 @@ def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_g
         truth = lbt.Truth(
             turbulence=spectrum, noise_nm=noise, sensor_gain=sensor_gain, vibrations=lines
         )
-        best = lbt.design.optimal_integrator(path, truth)
-        loop = lbt.close_loop(path, best.controller, sensor_gain=sensor_gain)
-        assert found.rms_nm[i] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-6)
-        assert found.gains[i] == pytest.approx(best.gain, rel=1e-4)
+        gain, rms_nm = best_of_means(path, truth)
+        assert found.rms_nm[i] == pytest.approx(rms_nm, rel=1e-6)
+        assert found.gains[i] == pytest.approx(gain, rel=1e-3)
         if isinstance(spectrum, lbt.models.ARModel):  # where the answer is exact, so is this
-            assert found.gains[i] == pytest.approx(best.gain, rel=1e-6)
+            assert found.gains[i] == pytest.approx(gain, rel=1e-5)
     assert not found.limited.any()
 
 
@@ -122,10 +138,7 @@ def test_sharp_peaks_of_arrays_are_those_of_models(damping):
     assert stacked.rms_nm[0] == pytest.approx(single.rms_nm[0], rel=1e-6)
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     truth = lbt.Truth(turbulence=model, noise_nm=15.5)
-    best = lbt.residual_budget(
-        lbt.close_loop(path, lbt.design.optimal_integrator(path, truth).controller), truth
-    )
-    assert stacked.rms_nm[0] == pytest.approx(best.rms_nm, rel=1e-6)
+    assert stacked.rms_nm[0] == pytest.approx(best_of_means(path, truth)[1], rel=1e-6)
 
 
 @pytest.mark.parametrize("bandwidth", [60.0, 250.0])
@@ -137,13 +150,12 @@ def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1, mirror=shell)
     truth = lbt.Truth(turbulence=slow, noise_nm=5.0, sensor_gain=0.8)
-    best = lbt.design.optimal_integrator(path, truth)
-    loop = lbt.close_loop(path, best.controller, sensor_gain=0.8)
+    gain, rms_nm = best_of_means(path, truth)
     known = {"delay_frames": delay, "sensor_gain": 0.8, "mirror": shell, "frame_rate_hz": RATE}
     found = modal_gains([slow], noise_nm=5.0, **known)
     assert (found.hardware.mirror, found.hardware.delay_frames) == (shell, delay)
-    assert found.gains[0] == pytest.approx(best.gain, rel=1e-5)
-    assert found.rms_nm[0] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-6)
+    assert found.gains[0] == pytest.approx(gain, rel=1e-5)
+    assert found.rms_nm[0] == pytest.approx(rms_nm, rel=1e-6)
     closed = integrator_loop(found.gains, **known)
     air = lbt.models.ModalTurbulence.of([slow])
     assert closed.residual_rms_nm(air, noise_nm=5.0)[0] == pytest.approx(found.rms_nm[0], rel=1e-6)

@@ -32,7 +32,8 @@ def test_predicted_error_is_the_closed_loops_residual(delay, order):
     )
     design = lbt.kalman(plant)
     truth = lbt.Truth(turbulence=turbulence, vibrations=(line,), noise_nm=9.0)
-    budget = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), truth)
+    loop = lbt.close_loop(plant.hardware, design.controller)
+    budget = lbt.residual_budget(loop, truth, frame_means=True)
     assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
 
 
