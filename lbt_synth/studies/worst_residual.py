@@ -114,7 +114,7 @@ def guaranteed_residual(
     ...     config.hardware, design, config.truth, error_hz=1.0, sensor_gains=(0.8, 1.2)
     ... )
     >>> round(wide.value_nm), wide.upper_nm / wide.value_nm < 1.01, wide.sensor_gains[0]
-    (80, True, 0.8)
+    (88, True, 0.8)
     """
     require_instance(hardware, LoopHardware, "hardware")
     require_instance(truth, Truth, "truth")

@@ -12,7 +12,13 @@ import lbt_synth as lbt
 from lbt_synth.report.draw import figure_series
 from lbt_synth.report.page.blocks import Chart, Listing, Notice
 from lbt_synth.report.page.html import page_html
-from lbt_synth.report.study import study_page
+from lbt_synth.report.study import (
+    binned_map,
+    cumulative_points,
+    histogram,
+    short_names,
+    study_page,
+)
 from lbt_synth.storage.tables import Cell, Table
 
 
@@ -214,3 +220,42 @@ def test_charts_show_the_numbers_of_the_columns(page):
     at = np.searchsorted(loss.x, 10, side="right") - 1
     expected = 100 * np.mean(100 * (best - sharp)[whole] > loss.x[at] + 1e-9)
     assert loss.y[at] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("n", [1, 5, 400, 401, 50_000])
+def test_points_of_a_distribution_lie_on_it(n):
+    values = np.round(np.random.default_rng(n).normal(size=n), 2)
+    level, part = cumulative_points(values)
+    assert len(level) <= 500
+    assert np.all(np.diff(level) > 0)
+    expected = [np.mean(values <= each) for each in level]
+    np.testing.assert_allclose(part, expected)
+    assert part[-1] == 1
+    assert level[0] == values.min()
+
+
+def test_a_histogram_has_every_sample():
+    values = np.random.default_rng(0).normal(size=1000)
+    edges, part = histogram(values)
+    assert part.sum() == pytest.approx(1)
+    assert len(edges) == len(part) + 1
+
+
+def test_a_map_has_the_mean_of_each_cell():
+    rng = np.random.default_rng(1)
+    x, y = rng.random(4000), rng.choice([1.0, 2.0, 5.0], 4000)
+    result = x * y
+    columns, rows, mean = binned_map(x, y, result)
+    np.testing.assert_array_equal(rows, [1, 2, 5])
+    inner = slice(1, -1)  # the outermost cells hold what is beyond
+    np.testing.assert_allclose(mean[:, inner], np.outer(rows, columns)[:, inner], atol=0.05)
+    edges = np.concatenate(([-np.inf], (columns[:-1] + columns[1:]) / 2, [np.inf]))
+    first = (y == 2) & (x < edges[1])
+    assert mean[1, 0] == pytest.approx(result[first].mean())
+    sparse = binned_map(np.arange(9.0), np.arange(9.0), np.arange(9.0))[2]
+    assert np.isnan(sparse).any()  # a cell without samples
+
+
+def test_short_names_are_different():
+    names = ["a.b.c", "d.b.c", "d.e", "e", "f.g"]
+    assert list(short_names(names).values()) == ["a.b.c", "d.b.c", "d.e", "e", "g"]

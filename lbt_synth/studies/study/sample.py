@@ -73,7 +73,7 @@ def evaluate_samples(
     >>> study = lbt.studies.load_study("examples/study.yaml")
     >>> columns, failures = lbt.studies.evaluate_samples(study, study.values(0, 2), 0)
     >>> columns["kalman.strehl"].round(3).tolist(), columns["kalman.stable"].tolist(), failures
-    ([0.837, 0.821], [1.0, 1.0], [])
+    ([0.831, 0.809], [1.0, 1.0], [])
     """
     columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
     failures: list[Failure] = []
