@@ -189,7 +189,9 @@ def residual_nm(it: Case, plant: lbt.models.TipTiltPlant, real: lbt.models.TipTi
     """Return what the Kalman filter of a plant leaves in the loop of the truth."""
     controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
     loop = lbt.close_loop(real.hardware, controller)
-    return lbt.residual_budget(loop, replace(it.truth, motions=real.motions)).rms_nm
+    return lbt.residual_budget(
+        loop, replace(it.truth, motions=real.motions), frame_means=True
+    ).rms_nm
 
 
 def true_plant(it: Case, *channels: str) -> lbt.models.TipTiltPlant:

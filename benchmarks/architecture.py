@@ -25,7 +25,7 @@ def ratios() -> None:
     for name, design in designs.items():
         low, high = lbt.loop.stable_sensor_gains(PLANT.hardware, design.controller)
         loop = lbt.close_loop(PLANT.hardware, design.controller)
-        budget = lbt.residual_budget(loop, CONFIG.truth)
+        budget = lbt.residual_budget(loop, CONFIG.truth, frame_means=True)
         print(
             f"{name:10s} norm {design.gamma:7.2f} nm, rms {design.rms:7.2f} nm, stable for sensor "
             f"gains {low:.3f} to {high:.3f}, residual {budget.rms_nm:5.1f} nm"
@@ -61,7 +61,9 @@ def turbulence_models() -> None:
             lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=model, noise_nm=CONFIG.noise_nm)
         )
     for name, design in designs.items():
-        budget = lbt.residual_budget(lbt.close_loop(path, design.controller), calm)
+        budget = lbt.residual_budget(
+            lbt.close_loop(path, design.controller), calm, frame_means=True
+        )
         low, high = lbt.loop.stable_sensor_gains(path, design.controller)
         print(
             f"{name:12s} residual {budget.rms_nm:5.1f} nm (turbulence {budget.turbulence_nm:.1f}, "
@@ -88,7 +90,7 @@ def fractional() -> None:
         )
         print(
             f"delay {delay}: estimation error {design.rms:.2f} nm, "
-            f"residual {lbt.residual_budget(loop, model).rms_nm:.2f} nm"
+            f"residual {lbt.residual_budget(loop, model, frame_means=True).rms_nm:.2f} nm"
         )
 
 

@@ -110,7 +110,7 @@ def sensor_row(config: lbt.config.Config, design: lbt.Design, seed: int) -> list
     missing = ("truth",) if design.other_sensors else ()
     own = design.controllers[frozenset(missing)]
     loop = lbt.close_loop(config.hardware, own, sensor_gain=gain, blind=missing)
-    exact = np.sqrt(np.diag(lbt.residual_budget(loop, truth).total_nm2))
+    exact = np.sqrt(np.diag(lbt.residual_budget(loop, truth, frame_means=True).total_nm2))
     tip, tilt = run.rms_nm[:2]
     return [run.strehl, tip, exact[0], tilt, exact[1], run.tip_tilt_gain]
 

@@ -161,7 +161,7 @@ def left(it: Case, controller: lbt.Controller) -> float:
     loop = lbt.close_loop(it.path, controller, sensor_gain=it.truth.sensor_gain)
     if not loop.is_stable:
         return float("inf")
-    return lbt.residual_budget(loop, it.truth).rms_nm ** 2
+    return lbt.residual_budget(loop, it.truth, frame_means=True).rms_nm ** 2
 
 
 def background(it: Case, line: lbt.Vibration) -> float:
@@ -317,7 +317,7 @@ def studied(seed: int, frames: int) -> dict:
     end = time.process_time()
     axis = model.axes[0]
     best = left(it, lbt.kalman(exact_plant(it)).controller)
-    limit = lbt.loop.least_residual(it.path, it.truth).rms_nm ** 2
+    limit = lbt.loop.least_residual(it.path, it.truth, frame_means=True).rms_nm ** 2
     half, other = lbt.identification.split_halves(it.record.stretches(), it.record.frames)
     halved = lbt.identify(it.record, stretches=half)
     gain = halved.sensor_gains[0]

@@ -203,7 +203,7 @@ def attack(seed: int) -> None:
     check(
         "spectral radius", abs(radius(matrix(path, own, gains)) - loop.spectral_radius) < 1e-7, seed
     )
-    budget = lbt.residual_budget(loop, truth)
+    budget = lbt.residual_budget(loop, truth, frame_means=True)
     covariance, sinusoids = integrate(path, own, truth)
     total = np.trace(covariance) + sum(np.sum(np.abs(a) ** 2) / 2 for a in sinusoids)
     check("residual", abs(total / budget.rms_nm**2 - 1) < 2e-5, seed)
@@ -239,7 +239,7 @@ def attack_limit(seed: int) -> None:
         for one in truth.vibrations
     )
     truth = replace(truth, vibrations=lines)
-    limit = lbt.loop.least_residual(path, truth).rms_nm ** 2
+    limit = lbt.loop.least_residual(path, truth, frame_means=True).rms_nm ** 2
     f = np.arange((1 << 16) + 1) * path.frame_rate_hz / (1 << 17)
     air = truth.turbulence
     whole = density(air.coefficients, air.driving_rms_nm, f, path.frame_rate_hz)

@@ -70,7 +70,10 @@ def worst_nm(config: lbt.config.Config, design: lbt.Design) -> float:
     """Return the residual with each line of a band at its worst place in it."""
     loop = lbt.close_loop(config.hardware, design.controller)
     bands = config.method_section("robust").bands
-    total = lbt.residual_budget(loop, replace(config.truth, vibrations=())).rms_nm ** 2
+    total = (
+        lbt.residual_budget(loop, replace(config.truth, vibrations=()), frame_means=True).rms_nm
+        ** 2
+    )
     for shaken in config.truth.vibrations:
         own = next((b for b in bands if b.low_hz <= shaken.frequency_hz <= b.high_hz), None)
         places = [shaken.frequency_hz]
@@ -80,7 +83,9 @@ def worst_nm(config: lbt.config.Config, design: lbt.Design) -> float:
         alone = lbt.Truth(turbulence=None)
         total += max(
             lbt.residual_budget(
-                loop, replace(alone, vibrations=(replace(shaken, frequency_hz=float(f)),))
+                loop,
+                replace(alone, vibrations=(replace(shaken, frequency_hz=float(f)),)),
+                frame_means=True,
             ).rms_nm
             ** 2
             for f in places

@@ -59,7 +59,7 @@ def load(air: str, ratio: float, damping: float) -> lbt.config.Config:
 
 def tip_nm(config: lbt.config.Config, loop: lbt.loop.ClosedLoop) -> float:
     """Return what a loop leaves of tip."""
-    return float(np.sqrt(lbt.residual_budget(loop, config.truth).total_nm2[0, 0]))
+    return float(np.sqrt(lbt.residual_budget(loop, config.truth, frame_means=True).total_nm2[0, 0]))
 
 
 def both_tip_nm(air: str, ratio: float, damping: float) -> float:
@@ -96,7 +96,9 @@ def print_table(what: str, cases: list[tuple[str, str, float]]) -> None:
         design = config.design("kalman")
         loops = [lbt.close_loop(config.hardware, each) for each in (lbt.kalman(alone), design)]
         own, both = (tip_nm(config, loop) for loop in loops)
-        lines = [lbt.residual_budget(loop, config.truth).vibration_nm for loop in loops]
+        lines = [
+            lbt.residual_budget(loop, config.truth, frame_means=True).vibration_nm for loop in loops
+        ]
         run = simulate_sensors(
             design.controllers,
             config.truth,
@@ -106,7 +108,9 @@ def print_table(what: str, cases: list[tuple[str, str, float]]) -> None:
         )
         simulated = float(np.sqrt(np.mean(run.residual_nm[:, :, 0] ** 2)))
         calm = replace(config.truth, vibrations=(), motions=())
-        least = np.sqrt(lbt.loop.least_residual(alone.hardware, calm).variance_nm2[0])
+        least = np.sqrt(
+            lbt.loop.least_residual(alone.hardware, calm, frame_means=True).variance_nm2[0]
+        )
         excess = partial(halving_excess, air=air, damping=damping, half_nm=own / 2)
         halved = brentq(excess, 2, 100, xtol=0.01)
         print(

@@ -125,7 +125,11 @@ def left(truth: lbt.Truth, plant: lbt.models.TipTiltPlant) -> float:
     """Variance that the Kalman filter of a plant leaves of a truth [nm^2]."""
     path = lbt.LoopHardware(frame_rate_hz=RATE)
     loop = lbt.close_loop(path, lbt.kalman(plant).controller, sensor_gain=truth.sensor_gain)
-    return lbt.residual_budget(loop, truth).rms_nm ** 2 if loop.is_stable else float("inf")
+    return (
+        lbt.residual_budget(loop, truth, frame_means=True).rms_nm ** 2
+        if loop.is_stable
+        else float("inf")
+    )
 
 
 def clear(truth: lbt.Truth, line: lbt.Vibration) -> bool:

@@ -77,7 +77,7 @@ def studied(task: tuple[int, float]) -> dict:
     out["time_s"] = time.process_time() - begin
     truth = it.truth
     best = lbt.kalman(loops.exact_plant(it)).controller
-    limit = lbt.loop.least_residual(it.path, truth).rms_nm ** 2
+    limit = lbt.loop.least_residual(it.path, truth, frame_means=True).rms_nm ** 2
     last, every = (frames, whole.frames), (0, whole.frames)
     later = [replayed(it, each, every, last)[0] for each in (found.design.controller, best)]
     # the test that auto makes, of a filter whose residual is known exactly

@@ -44,7 +44,7 @@ def residual_nm(design: lbt.Design, record: lbt.identification.LoopRecord, truth
     """Return what a design leaves in the true loop; infinite if that is unstable."""
     path = lbt.LoopHardware(frame_rate_hz=record.frame_rate_hz)
     loop = lbt.close_loop(path, design.controller, sensor_gain=truth.sensor_gain)
-    return lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else np.inf
+    return lbt.residual_budget(loop, truth, frame_means=True).rms_nm if loop.is_stable else np.inf
 
 
 def main() -> None:

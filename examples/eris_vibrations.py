@@ -162,7 +162,9 @@ def residual(loop: lbt.loop.ClosedLoop, met: Disturbance) -> dict[str, np.ndarra
     """Return the covariances [nm^2] that each part of the disturbance and the noise leave."""
 
     def left(spectra: tuple[lbt.models.Spectrum, ...] | None, noise_nm: float = 0.0) -> np.ndarray:
-        budget = lbt.residual_budget(loop, lbt.Truth(turbulence=spectra, noise_nm=noise_nm))
+        budget = lbt.residual_budget(
+            loop, lbt.Truth(turbulence=spectra, noise_nm=noise_nm), frame_means=True
+        )
         return np.asarray(budget.total_nm2)
 
     parts = {
@@ -287,7 +289,7 @@ def main(folder: str = "out", averages: int = AVERAGES) -> None:
 
     print("\nunder the spectrum of the file")
     print_table({name: residual(loop, met) for name, loop in loops.items()})
-    limit = lbt.loop.least_residual(plant.hardware, met.whole)
+    limit = lbt.loop.least_residual(plant.hardware, met.whole, frame_means=True)
     print(f"{'any linear controller':28s}{'at least':>44s}{limit.rms_nm:11.1f}", end="")
     best = np.diag(limit.variance_nm2)
     print("".join(f"{value:9.1f}" for value in strehls(best)))

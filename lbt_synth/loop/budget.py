@@ -203,8 +203,8 @@ def line_covariance(loop: ClosedLoop, line: Vibration) -> FloatArray:
 
 
 def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
-    """Covariance of what noise of covariance ``factor factor'`` leaves, in means over frames."""
-    return np.asarray(_view(loop, frame_means=True).of_noise(factor)[0])
+    """Covariance of what noise of covariance ``factor factor'`` leaves in the image, (n, n)."""
+    return np.asarray(np.sum(_view(loop, frame_means=False).of_noise(factor), axis=0))
 
 
 def _make_budget(

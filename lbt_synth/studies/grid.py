@@ -36,7 +36,7 @@ Rows = tuple[int, int]  # the first, and the one after the last
 Failure = tuple[int, str, str]  # a row, the controller without a result on it, and why
 Result = tuple[dict[str, FloatArray], list[Failure]]  # columns of some rows (b,), and failures
 RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what has them
-    name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm")
+    name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
 }
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
 _DELETE = "Delete it, and it is computed again."

@@ -77,6 +77,7 @@ class RobustnessRow:
     vibration_nm: float = nm_column("vibration", help="Its part of vibrations, rms")
     turbulence_nm: float = nm_column("turbulence", help="Its part of turbulence, rms")
     noise_nm: float = nm_column("noise", help="Its part of noise, rms")
+    within_nm: float = nm_column("within frames", help="Its part that moves within frames, rms")
     stable: bool = column("stable", help="Whether the loop is stable with the real sensor gain")
     gamma: float = column(unit="nm", help="H-infinity norm that the design achieves")
 

@@ -94,7 +94,7 @@ def test_an_estimate(tmp_path, monkeypatch):
     cost = estimate(loaded, 1)
     assert 4 < cost.seconds < 9
     assert cost.measured_rows >= 1000
-    assert cost.disk_bytes == 5000 * (13 * 8 + 8 * 6)
+    assert cost.disk_bytes == 5000 * (13 * 9 + 8 * 7)
     assert estimate(loaded, 100).seconds < 0.09
 
 

@@ -39,13 +39,13 @@ def test_design_and_show_give_the_residual_in_the_truth(tmp_path, capsys, config
         assert ours["residual_nm"] == pytest.approx(exact.rms_nm)
         assert ours["strehl"] == pytest.approx(lbt.strehl(exact, config.imaging))
         assert [row["design"] for row in others] == ["integrator", "hinf"]  # it is kalman itself
-        assert data["truth_limit_nm"] == pytest.approx(10.8414, abs=1e-4)
+        assert data["truth_limit_nm"] == pytest.approx(37.7777, abs=1e-4)
         assert data["wavelength_um"] == 2.2
-        assert data["residual_nm"] == pytest.approx(192.619, abs=1e-3)  # in its model
+        assert data["residual_nm"] == pytest.approx(205.143, abs=1e-3)  # in its model
     status, text, _ = run(capsys, "show", gain)
     assert status == 0
     assert "In the truth of k.fits; Strehl ratio at 2.2 um" in text
-    assert "least residual of any linear controller in the truth: 10.8414 nm rms" in text
+    assert "least residual of any linear controller in the truth: 37.7777 nm rms" in text
 
 
 def test_the_wavelength_is_that_of_the_file(tmp_path, capsys):
@@ -62,7 +62,10 @@ def test_a_residual_that_the_design_does_not_expect_is_a_warning(tmp_path, capsy
     still = LBT_YAML.with_name("lbt_robust.yaml")  # its model has no vibration
     status, text, _ = run(capsys, "design", still, "--method", "kalman", "-o", gain)
     assert status == 0
-    assert "warning: the truth leaves 776 nm where the design expects 12 nm" in text
+    assert (
+        "warning: the truth leaves 776 nm in means over frames, where the design expects 12 nm"
+        in text
+    )
     drifts = tmp_path / "drifts.yaml"
     moving = (
         "{kind: drift, axis: tip, frequency_hz: 20.0, end_hz: 21.0, duration_s: 9, rms_mas: 80.0}"

@@ -37,9 +37,9 @@ def test_robustness_rows(config):
     budget = lbt.residual_budget(lbt.close_loop(moved.hardware, moved.controller), config.truth)
     assert kalman[3].residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
     for row in rows:
-        parts = row.vibration_nm**2 + row.turbulence_nm**2 + row.noise_nm**2
-        # no command follows what moves within frames
-        assert row.residual_nm**2 - parts == pytest.approx(budget.within_nm**2)
+        parts = row.vibration_nm**2 + row.turbulence_nm**2 + row.noise_nm**2 + row.within_nm**2
+        assert row.residual_nm**2 == pytest.approx(parts)
+        assert row.within_nm == pytest.approx(budget.within_nm)  # no command follows it
 
 
 def test_unstable_rows_say_so(config):

@@ -259,7 +259,7 @@ def design_report(
     >>> report = lbt.report.design_report(config, {"integrator": slow})
     >>> one = report.assessments[0]
     >>> one.certified, f"{one.residual_nm:.0f} nm, Strehl {one.strehl:.2f}"
-    (True, '152 nm, Strehl 0.70')
+    (True, '156 nm, Strehl 0.70')
     """
     require_instance(config, Config)
     if not 1 <= len(designs) <= _MOST_DESIGNS:

@@ -60,6 +60,9 @@ class AssessmentRow:
         "", unit="nm rms", help="of that vibration", default=None
     )
     noise_nm: float | None = nm_column("", unit="nm rms", help="of that noise", default=None)
+    within_nm: float | None = nm_column(
+        "", unit="nm rms", help="of that within frames", default=None
+    )
     strehl: float = percent_column("Strehl", help="Strehl ratio, exact")
     strehl_simulated: float | None = percent_column("", help="Strehl ratio, simulated")
     worst_strehl: float = percent_column("worst Strehl", help="worst Strehl ratio")
@@ -184,7 +187,7 @@ def _certificate_sentence(report: DesignReport) -> str:
 _DESIGN = ("method", "route", "n_states", "multiplications", "gamma", "estimation_rms", "certified")
 _LOOP = (
     *("stable", "spectral_radius", "residual_nm", "turbulence_nm", "vibration_nm", "noise_nm"),
-    *("strehl", "strehl_simulated"),
+    *("within_nm", "strehl", "strehl_simulated"),
 )
 _GOOD = "within 10 % of its best Strehl ratio [Hz]"
 _MARGINS = (

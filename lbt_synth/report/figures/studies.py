@@ -68,6 +68,7 @@ def robustness_figure(
     ...     vibration_nm=10.0,
     ...     turbulence_nm=20.0,
     ...     noise_nm=30.0,
+    ...     within_nm=15.0,
     ...     stable=True,
     ...     gamma=190.0,
     ... )

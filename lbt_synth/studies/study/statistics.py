@@ -17,7 +17,7 @@ PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
 LEVELS = (0.3, 0.5, 0.7, 0.8)
 CONFIDENCE = 0.95
 _MOST_WORST = 10  # samples that are listed
-_PARTS = ("turbulence", "vibration", "noise")
+_PARTS = ("turbulence", "vibration", "noise", "within")
 _EQUAL = 1e-6  # difference of Strehl ratios that is rounding: the accuracy of the evaluation
 _FEWEST = 20  # samples for an index
 _CONSTANT = 1e-12  # of the largest result: a smaller scatter is rounding
@@ -120,7 +120,8 @@ def study_statistics(
     columns : mapping of str to (n,) array_like
         Results: each parameter under its name and, for each controller, ``NAME.strehl`` (nan
         where unstable or failed), ``NAME.residual_nm`` and ``NAME.stable`` (1, 0; nan where the
-        evaluation failed); ``NAME.turbulence_nm``, ``NAME.vibration_nm``, ``NAME.noise_nm`` and
+        evaluation failed); ``NAME.turbulence_nm``, ``NAME.vibration_nm``, ``NAME.noise_nm``,
+        ``NAME.within_nm`` and
         ``row`` (number of the sample) are optional.
     parameters : sequence of str
         Names of the parameters.

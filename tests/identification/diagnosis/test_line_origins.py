@@ -99,7 +99,8 @@ def test_squares_add_up_to_the_budget(found):
         ("running_nm", lbt.Controller(A=1.0, B=0.2, C=1.0, D=0.0, dt_s=1e-3)),
         ("best_nm", found.best_design.controller),
     ):
-        exact = lbt.loop.model_budget(lbt.close_loop(plant.hardware, controller), plant)
+        loop = lbt.close_loop(plant.hardware, controller)
+        exact = lbt.loop.model_budget(loop, plant, frame_means=True)
         values = {row.part: getattr(row, field) for row in found.costs}
         assert values["all"] == pytest.approx(exact.rms_nm, rel=1e-6)
         assert values["measurement noise"] == pytest.approx(exact.noise_nm, rel=1e-6)

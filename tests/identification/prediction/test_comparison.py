@@ -123,7 +123,8 @@ def test_the_table():
     np.testing.assert_allclose(rows[-1][1:3], limit.model_axis_nm)
     best = lbt.design.model_integrator(plant)
     loop = lbt.close_loop(plant.hardware, best.controller)
-    assert table["best integrator"].model_nm == lbt.loop.model_budget(loop, plant).rms_nm
+    exact = lbt.loop.model_budget(loop, plant, frame_means=True)
+    assert table["best integrator"].model_nm == exact.rms_nm
     unknown = lbt.identification.prediction_against_data(plant, z, {}, measurements=y)["what ran"]
     assert unknown.model_nm2 is None
     assert np.isnan([unknown.model_nm, unknown.ratio, unknown.deviations]).all()
@@ -247,7 +248,10 @@ def test_more_noise_than_the_data_has_is_a_note():
     [
         ({"controllers": {"best integrator": lbt.integrator(PATH, gain=0.3)}}, "may not be called"),
         ({"controllers": {1: lbt.integrator(PATH, gain=0.3)}}, "may not be called 1"),
-        ({"controllers": {"mine": PATH}}, "expected a Controller; got LoopHardware"),
+        (
+            {"controllers": {"mine": PATH}},
+            "controller must be a Controller, or a design; got LoopHardware",
+        ),
         ({"fit": [(0, 900)]}, "fit and test must both be given"),
         ({"fit": [(0, 900)], "test": [(800, 2000)]}, "frames that the fit has not"),
         ({"fit": [(0, 900)], "test": [(900, 2001)]}, "within 2000 frames"),

@@ -64,7 +64,7 @@ def test_the_verdict(exploration):
         lbt.close_loop(view.config.hardware, view.design.controller), view.config.truth
     )
     text = judge(view)
-    assert text.startswith(f"Kalman leaves {budget.rms_nm:.1f} nm rms, Strehl ratio 83.6 %")
+    assert text.startswith(f"Kalman leaves {budget.rms_nm:.1f} nm rms, Strehl ratio 82.7 %")
     assert "above the least of any linear controller" in text
     assert "Margins: modulus 0." in text
     assert text.endswith("checks of its certificate passed.")

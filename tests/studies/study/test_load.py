@@ -32,12 +32,13 @@ def test_controllers(tmp_path):
         "hinf (gamma_ratio 1.5) for each sample",
     ]
     assert d.gain == optimal_integrator(study.config.hardware, study.config.truth).gain
-    assert study.result_columns[:6] == (
+    assert study.result_columns[:7] == (
         "a.strehl",
         "a.residual_nm",
         "a.turbulence_nm",
         "a.vibration_nm",
         "a.noise_nm",
+        "a.within_nm",
         "a.stable",
     )
     assert study.columns[:2] == ("row", ONE)

@@ -93,7 +93,7 @@ def test_a_point_is_what_the_library_says(tmp_path):
         for name, design in (("fixed", fixed), ("own", lbt.kalman(plant))):
             loop = lbt.close_loop(hardware, design.controller, sensor_gain=0.7)
             budget = lbt.residual_budget(loop, truth)
-            for column in ("residual_nm", "turbulence_nm", "vibration_nm", "noise_nm"):
+            for column in ("residual_nm", "turbulence_nm", "vibration_nm", "noise_nm", "within_nm"):
                 expected = getattr(budget, column.replace("residual", "rms"))
                 assert columns[f"{name}.{column}"][i] == pytest.approx(expected, rel=1e-9)
             expected = lbt.strehl(budget, config.imaging)
