@@ -3,6 +3,7 @@
 import base64
 import re
 import sys
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -269,16 +270,21 @@ def test_the_keyboard_reaches_the_content(browser, pages):
 @pytest.mark.browser
 def test_the_accessibility_tree_names_what_matters(browser, pages):
     opened(browser, pages["marks"])
-    nodes = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
-    named = {}
-    for node in nodes:
-        if not node.get("ignored"):
-            role = node["role"]["value"]
-            named.setdefault(role, []).append(node.get("name", {}).get("value", ""))
+    titles, named = {chart.title for chart in every_mark()}, {}
+    for _ in range(20):  # the tree is made beside the page
+        nodes = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+        named = {}
+        for node in nodes:
+            if not node.get("ignored"):
+                role = node["role"]["value"]
+                named.setdefault(role, []).append(node.get("name", {}).get("value", ""))
+        if titles <= set(named.get("figure", ())):
+            break
+        time.sleep(0.5)
     for role in ("figure", "table", "link", "heading", "main", "navigation"):
         assert named[role], role
         assert all(name.strip() for name in named[role] if role != "main"), role
-    assert set(named["figure"]) >= {chart.title for chart in every_mark()}
+    assert set(named["figure"]) >= titles
 
 
 def test_the_same_page_is_the_same_file():
