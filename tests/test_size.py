@@ -24,16 +24,16 @@ LINES = {
     "loop": 5039,
     "methods": 1109,
     "models": 4550,
-    "report": 5793,
+    "report": 5797,
     "storage": 1263,
-    "studies": 3947,
+    "studies": 3951,
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 399,
-    "public names": 267,
+    "files of the package": 321,
+    "public names": 259,
     "tuned constants": 933,
-    "lines of tests": 42500,
+    "lines of tests": 42920,
     "words of docs": 72412,
 }
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
+from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import PANEL_IN, Panel, drawing
 from lbt_synth.report.page.blocks import (
     Block,
@@ -290,9 +290,9 @@ def _controllers_section(
     """List the controllers, with digests of what is the same for all samples, and failures."""
     origins = {name: section.text for name, section in study.settings.controllers.items()}
     digests = {
-        name: digest({matrix: getattr(each.controller, matrix) for matrix in "ABCD"}, {})
+        name: digest({matrix: getattr(design.controller, matrix) for matrix in "ABCD"}, {})
         for name, each in study.controllers.items()
-        if isinstance(each, Design)
+        if (design := fixed_design(each)) is not None
     }
     rows = tuple(
         (

@@ -17,7 +17,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, refuse_config
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
-from lbt_synth.methods.request import DesignRequest, Wording, design_request
+from lbt_synth.methods.request import DesignRequest, Wording, design_request, fixed_design
 from lbt_synth.studies.study.run import read_designs
 from lbt_synth.studies.study.sample import close_sample_loop, make_sample
 from lbt_synth.studies.study.study import (
@@ -113,10 +113,10 @@ def load_study(
         },
     )
     for name, controller in study.controllers.items():
-        if isinstance(controller, Design):
+        if (design := fixed_design(controller)) is not None:
             for where, sample in samples:
                 with refuse_config(f"{source}: controllers.{name}, {where}"):
-                    close_sample_loop(sample, controller)
+                    close_sample_loop(sample, design)
     return study
 
 

@@ -26,7 +26,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest
-from lbt_synth.methods.request import DesignRequest
+from lbt_synth.methods.request import fixed_design
 from lbt_synth.storage.atomic_files import (
     UNFINISHED,
     exclusive_lock,
@@ -367,7 +367,7 @@ def _write_files(
     own = {
         folder / f"row_{row}_{name}.fits": controller
         for name, controller in study.controllers.items()
-        if isinstance(controller, DesignRequest)
+        if fixed_design(controller) is None
     }
     refuse_replacing([path, *own], study.inputs)
     files = []

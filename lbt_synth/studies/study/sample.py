@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from lbt_synth.loop import ClosedLoop, simulate
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 from lbt_synth.loop.simulation.run import settling_frames
-from lbt_synth.methods.request import DesignRequest
+from lbt_synth.methods.request import DesignRequest, fixed_design
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import Failure, Result, loop_columns, stack_columns
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
@@ -102,10 +103,11 @@ def are_evaluated_together(study: Study, controller: Design | DesignRequest) -> 
     """Whether many samples of a controller can be evaluated at once."""
     if study.settings.evaluation != "exact":
         return False
-    if isinstance(controller, Design):
-        return not controller.other_sensors
+    if (design := fixed_design(controller)) is not None:
+        return not design.other_sensors
     # a Kalman filter without options, designed for each sample
-    plain = controller.method.batched and not controller.given
+    request = cast("DesignRequest", controller)
+    plain = request.method.batched and not request.given
     return plain and not study.config.hardware.suite.sensors
 
 
@@ -116,8 +118,8 @@ def _evaluate_groups(
     if not are_evaluated_together(study, controller):
         return
     fixed = None  # the matrices of one design for all
-    if isinstance(controller, Design):
-        fixed = textbook_matrices([controller.controller])
+    if (design := fixed_design(controller)) is not None:
+        fixed = textbook_matrices([design.controller])
     reads = ensemble.read_config(study.config, designs=fixed is None)
     for rows in _find_groups(study, values, reads):
         try:
@@ -241,7 +243,8 @@ def _note_failure(failures: list[Failure], row: int, controllers: Iterable[str])
 
 def design_for_sample(controller: Design | DesignRequest, sample: Sample) -> Design:
     """Return a controller's design, made for the sample if it has none for all."""
-    return controller if isinstance(controller, Design) else sample[0].design(controller)
+    design = fixed_design(controller)
+    return sample[0].design(cast("DesignRequest", controller)) if design is None else design
 
 
 def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:

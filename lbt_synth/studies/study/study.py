@@ -17,7 +17,7 @@ from lbt_synth.config.samples import Keys, parse_path
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.methods.method import Section
-from lbt_synth.methods.request import DesignRequest
+from lbt_synth.methods.request import DesignRequest, fixed_design
 from lbt_synth.studies.grid import RESIDUALS
 from lbt_synth.validation import FloatArray, IntArray, integer
 
@@ -250,9 +250,10 @@ class Study:
     def designed(self) -> dict[str, Design]:
         """The controllers that the study designs once, for all samples."""
         return {
-            name: controller
+            name: design
             for name, controller in self.controllers.items()
-            if self.settings.controllers[name].file is None and isinstance(controller, Design)
+            if self.settings.controllers[name].file is None
+            and (design := fixed_design(controller)) is not None
         }
 
     @property
