@@ -32,9 +32,9 @@ LINES = {
 COUNTS = {
     "files of the package": 321,
     "public names": 259,
-    "tuned constants": 933,
+    "tuned constants": 857,
     "lines of tests": 42920,
-    "words of docs": 72412,
+    "words of docs": 75543,
 }
 
 
