@@ -317,15 +317,16 @@ def loop_variances(plant: TipTiltPlant, controller: Controller) -> tuple[float, 
     command_C = np.hstack([loop.D[u, :n] @ held @ model.A, loop.C[u]])
     command_D = loop.D[u, :n] @ held @ model.B + loop.D[u, n:] @ model.D
     shape, first = hardware.influence, states + controller.n_states
-    core = slice(first, first + pieces.C.shape[1] * m)
-    power = 0.0
-    for L, position, direct in zip(*pieces, strict=True):
-        C, D = -direct * shape @ command_C, -direct * shape @ command_D
-        C[:, :states] += L @ model.A
-        C[:, core] -= np.kron(position, shape)
-        power += float(np.sum(output_variances(C, D + L @ model.B, root)))
+    hold = hardware.mirror_system.hold
+    root_length = np.sqrt(hold.weights)[:, None, None]
+    positions = hold.positions(shape, (command_C, command_D), first)
+    C, D = (-root_length * rows for rows in positions)
+    C[..., :states] += pieces.L @ model.A
+    D += pieces.L @ model.B
+    C, D = C.reshape(-1, C.shape[-1]), D.reshape(-1, D.shape[-1])
+    power = np.sum(output_variances(C, D, root))
     commands = output_variances(shape @ command_C, shape @ command_D, root)
-    return power, float(np.sum(commands))
+    return float(power), float(np.sum(commands))
 
 
 class Regulator(NamedTuple):

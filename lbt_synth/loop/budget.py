@@ -15,7 +15,7 @@ Nothing lies above half the frame rate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -95,8 +95,7 @@ def residual_budget(loop: ClosedLoop, truth: Truth, *, frame_means: bool = False
     view = _view(loop, frame_means=frame_means)
     turbulence, vibration = np.zeros((2, 2, n, n))
     for spectrum, modes in truth.turbulence_groups(n):
-        for mode in modes:
-            turbulence += view.of_spectrum(spectrum, _entry(loop, mode))
+        turbulence += view.of_spectrum(spectrum, _entry(loop, modes))
     lines = stationary_vibrations(truth.vibrations)
     amplitudes: list[ComplexArray] = []
     moving = _motions(loop, truth.motions, len(lines))
@@ -175,7 +174,7 @@ def plant_budget(
     view = _view(loop, frame_means=frame_means)
     turbulence, vibration = np.zeros((2, 2, loop.hardware.modes, loop.hardware.modes))
     for mode, model in enumerate(plant.turbulence):
-        turbulence += view.of_spectrum(model, _entry(loop, mode))
+        turbulence += view.of_spectrum(model, _entry(loop, [mode]))
     moving = _motions(loop, plant.motions, len(plant.vibrations))
     for line, motion in zip(plant.vibrations, moving, strict=True):
         vibration += view.of_line(line, motion, of_means=True)
@@ -189,7 +188,7 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
     """
     systems = [_noise_system(loop, loop.system, plant.own_noise_factor)]
     for mode, model in enumerate(plant.turbulence):
-        systems.append(_driven_system(loop.system, ar_process(model), _entry(loop, mode)))
+        systems.append(_driven_system(loop.system, ar_process(model), _entry(loop, [mode])))
     for line, motion in zip(plant.vibrations, plant.motions, strict=True):
         process, entry = _shaken(loop, line, motion)
         systems.append(_driven_system(loop.system, process, entry))
@@ -239,14 +238,15 @@ class _View:
     in_image: bool  # whether what moves within a frame counts
 
     def of_spectrum(self, spectrum: Spectrum, entry: FloatArray) -> FloatArray:
-        """Return what a spectrum leaves, or a sampled process, that enters as given."""
+        """Return what phases of a spectrum leave, or of a sampled process, one for each column."""
         if isinstance(spectrum, ARModel):
             require_loop_rate(spectrum.frame_rate_hz, self.loop.hardware)
-            return self.of_process(ar_process(spectrum), entry)
+            process = ar_process(spectrum)
+            return np.asarray(sum(self.of_process(process, one[:, None]) for one in entry.T))
 
         def density(frequency: FloatArray) -> FloatArray:
             pieces, rest = self._residuals(frequency, entry)
-            power = self._powers(pieces[..., None], rest, entry)
+            power = self._powers(pieces, rest, entry)
             return np.asarray(spectrum_density(spectrum, frequency)[:, None, None, None] * power)
 
         kinks = breakpoints_below(spectrum, self.loop.hardware.frame_rate_hz / 2)
@@ -284,7 +284,7 @@ class _View:
                 phase = means[:, None, :, None, None] * moving[:, :, None, None]
                 pieces = phase * entry[:n, :1] - positions
             power = np.sum(np.abs(moving) ** 2, axis=2)[:, 0] * rest
-            return 2 / rate * self._powers(pieces, power, entry)
+            return 2 / rate * self._powers(pieces, power, entry[:, :1])
 
         edges = panel_edges(_roots(process.poles, process.period), rate)
         return out + self._integral(density, edges[(edges > 0) & (edges < rate / 2)])
@@ -298,8 +298,8 @@ class _View:
         """
         entry = _sinusoid_entry(self.loop, line, motion)
         pieces, rest = self._residuals(np.array([line.frequency_hz]), entry)
-        within = line.rms_nm**2 * self._powers(pieces[..., None], rest, entry)[0, 1]
-        mean = np.einsum("g,tgi->ti", self._weights, pieces[0])
+        within = line.rms_nm**2 * self._powers(pieces, rest, entry)[0, 1]
+        mean = np.einsum("g,tgi->ti", self._weights, pieces[0, ..., 0])
         if self.pieces is not None:  # with the phase that it has in its own hold
             turn = line.frequency_hz / self.loop.hardware.frame_rate_hz * self.pieces.start
             mean = mean * np.exp(-2j * np.pi * turn)
@@ -331,19 +331,22 @@ class _View:
     def _residuals(
         self, frequency_hz: FloatArray, entry: FloatArray | ComplexArray
     ) -> tuple[ComplexArray, FloatArray]:
-        """Residual in each piece of a unit phase, (f, N, g, n), and the power within, (f,)."""
-        n = self.loop.hardware.modes
-        used = np.flatnonzero(entry[:, 0])
+        """Residual in each piece of unit phases, (f, N, g, n, w), and the power within, (f,).
+
+        The phases enter by the columns (n + q, w).
+        """
+        n, width = self.loop.hardware.modes, entry.shape[1]
+        used = np.flatnonzero(np.any(entry, axis=1))
         s = replace(self.system, B=self.system.B[..., used], D=self.system.D[..., used])
         share = np.ones(len(frequency_hz))  # of a unit phase that the mean over a frame is
         means, rest = self._phase_means(frequency_hz)
         if self.in_image:
             share = np.sinc(frequency_hz / self.loop.hardware.frame_rate_hz)
-        enters = np.where(used < n, share[:, None], 1.0) * entry[used, 0]
-        response = np.einsum("ftiu,fu->fti", s.phase_response(frequency_hz), enters)
-        pieces = response.reshape(*response.shape[:2], -1, n)
+        enters = np.where(used < n, share[:, None], 1.0)[..., None] * entry[used]
+        response = np.einsum("ftiu,fuw->ftiw", s.phase_response(frequency_hz), enters)
+        pieces = response.reshape(*response.shape[:2], -1, n, width)
         if self.pieces is not None:
-            pieces = means[:, None, :, None] * entry[:n, 0] - pieces
+            pieces = means[:, None, :, None, None] * entry[:n] - pieces
         return pieces, rest * self.in_image
 
     def _powers(self, pieces: ComplexArray, rest: FloatArray, entry: Any) -> FloatArray:
@@ -355,8 +358,8 @@ class _View:
         out = np.empty((len(pieces), 2, n, n))
         out[:, 0] = scale * np.real(np.einsum("ftiw,ftjw->fij", mean, mean.conj()))
         out[:, 1] = scale * np.real(np.einsum("g,ftgiw,ftgjw->fij", w, apart, apart.conj()))
-        along = np.real(entry[:n, 0])
-        out[:, 1] += rest[:, None, None] * np.outer(along, along)
+        along = np.real(entry[:n])
+        out[:, 1] += rest[:, None, None] * (along @ along.T)
         return out
 
     def _integral(
@@ -373,14 +376,10 @@ def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
     if frame_means or (hardware.mirror is None and hardware.delay_frames % 1 == 0):
         rows = replace(s, C=s.C[..., :n, :], D=s.D[..., :n, :])
         return _View(loop, _balanced(rows), None, not frame_means)
-    mirror, m = hardware.mirror_system, hardware.n_commands
-    command = slice(n, n + m)
-    first = loop.controller.n_states  # the states of the mirror follow those of the controller
-    core = slice(first, first + mirror.core.n_states * m)
-    pieces, N = mirror.hold, hardware.influence
-    C = np.einsum("g,im,...ms->...gis", pieces.D, N, s.C[..., command, :])
-    C[..., core] += np.einsum("gs,im->gism", pieces.C, N).reshape(len(pieces.D), n, -1)
-    D = np.einsum("g,im,...mw->...giw", pieces.D, N, s.D[..., command, :])
+    pieces, command = hardware.mirror_system.hold, slice(n, n + hardware.n_commands)
+    # the states of the mirror follow those of the controller
+    first, commands = loop.controller.n_states, (s.C[..., command, :], s.D[..., command, :])
+    C, D = pieces.positions(hardware.influence, commands, first)
     shape = len(pieces.D) * n
     C, D = C.reshape(*s.C.shape[:-2], shape, -1), D.reshape(*s.D.shape[:-2], shape, s.D.shape[-1])
     return _View(loop, _balanced(replace(s, C=C, D=D)), pieces, True)
@@ -391,9 +390,9 @@ def _balanced(system: StateSpace) -> StateSpace:
     return system.balanced() if system.period == 1 else system
 
 
-def _entry(loop: ClosedLoop, mode: int) -> FloatArray:
-    """Return how the phase of a mode enters a loop, (n + q, 1)."""
-    return np.eye(loop.system.B.shape[-1], 1, -mode)
+def _entry(loop: ClosedLoop, modes: Sequence[int]) -> FloatArray:
+    """Return how the phases of modes enter a loop, (n + q, w)."""
+    return np.eye(loop.system.B.shape[-1])[:, list(modes)]
 
 
 def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:

@@ -150,15 +150,12 @@ class LoopStack:
 
         Return also their lengths [frames], (g,), and the power that moves within them, (k,).
         """
-        n, N, hold = self.C.shape[1], self.part.influence, self.hold or _STILL
-        f, first = turn / (2 * np.pi), self.part.matrices[0].shape[-1]
-        core = slice(first, first + hold.C.shape[1] * N.shape[1])
-        C = np.einsum("g,im,kms->kgis", hold.D, N, self.command_C)
-        C[..., core] += np.einsum("gs,im->gism", hold.C, N).reshape(len(hold.D), n, -1)
-        D = np.einsum("g,im,kmj->kgij", hold.D, N, self.command_D[..., :n])
+        n, f, hold = self.C.shape[1], turn / (2 * np.pi), self.hold or _STILL
+        commands, first = (self.command_C, self.command_D), self.part.matrices[0].shape[-1]
+        C, D = hold.positions(self.part.influence, commands, first)
         pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
         states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
-        positions = (C @ states[:, None] + D) * np.sinc(f)[:, None, None, None]
+        positions = (C @ states[:, None] + D[..., :n]) * np.sinc(f)[:, None, None, None]
         late = np.exp(2j * np.pi * f * (self.start - hold.start - 0.5))
         means = hold.phase_means(f) * late[:, None]
         phase = means[..., None, None] * np.eye(n)

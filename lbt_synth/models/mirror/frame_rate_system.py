@@ -95,6 +95,20 @@ class Hold:
         """Lengths of the pieces [frames], (g,)."""
         return np.diff(self.edges)
 
+    def positions(
+        self, influence: FloatArray, commands: tuple[FloatArray, FloatArray], first: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return C (..., g, n, s) and D (..., g, n, w) of the mean positions in a loop.
+
+        The commands are its rows (..., m, s) and (..., m, w); the states of the core, one set a
+        command, begin at the ``first`` of its states. The influence matrix is (n, m).
+        """
+        C, D = (np.einsum("g,im,...ms->...gis", self.D, influence, rows) for rows in commands)
+        core = slice(first, first + self.C.shape[1] * influence.shape[1])
+        moved = np.einsum("gs,im->gism", self.C, influence)
+        C[..., core] += moved.reshape(*moved.shape[:2], -1)
+        return C, D
+
     def phase_means(self, frequency: FloatArray) -> ComplexArray:
         """Return the mean of ``exp(2 pi i f t)`` over each piece, for t from exposure k, (f, g).
 
