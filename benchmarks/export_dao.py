@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 import lbt_synth as lbt
 from lbt_synth.interop.dao.export import InnerLoop, direct_form_rows
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
 
 LOOPS, FRAMES, SETTLE = 20, 50_000, 5000
 
@@ -60,10 +60,9 @@ def main() -> None:
     """Print a line per sensor gain."""
     design, matrix = lbt.load_gain(sys.argv[1]), np.load(sys.argv[2])[:, 0]
     own = direct_form_rows(design.controller, len(matrix) // 2)[:, 0]
-    config, rng = lbt.load_config("examples/lbt_robust.yaml"), np.random.default_rng(0)
-    drawn = {"frames": FRAMES + SETTLE, "cases": LOOPS, "rng": rng}
-    phase = draw_disturbance(config.truth, config.hardware, **drawn)[:, :, 0].T
-    noise = draw_noise(config.truth, config.hardware, **drawn)[:, :, 0].T
+    config = lbt.load_config("examples/lbt_robust.yaml")
+    drawn = draw_disturbance(config.truth, config.hardware, frames=FRAMES + SETTLE, cases=LOOPS)
+    phase, noise = drawn.phase_nm[:, :, 0].T, drawn.noise[:, :, 0].T
     print(f"{LOOPS * FRAMES:.0e} frames; residual [nm rms]")
     print("gain   gain file   matrix in double   in single   noise of the arithmetic")
     for gain in [float(text) for text in sys.argv[3:]] or [1.0, 0.7, 0.5, 0.358]:

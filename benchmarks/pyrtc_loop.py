@@ -33,11 +33,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
 from support.pyrtc_systems import drawn, pol_series, residual_rms, running
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
 from lbt_synth.interop.pyrtc import plugin
 from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
-from lbt_synth.loop.simulation.run import step_loop
 
 FRAMES, SETTLE, QUIET = 16_000, 2000, 5
 
@@ -75,7 +75,7 @@ def compare_draws(designs: dict[str, lbt.Design]) -> None:
     for seed in range(3, 9):
         total, noise = drawn(truth, path, frames=FRAMES, seed=seed)
         runs = [
-            step_loop(design.controller.start(), 1.0, path, total, noise)[..., :2]
+            recorded_run(design.controller.start(), path, total, noise)[..., :2]
             for design in designs.values()
         ]
         training = pol_series(truth, path, frames=FRAMES, seed=100 + seed)
@@ -95,7 +95,7 @@ def compare_arithmetic(file: str) -> None:
     print(f"{file}\ngain    single      double      difference")
     for gain in (1.0, 0.7, 0.5, 0.358):
         single, double = (
-            step_loop(one, gain, design.hardware, total, noise)[:, SETTLE:, :2]
+            recorded_run(one, design.hardware, total, noise, sensor_gain=gain)[:, SETTLE:, :2]
             for one in (InnerLoop(pol_filter(design)), design.controller.start())
         )
         sizes = [residual_rms(series) for series in (single, double, single - double)]
@@ -124,13 +124,13 @@ def compare_predictors() -> None:
             train = None if kind is None else training
             with running(at, predictor=predictor, training=train) as (telescope, _):
                 start = time.perf_counter()
-                found = step_loop(telescope, 1.0, path, total, noise)
+                found = recorded_run(telescope, path, total, noise)
                 seconds = time.perf_counter() - start
             words = "-           -        "
             if kind is None:
                 largest = np.max(np.abs(found[..., 2:4]))
                 other = (design.controller.start(), InnerLoop(pol_filter(design)))
-                runs = (step_loop(one, 1.0, path, total, noise) for one in other)
+                runs = (recorded_run(one, path, total, noise) for one in other)
                 apart = (np.max(np.abs(run - found)[..., 2:4]) / largest for run in runs)
                 words = "   ".join(f"{value:<9.2g}" for value in apart)
             print(

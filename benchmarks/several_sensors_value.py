@@ -19,7 +19,6 @@ import numpy as np
 from scipy.optimize import brentq
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 
 CONFIG = """\
 version: 1
@@ -99,12 +98,14 @@ def print_table(what: str, cases: list[tuple[str, str, float]]) -> None:
         lines = [
             lbt.residual_budget(loop, config.truth, frame_means=True).vibration_nm for loop in loops
         ]
-        run = simulate_sensors(
-            design.controllers,
+        run = lbt.simulate(
+            design,
             config.truth,
             hardware=config.hardware,
             frames=FRAMES,
             cases=CASES,
+            settle_frames=1000,
+            frame_means=True,
         )
         simulated = float(np.sqrt(np.mean(run.residual_nm[:, :, 0] ** 2)))
         calm = replace(config.truth, vibrations=(), motions=())

@@ -14,7 +14,6 @@ from lbt_synth.design.modal import (
     modal_filters,
     modal_loop,
 )
-from lbt_synth.loop.simulation.run import step_loop
 
 RATE_HZ = 800.0
 LOOP_FRAMES = 4000
@@ -70,7 +69,8 @@ def _checked(
     path = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=len(total))
     running = controller.start() if isinstance(controller, ModalFilters) else controller
     some = total[:, :frames], noise[:, :frames]
-    expected = step_loop(running, 1.0, path, some[0].T[None], some[1].T[None])[0, :, : len(total)]
+    series = lbt.loop.Disturbance(phase_nm=some[0].T, noise=some[1].T, frame_means=True)
+    expected = lbt.simulate(running, series, hardware=path).residual_nm[0]
     error = np.max(np.abs(loop.run(*some).residual_nm - expected.T)) / np.max(np.abs(expected))
     assert error < 1e-10, error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import require_length
 from lbt_synth.interop import Rehearsal, rehearse
 from lbt_synth.loop import Imaging, series_strehl
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.draw import save_figure
@@ -40,11 +41,9 @@ class _Series:
     """What the loops run on."""
 
     source: str
-    total_nm: FloatArray
-    noise: FloatArray | None
+    disturbance: Disturbance
     hardware: LoopHardware
     imaging: Imaging
-    sensor_gain: float
     ran: tuple[FloatArray, FloatArray] | None = None  # residual and commands of the record
 
 
@@ -60,29 +59,33 @@ def run(arguments: Namespace) -> Report:
         found = rehearse(
             design,
             arguments.target,
-            series.total_nm,
+            series.disturbance,
             hardware=series.hardware,
-            noise=series.noise,
-            sensor_gain=series.sensor_gain,
             stroke=arguments.stroke,
         )
     imaging = series.imaging
     loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
     rows = [
-        _describe(name, one.residual_nm[0], one.commands[0], imaging, found.clipped_frames(one))
+        _describe(
+            name, one.image_nm2[0], one.commands[0], one.strehl, imaging, found.clipped_frames(one)
+        )
         for name, one in loops.items()
     ]
     if series.ran is not None:
         residual, commands = (part[found.settle_frames :] for part in series.ran)
-        rows.append(_describe("what ran", residual, commands, imaging, None))
+
+        def ratio(camera: Imaging) -> FloatArray:
+            return np.array([series_strehl(residual, camera)])
+
+        rows.append(_describe("what ran", residual**2, commands, ratio, imaging, None))
     report = Report(data={"gain": arguments.gain, "target": arguments.target})
     what = f"Rehearsal for {arguments.target} on {series.source}; {imaging.label}"
     report.add_rows("loops", what, rows)
     report.add_facts("The target beside the design", _difference_facts(found))
     report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
-    if series.noise is None:
+    if arguments.file is not None:
         report.notes += [
-            "note: residuals hold the noise of the measurements.",
+            "note: residuals are of means over frames, and hold the noise of the measurements.",
             "note: Strehl ratios are of tip and tilt alone; the record knows no other modes.",
         ]
     if design.hardware is not None:
@@ -96,12 +99,17 @@ def run(arguments: Namespace) -> Report:
 
 
 def _describe(
-    name: str, residual: FloatArray, commands: FloatArray, imaging: Imaging, clipped: int | None
+    name: str,
+    squares_nm2: FloatArray,
+    commands: FloatArray,
+    strehl: Callable[[Imaging], FloatArray],
+    imaging: Imaging,
+    clipped: int | None,
 ) -> Facts:
-    """Return the row of one loop on the series."""
-    axes = np.sqrt(np.mean(residual**2, axis=0)).tolist()
+    """Return the row of one loop on the series, from the squares of its residual."""
+    axes = np.sqrt(np.mean(squares_nm2, axis=0)).tolist()
     second = axes[1] if len(axes) == 2 else None
-    ratio = series_strehl(residual, imaging) if len(axes) <= 2 else None
+    ratio = float(strehl(imaging)[0]) if len(axes) <= 2 else None
     rms = {"unit": "nm rms", "format": ".1f"}
     largest_nm = float(np.max(np.abs(commands)))
     return facts(
@@ -150,11 +158,11 @@ def _recorded(arguments: Namespace) -> _Series:
         ran = (record.measurements[start:stop] / gain, commands[start:stop])
     return _Series(
         source=f"{stop - start} frames of {Path(arguments.file).name}",
-        total_nm=record.pseudo_open_loop(gain)[start:stop],
-        noise=None,
+        disturbance=Disturbance(
+            phase_nm=record.pseudo_open_loop(gain)[start:stop], sensor_gain=gain, frame_means=True
+        ),
         hardware=record.hardware,
         imaging=record_imaging(arguments, record),
-        sensor_gain=gain,
         ran=ran,
     )
 
@@ -170,15 +178,13 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     imaging = config.imaging
     if arguments.wavelength_um is not None:
         imaging = replace(imaging, wavelength_um=arguments.wavelength_um)
-    truth, rng = config.truth, np.random.default_rng(arguments.seed)
-    frames = _FRAMES
+    frames, alone = _FRAMES, config.hardware.own_sensor_alone()
+    seed = integer(arguments.seed, "--seed", at_least=0)
     if arguments.frames is not None:
         frames = integer(arguments.frames, "--frames", at_least=1, at_most=_MOST)
     return _Series(
         source=f"{frames} frames of its own truth",
-        total_nm=draw_disturbance(truth, config.hardware, frames=frames, cases=1, rng=rng)[0],
-        noise=draw_noise(truth, config.hardware, frames=frames, cases=1, rng=rng)[0],
+        disturbance=draw_disturbance(config.truth, alone, frames=frames, seed=seed),
         hardware=config.hardware,
         imaging=imaging,
-        sensor_gain=truth.sensor_gain,
     )

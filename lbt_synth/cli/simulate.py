@@ -32,8 +32,7 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_nan
-from lbt_synth.loop.simulation.failing_sensors import READINGS, Drop
-from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.loop.simulation.run import READINGS, Drop, settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
@@ -102,11 +101,9 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
     caption = f"{design.method} in the loop: {runs}; {config.imaging.label}"
     report.add_rows("segments", caption, [row for _, row in segments])
     if not truth.drifts:
-        ratio = strehl(residual_budget(loop, truth, frame_means=True), config.imaging)
+        ratio = strehl(residual_budget(loop, truth), config.imaging)
         report.data["strehl_exact"] = ratio
-        report.notes.append(
-            f"Strehl ratio with all sensors, exact, of means over frames: {100 * ratio:.2f} %"
-        )
+        report.notes.append(f"Strehl ratio with all sensors, exact: {100 * ratio:.2f} %")
     report.notes += loop_difference_notes(config, design)
     if arguments.output is not None:
         exact_nm = [row.exact_nm for _, row in segments]
@@ -117,13 +114,11 @@ def run_all_sensors(arguments: Namespace, config: Config, design: Design) -> Rep
 
 
 _EXACT = (  # what the loop leaves without chance
-    Column(name="strehl_exact", heading="Strehl ratio of means over frames", unit="%", scale=100),
-    Column(name="residual_exact_nm", heading="residual, means over frames", unit="nm rms"),
+    Column(name="strehl_exact", heading="Strehl ratio", unit="%", scale=100),
+    Column(name="residual_exact_nm", heading="residual", unit="nm rms"),
     Column(name="turbulence_nm", heading="  turbulence", unit="nm rms"),
     Column(name="vibration_nm", heading="  vibration", unit="nm rms"),
     Column(name="noise_nm", heading="  noise", unit="nm rms"),
-    Column(name="strehl_image", heading="Strehl ratio in the image", unit="%", scale=100),
-    Column(name="residual_image_nm", heading="residual in the image", unit="nm rms"),
     Column(name="within_nm", heading="  within frames", unit="nm rms"),
     Column(name="limit_nm", heading="  least of any controller", unit="nm rms"),
     Column(name="above_limit_percent", heading="  residual above it", unit="%"),
@@ -233,20 +228,17 @@ def _exact_answers(loop: ClosedLoop, config: Config, truth: Truth) -> Facts:
     """Return what the loop leaves without chance; a truth that drifts has no exact answer."""
     if truth.drifts:
         return Facts(_EXACT, {})
-    means, image = (residual_budget(loop, truth, frame_means=each) for each in (True, False))
+    image = residual_budget(loop, truth)
     alone = config.hardware.own_sensor_alone()
     limit_nm = limit_or_nan(lambda: least_residual(alone, truth))
-    parts = {name: getattr(means, name) for name in ("turbulence_nm", "vibration_nm", "noise_nm")}
-    exact = {
-        "strehl_exact": strehl(means, config.imaging),
-        "residual_exact_nm": means.rms_nm,
-        "strehl_image": strehl(image, config.imaging),
-        "residual_image_nm": image.rms_nm,
-        "within_nm": image.within_nm,
+    names = ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
+    exact = {name: getattr(image, name) for name in names} | {
+        "strehl_exact": strehl(image, config.imaging),
+        "residual_exact_nm": image.rms_nm,
         "limit_nm": limit_nm,
         "above_limit_percent": round(above_percent(image.rms_nm, limit_nm), 6) + 0.0,
     }
-    return Facts(_EXACT, parts | exact)
+    return Facts(_EXACT, exact)
 
 
 def _require_stable(loop: ClosedLoop, design: Design, reference_gain: float) -> None:

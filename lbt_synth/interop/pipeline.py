@@ -29,8 +29,8 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
 from lbt_synth.interop.proof import Written, prove_written, require_proved
 from lbt_synth.linear.state_space import RunningController
-from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
-from lbt_synth.loop.simulation.run import SteppedController, step_loop
+from lbt_synth.loop.simulation.disturbances import Disturbance
+from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import column, json_record, table_row
@@ -452,8 +452,8 @@ def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
         return _rehearse(design, design.controller.start()), None
     plant, (starts, length) = design.problem, _absences(design)
     rate = plant.hardware.frame_rate_hz
-    run = simulate_sensors(
-        design.controllers,
+    run = simulate(
+        design,
         Truth(
             turbulence=plant.turbulence,
             vibrations=plant.vibrations,
@@ -486,11 +486,12 @@ def _rehearse(design: Design, controller: SteppedController | RunningController)
     hardware, q = design.hardware, design.controller.B.shape[1]
     if hardware is None:
         return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
-    n, total = hardware.modes, rng.standard_normal((1, FRAMES, hardware.modes))
+    total = rng.standard_normal((1, FRAMES, hardware.modes))
     for k in range(1, FRAMES):
         total[0, k] = _POLE * total[0, k - 1] + np.sqrt(1 - _POLE**2) * total[0, k]
     noise = 0.1 * rng.standard_normal((1, FRAMES, q))
-    return step_loop(controller, 1.0, hardware, total, noise)[0, :, n : n + hardware.n_commands]
+    disturbance = Disturbance(phase_nm=total, noise=noise, frame_means=True)
+    return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
 
 
 def _rehearse_sensors(

@@ -7,7 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lbt_synth.design import Check, Design
 from lbt_synth.design.result import require_hardware
@@ -15,9 +14,10 @@ from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.pipeline import export, target_named
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import close_loop
-from lbt_synth.loop.simulation.run import Simulation, record_run, settling_frames, step_loop
+from lbt_synth.loop.simulation.disturbances import Disturbance
+from lbt_synth.loop.simulation.run import Simulation, settling_frames, simulate
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, float_array, number
+from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
 
@@ -58,11 +58,9 @@ class Rehearsal:
 def rehearse(
     design: Design,
     target: str,
-    total_nm: ArrayLike,
+    disturbance: Disturbance,
     *,
     hardware: LoopHardware | None = None,
-    noise: ArrayLike | None = None,
-    sensor_gain: float = 1.0,
     stroke: float | None = None,
 ) -> Rehearsal:
     """Run what is exported to a target in its arithmetic, and the design in double precision.
@@ -75,15 +73,12 @@ def rehearse(
         The design.
     target : str
         Name of a target, whose export has its usual options.
-    total_nm : (frames, n) array_like
-        Phase of each frame; or the pseudo-open-loop series of a record, whose noise is then part
-        of the residual [nm].
+    disturbance : Disturbance
+        Phase and noise of one case. The pseudo-open-loop series of a record may stand for the
+        phase; its noise is then part of the residual, and ``frame_means`` keeps it out of what
+        moves within frames.
     hardware : LoopHardware, optional
         The loop; by default that of the design.
-    noise : (frames, q) array_like, optional
-        Noise of the measurements; none by default.
-    sensor_gain : float, optional
-        Real sensor gain relative to the sensor matrix.
     stroke : float, optional
         Largest modulus of a command that the mirror applies; without a limit by default.
 
@@ -107,42 +102,39 @@ def rehearse(
     --------
     >>> import lbt_synth as lbt, numpy as np
     >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5)
-    >>> phase = 100 * np.sin(np.arange(2000.0)[:, None] / 50)
-    >>> run = lbt.interop.rehearse(slow, "dao", phase)
+    >>> wave = lbt.loop.Disturbance(phase_nm=100 * np.sin(np.arange(2000.0)[:, None] / 50))
+    >>> run = lbt.interop.rehearse(slow, "dao", wave)
     >>> bool(0 < np.max(np.abs(run.differences)) < 1e-3)
     True
     """
     controller = as_controller(design)
     path = require_hardware(design, "a rehearsal") if hardware is None else hardware
-    total = float_array(total_nm, "total_nm")
-    seen = (
-        np.zeros((len(total), path.n_measurements))
-        if noise is None
-        else float_array(noise, "noise")
-    )
-    if total.ndim != 2 or total.shape[1] != path.modes or len(seen) != len(total):
+    require_instance(disturbance, Disturbance, "disturbance")
+    cases, frames, n = disturbance.phase_nm.shape
+    if (cases, n) != (1, path.modes):
         raise DimensionError(
-            f"total_nm must be (frames, {path.modes}), with as many frames of noise; got "
-            f"{total.shape} and {seen.shape}."
+            f"phase_nm must be (frames, {path.modes}), of one case; got "
+            f"{disturbance.phase_nm.shape}."
         )
-    gain = number(sensor_gain, "sensor_gain", above=0)
     limit = np.inf if stroke is None else number(stroke, "stroke", above=0, at_most=1e30)
-    loop = close_loop(path, controller, sensor_gain=gain)
+    loop = close_loop(path, controller, sensor_gain=disturbance.sensor_gain)
     loop.require_stable()
-    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * len(total)))
+    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * frames))
     with TemporaryDirectory() as folder:
         exported = export(target_named(target).path_in(Path(folder)), design, target)
     runs = []
     for running in (exported.start(limit), controller.start()):
         try:
             with np.errstate(all="ignore"):  # what overflows is found to be infinite
-                out = step_loop(running, gain, path, total[None], seen[None], stroke=limit)
+                run = simulate(
+                    running, disturbance, hardware=path, settle_frames=settle, stroke=stroke
+                )
         except ProblemError as error:
             raise NumericalError(
                 f"in the arithmetic of {target} the loop grows beyond all numbers: {error}",
                 status="arithmetic",
             ) from error
-        runs.append(record_run(total[None], out, path, settle=settle, seed=0))
+        runs.append(run)
     return Rehearsal(
         target=runs[0],
         design=runs[1],

@@ -16,14 +16,13 @@ doi:10.1016/0005-1098(87)90029-X).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError
+from lbt_synth.errors import NumericalError
 from lbt_synth.linear.held_controller import HasController, as_controller
-from lbt_synth.linear.state_space import Controller
+from lbt_synth.linear.state_space import Controller, RunningController
 from lbt_synth.validation import FloatArray, frozen_copy
 
 _STABLE = 1 - 1e-9  # largest modulus of a pole
@@ -45,44 +44,13 @@ class EstimatorForm:
         """Largest modulus of its poles: how fast it forgets."""
         return float(np.max(np.abs(np.linalg.eigvals(self.A))))
 
-    def start(self) -> RunningEstimator:
-        """Return a running copy with a zero state, to be stepped sample by sample."""
-        return RunningEstimator(self)
+    def stacks(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return A, B, C, D of the samples of its period, which is one."""
+        return self.A[None], self.B[None], self.C[None], np.zeros((1, len(self.C), self.B.shape[1]))
 
-
-@dataclass(slots=True, eq=False)
-class RunningEstimator:
-    """An estimator form with its state: call ``step(y, applied) -> u`` once per sample."""
-
-    estimator: EstimatorForm
-    state: FloatArray = field(init=False)
-    form = "estimator"
-
-    def __post_init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Set the state to zero."""
-        self.state = np.zeros(len(self.estimator.A))
-
-    def step(self, y: ArrayLike, applied: ArrayLike | None = None) -> FloatArray:
-        """Take y(k), (q,), and the command applied in the last frame, (m,); return u(k), (m,).
-
-        Without an applied command the last one of its own counts. Values that are not finite
-        raise a NonFiniteError and leave the state as it is: hold the last command.
-        """
-        k = self.estimator
-        given = k.C @ self.state if applied is None else np.asarray(applied, dtype=np.float64)
-        measured = np.asarray(y, dtype=np.float64)
-        for name, value, width in (("y", measured, k.B), ("applied", given, k.applied)):
-            if value.shape != width.shape[1:]:
-                raise DimensionError(
-                    f"{name} must have shape {width.shape[1:]}; got {value.shape}."
-                )
-            if not np.isfinite(value).all():
-                raise NonFiniteError(f"{name} must be finite; got {value}. Hold the last command.")
-        self.state = k.A @ self.state + k.B @ measured + k.applied @ given
-        return np.asarray(k.C @ self.state)
+    def start(self) -> RunningController:
+        """Return a running copy with a zero state: ``step(y, applied) -> u`` sample by sample."""
+        return RunningController(self, form="estimator")
 
 
 def estimator_form(controller: Controller | HasController) -> EstimatorForm:

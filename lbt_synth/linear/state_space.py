@@ -12,6 +12,7 @@ doi:10.1007/978-1-84800-911-0.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -541,46 +542,74 @@ class Controller(LinearSystem):
         """Return its textbook form."""
         return self.to_statespace(), "largest singular value"
 
-    def start(self) -> RunningController:
-        """Return a running copy with a zero state, to be stepped sample by sample."""
-        return RunningController(self)
+    def start(
+        self, fallbacks: Mapping[frozenset[str], Controller] | None = None
+    ) -> RunningController:
+        """Return a running copy with a zero state, to be stepped sample by sample.
+
+        The fall-backs are the controllers for sets of sensors that are not read.
+        """
+        return RunningController(self, fallbacks=fallbacks or {})
 
 
 @dataclass(slots=True, eq=False)
 class RunningController:
     """A controller with its state: call ``step(y) -> u`` once per sample, or ``reset()``.
 
-    The plain form assumes that its commands are applied; :func:`estimator_form` does not.
+    The plain form assumes that its commands are applied; an estimator form is given those that
+    were. Fall-backs share the states, so that a switch is without a jump.
     """
 
-    controller: Controller
+    controller: Any  # a Controller, or an estimator form
+    form: str = "plain"  # or "estimator"
+    fallbacks: Mapping[frozenset[str], Controller] = field(default_factory=dict)
     state: FloatArray = field(init=False)
     phase: int = field(init=False)  # of the next sample
     _phases: list[tuple[FloatArray, ...]] = field(init=False, repr=False)  # A, B, C, D of each
-    form = "plain"
 
     def __post_init__(self) -> None:
-        self._phases = list(zip(*self.controller.stacks(), strict=True))
         self.reset()
 
     def reset(self) -> None:
-        """Set the state to zero; the next sample is the first of a period."""
-        self.state, self.phase = np.zeros(self.controller.n_states), 0
+        """Set the state to zero; the next sample is the first of a period, all sensors are read."""
+        self._phases = list(zip(*self.controller.stacks(), strict=True))
+        self.state, self.phase = np.zeros(len(self._phases[0][0])), 0
 
-    def step(self, y: ArrayLike) -> FloatArray:
+    def miss(self, missing: Iterable[str]) -> None:
+        """Go on with the fall-back for sensors that are not read; with all for none."""
+        names = frozenset(missing)
+        if names and names not in self.fallbacks:
+            raise ProblemError(f"there is no filter without {', '.join(sorted(names))}.")
+        controller = self.fallbacks[names] if names else self.controller
+        self._phases = list(zip(*controller.stacks(), strict=True))
+
+    def step(self, y: ArrayLike, applied: ArrayLike | None = None) -> FloatArray:
         """Take the measurements y(k), (q,), and return the command u(k), (m,).
 
-        A measurement that is not finite raises a NonFiniteError and leaves the state as it is:
-        hold the last command.
+        Cases side by side have (q, c) and (m, c). An estimator form takes the command that was
+        applied in the last sample, too; without it the last one of its own counts. A value that is
+        not finite raises a NonFiniteError and leaves the state as it is: hold the last command.
         """
         A, B, C, D = self._phases[self.phase]
-        measured = np.asarray(y, dtype=np.float64)
-        if measured.shape != (B.shape[1],):
-            raise DimensionError(
-                f"y must have shape ({B.shape[1]},) to match B {B.shape}; got {measured.shape}."
-            )
-        if not np.isfinite(measured).all():
-            raise NonFiniteError(f"y must be finite; got {measured}. Hold the last command.")
-        self.state = A @ self.state + B @ measured
+        measured = _signal(y, "y", B)
+        state = self.state[:, None] if measured.ndim > self.state.ndim else self.state
+        drive = B @ measured
+        if self.form == "estimator":
+            last = C @ state if applied is None else _signal(applied, "applied", C.T)
+            drive = drive + self.controller.applied @ last
+        self.state = A @ state + drive
         self.phase = (self.phase + 1) % len(self._phases)
         return np.asarray(C @ self.state + D @ measured)
+
+
+def _signal(values: ArrayLike, name: str, matrix: FloatArray) -> FloatArray:
+    """Return a signal that a matrix takes, (q,) or (q, c)."""
+    signal = np.asarray(values, dtype=np.float64)
+    if signal.ndim not in (1, 2) or len(signal) != matrix.shape[1]:
+        raise DimensionError(
+            f"{name} must have shape ({matrix.shape[1]},) to match a matrix {matrix.shape}; got "
+            f"{signal.shape}."
+        )
+    if not np.isfinite(signal).all():
+        raise NonFiniteError(f"{name} must be finite; got {signal}. Hold the last command.")
+    return signal

@@ -15,6 +15,7 @@ from .margins import loop_margins as loop_margins
 from .margins import stable_sensor_gains as stable_sensor_gains
 from .moving_gain import moving_gain as moving_gain
 from .residual import ResidualBudget as ResidualBudget
+from .simulation.disturbances import Disturbance as Disturbance
 from .simulation.run import Simulation as Simulation
 from .simulation.run import simulate as simulate
 from .simulation.run import step_response as step_response

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import Annotated, Any
 
 import numpy as np
@@ -262,10 +263,13 @@ def _choose_rules(
     return np.stack([fineness, directions], axis=1)
 
 
-def series_strehl(residual_nm: ArrayLike, imaging: Imaging) -> float:
+def series_strehl(
+    residual_nm: ArrayLike, imaging: Imaging, *, within_nm2: ArrayLike = 0.0
+) -> float:
     """Long-exposure Strehl ratio of a residual series, whatever its distribution.
 
-    It is the mean, over the frames, of the image of a star at its mean position.
+    It is the mean, over the frames, of the image of a star at its mean position. What moves within
+    a frame counts by its variance: the star stands a deviation to either side on each axis.
 
     Parameters
     ----------
@@ -273,6 +277,8 @@ def series_strehl(residual_nm: ArrayLike, imaging: Imaging) -> float:
         Residual of the axes, frame by frame [nm rms wavefront].
     imaging : Imaging
         The camera.
+    within_nm2 : float or (axes,) array_like, optional
+        Variance that moves within a frame on each axis [nm^2]; none by default.
 
     Returns
     -------
@@ -295,7 +301,11 @@ def series_strehl(residual_nm: ArrayLike, imaging: Imaging) -> float:
     if series.ndim != 2 or series.shape[0] == 0:
         raise DimensionError(f"residual_nm must be (frames, axes); got shape {series.shape}.")
     _require_axes(series.shape[1])
-    distance = np.linalg.norm(series - series.mean(axis=0), axis=1)
+    axes = series.shape[1]
+    deviation = np.sqrt(np.maximum(np.broadcast_to(within_nm2, axes), 0.0))
+    signs = np.array(list(product((-1.0, 1.0), repeat=axes))) if np.any(deviation) else [0.0]
+    away = series - series.mean(axis=0)
+    distance = np.concatenate([np.linalg.norm(away + sign * deviation, axis=1) for sign in signs])
     image = _annular_image(imaging.cycles_per_nm * distance, imaging.obstruction)
     return float(imaging.other_modes * min(float(np.mean(image)), 1.0))
 

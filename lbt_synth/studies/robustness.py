@@ -35,10 +35,10 @@ from lbt_synth.loop import (
     loop_margins,
     residual_budget,
     settling_error,
+    simulate,
 )
 from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
-from lbt_synth.loop.simulation.failing_sensors import Drop, Segment, run_segments, simulate_sensors
-from lbt_synth.loop.strehl import series_strehl
+from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
 from lbt_synth.methods.mixed import METHOD as MIXED
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
@@ -358,8 +358,8 @@ def run_failures(
     """
     filters, rate = design.controllers, config.hardware.frame_rate_hz
     hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
-    simulation = simulate_sensors(
-        filters,
+    simulation = simulate(
+        design,
         truth,
         hardware=hardware,
         frames=frames,
@@ -379,15 +379,14 @@ def run_failures(
         # a frozen reading adds an offset of its own
         exact = loop.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
         first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
-        residual = simulation.residual_nm[:, first:last]
-        strehls = [series_strehl(case, config.imaging) for case in residual if loop.is_stable]
+        part = simulation.part(first, last)
         row = SegmentRow(
             start_s=segment.start_s,
             end_s=segment.end_s,
             sensors=segment.text or "none",
-            residual_nm=float(np.sqrt(np.mean(np.sum(residual**2, axis=2)))),
-            exact_nm=residual_budget(loop, truth, frame_means=True).rms_nm if exact else np.nan,
-            strehl=float(np.mean(strehls)) if strehls else np.nan,
+            residual_nm=float(np.sqrt(np.mean(part.rms_nm**2))),
+            exact_nm=residual_budget(loop, truth).rms_nm if exact else np.nan,
+            strehl=float(np.mean(part.strehl(config.imaging))) if loop.is_stable else np.nan,
             stable=loop.is_stable,
         )
         rows.append((segment, row))

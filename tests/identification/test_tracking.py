@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
-from lbt_synth.loop.simulation.run import step_loop
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 
 AIR = lbt.models.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
@@ -42,8 +42,8 @@ def disturbed(plant, *, frames, hz=20, seed=0):
     along = tuple(np.eye(plant.hardware.modes)[0])
     shake = lbt.models.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=along)
     truth = lbt.Truth(turbulence=AIR, vibrations=(shake,), noise_nm=15.5)
-    size = {"frames": frames, "cases": 1, "rng": np.random.default_rng(seed)}
-    return (draw(truth, plant.hardware, **size) for draw in (draw_disturbance, draw_noise))
+    drawn = draw_disturbance(truth, plant.hardware, frames=frames, seed=seed)
+    return drawn.phase_nm, drawn.noise
 
 
 class Watched:
@@ -65,7 +65,7 @@ class Watched:
 
 def run(controller, plant, series):
     """Residual and commands, (frames, n + m)."""
-    return step_loop(controller, 1.0, plant.hardware, *series)[0]
+    return recorded_run(controller, plant.hardware, *series)[0]
 
 
 PLANTS = {

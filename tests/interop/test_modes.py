@@ -8,10 +8,10 @@ import pytest
 from astropy.io import fits
 from support.compiled import Compiled
 from support.exports import relative
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
 from lbt_synth.design.modal import MixedController, modal_filters
-from lbt_synth.loop.simulation.run import step_loop
 
 pytestmark = pytest.mark.usefixtures("short_rehearsal")
 AIR = lbt.models.ARModel(coefficients=[0.98], driving_rms_nm=20.0, frame_rate_hz=800)
@@ -80,7 +80,7 @@ def loop_commands(run, hardware, seed=4, frames=600):
     path = lbt.LoopHardware(frame_rate_hz=hardware.frame_rate_hz, modes=6)
     total = np.cumsum(rng.standard_normal((1, frames, 6)), axis=1)
     noise = 0.1 * rng.standard_normal((1, frames, 6))
-    return step_loop(run, 1.0, path, total, noise)[0, :, 6:12]
+    return recorded_run(run, path, total, noise)[0, :, 6:12]
 
 
 def test_cacao_holds_all_modes_in_one_matrix(tmp_path, designs):

@@ -8,11 +8,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from support.plants import ROOT
+from support.recorded_runs import recorded_run
 from support.written_files import ORACLES, WITHOUT_ORACLE, is_schur, judge
 
 import lbt_synth as lbt
 from lbt_synth.interop.pipeline import target_names
-from lbt_synth.loop.simulation.run import step_loop
 
 CHUNK = 100
 
@@ -158,7 +158,7 @@ def test_a_sensor_gain_of_each_axis_is_in_the_numbers(tmp_path, designs, name):
         written = lbt.interop.export(target.path_in(tmp_path), design, name)
         assert all(check.passed for check in written.checks)
         runs = [
-            step_loop(run, 1.0, hardware, phase[None], np.zeros((1, 600, 2)))[0, :, :2]
+            recorded_run(run, hardware, phase[None], np.zeros((1, 600, 2)))[0, :, :2]
             for run in (written.start(np.inf), design.controller.start())
         ]
         assert np.std(runs[0] - runs[1]) < 1e-2 * np.std(runs[1])

@@ -45,10 +45,8 @@ PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
 
 def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):
     truth = lbt.Truth(turbulence=None, vibrations=(line,))
-    rng = np.random.default_rng(seed)
-    return draw_disturbance(
-        truth, PATH, frames=frames, cases=cases, rng=rng, zero_frame=zero_frame
-    )[..., 0]
+    options = {"frames": frames, "cases": cases, "seed": seed, "zero_frame": zero_frame}
+    return draw_disturbance(truth, PATH, frame_means=True, **options).phase_nm[..., 0]
 
 
 def test_the_sinusoid_has_the_frequency_at_each_time():

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import yaml
 
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
 
 _NUMBERS = itertools.count()
 _LONGEST_S = 300
@@ -127,10 +127,8 @@ def _give_up(*_):
 
 def drawn(truth, hardware, *, frames, seed, quiet=0):
     """Phase and noise, (1, frames, modes); both are zero in the first frames."""
-    rng = np.random.default_rng(seed)
-    size = {"frames": frames, "cases": 1}
-    total = draw_disturbance(truth, hardware, rng=rng, **size)
-    noise = draw_noise(truth, hardware, rng=rng, **size)
+    series = draw_disturbance(truth, hardware, frames=frames, seed=seed)
+    total, noise = series.phase_nm, series.noise
     total[:, :quiet] = 0
     noise[:, :quiet] = 0
     return total, noise

@@ -117,7 +117,7 @@ class MixedController:
     def dt_s(self) -> float | None:
         """Sampling period of the filter [s]; None where nothing says it."""
         if isinstance(self._running, RunningController):
-            return self._running.controller.dt_s
+            return float(self._running.controller.dt_s)
         return getattr(self.filter, "dt_s", None)
 
     @property
@@ -206,7 +206,7 @@ class MixedController:
         leak, gain = self._leak[kept, None, None], self._gain[kept, None, None]
         out = [Bank(kept[:, None], leak, gain, one, np.zeros_like(one))] if kept.size else []
         out += self._stacks
-        if isinstance(self._running, RunningController):
+        if isinstance(self._running, RunningController) and self._running.form == "plain":
             k = self._running.controller
             out.append(Bank(self._modes[None], k.A[None], k.B[None], k.C[None], k.D[None]))
         elif self._running is not None:
@@ -283,7 +283,7 @@ def _start_filter(given: Any, modes: int) -> SteppedController:
             "filter must be a design, a Controller, an object with step(y) and reset(), or None; "
             f"got {type(given).__name__}."
         )
-    if isinstance(running, RunningController):
+    if isinstance(running, RunningController) and running.form == "plain":
         D = running.controller.D
         if D.shape != (modes, modes):
             raise DimensionError(

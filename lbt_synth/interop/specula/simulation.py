@@ -19,8 +19,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop.specula.calibration import Calibration, cache_directory, calibrate
 from lbt_synth.interop.specula.optics import EndToEndSystem, Modes, Optics
 from lbt_synth.linear import Controller
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_parts
-from lbt_synth.loop.simulation.failing_sensors import draw_others
+from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.loop.simulation.run import SteppedController, step_controller
 from lbt_synth.models import (
     DriftingVibration,
@@ -232,7 +231,7 @@ def accompany_filter(
     missing = frozenset(unread_sensors(design))
     size = {"frames": settle_frames + frames, "cases": 1, "zero_frame": settle_frames}
     rng = np.random.default_rng(seed)
-    _, lines = draw_parts(shaken, hardware, rng=rng, oscillators=True, **size)
+    _, lines = draw_phase(shaken, hardware, rng=rng, oscillators=True, frame_means=True, **size)
     (own_rng,) = rng.spawn(1)
     others = draw_others(shaken, hardware, lines, own_rng, **size)
     return AccompaniedFilter(
@@ -489,21 +488,22 @@ has; got FilterDesign.
         )
     system, settle, seed = setup.system, setup.settle_frames, setup.seed
     total = settle + setup.frames
-    tilts = draw_disturbance(
+    phase, _ = draw_phase(
         setup.shaken,
         system.hardware,
         frames=total,
         cases=1,
         rng=np.random.default_rng(seed),
         zero_frame=settle,
+        frame_means=True,
         oscillators=True,
-    )[0]
+    )
     if calibration is None:
         calibration = calibrate(system, cache=cache)
     screens = cache_directory(cache) / "screens"
     optics = Optics(system, calibration.modes, screens=screens, frames=total, seed=seed)
     started = time.perf_counter()
-    fields = _run_frames(optics, calibration, controller, tilts, settle, progress)
+    fields = _run_frames(optics, calibration, controller, phase[0], settle, progress)
     return EndToEndRun(
         system=system,
         **fields,

@@ -1,22 +1,125 @@
-"""Random series of a truth's disturbances and noise, stationary from their first frame."""
+"""What enters a loop, frame by frame: recorded, or drawn and stationary from the first frame."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
+from lbt_synth.errors import DimensionError
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.models import ARModel, DriftingVibration, LoopHardware, Spectrum, Truth, Vibration
+from lbt_synth.models import (
+    ARModel,
+    DriftingVibration,
+    LoopHardware,
+    SinusoidalVibration,
+    Spectrum,
+    Truth,
+    Vibration,
+)
+from lbt_synth.models.mirror.frame_rate_system import Hold
 from lbt_synth.models.plant.seen_vibration import SeenVibration, seen_vibration
+from lbt_synth.models.sensor_suite import Accelerometer, Motion, checked_motions, period_frames
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration import checked_direction
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, float_array, number
 
 # A spectrum is drawn over this many times the wanted frames, which hides the series' period.
 _PERIODS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Disturbance:
+    """Phase and noise of each frame of a loop.
+
+    Parameters
+    ----------
+    phase_nm : (cases, frames, n) array_like
+        Mean phase over each frame [nm]; a single case may leave out its dimension.
+    noise : (cases, frames, q) array_like, optional
+        What the readings have beside the residual: noise, and of accelerometers the motion. Zeros
+        for the loop's own sensor by default.
+    sensor_gain : float, optional
+        Real sensor gain relative to the sensor matrix.
+    frame_means : bool, optional
+        Whether the phase of a frame is one number, as in a simulator that steps by frames; nothing
+        then moves within a frame. Otherwise the phase between the means is their interpolation
+        below half the frame rate.
+
+    Raises
+    ------
+    ProblemError
+        If a number is not finite, or sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, numpy as np
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> wave = 100 * np.sin(np.arange(2000.0)[:, None] / 20)
+    >>> recorded = lbt.loop.Disturbance(phase_nm=wave)
+    >>> run = lbt.simulate(lbt.integrator(path, gain=0.5), recorded, hardware=path)
+    >>> bool(run.rms_nm[0] < 15)
+    True
+    """
+
+    phase_nm: FloatArray
+    noise: FloatArray | None = None
+    sensor_gain: float = 1.0
+    frame_means: bool = False
+
+    def __post_init__(self) -> None:
+        phase = float_array(self.phase_nm, "phase_nm")
+        phase = phase[None] if phase.ndim == 2 else phase
+        noise = phase if self.noise is None else float_array(self.noise, "noise")
+        noise = noise[None] if noise.ndim == 2 else noise
+        if phase.ndim != 3 or noise.ndim != 3 or noise.shape[:2] != phase.shape[:2]:
+            raise DimensionError(
+                "phase_nm must be (cases, frames, n), and noise (cases, frames, q) of as many; got "
+                f"{phase.shape} and {noise.shape}."
+            )
+        number(self.sensor_gain, "sensor_gain", above=0)
+        object.__setattr__(self, "phase_nm", phase)
+        object.__setattr__(self, "noise", None if self.noise is None else noise)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return int(self.phase_nm.shape[1])
+
+    def noise_of(self, readings: int) -> FloatArray:
+        """Return the noise of so many readings, (cases, frames, q)."""
+        cases, frames, _ = self.phase_nm.shape
+        noise = np.zeros((cases, frames, readings)) if self.noise is None else self.noise
+        if noise.shape[2] != readings:
+            raise DimensionError(
+                f"noise must have {readings} readings a frame; got {noise.shape[2]}."
+            )
+        return noise
+
+    def over_holds(self, hold: Hold) -> tuple[FloatArray, FloatArray]:
+        """Return the mean phase in the pieces of holds, and the mean square within the pieces.
+
+        They are (cases, frames, g, n), of the hold that begins in each frame, and (cases, n). A
+        line from the first frame to the last is taken out of the Fourier series, and counts by
+        itself; beyond the last frame the series goes on as from the first.
+        """
+        frames, f = self.frames, rfftfreq(self.frames)
+        slope = (self.phase_nm[:, -1:] - self.phase_nm[:, :1]) / max(frames - 1, 1)
+        time = np.arange(float(frames))
+        bins = rfft(self.phase_nm - slope * time[:, None], axis=1)
+        # from the mean over a frame, which has its phase in the middle
+        late = hold.start % 1 - hold.start
+        turn = np.exp(1j * np.pi * f * (2 * late - 1)) / np.sinc(f)
+        means = hold.phase_means(f) * turn[:, None]
+        pieces = irfft(bins[:, :, None] * means[:, :, None], n=frames, axis=1)
+        middle = hold.start % 1 + (hold.edges[1:] + hold.edges[:-1] - 1) / 2
+        pieces += slope[:, :, None] * (time[:, None, None] + middle[:, None])
+        moving = np.maximum(1 / np.sinc(f) ** 2 - np.abs(means) ** 2 @ hold.weights, 0.0)
+        moving *= np.where((f > 0) & (f < 0.5), 2.0, 1.0) / frames**2
+        return np.asarray(pieces), np.asarray(np.einsum("f,cfi->ci", moving, np.abs(bins) ** 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,33 +137,39 @@ def draw_disturbance(
     hardware: LoopHardware,
     *,
     frames: int,
-    cases: int,
-    rng: np.random.Generator,
+    cases: int = 1,
+    seed: int = 0,
     zero_frame: int = 0,
-    oscillators: bool = False,
-) -> FloatArray:
-    """Draw the total phase, (cases, frames, n) [nm].
+    frame_means: bool = False,
+) -> Disturbance:
+    """Draw the phase and the noise of all sensors of a loop.
 
-    Each part has its own random stream: a truth with one more vibration keeps its turbulence.
-    So has each mode where the modes have different spectra. Time 0 of a vibration that drifts is
-    frame ``zero_frame``. Resonances are AR2 processes; with ``oscillators`` those that channels
-    of the truth see are continuous oscillators.
+    Phase, noise and the readings of the other sensors have a random stream each. Resonances that
+    accelerometers of the loop see are continuous oscillators.
     """
-    total, lines = draw_parts(
+    rng, noise_rng, other_rng = np.random.default_rng(seed).spawn(3)
+    size = {"frames": frames, "cases": cases}
+    others = bool(hardware.suite.sensors)
+    phase, lines = draw_phase(
         truth,
         hardware,
-        frames=frames,
-        cases=cases,
         rng=rng,
         zero_frame=zero_frame,
-        oscillators=oscillators,
+        frame_means=frame_means,
+        oscillators=others,
+        **size,
     )
-    for vibration, line in zip(truth.vibrations, lines, strict=True):
-        total += line.motion[:, :, None] * checked_direction(vibration, hardware)
-    return total
+    q = hardware.n_measurements
+    noise = truth.noise_per_measurement(q) * noise_rng.standard_normal((cases, frames, q))
+    if others:
+        readings = draw_others(truth, hardware, lines, other_rng, zero_frame=zero_frame, **size)
+        noise = np.concatenate([noise, readings], axis=2)
+    return Disturbance(
+        phase_nm=phase, noise=noise, sensor_gain=truth.sensor_gain, frame_means=frame_means
+    )
 
 
-def draw_parts(
+def draw_phase(
     truth: Truth,
     hardware: LoopHardware,
     *,
@@ -68,40 +177,63 @@ def draw_parts(
     cases: int,
     rng: np.random.Generator,
     zero_frame: int = 0,
+    frame_means: bool = False,
     oscillators: bool = False,
 ) -> tuple[FloatArray, list[DrawnLine]]:
-    """Draw the turbulence, (cases, frames, n) [nm], and each vibration."""
+    """Draw the mean phase over each frame, (cases, frames, n) [nm], and each vibration.
+
+    Each part has its own random stream: a truth with one more vibration keeps its turbulence.
+    So has each mode where the modes have different spectra. Time 0 of a vibration that drifts is
+    frame ``zero_frame``. Resonances are AR2 processes; with ``oscillators`` those that channels
+    of the truth see are continuous oscillators. With ``frame_means`` spectra, and the rms of lines,
+    are those of the numbers that frames have.
+    """
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
     total, lines = np.zeros((cases, frames, n)), []
-    spectra = truth.turbulence_per_mode(n)
+    spectra, size = truth.turbulence_per_mode(n), (frames, cases)
+    means = {"frame_means": frame_means}
     if truth.is_uniform and spectra[0] is not None:
-        drawn = _draw(spectra[0], hardware, frames, cases * n, turbulence_rng)
+        drawn = _draw(spectra[0], hardware, frames, cases * n, turbulence_rng, **means)
         total += np.moveaxis(drawn.reshape(cases, n, frames), 1, 2)
     elif not truth.is_uniform:
         for mode, (own, mode_rng) in enumerate(zip(spectra, turbulence_rng.spawn(n), strict=True)):
             if own is not None:
-                total[:, :, mode] += _draw(own, hardware, frames, cases, mode_rng)
+                total[:, :, mode] += _draw(own, hardware, *size, mode_rng, **means)
     for vibration, seen, line_rng in zip(truth.vibrations, truth.motions, line_rngs, strict=True):
-        checked_direction(vibration, hardware)
+        direction = checked_direction(vibration, hardware)
         if isinstance(vibration, Vibration) and seen and oscillators:
             alone = seen_vibration(vibration, {}, (), hardware)
             drive = line_rng.standard_normal((cases, 1 + frames, alone.B.shape[-1]))
-            motion = run_oscillator(alone, vibration, drive)[:, :, 0]
-            lines.append(DrawnLine(motion=motion, drive=drive))
-            continue
-        if isinstance(vibration, Vibration):
-            model = vibration.ar_model(hardware.frame_rate_hz)
-            motion = _draw_ar(model, frames, cases, line_rng)
-        elif isinstance(vibration, DriftingVibration):
-            time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
-            motion = _draw_drift(vibration, time_s, hardware.frame_rate_hz, cases, line_rng)
+            line = DrawnLine(motion=run_oscillator(alone, vibration, drive)[:, :, 0], drive=drive)
         else:
-            turns = vibration.frequency_hz / hardware.frame_rate_hz * np.arange(frames)
-            phase = line_rng.uniform(0, 2 * np.pi, (cases, 1))
-            motion = vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase)
-        lines.append(DrawnLine(motion=motion))
+            time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
+            motion, frequency_hz = _draw_line(vibration, hardware, time_s, cases, line_rng)
+            share = 1.0 if frame_means else np.sinc(frequency_hz / hardware.frame_rate_hz)
+            line = DrawnLine(motion=share * motion)
+        lines.append(line)
+        total += line.motion[:, :, None] * direction
     return total, lines
+
+
+def _draw_line(
+    vibration: Vibration | SinusoidalVibration | DriftingVibration,
+    hardware: LoopHardware,
+    time_s: FloatArray,
+    cases: int,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Return a line of its rms, (cases, frames), and its frequencies of the moment [Hz]."""
+    rate, frames = hardware.frame_rate_hz, len(time_s)
+    if isinstance(vibration, DriftingVibration):
+        drift = _draw_drift(vibration, time_s, rate, cases, rng)
+        return drift, vibration.frequency_hz_at(time_s)
+    constant_hz = np.full(frames, vibration.frequency_hz)
+    if isinstance(vibration, Vibration):
+        return _draw_ar(vibration.ar_model(rate), frames, cases, rng), constant_hz
+    turns = vibration.frequency_hz / rate * np.arange(frames)
+    phase = rng.uniform(0, 2 * np.pi, (cases, 1))
+    return vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase), constant_hz
 
 
 def run_oscillator(seen: SeenVibration, line: Vibration, drive: FloatArray) -> FloatArray:
@@ -120,16 +252,84 @@ def run_oscillator(seen: SeenVibration, line: Vibration, drive: FloatArray) -> F
     return np.asarray(out.transpose(2, 0, 1))
 
 
-def draw_noise(
-    truth: Truth, hardware: LoopHardware, *, frames: int, cases: int, rng: np.random.Generator
+def draw_others(
+    truth: Truth,
+    hardware: LoopHardware,
+    lines: Sequence[DrawnLine],
+    rng: np.random.Generator,
+    *,
+    frames: int,
+    cases: int,
+    zero_frame: int,
 ) -> FloatArray:
-    """Draw the measurement noise, (cases, frames, q) [nm]."""
-    q = hardware.n_measurements
-    return truth.noise_per_measurement(q) * rng.standard_normal((cases, frames, q))
+    """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q).
+
+    What a wavefront sensor reads of the residual is no part of them. The lines are those of
+    :func:`draw_phase`, whose time 0 is frame ``zero_frame``.
+    """
+    suite = hardware.suite
+    factors = [sensor.noise_factor(hardware.modes) for sensor in suite.sensors]
+    drawn = [rng.standard_normal((cases, frames, len(factor))) @ factor.T for factor in factors]
+    out = np.concatenate(drawn, axis=2)
+    moving = checked_motions(truth.motions, suite, len(lines))
+    first = out.shape[2] - len(suite.channels)  # column of the first channel
+    for vibration, line, moved in zip(truth.vibrations, lines, moving, strict=True):
+        seen = [first + i for i, name in enumerate(suite.channels) if name in moved]
+        if not seen:
+            continue
+        if isinstance(vibration, Vibration):
+            process = seen_vibration(vibration, moved, suite.accelerometers, hardware)
+            inner = rng.standard_normal((cases, 1 + frames, process.B.shape[-1] - 3))
+            drive = np.concatenate([line.drive, inner], axis=2)
+            out[:, :, seen] += run_oscillator(process, vibration, drive)[:, :, 1:]
+        else:
+            time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
+            readings = [
+                _acceleration(sensor, hardware, vibration, line.motion, moved[name], time_s)
+                for sensor in suite.accelerometers
+                for name in sensor.channels
+                if name in moved
+            ]
+            out[:, :, seen] += np.stack(readings, axis=2)
+    return out
+
+
+def _acceleration(
+    sensor: Accelerometer,
+    hardware: LoopHardware,
+    line: SinusoidalVibration | DriftingVibration,
+    motion: FloatArray,
+    moved: Motion,
+    time_s: FloatArray,
+) -> FloatArray:
+    """Return what a channel reads of a sinusoid, (cases, frames) [m/s^2].
+
+    A line that drifts counts with its frequency of the moment. That of one with a damping is an
+    approximation, good for a narrow line: its mean acceleration is not only ``-w^2`` times its mean
+    position.
+    """
+    if isinstance(line, DriftingVibration):
+        frequency_hz = line.frequency_hz_at(time_s)
+    else:
+        frequency_hz = np.full(len(time_s), line.frequency_hz)
+    turn = 2 * np.pi * frequency_hz * hardware.dt_s
+    # whole frames of the age are a delay; what is left of it turns the phase, by two frames
+    newest = int(sensor.age_frames(hardware) - period_frames(sensor, hardware) + 1)
+    swing = sensor.swing(moved, frequency_hz, hardware) * np.exp(1j * turn * newest)
+    # beyond its begin the motion counts as still: the first readings are in the settling
+    padded = np.pad(motion, ((0, 0), (newest + 1, 0)), mode="edge")[:, : motion.shape[1] + 1]
+    now, before = padded[:, 1:], padded[:, :-1]
+    return np.asarray(swing.real * now - swing.imag * (before - np.cos(turn) * now) / np.sin(turn))
 
 
 def _draw(
-    spectrum: Spectrum, hardware: LoopHardware, frames: int, cases: int, rng: np.random.Generator
+    spectrum: Spectrum,
+    hardware: LoopHardware,
+    frames: int,
+    cases: int,
+    rng: np.random.Generator,
+    *,
+    frame_means: bool,
 ) -> FloatArray:
     if isinstance(spectrum, ARModel):
         return _draw_ar(spectrum, frames, cases, rng)
@@ -138,6 +338,8 @@ def _draw(
     length += length % 2  # an even length has a bin at the Nyquist frequency
     # E|X_k|^2 = power_k length^2 / 2; the two end bins are real, with twice that variance
     amplitude = length * np.sqrt(_bin_powers(spectrum, rate, length)) / 2
+    if not frame_means:
+        amplitude *= np.sinc(rfftfreq(length))
     out = np.empty((cases, frames))
     for case in range(cases):
         white = rng.standard_normal((2, amplitude.size))

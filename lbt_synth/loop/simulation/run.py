@@ -1,29 +1,60 @@
-"""Runs a loop in the time domain: random disturbances, any controller, all series."""
+"""Runs a loop in time: any disturbance, any controller, sensors that fail; returns all series."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import Controller
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.linear.estimator_form import EstimatorForm, RunningEstimator
+from lbt_synth.linear.estimator_form import EstimatorForm
 from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.linear.state_space import RunningController
-from lbt_synth.loop.closed_loop import ClosedLoop, close_loop
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
+from lbt_synth.loop.closed_loop import ClosedLoop, close_loop, reads_others
+from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
 from lbt_synth.storage.summaries import Summarised
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, choice, frozen_copy, integer, number, require_instance
 
 _SETTLED = 1e-4  # decay of the slowest mode after which a loop has settled
 _MOST_SETTLING = 200_000  # frames
 _DEFAULT_SETTLING = 1000  # frames
 _MOST_GIGABYTES = 8.0
+
+READINGS = ("missing", "zero", "frozen")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drop:
+    """A sensor or channel that fails for a while.
+
+    Its readings are missing, which is seen, so that the fall-back filter takes over; or they are
+    zero, or frozen at the last one, which the filter believes.
+    """
+
+    unit: str
+    start_s: float
+    end_s: float = np.inf
+    reading: str = "missing"
+
+    def __post_init__(self) -> None:
+        number(self.start_s, "start_s", at_least=0)
+        choice(self.reading, "reading", READINGS)
+        if not self.end_s > self.start_s:
+            raise ProblemError(
+                f"{self.unit} must be back after it fails, at {self.start_s:g} s; got "
+                f"{self.end_s:g} s."
+            )
+
+    def covers(self, time_s: float) -> bool:
+        """Whether the sensor is away at a time."""
+        return self.start_s <= time_s < self.end_s
 
 
 @runtime_checkable
@@ -46,19 +77,23 @@ class Simulation(Summarised):
     Attributes
     ----------
     total_nm, residual_nm : (cases, frames, n) ndarray
-        Phase before and after the correction [nm].
+        Mean phase over each frame before and after the correction [nm].
+    image_nm2 : (cases, frames, n) ndarray
+        Mean square of the residual, as the camera sees it, while the command holds that arrives in
+        a frame [nm^2].
     commands : (cases, frames, m) ndarray
         Commands u(k), as the mirror applied them.
     measurements : (cases, frames, q) ndarray
-        Measurements y(k).
+        Measurements y(k); of several sensors all of them, held from one reading to the next.
     frame_rate_hz : float
         Frame rate [Hz].
     seed : int
-        Seed of the random series.
+        Seed of the random series; 0 where they were recorded.
     """
 
     total_nm: FloatArray
     residual_nm: FloatArray
+    image_nm2: FloatArray
     commands: FloatArray
     measurements: FloatArray
     frame_rate_hz: float
@@ -70,24 +105,33 @@ class Simulation(Summarised):
 
     @property
     def rms_nm(self) -> FloatArray:
-        """Residual of each case over all modes [nm rms], (cases,)."""
-        return np.asarray(np.sqrt(np.sum(np.mean(self.residual_nm**2, axis=1), axis=1)))
+        """Residual of each case over all modes, as the camera sees it [nm rms], (cases,)."""
+        return np.asarray(np.sqrt(np.sum(np.mean(self.image_nm2, axis=1), axis=1)))
 
     def strehl(self, imaging: Imaging) -> FloatArray:
         """Long-exposure Strehl ratio of each case, (cases,)."""
-        return np.array([series_strehl(case, imaging) for case in self.residual_nm])
+        beside = np.mean(self.image_nm2 - self.residual_nm**2, axis=1)  # the means over frames
+        pairs = zip(self.residual_nm, beside, strict=True)
+        return np.array([series_strehl(case, imaging, within_nm2=w) for case, w in pairs])
+
+    def part(self, first: int, last: int) -> Simulation:
+        """Return the run from one frame to before another."""
+        names = ("total_nm", "residual_nm", "image_nm2", "commands", "measurements")
+        return replace(self, **{name: getattr(self, name)[:, first:last] for name in names})
 
 
 def simulate(
     controller: Controller | EstimatorForm | HasController | SteppedController,
-    truth: Truth,
+    disturbance: Truth | Disturbance,
     *,
     hardware: LoopHardware,
-    frames: int,
+    frames: int | None = None,
     cases: int = 1,
     seed: int = 0,
     settle_frames: int | None = None,
     stroke: float | None = None,
+    drops: Sequence[Drop] = (),
+    frame_means: bool = False,
 ) -> Simulation:
     """Close the loop in the time domain.
 
@@ -99,24 +143,31 @@ def simulate(
     Parameters
     ----------
     controller : Controller, Design, EstimatorForm or object with ``step(y)`` and ``reset()``
-        The controller; a :class:`Controller` runs at the speed of matrix products where the
-        stroke is not limited. The form of :func:`~lbt_synth.linear.estimator_form` is given the
-        commands that were applied.
-    truth : Truth
-        Disturbances, noise and sensor gain.
+        The controller; a :class:`Controller` of the loop's own sensor runs at the speed of matrix
+        products where the stroke is not limited. The form of
+        :func:`~lbt_synth.linear.estimator_form` is given the commands that were applied. A design
+        of several sensors has its fall-backs with it.
+    disturbance : Truth or Disturbance
+        A truth, from which phase and noise are drawn; or the series themselves.
     hardware : LoopHardware
-        Sensor, mirror and delay.
-    frames : int
-        Frames to keep.
+        Sensors, mirror and delay.
+    frames : int, optional
+        Frames to keep; all by default where the series are given.
     cases : int, optional
-        Independent runs at once.
+        Independent runs at once, of a truth.
     seed : int, optional
-        Seed of the random series.
+        Seed of the random series, of a truth.
     settle_frames : int, optional
         Frames run before and dropped; by default until the slowest mode of the
-        loop has decayed to 1e-4 (1000 frames for a stepped controller).
+        loop has decayed to 1e-4 (1000 frames for a stepped controller), and none of series that are
+        given.
     stroke : float, optional
         Largest modulus of a command that the mirror applies; without a limit by default.
+    drops : sequence of Drop, optional
+        Sensors that fail, in a loop of several; they count from the first frame that is kept.
+    frame_means : bool, optional
+        Whether the phase of a frame that is drawn is one number, as in
+        :func:`residual_budget`.
 
     Returns
     -------
@@ -128,8 +179,8 @@ def simulate(
     UnstableLoopError
         If the loop of a :class:`Controller` is unstable or marginally stable.
     ProblemError
-        If a value is out of range, sizes clash, or a stepped controller returns
-        commands that are not finite.
+        If a value is out of range, sizes clash, a stepped controller returns commands that are not
+        finite, or a sensor that fails is not there or has no fall-back.
 
     Examples
     --------
@@ -141,71 +192,125 @@ def simulate(
     ...     noise_nm=10.0,
     ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
     ... )
-    >>> run = lbt.simulate(lazy.controller, shake, hardware=path, frames=4000)
+    >>> run = lbt.simulate(lazy, shake, hardware=path, frames=4000)
     >>> exact = lbt.residual_budget(lbt.close_loop(path, lazy.controller), shake)
     >>> bool(abs(run.rms_nm[0] / exact.rms_nm - 1) < 0.05)
     True
     """
-    frames = integer(frames, "frames", at_least=1)
-    cases = integer(cases, "cases", at_least=1)
-    seed = integer(seed, "seed", at_least=0)
+    if not isinstance(disturbance, Truth):
+        require_instance(disturbance, Disturbance, "disturbance")
     limit = np.inf if stroke is None else number(stroke, "stroke", above=0)
-    if isinstance(controller, EstimatorForm):
-        controller = controller.start()
-    if isinstance(controller, SteppedController):
-        default = _DEFAULT_SETTLING
-    else:
-        controller = as_controller(controller, others=", an object with step(y) and reset()")
-        loop = close_loop(hardware, controller, sensor_gain=truth.sensor_gain)
-        loop.require_stable()
-        if loop.reads_others:
-            raise ProblemError(
-                "this run has readings of the loop's own sensor alone; got a controller of several "
-                "sensors. Try lbt-synth simulate."
-            )
-        default = settling_frames(loop.spectral_radius)
-    settle = default
+    running, path, loop = _started(controller, hardware, disturbance.sensor_gain)
+    settle = 0
+    if isinstance(disturbance, Truth):
+        settle = settling_frames(loop.radius_per_frame) if loop else _DEFAULT_SETTLING
     if settle_frames is not None:
         settle = integer(settle_frames, "settle_frames", at_least=0)
-    channels = 2 * (hardware.modes + hardware.n_measurements) + hardware.n_commands
+    if isinstance(disturbance, Truth):
+        kept = integer(frames, "frames", at_least=1)
+        cases = integer(cases, "cases", at_least=1)
+        seed = integer(seed, "seed", at_least=0)
+        _require_memory(path, frames=kept, cases=cases, settle=settle)
+        disturbance = draw_disturbance(
+            disturbance,
+            path,
+            frames=settle + kept,
+            cases=cases,
+            seed=seed,
+            zero_frame=settle,
+            frame_means=frame_means,
+        )
+    if loop is not None and stroke is None and not (path.suite.sensors or drops):
+        noise = disturbance.noise_of(path.n_measurements)
+        inputs = np.concatenate([disturbance.phase_nm, noise], axis=2)
+        outputs = filter_series(loop.system, inputs)
+    else:
+        outputs = _step(
+            running, disturbance, path, limit, _events(drops, path, settle, disturbance.frames)
+        )
+    return _record(disturbance, outputs, path, settle=settle, seed=seed)
+
+
+def _started(
+    controller: Controller | EstimatorForm | HasController | SteppedController,
+    hardware: LoopHardware,
+    sensor_gain: float,
+) -> tuple[SteppedController | RunningController, LoopHardware, ClosedLoop | None]:
+    """Return a controller that runs, the hardware with what it reads, and its loop if it is linear.
+
+    Other objects that step read the loop's own sensor.
+    """
+    alone = hardware.own_sensor_alone()
+    if isinstance(controller, EstimatorForm):
+        return controller.start(), alone, None
+    if isinstance(controller, SteppedController):
+        ours = controller.controller if isinstance(controller, RunningController) else None
+        reads = isinstance(ours, Controller) and reads_others(hardware, ours)
+        return controller, hardware if reads else alone, None
+    others = ", an object with step(y) and reset()"
+    plain = as_controller(controller, others=others, any_period=True)
+    path = hardware if reads_others(hardware, plain) else alone
+    loop = close_loop(path, plain, sensor_gain=sensor_gain)
+    loop.require_stable()
+    return plain.start(getattr(controller, "controllers", None)), path, loop
+
+
+def _require_memory(hardware: LoopHardware, *, frames: int, cases: int, settle: int) -> None:
+    """Refuse a run that does not fit into the memory."""
+    pieces = 2 + len(hardware.mirror_system.hold.D)
+    channels = pieces * hardware.modes + 2 * hardware.n_readings + hardware.n_commands
     gigabytes = 8e-9 * (settle + frames) * cases * channels
     if gigabytes > _MOST_GIGABYTES:
         raise ProblemError(
             f"frames x cases must fit into {_MOST_GIGABYTES:g} GB; got {frames} x {cases}, which "
             f"need {gigabytes:.3g} GB. Run fewer cases at once, with different seeds."
         )
-    disturbance_rng, noise_rng = np.random.default_rng(seed).spawn(2)
-    total = draw_disturbance(
-        truth,
-        hardware,
-        frames=settle + frames,
-        cases=cases,
-        rng=disturbance_rng,
-        zero_frame=settle,
-    )
-    noise = draw_noise(truth, hardware, frames=settle + frames, cases=cases, rng=noise_rng)
-    if isinstance(controller, Controller) and stroke is None:
-        outputs = filter_series(loop.system, np.concatenate([total, noise], axis=2))
-    else:
-        own = controller.start() if isinstance(controller, Controller) else controller
-        outputs = step_loop(own, truth.sensor_gain, hardware, total, noise, stroke=limit)
-    return record_run(total, outputs, hardware, settle=settle, seed=seed)
 
 
-def record_run(
-    total: FloatArray, outputs: FloatArray, hardware: LoopHardware, *, settle: int, seed: int
+def _record(
+    disturbance: Disturbance,
+    outputs: FloatArray,
+    hardware: LoopHardware,
+    *,
+    settle: int,
+    seed: int,
 ) -> Simulation:
     """Return the series of a loop after it has settled, from ``phi_res, u, y`` side by side."""
     n, m = hardware.modes, hardware.n_commands
-    kept = outputs[:, settle:]
+    residual = outputs[:, settle:, :n]
+    squares: FloatArray = residual**2
+    if not disturbance.frame_means:
+        squares = _held_squares(disturbance, outputs[:, :, n : n + m], hardware)[:, settle:]
     return Simulation(
-        total_nm=frozen_copy(total[:, settle:]),
-        residual_nm=frozen_copy(kept[:, :, :n]),
-        commands=frozen_copy(kept[:, :, n : n + m]),
-        measurements=frozen_copy(kept[:, :, n + m :]),
+        total_nm=frozen_copy(disturbance.phase_nm[:, settle:]),
+        residual_nm=frozen_copy(residual),
+        image_nm2=frozen_copy(squares),
+        commands=frozen_copy(outputs[:, settle:, n : n + m]),
+        measurements=frozen_copy(outputs[:, settle:, n + m :]),
         frame_rate_hz=hardware.frame_rate_hz,
         seed=seed,
     )
+
+
+def _held_squares(
+    disturbance: Disturbance, commands: FloatArray, hardware: LoopHardware
+) -> FloatArray:
+    """Return the mean square of the residual over the hold that begins in each frame.
+
+    It is (cases, frames, n); before the first command arrives the mirror is flat.
+    """
+    system, hold, m = hardware.mirror_system, hardware.mirror_system.hold, commands.shape[2]
+    pieces, moving = disturbance.over_holds(hold)
+    A, B, _ = system.core.repeated(m)
+    rows = np.zeros((m, len(A))), np.eye(m)
+    C, D = hold.positions(hardware.influence, rows, 0)
+    outputs = D.shape[0] * D.shape[1]  # (g n)
+    mirror = StateSpace(A=A, B=B, C=C.reshape(outputs, -1), D=D.reshape(outputs, m))
+    positions = np.reshape(filter_series(mirror, commands), pieces.shape)
+    late = int(hold.start)
+    pieces[:, late:] -= positions[:, : commands.shape[1] - late]
+    squares = np.einsum("g,ckgi->cki", hold.weights, pieces**2) + moving[:, None]
+    return np.asarray(squares, dtype=np.float64)
 
 
 def settling_frames(radius: float) -> int:
@@ -216,7 +321,7 @@ def settling_frames(radius: float) -> int:
 
 
 def step_controller(
-    controller: SteppedController | RunningController | RunningEstimator,
+    controller: SteppedController | RunningController,
     y: FloatArray,
     size: int,
     *,
@@ -225,14 +330,14 @@ def step_controller(
 ) -> FloatArray:
     """Give a controller its measurements, and return its commands if they are finite.
 
-    An estimator form is given the commands that were applied in the last frame, too.
+    One of ours is given the commands that were applied in the last frame, too.
     """
-    if isinstance(controller, RunningEstimator):
+    if isinstance(controller, RunningController):
         u = controller.step(y, applied)
     else:
         u = np.asarray(controller.step(y), dtype=np.float64)
     finite = bool(np.isfinite(u).all())
-    if u.shape != (size,) or not finite:
+    if u.shape != (size, *y.shape[1:]) or not finite:
         kind = "" if finite else " with values that are not finite"
         raise ProblemError(
             f"the controller must return {size} finite commands; got {u.shape}{kind} in frame "
@@ -241,38 +346,113 @@ def step_controller(
     return u
 
 
-def step_loop(
-    controller: SteppedController | RunningController | RunningEstimator,
+def _step(
+    controller: SteppedController | RunningController,
+    disturbance: Disturbance,
+    hardware: LoopHardware,
+    stroke: float,
+    events: Mapping[int, Segment],
+) -> FloatArray:
+    """Run the loop frame by frame; return ``phi_res, u, y``, (cases, frames, n + m + q)."""
+    phase, noise = disturbance.phase_nm, disturbance.noise_of(hardware.n_readings)
+    together = isinstance(controller, RunningController)
+    batches = [slice(None)] if together else [slice(i, i + 1) for i in range(len(phase))]
+    gain, runs = disturbance.sensor_gain, []
+    for some in batches:
+        controller.reset()
+        series = phase[some], noise[some]
+        runs.append(_step_cases(controller, gain, hardware, *series, stroke, events))
+    return np.concatenate(runs)
+
+
+def _step_cases(
+    controller: SteppedController | RunningController,
     sensor_gain: float,
     hardware: LoopHardware,
     total: FloatArray,
     noise: FloatArray,
-    *,
-    stroke: float = np.inf,
+    stroke: float,
+    events: Mapping[int, Segment],
 ) -> FloatArray:
-    """Run the loop one frame at a time, as written in :class:`LoopHardware`.
+    """Run cases side by side, as written in :class:`LoopHardware`.
 
     The mirror clips commands at the stroke, which then are those applied.
-
-    Return ``phi_res, u, y`` side by side, (cases, frames, n + m + q).
     """
-    cases, frames, n = total.shape
-    m, q = hardware.n_commands, hardware.n_measurements
-    taps, sensor, influence = hardware.mirror_taps, hardware.sensor, hardware.influence
-    out = np.zeros((cases, frames, n + m + q))
-    for phase, white, left in zip(total, noise, out, strict=True):
-        controller.reset()
-        residual = np.zeros(n)
-        commands = np.zeros((len(taps), m))  # u(k), u(k-1), ...
-        residuals, applied, measured = np.split(left, [n, n + m], axis=1)
-        for k in range(frames):
-            y = sensor_gain * sensor @ residual + white[k]
-            u = step_controller(controller, y, m, frame=k, applied=commands[0])
-            commands[1:] = commands[:-1]
-            commands[0] = u if stroke == np.inf else np.clip(u, -stroke, stroke)
-            residual = phase[k] - influence @ (taps @ commands)
-            residuals[k], applied[k], measured[k] = residual, commands[0], y
+    (cases, frames, n), m, suite = total.shape, hardware.n_commands, hardware.suite
+    rows, read, taps = suite.rows(hardware), suite.read(hardware), hardware.mirror_taps
+    held = memory([own_exposure(hardware), *other_exposures(hardware)], n, len(read))
+    seen = held.C.copy()
+    seen[:, : hardware.n_measurements] *= sensor_gain
+    wavefront = read[:, : seen.shape[1]]
+    state, y = np.zeros((held.n_states, cases)), np.zeros((noise.shape[2], cases))
+    commands = np.zeros((len(taps), m, cases))  # u(k), u(k-1), ...
+    out = np.zeros((cases, frames, n + m + len(y)))
+    wrong: Mapping[str, str] = {}
+    one = slice(None) if isinstance(controller, RunningController) else 0  # has a single case
+    for k in range(frames):
+        if k in events:
+            wrong = events[k].wrong
+            if isinstance(controller, RunningController):
+                controller.miss(events[k].missing)
+        t, last = k % len(read), y.copy()
+        y[read[t]] = noise[:, k, read[t]].T
+        y[: seen.shape[1]][wavefront[t]] += (seen[t] @ state)[wavefront[t]]
+        for unit, reading in wrong.items():
+            y[rows[unit]] = last[rows[unit]] if reading == "frozen" else 0.0
+        u = step_controller(controller, y[:, one], m, frame=k, applied=commands[0][:, one])
+        commands[1:] = commands[:-1].copy()
+        commands[0][:, one] = u if stroke == np.inf else np.clip(u, -stroke, stroke)
+        residual = total[:, k].T - hardware.influence @ np.tensordot(taps, commands, 1)
+        state = held.A[t] @ state + held.B[t] @ residual
+        out[:, k, :n], out[:, k, n : n + m], out[:, k, n + m :] = residual.T, commands[0].T, y.T
     return out
+
+
+def _events(
+    drops: Sequence[Drop], hardware: LoopHardware, settle: int, frames: int
+) -> dict[int, Segment]:
+    """Return what fails from which frame on."""
+    for drop in drops:
+        if drop.unit not in hardware.suite.units:
+            raise ProblemError(
+                f"a sensor that fails must be one of {', '.join(hardware.suite.units)}; got "
+                f"{drop.unit!r}."
+            )
+    if not drops:
+        return {}
+    rate = hardware.frame_rate_hz
+    segments = run_segments(drops, (frames - settle) / rate)
+    return {settle + int(np.ceil(s.start_s * rate - 1e-6)): s for s in segments}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Segment:
+    """A time between two events: what is not read, and what reads zeros or its last reading."""
+
+    start_s: float
+    end_s: float
+    missing: tuple[str, ...]
+    wrong: Mapping[str, str]
+
+    @property
+    def text(self) -> str:
+        """What fails, in words; empty if nothing does."""
+        return ", ".join(
+            [*self.missing, *(f"{unit} ({reading})" for unit, reading in self.wrong.items())]
+        )
+
+
+def run_segments(drops: Sequence[Drop], duration_s: float) -> tuple[Segment, ...]:
+    """Return the times between failures and returns of sensors in a run."""
+    events = {0.0, *(t for d in drops for t in (d.start_s, d.end_s) if t < duration_s)}
+    starts = sorted(events)
+    out = []
+    for start_s, end_s in zip(starts, [*starts[1:], duration_s], strict=True):
+        away = [drop for drop in drops if drop.covers(start_s)]
+        missing = tuple(sorted({d.unit for d in away if d.reading == "missing"}))
+        wrong = {d.unit: d.reading for d in away if d.unit not in missing}
+        out.append(Segment(start_s=start_s, end_s=end_s, missing=missing, wrong=wrong))
+    return tuple(out)
 
 
 SHOWN_FRAMES = 120  # of a response, unless more are asked for

@@ -15,7 +15,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
-from lbt_synth.loop.simulation.failing_sensors import Drop
+from lbt_synth.loop.simulation.run import Drop
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.models.vibration import stationary_vibrations

@@ -11,7 +11,7 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.loop import ClosedLoop, Simulation, simulate, step_response
 from lbt_synth.loop.simulation.run import LoopStep
-from lbt_synth.models import Truth, Vibration
+from lbt_synth.models import ARModel, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy
 
@@ -75,7 +75,8 @@ def exact_spectrum(
 ) -> FloatArray:
     """One-sided spectrum of the residual, summed over the axes [nm^2/Hz], (f,).
 
-    Random disturbances add ``|transfer|^2 spectrum``. A sinusoid of amplitude a at f0 adds what
+    It is that of means over frames; a spectrum S of the phase counts as ``S sinc^2(f / f_s)``.
+    Random disturbances add ``|transfer|^2`` times that. A sinusoid of amplitude a at f0 adds what
     Welch's method makes of it with a Hann window w of that length:
     ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the window's Fourier transform.
     """
@@ -86,16 +87,19 @@ def exact_spectrum(
     total = np.zeros(frequency_hz.size)
     for spectrum, modes in truth.turbulence_groups(n):
         gain = np.sum(np.abs(rejection[:, :, list(modes)]) ** 2, axis=(1, 2))
-        total += gain * spectrum.psd(inside)
+        share = 1.0 if isinstance(spectrum, ARModel) else np.sinc(inside / rate) ** 2
+        total += share * gain * spectrum.psd(inside)
     noise = noise_transfer * truth.noise_per_measurement(loop.hardware.n_measurements)
     total += np.sum(np.abs(noise) ** 2, axis=(1, 2)) * 2 / rate
     for line in stationary_vibrations(truth.vibrations):
         direction = checked_direction(line, loop.hardware)
         if isinstance(line, Vibration):
             gain = np.sum(np.abs(rejection @ direction) ** 2, axis=1)
-            total += gain * line.ar_model(rate).psd(inside)
+            share = np.sinc(line.frequency_hz / rate) ** 2
+            total += share * gain * line.ar_model(rate).psd(inside)
             continue
-        left = line.amplitude_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
+        seen_nm = np.sinc(line.frequency_hz / rate) * line.amplitude_nm
+        left = seen_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
         power = float(np.sum(np.abs(left) ** 2)) / 2
         offset = 2 * np.pi * (frequency_hz - line.frequency_hz) / rate
         # the sum of the squares of a Hann window is 3/8 of its length

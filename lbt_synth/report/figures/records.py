@@ -13,7 +13,7 @@ from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedM
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import Simulation, close_loop
-from lbt_synth.loop.simulation.failing_sensors import Segment
+from lbt_synth.loop.simulation.run import Segment
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing
 from lbt_synth.report.figures.loops import FREQUENCY
 from lbt_synth.storage.display_unit import nm_text

@@ -18,7 +18,6 @@ from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, refuse_config
 from lbt_synth.loop import ClosedLoop, simulate
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
-from lbt_synth.loop.simulation.failing_sensors import simulate_sensors
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest, fixed_design
 from lbt_synth.models import LoopHardware, Truth
@@ -257,12 +256,15 @@ def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> di
     """Return the mean Strehl ratio and the residual of a stable loop, simulated as configured."""
     config, _, truth = sample
     section, hardware = config.settings.simulation, loop.hardware
-    sizes = {"frames": section.frames, "cases": section.cases, "settle_frames": settle}
-    if loop.reads_others:
-        filters = {frozenset[str](): loop.controller}
-        run = simulate_sensors(filters, truth, hardware=hardware, seed=seed, drops=(), **sizes)
-    else:
-        run = simulate(loop.controller, truth, hardware=hardware, seed=seed, **sizes)
+    run = simulate(
+        loop.controller,
+        truth,
+        hardware=hardware,
+        frames=section.frames,
+        cases=section.cases,
+        seed=seed,
+        settle_frames=settle,
+    )
     return {
         "stable": 1.0,
         "strehl": float(np.mean(run.strehl(config.imaging))),

@@ -7,10 +7,10 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 from support.modal import HUM, LINE, RATE, integrator_loop, some_air
 from support.plants import lbt_axis_plant
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
 from lbt_synth.design.modal import MixedController, modal_filters, modal_loop
-from lbt_synth.loop.simulation.run import step_loop
 
 
 def controllers(n, delay):
@@ -40,7 +40,7 @@ def test_series_are_those_of_the_loop_as_written(kind, delay):
     gain = np.linspace(0.6, 1.1, n)
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, sensor_matrix=np.diag(gain))
     running = controller.start() if kind == "filters" else controller
-    expected = step_loop(running, 1.0, path, total.T[None], noise.T[None])[0].T
+    expected = recorded_run(running, path, total.T, noise.T)[0].T
     loop = modal_loop(controller, hardware=path, sensor_gain=gain)
     run = loop.run(total, noise, all_series=True)
     got = np.concatenate([run.residual_nm, run.commands, run.measurements])

@@ -10,8 +10,7 @@ from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
-from lbt_synth.loop.simulation.disturbances import draw_parts
-from lbt_synth.loop.simulation.failing_sensors import draw_others
+from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 
 RATE = 1000.0
@@ -146,7 +145,7 @@ def test_a_run_gives_the_motions_back(delay_frames):
     truth = lbt.Truth(turbulence=None, vibrations=lines, motions=motions)
     size = {"frames": 40_000, "cases": 1, "zero_frame": 0}
     rng = np.random.default_rng(1)
-    _, drawn = draw_parts(truth, path, rng=rng, oscillators=True, **size)
+    _, drawn = draw_phase(truth, path, rng=rng, oscillators=True, **size)
     read = draw_others(truth, path, drawn, rng, **size)
     # the wavefront sensor measures in frame k the phase of frame k - 1
     seen = np.stack([np.roll(line.motion[0], 1) for line in drawn], axis=1)

@@ -20,7 +20,8 @@ from lbt_synth.interop import pipeline
 from lbt_synth.interop.c import export as c_export
 from lbt_synth.interop.c.terms import RunningSource, source_terms
 from lbt_synth.interop.pipeline import rehearsal_error, target_named, target_names
-from lbt_synth.loop.simulation.failing_sensors import Drop, simulate_sensors
+from lbt_synth.linear.state_space import RunningController
+from lbt_synth.loop.simulation.run import Drop
 
 FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
@@ -339,12 +340,12 @@ def theirs(sensor_files):
     return Compiled(sensor_files["double"].files[0])
 
 
-def run_sensors(sensors_design, config, filters):
+def run_sensors(controller, config, hardware):
     """A run in which sensors fail, alone and together; its readings and commands."""
-    return simulate_sensors(
-        filters,
+    return lbt.simulate(
+        controller,
         config.truth,
-        hardware=sensors_design.hardware,
+        hardware=hardware,
         frames=SENSOR_FRAMES,
         settle_frames=0,
         drops=DROPS,
@@ -354,7 +355,7 @@ def run_sensors(sensors_design, config, filters):
 @pytest.fixture(scope="module")
 def simulated(sensors_design, sensors_config):
     """That run with the filters of the design."""
-    return run_sensors(sensors_design, sensors_config, sensors_design.controllers)
+    return run_sensors(sensors_design, sensors_config, sensors_design.hardware)
 
 
 def fresh_in(k, missing=None):
@@ -383,27 +384,19 @@ def test_the_compiled_filter_closes_the_loop(
     theirs = Compiled(sensor_files[precision].files[0], single=precision == "single")
     frame = iter(range(SENSOR_FRAMES))
 
-    class Stepped:
-        """What a filter multiplies its new state by, which is y, to get the commands."""
+    class Source(RunningController):
+        """It says what is new, and takes the commands that were applied."""
 
-        def __init__(self, missing):
+        def reset(self):
+            self.missing = ()
+
+        def miss(self, missing):
             self.missing = missing
 
-        def __matmul__(self, y):
-            return theirs.step(y[:, 0], fresh_in(next(frame), self.missing), theirs.u)[:, None]
+        def step(self, y, applied):
+            return theirs.step(y[:, 0], fresh_in(next(frame), self.missing), applied[:, 0])[:, None]
 
-    class Filter:
-        n_states = sensors_design.problem.n_measurements
-
-        def __init__(self, missing):
-            self.missing = missing
-
-        def stacks(self):
-            A, B, D = np.zeros((2, 6, 6)), np.tile(np.eye(6), (2, 1, 1)), np.zeros((2, 2, 6))
-            return A, B, [Stepped(self.missing)] * 2, D
-
-    filters = {some: Filter(some) for some in sensors_design.controllers}
-    found = run_sensors(sensors_design, sensors_config, filters)
+    found = run_sensors(Source(sensors_design.controller), sensors_config, sensors_design.hardware)
     assert relative(found.commands, simulated.commands) < limit
     assert relative(found.residual_nm, simulated.residual_nm) < limit
 

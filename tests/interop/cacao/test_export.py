@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
 from lbt_synth.interop.cacao.export import (
@@ -15,7 +16,6 @@ from lbt_synth.interop.cacao.export import (
     predictive_filter,
 )
 from lbt_synth.interop.proof import mode_variances, prove_written
-from lbt_synth.loop.simulation.run import step_loop
 
 STEPS = 40
 AIR = lbt.models.ARModel(coefficients=np.array([0.99]), driving_rms_nm=40.0, frame_rate_hz=800)
@@ -52,7 +52,7 @@ def test_the_matrix_is_the_controller_in_its_loop(turned):
         pulse = np.zeros((1, STEPS, 2))
         pulse[0, 0, mode] = 1.0
         rest = np.zeros((1, STEPS, 2))
-        run = step_loop(design.controller.start(), 1.0, design.hardware, rest, pulse)
+        run = recorded_run(design.controller.start(), design.hardware, rest, pulse)
         assert np.allclose(-matrix[:, mode::2].T, run[0, :, 2:4], rtol=1e-6, atol=1e-7)
     assert abs(matrix[0, 1]) > 1e-3  # the axes are coupled
     assert written.error == written.error_single < 0.02
@@ -187,7 +187,7 @@ def test_rounding_is_bounded_by_a_loop_in_that_arithmetic(path):
     total = 300 * np.cumsum(rng.standard_normal((1, 3000, 1)), axis=1) / 30
     rest = np.zeros((1, 3000, 1))
     single, double = (
-        step_loop(run, 1.0, path, total, rest)[0]
+        recorded_run(run, path, total, rest)[0]
         for run in (AppliedFilter(matrix), cut_controller(taps, path).start())
     )
     assert 0 < np.std(single[:, 0] - double[:, 0]) < 3 * bound * np.std(double[:, 0])

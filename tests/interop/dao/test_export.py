@@ -10,6 +10,7 @@ from astropy.io import fits
 from hypothesis import given
 from hypothesis import strategies as st
 from support.exports import relative
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
@@ -22,8 +23,7 @@ from lbt_synth.interop.dao.export import (
 )
 from lbt_synth.interop.dao.refit import make_again
 from lbt_synth.interop.proof import prove_written
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_noise
-from lbt_synth.loop.simulation.run import step_loop
+from lbt_synth.loop.simulation.disturbances import draw_disturbance
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
@@ -77,10 +77,9 @@ def shaped_run(shaped):
         frequency_hz=20.0, rms_nm=line.rms_nm, direction=(1.0,)
     )
     truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, vibrations=[vibration])
-    rng, size = np.random.default_rng(1), {"frames": 6000, "cases": 1}
-    total = draw_disturbance(truth, shaped.hardware, rng=rng, **size)
-    noise = draw_noise(truth, shaped.hardware, rng=rng, **size)
-    own = step_loop(shaped.controller.start(), 1.0, shaped.hardware, total, noise)
+    drawn = draw_disturbance(truth, shaped.hardware, frames=6000, seed=1)
+    total, noise = drawn.phase_nm, drawn.noise
+    own = recorded_run(shaped.controller.start(), shaped.hardware, total, noise)
     return total, noise, own[0, 1000:, 0]
 
 
@@ -97,7 +96,7 @@ def test_a_shaped_design_that_single_precision_breaks_is_made_again(
     assert written.notes[0].startswith("made again for single precision")
     assert beside["notes"] == list(written.notes)
     total, noise, own = shaped_run
-    found = step_loop(InnerLoop(matrix), 1.0, shaped.hardware, total, noise)[0, 1000:, 0]
+    found = recorded_run(InnerLoop(matrix), shaped.hardware, total, noise)[0, 1000:, 0]
     assert np.std(found) == pytest.approx(np.std(own), rel=0.03)
     assert np.std(found) < 0.3 * np.std(total)
 

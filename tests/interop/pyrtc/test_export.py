@@ -8,11 +8,11 @@ import pytest
 from ruamel.yaml import YAML
 from support.exports import bare_design, lbt_designs, relative, with_controller
 from support.gain_file_edits import odd_plant
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
-from lbt_synth.loop.simulation.run import step_loop
 
 NAMES = ["config.yaml", "config.yaml.certificate.json", "gain.fits", "interaction_matrix.npz"]
 
@@ -169,7 +169,7 @@ def test_its_commands_are_those_of_the_controller(name):
     design = lbt.kalman(odd_plant()) if name == "odd" else lbt_designs()[name]
     given = series(design, 1000)
     own, twin = (
-        step_loop(one, 1.0, design.hardware, *given)[0, :, 2:4]
+        recorded_run(one, design.hardware, *given)[0, :, 2:4]
         for one in (design.controller.start(), InnerLoop(pol_filter(design)))
     )
     assert 0 < relative(twin, own) < 1e-6
@@ -181,9 +181,7 @@ def test_a_clipped_command_winds_nothing_up():
     total, noise = series(design, 3000)
     total[:, 500:1000] += 1e5  # far beyond the stroke
     free, held = (
-        step_loop(InnerLoop(pol_filter(design), limit), 1.0, design.hardware, total, noise)[
-            0, :, :2
-        ]
+        recorded_run(InnerLoop(pol_filter(design), limit), design.hardware, total, noise)[0, :, :2]
         for limit in (np.inf, 500.0)
     )
     assert np.max(np.abs(held[600:1000])) > 9e4
@@ -198,7 +196,7 @@ def test_a_loop_that_was_open_closes_as_if_it_had_not_been():
     """The mirror is flattened while the loop does not run."""
     design, frames = lbt_designs()["kalman"], 2500
     total, noise = series(design, frames)
-    whole = step_loop(InnerLoop(pol_filter(design)), 1.0, design.hardware, total, noise)[0, :, :2]
+    whole = recorded_run(InnerLoop(pol_filter(design)), design.hardware, total, noise)[0, :, :2]
     loop, commands, residual = InnerLoop(pol_filter(design)), np.zeros((2, 2)), np.zeros(2)
     for k in range(frames):
         closed = not 500 <= k < 800

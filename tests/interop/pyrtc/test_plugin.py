@@ -15,12 +15,12 @@ from support.pyrtc_systems import (
     running,
     synthetic,
 )
+from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
 from lbt_synth.interop.pyrtc import plugin
 from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
 from lbt_synth.interop.pyrtc.plugin import GainFilePredictor
-from lbt_synth.loop.simulation.run import step_loop
 
 QUIET = 5  # frames without a signal, until the loop runs
 SETTLE = 500
@@ -38,7 +38,7 @@ def export(folder, name="kalman", **options):
 
 
 def commands(controller, hardware):
-    return step_loop(controller, 1.0, hardware, *given())
+    return recorded_run(controller, hardware, *given())
 
 
 def test_only_the_loop_is_lent():

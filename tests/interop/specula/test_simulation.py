@@ -21,7 +21,7 @@ from lbt_synth.interop.specula.simulation import (
     run_case,
 )
 from lbt_synth.linear import Controller
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.simulation.disturbances import draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 
@@ -246,9 +246,11 @@ def test_channels_follow_the_motions_that_shake_the_telescope():
     quiet = dim_filter(replace(MIRROR, noise_m_s2=1e-7))
     shaken = lbt.Truth(turbulence=None, vibrations=SHAKES, motions=MOTIONS)
     own = accompany_filter(quiet, shaken, **LENGTH)
-    tilts = draw_disturbance(
-        shaken, PATH, frames=2000, cases=1, rng=np.random.default_rng(2), zero_frame=400
-    )[0]
+    rng = np.random.default_rng(2)
+    phase, _ = draw_phase(
+        shaken, PATH, frames=2000, cases=1, rng=rng, zero_frame=400, frame_means=True
+    )
+    tilts = phase[0]
     # the second line alone has a part along tilt
     second = tilts[:, 1] / 0.8
     moved = {0: tilts[:, 0] - 0.6 * second, 1: second}

@@ -7,13 +7,14 @@ from support.drifting import drifting
 from support.uneven_axes import LOOPS, QUICK, SLOW, TABLE
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_others, draw_phase
+from lbt_synth.models.plant.seen_vibration import seen_vibration
 
 
 def test_drawn_series_have_their_spectrum(air):
     path = lbt.LoopHardware(frame_rate_hz=400, modes=1)
     truth = lbt.Truth(turbulence=air)
-    series = draw_disturbance(truth, path, frames=8192, cases=200, rng=np.random.default_rng(0))[
+    series = draw_disturbance(truth, path, frames=8192, cases=200, frame_means=True).phase_nm[
         ..., 0
     ]
     variance = np.mean(series**2, axis=1)
@@ -42,8 +43,9 @@ def test_power_is_drawn_whole_however_short_the_series(frames):
             path,
             frames=frames,
             cases=3000,
-            rng=np.random.default_rng(2),
-        )
+            seed=2,
+            frame_means=True,
+        ).phase_nm
         assert np.sqrt(np.mean(series**2)) == pytest.approx(rms, rel=0.05)
 
 
@@ -51,8 +53,8 @@ def test_white_noise_is_drawn_white():
     flat = lbt.models.TabulatedSpectrum(frequency_hz=[0, 400], density_nm2_hz=[1.0, 1.0])
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     series = draw_disturbance(
-        lbt.Truth(turbulence=flat), path, frames=8, cases=60_000, rng=np.random.default_rng(3)
-    )
+        lbt.Truth(turbulence=flat), path, frames=8, cases=60_000, seed=3, frame_means=True
+    ).phase_nm
     assert np.mean(series**2) == pytest.approx(400, rel=0.01)
 
 
@@ -64,8 +66,9 @@ def test_drawn_ar_series_are_stationary_from_the_first_frame():
         path,
         frames=40,
         cases=6000,
-        rng=np.random.default_rng(1),
-    )[..., 0]
+        seed=1,
+        frame_means=True,
+    ).phase_nm[..., 0]
     for frame in (0, 1, 20, 39):
         assert series[:, frame].std() == pytest.approx(100, rel=0.05)
     model = line.ar_model(800)
@@ -99,10 +102,8 @@ PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
 
 def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):
     truth = lbt.Truth(turbulence=None, vibrations=(line,))
-    rng = np.random.default_rng(seed)
-    return draw_disturbance(
-        truth, PATH, frames=frames, cases=cases, rng=rng, zero_frame=zero_frame
-    )[..., 0]
+    options = {"frames": frames, "cases": cases, "seed": seed, "zero_frame": zero_frame}
+    return draw_disturbance(truth, PATH, frame_means=True, **options).phase_nm[..., 0]
 
 
 def test_the_drawn_resonance_has_its_rms_and_its_decay():
@@ -118,3 +119,56 @@ def test_the_drawn_resonance_has_its_rms_and_its_decay():
         a1, a2 = model.coefficients
         correlation = np.mean(pair[:, 0] * pair[:, 1]) / np.mean(pair**2)
         assert correlation == pytest.approx(a1 / (1 - a2), abs=1.5e-3)
+
+
+def path_with(channel):
+    """A loop at 800 Hz whose accelerometer is another sensor."""
+    suite = lbt.models.SensorSuite(sensors=(channel,))
+    return lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1, suite=suite)
+
+
+@pytest.mark.parametrize(("period", "delay_frames"), [(1, 1.3), (2, 1.6)])
+def test_readings_and_phase_of_a_run_are_those_of_one_oscillator(period, delay_frames):
+    """Where exposures end within a frame; the positions are drawn without knowing of it."""
+    line = lbt.Vibration(frequency_hz=60, damping=0.1, rms_nm=100, direction=(1,))
+    channel = lbt.models.Accelerometer(
+        name="mirror",
+        rate_hz=800 / period,
+        delay_frames=delay_frames,
+        channels=("m1",),
+        noise_m_s2=1e-9,
+    )
+    path = path_with(channel)
+    motion = {"m1": lbt.models.Motion(size=1, phase_deg=50)}
+    truth = lbt.Truth(turbulence=None, vibrations=(line,), motions=(motion,))
+    size = {"frames": 20_000, "cases": 4}
+    rng = np.random.default_rng(4)
+    same, drawn = draw_phase(truth, path, rng=rng, oscillators=True, **size)
+    read = draw_others(truth, path, drawn, rng, zero_frame=0, **size)[:, 100::period, 0]
+    both = np.stack([drawn[0].motion[:, 100::period].ravel(), read.ravel()])
+    expected = seen_vibration(line, motion, (channel,), path).output_covariances()[0]
+    sizes = np.sqrt(np.diag(expected))
+    found = np.cov(both) / np.outer(sizes, sizes)
+    np.testing.assert_allclose(found, expected / np.outer(sizes, sizes), atol=0.03)
+    np.testing.assert_array_equal(same[:, :, 0], drawn[0].motion)
+
+
+def test_a_line_that_drifts_is_read_at_its_frequency_of_the_moment():
+    line = lbt.models.DriftingVibration(
+        start_hz=40, end_hz=80, duration_s=10, rms_nm=100, direction=(1,)
+    )
+    channel = lbt.models.Accelerometer(
+        name="mirror", rate_hz=800, delay_frames=2.5, channels=("m1",), noise_m_s2=1e-12
+    )
+    path = path_with(channel)
+    motion = {"m1": lbt.models.Motion(size=2, phase_deg=70)}
+    truth = lbt.Truth(turbulence=None, vibrations=(line,), motions=(motion,))
+    size = {"frames": 8000, "cases": 1, "zero_frame": 0}
+    _, drawn = draw_phase(truth, path, rng=np.random.default_rng(4), frame_means=True, **size)
+    read = draw_others(truth, path, drawn, np.random.default_rng(5), **size)[0, :, 0]
+    time_s = np.arange(8000) / 800
+    wave = np.exp(2j * np.pi * line.turns_at(time_s - 1.5 / 800))
+    start = np.random.default_rng(4).spawn(2)[1].uniform(0, 2 * np.pi)
+    size_m_s2 = 1e-9 * (2 * np.pi * line.frequency_hz_at(time_s)) ** 2 * line.amplitude_nm
+    expected = np.real(-size_m_s2 * motion["m1"].factor * wave * np.exp(1j * start))
+    assert np.abs(read - expected)[5:].max() < 2e-3 * np.abs(expected).max()

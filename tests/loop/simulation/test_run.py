@@ -1,5 +1,7 @@
 """Simulated loops against the loop equations and the exact residual."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import hilbert
@@ -9,7 +11,9 @@ from support.plants import lbt_axis_plant
 from support.uneven_axes import LINES, LOOPS, SLOW, TABLE
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear.block_filtering import filter_series
+from lbt_synth.loop.simulation.run import Drop, run_segments
 
 
 @pytest.mark.parametrize("delay", [1, 1.4, 2, 2.7, 3])
@@ -43,14 +47,19 @@ def test_fast_loop_is_the_loop_as_written(delay):
         assert np.allclose(one, other, atol=1e-9 * np.abs(other).max()), name
 
 
-def test_simulation_agrees_with_the_exact_answer(config):
+@pytest.mark.parametrize("frame_means", [False, True])
+@pytest.mark.parametrize(("delay", "mirror"), [(2, None), (2.4, None), (2, 70), (2.4, 70)])
+def test_simulation_agrees_with_the_exact_answer(config, delay, mirror, frame_means):
     """Within the statistical error, which the scatter of independent runs gives."""
-    controller = lbt.kalman(config.plant).controller
+    moved = None if mirror is None else shell(mirror, delay_samples=2)
+    path = replace(config.hardware, delay_frames=delay, mirror=moved)
+    controller = lbt.lqg(replace(config.plant, hardware=path), command_weight=1e-3).controller
+    options = {"frame_means": frame_means}
     run = lbt.simulate(
-        controller, config.truth, hardware=config.hardware, frames=8000, cases=24, seed=3
+        controller, config.truth, hardware=path, frames=8000, cases=24, seed=3, **options
     )
-    loop = lbt.close_loop(config.hardware, controller)
-    exact = lbt.residual_budget(loop, config.truth, frame_means=True)
+    loop = lbt.close_loop(path, controller)
+    exact = lbt.residual_budget(loop, config.truth, **options)
     variances = run.rms_nm**2
     error = variances.std(ddof=1) / np.sqrt(len(variances))
     assert abs(variances.mean() - exact.rms_nm**2) < 4 * error
@@ -123,11 +132,11 @@ def test_wrong_controllers_and_counts_are_refused(axis_plant):
 
 
 def test_axis_of_the_lbt_in_the_time_domain():
-    """Truth is the model: the simulated residual is the Kalman filter's 135.958 nm."""
+    """Truth is the model: the simulated means over frames are the Kalman filter's 135.958 nm."""
     plant = lbt_axis_plant()
     truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
     run = lbt.simulate(
-        lbt.kalman(plant).controller, truth, hardware=plant.hardware, frames=4000, cases=50
+        lbt.kalman(plant), truth, hardware=plant.hardware, frames=4000, cases=50, frame_means=True
     )
     variances = run.rms_nm**2
     error = variances.std(ddof=1) / np.sqrt(len(variances))
@@ -151,8 +160,8 @@ def test_a_simulation_agrees_with_the_exact_answer():
     design = lbt.integrator(both, gain=0.4)
     run = lbt.simulate(design.controller, truth, hardware=both, frames=20_000, cases=4, seed=3)
     loop = lbt.close_loop(both, design.controller)
-    exact = lbt.residual_budget(loop, truth, frame_means=True)
-    power = np.mean(run.residual_nm**2, axis=(0, 1))
+    exact = lbt.residual_budget(loop, truth)
+    power = np.mean(run.image_nm2, axis=(0, 1))
     np.testing.assert_allclose(power, np.diag(exact.total_nm2), rtol=0.05)
 
 
@@ -217,3 +226,92 @@ def test_the_step_is_on_the_axis_that_is_named():
     assert step(0.3, path, axis=1).residual == pytest.approx(step(0.3).residual)
     with pytest.raises(lbt.errors.ProblemError, match="axis must be below 2"):
         step(0.3, path, axis=2)
+
+
+def failing_run(design, truth, drops=(), **options):
+    """One run of the loop."""
+    options = {"frames": 10_000, "cases": 8, "seed": 3, "hardware": design.hardware} | options
+    options = {"settle_frames": 1000} | options
+    return lbt.simulate(design, truth, drops=drops, **options)
+
+
+def exact_nm(design, truth, missing, filtered):
+    """The exact residual where some sensors read zero and a filter takes some as missing."""
+    controller = design.controllers[frozenset(filtered)]
+    loop = lbt.close_loop(design.hardware, controller, blind=missing)
+    return lbt.residual_budget(loop, truth).rms_nm
+
+
+@pytest.mark.parametrize(
+    ("missing", "reading"),
+    [((), "missing"), (("m1",), "missing"), (("m2",), "zero"), (("slow", "m2"), "missing")],
+)
+def test_a_run_has_the_exact_residual(sensors_design, sensors_config, missing, reading):
+    drops = [Drop(unit=unit, start_s=0, reading=reading) for unit in missing]
+    found = np.sqrt(np.mean(failing_run(sensors_design, sensors_config.truth, drops).rms_nm ** 2))
+    filtered = missing if reading == "missing" else ()
+    assert found == pytest.approx(
+        exact_nm(sensors_design, sensors_config.truth, missing, filtered), rel=0.03
+    )
+
+
+def test_the_wavefront_sensor_may_go_and_come_back(sensors_design, sensors_config):
+    away = Drop(unit="wavefront", start_s=3, end_s=3.2)
+    found = failing_run(sensors_design, sensors_config.truth, [away])
+    untouched = failing_run(sensors_design, sensors_config.truth)
+    assert np.array_equal(found.residual_nm[:, :3000], untouched.residual_nm[:, :3000])
+    apart = np.abs(found.residual_nm - untouched.residual_nm)
+    assert np.max(apart[:, 3000:3200]) > 20
+    assert np.max(apart[:, 9000:]) < 1e-6  # what it left has decayed
+    steps = np.abs(np.diff(found.commands, axis=1))
+    # no jump of the commands where filters are switched
+    assert np.max(steps[:, 2998:3003]) < 2 * np.max(steps[:, :2990])
+
+
+def test_a_frozen_wavefront_runs_away_where_the_table_says_so(sensors_design, sensors_config):
+    away = Drop(unit="wavefront", start_s=1, reading="frozen")
+    loop = lbt.close_loop(sensors_design.hardware, sensors_design.controller, blind=("wavefront",))
+    found = failing_run(sensors_design, sensors_config.truth, [away], frames=6000, cases=2)
+    grows = np.max(np.abs(found.residual_nm[:, -100:])) > 1e4
+    assert grows == (not loop.is_stable)
+
+
+def test_a_sinusoid_that_channels_see(sensors_design, sensors_config):
+    lines = tuple(
+        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=100, direction=d)
+        for f, d in ((20, (1, 0)), (33, (0, 1)))
+    )
+    truth = replace(sensors_config.truth, vibrations=lines)
+    loop = sensors_design.close(sensors_config.hardware)
+    exact = lbt.residual_budget(loop, truth)
+    found = failing_run(sensors_design, truth, frames=20_000, cases=4)
+    assert np.sqrt(np.mean(found.rms_nm**2)) == pytest.approx(exact.rms_nm, rel=0.03)
+
+
+def test_segments_of_drops_that_overlap():
+    drops = [Drop(unit="a", start_s=1, end_s=3), Drop(unit="b", start_s=2, reading="zero")]
+    found = run_segments(drops, 4.0)
+    assert [(s.start_s, s.end_s, s.text) for s in found] == [
+        (0, 1, ""),
+        (1, 2, "a"),
+        (2, 3, "a, b (zero)"),
+        (3, 4, "b (zero)"),
+    ]
+
+
+def test_a_sensor_that_is_not_there(sensors_design, sensors_config):
+    with pytest.raises(ProblemError, match="must be one of wavefront, slow, m1, m2; got 'm3'"):
+        failing_run(sensors_design, sensors_config.truth, [Drop(unit="m3", start_s=0)], frames=10)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"start_s": 2, "end_s": 1}, "must be back after it fails"),
+        ({"start_s": 0, "reading": "odd"}, "missing, zero, frozen"),
+        ({"start_s": -1}, "at least 0"),
+    ],
+)
+def test_wrong_drops(fields, said):
+    with pytest.raises(ProblemError, match=said):
+        Drop(unit="m1", **fields)

@@ -5,7 +5,7 @@ import pytest
 from support.eris import eris_model
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.failing_sensors import Drop, run_segments, simulate_sensors
+from lbt_synth.loop.simulation.run import Drop, run_segments
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 
 
@@ -72,8 +72,8 @@ def test_modes_count_from_one_as_everywhere():
 
 def test_spans_and_levels(sensors_design, sensors_config):
     drops = [Drop(unit="m1", start_s=0.5, end_s=1), Drop(unit="m1", start_s=1.5)]
-    run = simulate_sensors(
-        sensors_design.controllers,
+    run = lbt.simulate(
+        sensors_design,
         sensors_config.truth,
         hardware=sensors_design.hardware,
         frames=2000,
