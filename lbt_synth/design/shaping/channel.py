@@ -7,6 +7,13 @@ With ``u = Q ybar`` and ``Q = sum c_i Phi_i``, at unit sensor gain::
 
 M is the delay of the mirror. At the sensor gain g all of it is divided by ``1 - (1 - g) T``.
 
+What is minimised is the residual while a command holds. At a fraction p of the delay, and where the
+mirror settles at once, a hold lies in two frames; its mean is interpolated between those of the
+frames, as the targets of the filters are. With j whole frames before the arrival and the
+denominator above it is, at any gain::
+
+    (p + (1 - p) z^-1) (1 - (1 - g) T) phi - z^-(j + 1) Q (g z^-1 phi + w)
+
 The functions Phi are orthonormal and have given poles: the states of a cascade of all-pass
 sections driven by one input span everything with the sections' poles (the Takenaka-Malmquist
 functions; B. Ninness, F. Gustafsson, IEEE Trans. Autom. Control 42, 515 (1997),
@@ -125,6 +132,26 @@ class Channel:
         """Slopes of T, (f, n)."""
         return self.noise_rows(frequency_hz) / self._z(frequency_hz)[:, None]
 
+    def residual_rows(
+        self, frequency_hz: FloatArray, sensor_gain: float
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Slopes of a hold's residual over the denominator, (f, n), and its value at Q = 0, (f,)."""
+        late = held_fraction(self.hardware)
+        if not late:
+            return -self.complementary_rows(frequency_hz), np.ones(len(frequency_hz), complex)
+        z = self._z(frequency_hz)
+        target = late + (1 - late) / z
+        steered = (1 - sensor_gain) * target[:, None] * self.complementary_rows(frequency_hz)
+        measured = sensor_gain / z[:, None] * self.residual_noise_rows(frequency_hz)
+        return -steered - measured, target
+
+    def residual_noise_rows(self, frequency_hz: FloatArray) -> ComplexArray:
+        """Slopes of the noise in the residual of a hold over the denominator, (f, n)."""
+        if not held_fraction(self.hardware):
+            return self.noise_rows(frequency_hz)
+        arrival = self._z(frequency_hz) ** -(self.hardware.mirror_system.lead + 1.0)
+        return np.asarray(arrival[:, None] * self.command_rows(frequency_hz))
+
     def steering_rows(self, frequency_hz: FloatArray, sensor_gain: float) -> ComplexArray | None:
         """Slopes of the denominator at a sensor gain, (f, n); None at 1, where it is 1."""
         rest = 1 - sensor_gain
@@ -155,6 +182,12 @@ class SingleModeLoop:
             self._loops[sensor_gain] = loop
         return self._loops[sensor_gain]
 
+    def held(self, sensor_gain: float) -> ClosedLoop:
+        """Return the loop at a sensor gain, its residual that of holds as in the module."""
+        loop = self.at(sensor_gain)
+        late = held_fraction(self.hardware)
+        return replace(loop, system=_held_system(loop, late)) if late else loop
+
     @property
     def sensitivity(self) -> StateSpace:
         """S at unit sensor gain."""
@@ -171,6 +204,29 @@ class SingleModeLoop:
         """``T = 1 - S`` at unit sensor gain."""
         s = self.sensitivity
         return replace(s, C=-s.C, D=1 - s.D)
+
+
+def held_fraction(hardware: LoopHardware) -> float:
+    """Part of a frame by which a hold begins within one; 0 for a mirror that moves within it."""
+    return hardware.delay_frames % 1 if hardware.mirror is None else 0.0
+
+
+def _held_system(loop: ClosedLoop, late: float) -> StateSpace:
+    """Return the loop of one mode whose residual is that of the hold which ends in the frame.
+
+    Its further states are the phase of the frame before, and the commands since the one that held.
+    """
+    s, n, count = loop.system, loop.system.n_states, loop.hardware.mirror_system.lead + 1
+    A, B = np.zeros((n + 1 + count, n + 1 + count)), np.zeros((n + 1 + count, s.B.shape[1]))
+    A[:n, :n], B[:n] = s.A, s.B
+    B[n, 0] = 1.0
+    A[n + 1, :n], B[n + 1] = s.C[1], s.D[1]
+    A[n + 2 :, n + 1 : -1] = np.eye(count - 1)
+    C, D = np.zeros((len(s.C), len(A))), s.D.copy()
+    C[:, :n] = s.C
+    C[0], D[0] = 0.0, 0.0
+    C[0, n], C[0, -1], D[0, 0] = 1 - late, -1.0, late
+    return StateSpace(A=A, B=B, C=C, D=D, dt_s=s.dt_s)
 
 
 def mode_loop(hardware: LoopHardware, parameter: Controller) -> SingleModeLoop:

@@ -85,7 +85,7 @@ class ResidualVariance(CheckedFields):
         f, w = grid.nodes_hz, grid.weights_hz
         left = _left_of(self.turbulence, self.sensor_gain, channel, grid)
         noise = self.noise_nm * np.sqrt(w / channel.nyquist_hz)
-        noise_rows = noise[:, None, None] * channel.noise_rows(f)[:, None]
+        noise_rows = noise[:, None, None] * channel.residual_noise_rows(f)[:, None]
         return replace(
             left,
             rows=np.concatenate([left.rows, noise_rows], axis=1),
@@ -104,10 +104,11 @@ def _left_of(
     f = grid.nodes_hz
     density = np.zeros(f.size) if spectrum is None else spectrum.psd(f)
     size = np.sqrt(grid.weights_hz * density)[:, None]
+    rows, centres = channel.residual_rows(f, sensor_gain)
     return Fractions(
         frequency_hz=f,
-        rows=(-size * channel.complementary_rows(f))[:, None],
-        centres=size.astype(np.complex128),
+        rows=(size * rows)[:, None],
+        centres=size * centres[:, None],
         steering=channel.steering_rows(f, sensor_gain),
         worst=False,
     )
@@ -118,7 +119,8 @@ def _measured_left(
 ) -> float:
     """Return the variance that the real loop leaves of a spectrum and noise, exactly [nm^2]."""
     truth = Truth(turbulence=spectrum, noise_nm=noise_nm, sensor_gain=sensor_gain)
-    return float(np.trace(residual_budget(loop.at(sensor_gain), truth, frame_means=True).total_nm2))
+    budget = residual_budget(loop.held(sensor_gain), truth, frame_means=True)
+    return float(np.trace(budget.total_nm2))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,8 +206,8 @@ class VibrationBand(Band):
     def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""
         f = grid.within(self.low_hz, self.high_hz)
-        rows = -self.rms_nm * channel.complementary_rows(f)[:, None, :]
-        centres = np.full((f.size, 1), self.rms_nm, dtype=np.complex128)
+        slopes, target = channel.residual_rows(f, self.sensor_gain)
+        rows, centres = self.rms_nm * slopes[:, None], self.rms_nm * target[:, None]
         steering = channel.steering_rows(f, self.sensor_gain)
         inside = Fractions(
             frequency_hz=f, rows=rows, centres=centres, steering=steering, worst=True
@@ -218,7 +220,7 @@ class VibrationBand(Band):
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets, and that of the skirts."""
-        inside = (self.rms_nm * self.peak(loop.at(self.sensor_gain).rejection())) ** 2
+        inside = (self.rms_nm * self.peak(loop.held(self.sensor_gain).rejection())) ** 2
         skirts = self.skirts(loop.hardware.frame_rate_hz)
         if skirts is None:
             return inside

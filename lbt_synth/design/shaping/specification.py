@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
-from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, mode_loop
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, held_fraction, mode_loop
 from lbt_synth.design.shaping.frequencies import Grid, distinct_bands, first_grid
 from lbt_synth.design.shaping.objectives import (
     ResidualVariance,
@@ -253,8 +253,10 @@ def specified_limit(
 
     Both are over all modes at unit sensor gain: the variance plus the worst of the band. They
     are nan where a mode has no variance at unit gain, or several bands, as the limit of their
-    sum is not known.
+    sum is not known, and where a hold lies in two frames.
     """
+    if held_fraction(hardware):
+        return np.nan, np.nan
     limit_nm2, residual_nm2 = 0.0, 0.0
     for spec, parameter in zip(specifications, parameters, strict=True):
         at_unit = [leaf for leaf in leaves(spec.objective) if leaf.sensor_gain == 1]

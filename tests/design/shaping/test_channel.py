@@ -9,7 +9,12 @@ from support.shaping import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping.channel import laguerre_basis, orthonormal_basis
+from lbt_synth.design.shaping.channel import (
+    Channel,
+    laguerre_basis,
+    mode_loop,
+    orthonormal_basis,
+)
 
 
 @settings(max_examples=30, deadline=None)
@@ -46,3 +51,29 @@ def test_taps_and_laguerre_functions_are_special_cases():
 def test_a_basis_refuses_poles_that_are_none(poles, message):
     with pytest.raises(lbt.errors.ProblemError, match=message):
         orthonormal_basis(np.array(poles, dtype=complex), dt_s=1.0)
+
+
+@pytest.mark.parametrize("sensor_gain", [1.0, 0.6])
+@pytest.mark.parametrize("delay", [1.3, 2.25, 2.49, 3.75])
+def test_the_residual_of_holds_is_what_the_image_has_beyond_its_floor(delay, sensor_gain):
+    """Of a slow line, whose mean over a hold is interpolated between the two frames of the hold."""
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=delay)
+    channel = Channel(hardware=path, basis=laguerre_basis(4, 0.5, dt_s=1 / 800))
+    coefficients = np.array([0.5, 0.3, -0.1, 0.2])
+    loop = mode_loop(path, channel.basis.parameter(coefficients))
+    line = lbt.models.SinusoidalVibration(frequency_hz=15.0, rms_nm=100, direction=(1,))
+    truth = lbt.Truth(turbulence=None, noise_nm=7.0, vibrations=(line,), sensor_gain=sensor_gain)
+    image = lbt.residual_budget(loop.at(sensor_gain), truth)
+    held = lbt.residual_budget(loop.held(sensor_gain), truth, frame_means=True)
+    assert held.noise_nm == pytest.approx(image.noise_nm, rel=1e-9)
+    assert held.vibration_nm == pytest.approx(image.vibration_nm, rel=5e-3)
+    f = np.array([3.0, 90.0, 333.0])
+    rows, target = channel.residual_rows(f, sensor_gain)
+    steering = channel.steering_rows(f, sensor_gain)
+    denominator = 1.0 if steering is None else 1 - steering @ coefficients
+    shaped = (rows @ coefficients + target) / denominator
+    np.testing.assert_allclose(shaped, loop.held(sensor_gain).sensitivity(f)[:, 0, 0], rtol=1e-9)
+    noise = channel.residual_noise_rows(f) @ coefficients / denominator
+    np.testing.assert_allclose(
+        np.abs(noise), np.abs(loop.held(sensor_gain).noise_transfer(f)[:, 0, 0]), rtol=1e-9
+    )
