@@ -135,7 +135,7 @@ class Channel:
     def residual_rows(
         self, frequency_hz: FloatArray, sensor_gain: float
     ) -> tuple[ComplexArray, ComplexArray]:
-        """Slopes of a hold's residual over the denominator, (f, n), and its value at Q = 0, (f,)."""
+        """Slopes of a hold's residual over the denominator, (f, n), and its value at Q = 0."""
         late = held_fraction(self.hardware)
         if not late:
             return -self.complementary_rows(frequency_hz), np.ones(len(frequency_hz), complex)
