@@ -24,6 +24,8 @@ from lbt_synth.models.mirror.frame_rate_system import (
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
+_FRACTIONS = 12  # of a delay, between which a smooth function is interpolated to 1e-10
+_CANCELS = 1e-5  # of a square that is a sum of terms of the order of 1
 _STILL = Hold(start=0.0, edges=np.array([0.0, 1.0]), C=np.zeros((1, 0)), D=np.ones(1))
 
 
@@ -80,6 +82,31 @@ class LoopStack:
         """Whether each command holds for one whole exposure in all of these loops."""
         return self.hold is None and not np.any(self.fraction)
 
+    @property
+    def is_single(self) -> bool:
+        """Whether these are loops of one mode, measurement and command with a settled mirror."""
+        sizes = *self.part.sensor.shape, self.part.influence.shape[1]
+        return self.hold is None and sizes == (1, 1, 1)
+
+    def single_powers(self, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Powers (f, k) of what a hold leaves of a unit mean over frames, and of unit noise.
+
+        They are those of :meth:`piece_responses` for loops that are single, in fewer operations. A
+        hold leaves ``(1 + g w) / (1 + g L)`` of the mean, g the gain, L the open loop at a gain of
+        1, and w what L through the two frames of the hold is beyond L at its arrival.
+        """
+        part, gain, late = self.part, self.sensor_gains, self.fraction
+        command = part.influence[0, 0] * stacked_response(part.controllers(self.rows), z)[..., 0, 0]
+        measured = part.sensor[0, 0] * command / z[:, None]
+        first, second = (_mirror_response(one, z)[:, None] * measured for one in self.mirrors)
+        arrival = measured * z[:, None] ** -(self.start[0] - late[0])
+        power = command.real**2 + command.imag**2
+        if command.shape[1] == 1:
+            left, size = _shared_powers(first, second - first, arrival, z, gain, late)
+        else:
+            left, size = _squares(first, second - first, arrival, z, gain, late)
+        return np.divide(left, size, out=left), np.divide(power, size, out=size)
+
     def responses(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
         """Rejection (n, n, f, k) at f points and negative response to noise (n, q, f, k).
 
@@ -130,8 +157,13 @@ class LoopStack:
         part = self.part
         controller = np.moveaxis(stacked_response(part.controllers(self.rows), z), (2, 3), (0, 1))
         unit = np.einsum("nm,mq...->nq...", part.influence, controller)
-        first, second = (unit * _mirror_response(one, z)[:, None] for one in self.mirrors)
-        path, turn = first + self.fraction * (second - first), self.sensor_gains / z[:, None]
+        path, turn = (
+            unit * _mirror_response(self.mirrors[0], z)[:, None],
+            self.sensor_gains / z[:, None],
+        )
+        if np.any(self.fraction):
+            second = unit * _mirror_response(self.mirrors[1], z)[:, None]
+            path = path + self.fraction * (second - path)
         sensor, modes = part.sensor[..., None, None], range(len(part.influence))
         loop = np.eye(len(modes), dtype=np.complex128)[:, :, None, None]
         for j in range(path.shape[1]):
@@ -279,6 +311,59 @@ def _mirrors_by_delay(
 
 def _are_stable(poles: ComplexArray) -> BoolArray:
     return np.asarray(np.max(np.abs(poles), axis=-1) < 1 - STABILITY_MARGIN)
+
+
+def _squares(
+    first: ComplexArray,
+    change: ComplexArray,
+    arrival: ComplexArray,
+    z: ComplexArray,
+    gain: FloatArray,
+    late: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """``|1 + g w|^2`` and ``|1 + g L|^2``, (f, k), of open loops ``L = first + late change``."""
+    through = first + late * change
+    beyond = through - arrival * np.exp(-1j * np.angle(z)[:, None] * late)
+    pair = (1 + gain * (beyond if np.any(late) else 0 * beyond), 1 + gain * through)
+    left, size = (np.asarray(one.real**2 + one.imag**2) for one in pair)
+    return left, size
+
+
+def _shared_powers(
+    first: ComplexArray,
+    change: ComplexArray,
+    arrival: ComplexArray,
+    z: ComplexArray,
+    gain: FloatArray,
+    late: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return :func:`_squares` of loops of one controller, (f, 1), by products of two matrices.
+
+    The second is a polynomial of gain and fraction; the first is one of the gain, whose
+    coefficients are interpolated between fractions.
+    """
+    cross = 2 * (first * change.conj()).real
+    terms = [np.ones_like(cross), 2 * first.real, 2 * change.real]
+    terms += [np.abs(first) ** 2, cross, np.abs(change) ** 2]
+    powers = [gain**0, gain, gain * late, gain**2, gain**2 * late, gain**2 * late**2]
+    size = np.hstack(terms) @ np.array(powers)
+    left = np.ones_like(size)
+    if np.any(late):
+        middle, half = (late.max() + late.min()) / 2, (late.max() - late.min()) / 2 or 1.0
+        angle = np.pi * (np.arange(_FRACTIONS) + 0.5) / _FRACTIONS
+        places = middle + half * np.cos(angle)
+        beyond = first + places * change
+        beyond = beyond - arrival * np.exp(-1j * np.angle(z)[:, None] * places)
+        degrees = np.arange(_FRACTIONS)[:, None]
+        turns = np.arccos(np.clip((late - middle) / half, -1, 1))
+        weights = np.linalg.solve(np.cos(degrees * angle), np.cos(degrees * turns))
+        coefficients = np.hstack([2 * beyond.real, np.abs(beyond) ** 2])
+        left += coefficients @ np.vstack([weights * gain, weights * gain**2])
+    poor = np.min(size, axis=0) < _CANCELS  # next to instability
+    if np.any(poor):
+        some = _squares(first, change, arrival, z, gain[poor], late[poor])
+        left[:, poor], size[:, poor] = some
+    return left, size
 
 
 def _mirror_response(mirror: Response, z: ComplexArray) -> ComplexArray:

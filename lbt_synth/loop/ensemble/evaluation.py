@@ -45,7 +45,7 @@ from lbt_synth.validation import (
 Process: TypeAlias = ARModel | ModalTurbulence
 
 _AT_ONCE = 1024  # loops with vibrations
-_TOGETHER = 256  # loops with the same frequencies; more do not fit the processor's cache
+_TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
 _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 _ROUNDING = 1e-8  # of the terms of a variance, the least part that it is computed from
 

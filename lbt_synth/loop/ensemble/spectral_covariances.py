@@ -49,7 +49,7 @@ def spectral_covariances(
     def integrand(frequency: FloatArray) -> FloatArray:
         """Return what each spectrum leaves on the way of each mode, and unit noise (f, k, ...).
 
-        First come all that the means leave, then all that moves within.
+        First come all that the means leave; where holds are no frames, then all that moves within.
         """
         z = np.exp(1j * np.pi * frequency / nyquist)
         density = [_density(spectrum, frequency) for spectrum in spectra]
@@ -61,26 +61,78 @@ def spectral_covariances(
             weights = [one * share * scale for one in density]
             left = [_power(rejection[:, j]) * weights[i] for i, j, _ in ways]
             left += [_power(path[:, j]) * scale for j in range(path.shape[1])]
-            still = np.ones((frequency.size, stack.rows.size))
-            left += [_unit(n, j) * (density[i] * (1 - share) * still) for i, j, _ in ways]
-            left += [np.zeros_like(left[0])] * path.shape[1]
         return np.moveaxis(np.array(left), (3, 4), (0, 1))
 
     edges = [graded_edges(stack.poles.ravel()) * nyquist]
     edges += [breakpoints_below(spectrum, nyquist) for spectrum in spectra]
-    covariances = adaptive_integral(integrand, np.unique(np.concatenate(edges)))
-    means, within = np.split(covariances, 2, axis=1)
+    panels = np.unique(np.concatenate(edges))
+    if stack.is_single and (in_image or stack.holds_are_frames):
+        own = [spectra[i] for i, _, _ in ways]
+        means, within = _of_single(stack, own, panels, nyquist, in_image=in_image)
+    elif plain:
+        means, within = adaptive_integral(integrand, panels), np.zeros((1, 0, n, n))
+        if in_image and ways:
+            powers = [_power_within(spectrum, panels, nyquist) for spectrum in spectra]
+            parts = [powers[i][:, None, None] * _unit(n, j)[..., 0, 0] for i, j, _ in ways]
+            within = np.stack(np.broadcast_arrays(*parts), axis=1)
+    else:
+        means, within = np.split(adaptive_integral(integrand, panels), 2, axis=1)
     out = np.zeros((stack.rows.size, 3, hardware.modes, hardware.modes))
     for own, inputs in zip(part.modes, part.measurements, strict=True):
         at = np.ix_(own, own)
         for place, (_, j, modes) in enumerate(ways):
             if own[j] in modes:
                 out[:, 0, *at] += means[:, place]
-                out[:, 2, *at] += within[:, place]
+                if within.shape[1]:
+                    out[:, 2, *at] += within[:, place]
         variance = noise_nm[:, inputs] ** 2 / nyquist
         out[:, 1, *at] = np.einsum("kjil,kj->kil", means[:, len(ways) :], variance)
-        out[:, 2, *at] += np.einsum("kjil,kj->kil", within[:, len(ways) :], variance)
+        if within.shape[1] > len(ways):
+            out[:, 2, *at] += np.einsum("kjil,kj->kil", within[:, len(ways) :], variance)
     return out
+
+
+def _of_single(
+    stack: LoopStack,
+    spectra: list[Turbulence],
+    panels: FloatArray,
+    nyquist_hz: float,
+    *,
+    in_image: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (k, s + 1, 1, 1) that spectra and unit noise leave, and (k, s, 1, 1) within."""
+
+    def integrand(frequency: FloatArray) -> FloatArray:
+        phase, noise = stack.single_powers(np.exp(1j * np.pi * frequency / nyquist_hz))
+        share = np.sinc(frequency / nyquist_hz / 2)[:, None] ** 2 if in_image else 1.0
+        out = np.empty((len(phase), len(spectra) + 1, phase.shape[1]))
+        for i, spectrum in enumerate(spectra):
+            shapes, which, _ = _factored(spectrum, frequency)
+            np.multiply((shapes * share)[:, which], phase, out=out[:, i])
+        out[:, -1] = noise
+        return out[..., None, None]
+
+    means = np.moveaxis(adaptive_integral(integrand, panels), 0, 1)
+    factors = [_factored(spectrum, panels[1:2])[2] for spectrum in spectra]
+    for i, factor in enumerate(factors):
+        means[:, i, 0, 0] *= factor
+    if not in_image:
+        return means, np.zeros((1, 0, 1, 1))
+    within = np.zeros((stack.rows.size, len(spectra), 1, 1))
+    for i, spectrum in enumerate(spectra):
+        within[:, i, 0, 0] = _power_within(spectrum, panels, nyquist_hz)
+    return means, within
+
+
+def _power_within(spectrum: Turbulence, panels: FloatArray, nyquist_hz: float) -> FloatArray:
+    """Power of the spectrum of each loop that moves within frames [nm^2], (k,) or (1,)."""
+
+    def integrand(frequency: FloatArray) -> FloatArray:
+        rest = 1 - np.sinc(frequency / nyquist_hz / 2) ** 2
+        return (_factored(spectrum, frequency)[0] * rest[:, None])[..., None, None]
+
+    _, which, factor = _factored(spectrum, panels[1:2])
+    return np.asarray(adaptive_integral(integrand, panels)[which, 0, 0] * factor)
 
 
 def _of_pieces(
@@ -196,7 +248,15 @@ def _power(transfer: ComplexArray) -> FloatArray:
 
 def _density(spectrum: Turbulence, frequency: FloatArray) -> FloatArray:
     """Return the spectrum of each loop (f, k), or that of all (f, 1)."""
+    shapes, which, factor = _factored(spectrum, frequency)
+    return shapes[:, which] * factor
+
+
+def _factored(
+    spectrum: Turbulence, frequency: FloatArray
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return the different shapes of a spectrum (f, u), and of each loop its shape and factor."""
     if isinstance(spectrum, FrozenFlows):
         shapes, which, factor = spectrum.factored_psd(frequency)
-        return shapes.T[:, which] * factor
-    return spectrum_density(spectrum, frequency)[:, None]
+        return shapes.T, which, factor
+    return spectrum_density(spectrum, frequency)[:, None], np.zeros(1, dtype=np.intp), np.ones(1)
