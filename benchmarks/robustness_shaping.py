@@ -24,7 +24,7 @@ PATH = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=1)
 AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
 DEMANDS = (
     lbt.design.shaping.ModulusMargin(at_least=0.45),
-    lbt.design.shaping.SensorGainRange(low=0.25, high=1.3),
+    lbt.design.shaping.LoopErrors(low=0.25, high=1.3),
 )
 
 

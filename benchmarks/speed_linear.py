@@ -204,9 +204,9 @@ def shaped(functions: int, bands: int) -> Row:
         objective=lbt.design.shaping.Total(terms=tuple(terms)),
         demands=(
             lbt.design.shaping.ModulusMargin(at_least=0.45),
-            lbt.design.shaping.SensorGainRange(low=0.25, high=1.3),
+            lbt.design.shaping.LoopErrors(low=0.25, high=1.3),
             lbt.design.shaping.Attenuation(low_hz=0, high_hz=1, at_most=0.05),
-            lbt.design.shaping.DelayError(frames=0.3),
+            lbt.design.shaping.LoopErrors(delay_frames=0.3),
         ),
     )
     path = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=1)

@@ -10,11 +10,13 @@ from lbt_synth.design.loop_shaping import ShapedDesign, noise_per_mode, shape
 from lbt_synth.design.shaping.bounds import ModulusMargin
 from lbt_synth.design.shaping.objectives import Leaf, ResidualVariance, Total, VibrationBand
 from lbt_synth.design.shaping.specification import Demand, Specification
-from lbt_synth.design.shaping.uncertainty import MovingSensorGain, SensorGainRange
+from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.validation import number, require_instance, sequence
+
+_DELAY_ERROR = 0.1  # frames, at which a loop has to be stable: 100 us at 1 kHz
 
 
 def robust(
@@ -25,6 +27,7 @@ def robust(
     moving_gain: bool = False,
     scenarios: Sequence[float] = (1.0,),
     modulus_margin: float = 0.45,
+    delay_error_frames: float | None = None,
     turbulence: Spectrum | None = None,
     demands: Sequence[Demand] = (),
     functions: int = 60,
@@ -55,6 +58,10 @@ def robust(
         Sensor gains whose residuals are added up.
     modulus_margin : float, optional
         Modulus margin at unit sensor gain.
+    delay_error_frames : float, optional
+        Error of the delay, late or early, at which the loop stays stable at every sensor gain of
+        the interval [frames]. By default 0.1 where the mirror settles at once, and none for a
+        mirror with dynamics.
     turbulence : Atmosphere, ARModel or TabulatedSpectrum, optional
         Spectrum of each mode instead of the plant's models.
     demands : sequence of demands, optional
@@ -101,11 +108,15 @@ def robust(
     low, high = ends
     further = sequence(demands, "demands")
     fixed: list[Demand] = [ModulusMargin(at_least=modulus_margin)]
-    if (low, high) != (1, 1):
-        kind = MovingSensorGain if moving_gain else SensorGainRange
-        fixed.append(kind(low=low, high=high))
-    elif moving_gain:
+    late = delay_error_frames
+    if late is None:
+        late = _DELAY_ERROR if plant.hardware.mirror is None else 0.0
+    if late or ((low, high) != (1, 1) and not moving_gain):
+        fixed.append(LoopErrors(low=low, high=high, delay_frames=late))
+    if moving_gain and (low, high) == (1, 1):
         raise ProblemError("moving_gain needs the interval in which it moves; give sensor_gain.")
+    if moving_gain:
+        fixed.append(MovingSensorGain(low=low, high=high))
     deviations = noise_per_mode(plant.hardware, plant.R)
     by_mode: dict[object, Specification] = {}
     specifications = []

@@ -18,10 +18,9 @@ from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.design.shaping.specification import Demand
 from lbt_synth.design.shaping.uncertainty import (
-    DelayError,
+    LoopErrors,
     MirrorUncertainty,
     MovingSensorGain,
-    SensorGainRange,
 )
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
@@ -170,7 +169,7 @@ def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
     """Return the sensor gains that are demanded, or 1 % less than the design holds."""
     if specifications := design.mode_specifications:
         demands = [demand for spec in specifications for demand in spec.demands]
-        ranges = [demand for demand in demands if isinstance(demand, SensorGainRange)]
+        ranges = [d for d in demands if isinstance(d, LoopErrors | MovingSensorGain)]
         return min([1.0, *(r.low for r in ranges)]), max([1.0, *(r.high for r in ranges)])
     low, high = stable_sensor_gains(hardware, design.controller)
     return min(max(low * _STEP, 1 / _WIDEST), 1.0), max(min(high / _STEP, _WIDEST), 1.0)
@@ -296,7 +295,8 @@ def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:
     system = replace(s, B=np.stack(inputs, axis=1), C=s.C[rows], D=np.stack(direct, axis=1)[rows])
     one = hardware.single_mode()
     own = replace(loop, system=system, hardware=one)
-    return SingleModeLoop(hardware=one, controller=loop.controller, _loops={loop.sensor_gain: own})
+    loops = {loop.sensor_gain: own}
+    return SingleModeLoop(hardware=one, controller=loop.controller, in_frames=True, _loops=loops)
 
 
 def _demand_checks(
@@ -334,5 +334,5 @@ def _demand_change(demand: Demand, change: Callable[[float], float]) -> float:
     if isinstance(demand, Attenuation):
         return change(demand.sensor_gain)
     factor = demand.relative if isinstance(demand, MirrorUncertainty) else 1.0
-    factor = 2.0 if isinstance(demand, DelayError) else factor  # the taps of two delays
+    factor = 1 + demand.high if isinstance(demand, LoopErrors) else factor  # taps of two loops
     return factor * change(1.0)

@@ -41,7 +41,15 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
     assumed = inputs.sensor_gain
     arguments: dict[str, Any] = {
         name: getattr(section, name)
-        for name in ("moving_gain", "modulus_margin", "functions", "pole", "states", "loss")
+        for name in (
+            "moving_gain",
+            "modulus_margin",
+            "delay_error_frames",
+            "functions",
+            "pole",
+            "states",
+            "loss",
+        )
     }
     if section.sensor_gain is not None:
         low, high = section.sensor_gain
@@ -124,13 +132,11 @@ def _build_entry(
 def _list_demands(
     inputs: DesignInputs, section: RobustSection, spectrum: Spectrum | None
 ) -> list[Demand]:
-    from lbt_synth.design.shaping import Attenuation, DelayError, MirrorUncertainty, NoisePeak
+    from lbt_synth.design.shaping import Attenuation, MirrorUncertainty, NoisePeak
 
     out: list[Demand] = []
     if section.noise_peak is not None:
         out.append(NoisePeak(at_most=section.noise_peak))
-    if section.delay_error_frames is not None:
-        out.append(DelayError(frames=section.delay_error_frames))
     for i, step in enumerate(section.attenuation):
         gain = 1.0 if step.sensor_gain is None else step.sensor_gain / inputs.sensor_gain
         entry = step.model_dump() | {"sensor_gain": gain}

@@ -89,9 +89,10 @@ class RobustSection(Section):
     )
     delay_error_frames: float | None = Field(
         default=None,
-        ge=1e-3,
+        ge=0,
         le=1,
-        description="stable for delay errors up to this [frames], late or early",
+        description="stable for delay errors up to this [frames], late or early, at every gain of "
+        "sensor_gain (default: 0.1 where the mirror settles at once, else 0)",
     )
     command_stroke_nm: Nanometres | None = Field(
         default=None, description="largest rms of the commands [nm]"

@@ -57,9 +57,9 @@ def test_every_demand_holds_in_a_loop_measured_by_other_means():
         lbt.design.shaping.NoisePeak(at_most=1.9),
         lbt.design.shaping.Attenuation(low_hz=0, high_hz=2, at_most=0.12),
         lbt.design.shaping.Attenuation(low_hz=4, high_hz=6, at_most=0.5, sensor_gain=0.6),
-        lbt.design.shaping.SensorGainRange(low=0.3, high=1.6),
+        lbt.design.shaping.LoopErrors(low=0.3, high=1.6),
         lbt.design.shaping.MirrorUncertainty(relative=0.7, low_hz=150, high_hz=400),
-        lbt.design.shaping.DelayError(frames=0.5),
+        lbt.design.shaping.LoopErrors(delay_frames=0.5),
         lbt.design.shaping.CommandRms(at_most_nm=40, turbulence=SLOW, noise_nm=NOISE, rate=True),
     )
     design = lbt.design.shape(ONE, spec(*demands), functions=30, states=None)
@@ -196,9 +196,9 @@ def test_a_changed_parameter_a_changed_demand_or_a_better_claim_fails_the_certif
             lambda: lbt.design.shaping.Attenuation(low_hz=0, high_hz=1, at_most=3, sensor_gain=0.5),
             "at_most must be below 2 at sensor gain 0.5",
         ),
-        (lambda: lbt.design.shaping.SensorGainRange(low=1.1, high=1.3), "low must be at most 1"),
-        (lambda: lbt.design.shaping.SensorGainRange(low=0.5, high=0.9), "high must be at least 1"),
-        (lambda: lbt.design.shaping.DelayError(frames=1.5), "frames must be at most 1"),
+        (lambda: lbt.design.shaping.LoopErrors(low=1.1, high=1.3), "low must be at most 1"),
+        (lambda: lbt.design.shaping.LoopErrors(low=0.5, high=0.9), "high must be at least 1"),
+        (lambda: lbt.design.shaping.LoopErrors(delay_frames=1.5), "frames must be at most 1"),
         (
             lambda: lbt.design.shaping.MirrorUncertainty(relative=0, low_hz=0, high_hz=1),
             "relative must be above 0",

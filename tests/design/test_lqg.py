@@ -275,7 +275,7 @@ def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
         lbt.design.shape(
             path,
             lbt.design.shaping.Specification(
-                objective=objective, demands=[lbt.design.shaping.DelayError(frames=0.2)]
+                objective=objective, demands=[lbt.design.shaping.LoopErrors(delay_frames=0.2)]
             ),
         )
 

@@ -25,7 +25,7 @@ def test_sensor_gains_of_the_file_are_real_ones(small):
     design = lbt.load_config(small(section, **believed)).design("robust")
     assert plain.specifications[0].objective.terms[0].sensor_gain == 1
     labels = [d.label for d in design.specifications[0].demands]
-    assert "stability for sensor gains 0.6 to 1.6" in labels
+    assert "stability for sensor gains 0.6 to 1.6 and delay errors up to 0.1 frames" in labels
     noise = [d.specifications[0].objective.terms[0].noise_nm for d in (plain, design)]
     assert noise[1] == pytest.approx(2 * noise[0])
 
@@ -36,7 +36,7 @@ def test_a_moving_gain_is_demanded_and_kept_in_the_file(small, tmp_path):
     kept = lbt.load_gain(lbt.save_gain(tmp_path / "moving.fits", design))
     for each in (design, kept):
         kinds = [type(d).__name__ for d in each.specifications[0].demands]
-        assert kinds == ["ModulusMargin", "MovingSensorGain"]
+        assert kinds == ["ModulusMargin", "LoopErrors", "MovingSensorGain"]
     assert any("moving gain" in check.name for check in kept.recertify().checks)
     with pytest.raises(ProblemError, match="sensor_gain") as caught:
         lbt.load_config(small(SMALL + "    moving_gain: true\n")).design("robust")
@@ -60,8 +60,8 @@ def test_every_demand_of_the_file_reaches_the_specification(small):
     kinds = [type(d).__name__ for d in design.specifications[0].demands]
     assert kinds == [
         "ModulusMargin",
+        "LoopErrors",
         "NoisePeak",
-        "DelayError",
         "Attenuation",
         "MirrorUncertainty",
         "CommandRms",

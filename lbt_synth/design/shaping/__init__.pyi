@@ -7,7 +7,6 @@ from .objectives import Total as Total
 from .objectives import VibrationBand as VibrationBand
 from .objectives import Worst as Worst
 from .specification import Specification as Specification
-from .uncertainty import DelayError as DelayError
+from .uncertainty import LoopErrors as LoopErrors
 from .uncertainty import MirrorUncertainty as MirrorUncertainty
 from .uncertainty import MovingSensorGain as MovingSensorGain
-from .uncertainty import SensorGainRange as SensorGainRange

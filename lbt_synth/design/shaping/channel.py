@@ -173,6 +173,7 @@ class SingleModeLoop:
 
     hardware: LoopHardware
     controller: Controller
+    in_frames: bool = False  # whether its outputs stand for frames, and not for holds
     _loops: dict[float, ClosedLoop] = field(default_factory=dict)
 
     def at(self, sensor_gain: float) -> ClosedLoop:
@@ -185,7 +186,7 @@ class SingleModeLoop:
     def held(self, sensor_gain: float) -> ClosedLoop:
         """Return the loop at a sensor gain, its residual that of holds as in the module."""
         loop = self.at(sensor_gain)
-        late = held_fraction(self.hardware)
+        late = 0.0 if self.in_frames else held_fraction(self.hardware)
         return replace(loop, system=_held_system(loop, late)) if late else loop
 
     @property

@@ -28,7 +28,7 @@ from lbt_synth.design.shaping.objectives import (
     require_term,
     spectrum_of,
 )
-from lbt_synth.design.shaping.uncertainty import SensorGainRange, Uncertainty
+from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain, Uncertainty
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
@@ -64,9 +64,9 @@ class Specification:
     objective : ResidualVariance, VibrationBand, Total or Worst
         What is made least.
     demands : sequence of demands, optional
-        What has to hold: ModulusMargin, NoisePeak, Attenuation, SensorGainRange, MovingSensorGain,
-        DelayError, MirrorUncertainty, CommandRms. Stability at every sensor gain that the objective
-        or a demand names is added where no range covers it.
+        What has to hold: ModulusMargin, NoisePeak, Attenuation, LoopErrors, MovingSensorGain,
+        MirrorUncertainty, CommandRms. Stability at every sensor gain that the objective or a demand
+        names is added where none covers it, with the largest delay error that is demanded.
 
     Raises
     ------
@@ -103,9 +103,10 @@ class Specification:
         gains = [leaf.sensor_gain for leaf in leaves(self.objective)]
         gains += [d.sensor_gain for d in demands if isinstance(d, Attenuation)]
         low, high = min(1.0, *gains), max(1.0, *gains)
-        ranges = [d for d in demands if isinstance(d, SensorGainRange)]
+        ranges = [d for d in demands if isinstance(d, LoopErrors | MovingSensorGain)]
         if not any(r.low <= low and r.high >= high for r in ranges) and low < high:
-            demands.append(SensorGainRange(low=low, high=high))
+            late = max((d.delay_frames for d in demands if isinstance(d, LoopErrors)), default=0.0)
+            demands.append(LoopErrors(low=low, high=high, delay_frames=late))
         set_fields(self, demands=tuple(demands))
 
     @property

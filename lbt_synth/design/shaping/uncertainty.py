@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, TypeAlias
 
 import numpy as np
@@ -12,7 +12,6 @@ from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, append_taps
 from lbt_synth.design.shaping.frequencies import LEVEL_SETS, ROOM, Band, CheckedFields, Grid, discs
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
 from lbt_synth.linear.norms import largest_real_part
 from lbt_synth.loop.moving_gain import CIRCLE_LIMIT, circle_norm
@@ -24,60 +23,103 @@ _HOLDS_ONE = "The range must hold 1, the gain that is designed for; set model.se
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorGainRange(CheckedFields):
-    """Guaranteed stability for every sensor gain of an interval.
+class LoopErrors(CheckedFields):
+    """Guaranteed stability for every sensor gain of an interval and every delay error, together.
 
-    The loop is stable at g while ``1 - (1 - g) T`` does not vanish: the real part of T is
-    kept below ``1 / (1 - low)`` and above ``-1 / (high - 1)``, which is convex.
+    With the mirror's response ``M_d`` at a delay d, the loop is stable at the gain g and the delay
+    ``d + e`` while ``1 + z^-1 (g M_(d+e) - M_d) Q`` does not vanish: its real part is kept above
+    zero, which is convex. Delays, fractions included, are those of :class:`LoopHardware`, whose
+    response is piecewise linear in e; so the ends of both intervals and the whole delays between
+    stand for all loops. A delay below one frame does not occur.
 
     Parameters
     ----------
-    low, high : float
-        Ends of the interval, around 1 (the gain that is designed for).
+    low, high : float, optional
+        Ends of the interval of gains, around 1 (the gain that is designed for).
+    delay_frames : float, optional
+        Largest error of the delay, late or early [frames], at most 1.
 
     Raises
     ------
     ProblemError
-        If the interval does not hold 1, or is not positive.
+        If the interval does not hold 1, or is not positive, or nothing is uncertain; in a design
+        with an error of the delay, if the mirror has dynamics.
 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.SensorGainRange(low=0.25, high=1.3).label
-    'stability for sensor gains 0.25 to 1.3'
+    >>> lbt.design.shaping.LoopErrors(low=0.25, high=1.3, delay_frames=0.1).label
+    'stability for sensor gains 0.25 to 1.3 and delay errors up to 0.1 frames'
     """
 
-    _label: ClassVar = "stability for sensor gains {0.low:g} to {0.high:g}"
-    low: Annotated[float, ("above", 0), ("at_most", 1), ("hint", _HOLDS_ONE)]
-    high: Annotated[float, ("at_least", 1), ("hint", _HOLDS_ONE)]
+    low: Annotated[float, ("above", 0), ("at_most", 1), ("hint", _HOLDS_ONE)] = 1.0
+    high: Annotated[float, ("at_least", 1), ("hint", _HOLDS_ONE)] = 1.0
+    delay_frames: Annotated[float, ("at_least", 0), ("at_most", 1)] = 0.0
 
-    def _bounds(self) -> tuple[tuple[float, float], ...]:
-        """Return signs and bounds of the real part of T."""
-        ends = ((1.0, 1 - self.low), (-1.0, self.high - 1))
-        return tuple((sign, 1 / change) for sign, change in ends if change > 0)
+    def __post_init__(self) -> None:
+        CheckedFields.__post_init__(self)
+        if self.low == self.high and not self.delay_frames:
+            raise ProblemError(
+                "loop errors need an interval of gains, or an error of the delay; got neither."
+            )
+
+    @property
+    def label(self) -> str:
+        """What is demanded, in words."""
+        gains = f"sensor gains {self.low:g} to {self.high:g}" * (self.low < self.high)
+        late = f"delay errors up to {self.delay_frames:g} frames" * (self.delay_frames > 0)
+        return f"stability for {' and '.join(text for text in (gains, late) if text)}"
+
+    def _changes(self, hardware: LoopHardware) -> list[tuple[float, float, FloatArray]]:
+        """Return the loops that stand for all: gain, delay, and taps of ``z^-1 (M_d - g M)``."""
+        d, gains = hardware.delay_frames, sorted({self.low, self.high})
+        if not self.delay_frames:
+            taps = np.concatenate([[0.0], hardware.mirror_taps])
+            return [(g, d, (1 - g) * taps) for g in gains if g != 1]
+        if hardware.mirror is not None:
+            raise ProblemError(
+                "a bound for all delay errors needs a mirror that settles at once, whose response "
+                "is piecewise linear in the delay; got one with dynamics. Try MirrorUncertainty, "
+                "or a design for mirror=None and its map at delay errors."
+            )
+        early, late = max(d - self.delay_frames, 1.0), d + self.delay_frames
+        delays = {early, late, d, *np.arange(np.ceil(early), np.floor(late) + 1).tolist()}
+        own = hardware.mirror_taps
+        return [
+            (g, other, np.concatenate([[0.0], polysub(own, g * instant_mirror(other).taps)]))
+            for g in gains
+            for other in sorted(delays)
+            if (g, other) != (1, d)
+        ]
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.points_hz
-        rows = channel.complementary_rows(f).real
+        rows = channel.command_rows(f)
+        changes = [taps for _, _, taps in self._changes(channel.hardware)]
+        turns = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None]
+        powers = turns ** np.arange(max(taps.size for taps in changes))
+        bounds = np.full(f.size, 1 - ROOM)
+        responses = ((powers[:, : taps.size] @ taps)[:, None] * rows for taps in changes)
         return tuple(
-            HalfPlanes(frequency_hz=f, rows=sign * rows, bounds=np.full(f.size, (1 - ROOM) * bound))
-            for sign, bound in self._bounds()
+            HalfPlanes(frequency_hz=f, rows=response.real, bounds=bounds) for response in responses
         )
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
-        """Check the real loop."""
-        T, checks = loop.complementary, []
-        for sign, bound in self._bounds():
-            which = "largest" if sign > 0 else "least, negated"
-            peak = largest_real_part(replace(T, C=sign * T.C, D=sign * T.D))
-            name = f"real part of the complementary sensitivity, {which}"
-            checks.append(Check(name, peak, bound, LEVEL_SETS))
-        return tuple(checks)
+        """Check the real loop, over all frequencies."""
+        return tuple(
+            Check(
+                f"loop change by a sensor gain of {gain:g} and a delay of {delay:g} frames",
+                largest_real_part(append_taps(loop.parameter, taps)),
+                1.0,
+                LEVEL_SETS,
+            )
+            for gain, delay, taps in self._changes(loop.hardware)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MovingSensorGain(SensorGainRange):
+class MovingSensorGain(CheckedFields):
     """Guaranteed stability for a sensor gain that moves in an interval, at any speed.
 
     With ``a = high - 1`` and ``b = 1 - low``, one Lyapunov function for all gains exists if and
@@ -103,6 +145,9 @@ class MovingSensorGain(SensorGainRange):
 
     _label: ClassVar = "stability while the sensor gain moves in {0.low:g} to {0.high:g}"
 
+    low: Annotated[float, ("above", 0), ("at_most", 1), ("hint", _HOLDS_ONE)]
+    high: Annotated[float, ("at_least", 1), ("hint", _HOLDS_ONE)]
+
     def _disc(self) -> tuple[float, float] | None:
         """Return centre and radius of the disc for T; None for a half-plane."""
         a, b = self.high - 1, 1 - self.low
@@ -112,7 +157,7 @@ class MovingSensorGain(SensorGainRange):
         """Return the convex constraints at the points of a grid."""
         disc, f = self._disc(), grid.points_hz
         if disc is None:
-            return SensorGainRange.constraints(self, channel, grid)
+            return LoopErrors(low=self.low, high=self.high).constraints(channel, grid)
         return (discs(f, channel.complementary_rows(f), -disc[0], (1 - ROOM) * disc[1]),)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
@@ -120,72 +165,6 @@ class MovingSensorGain(SensorGainRange):
         value = circle_norm(loop.at(1.0), low=self.low, high=self.high)
         name = f"circle criterion of a moving gain, {self.low:g} to {self.high:g}"
         return (Check(name, value, CIRCLE_LIMIT, LEVEL_SETS),)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DelayError(CheckedFields):
-    """Guaranteed stability for every error of the delay up to a bound, late or early.
-
-    Delays, fractions included, are those of :class:`LoopHardware`: with the mirror's response
-    ``M_d`` at a delay d, the loop stays stable at ``d + e`` while
-    ``|M_(d+e) - M_d| |Q| < 1``. The response is piecewise linear in e, so the ends of the
-    interval and the whole delays within it stand for all of it. A delay below one frame does
-    not occur.
-
-    Parameters
-    ----------
-    frames : float
-        Largest error [frames], at most 1.
-
-    Raises
-    ------
-    ProblemError
-        If it is out of its range; in a design, if the mirror has dynamics.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.DelayError(frames=0.25).frames
-    0.25
-    """
-
-    _label: ClassVar = "stability for delay errors up to {0.frames:g} frames"
-    frames: Annotated[float, ("above", 0), ("at_most", 1)]
-
-    def _differences(self, hardware: LoopHardware) -> list[tuple[float, FloatArray]]:
-        """Return the delays that stand for all of them, each with the taps of ``M_(d+e) - M_d``."""
-        if hardware.mirror is not None:
-            raise ProblemError(
-                "a bound for all delay errors needs a mirror that settles at once, whose response "
-                "is piecewise linear in the delay; got one with dynamics. Try MirrorUncertainty, "
-                "or a design for mirror=None and its map at delay errors."
-            )
-        d = hardware.delay_frames
-        low, high = max(d - self.frames, 1.0), d + self.frames
-        whole = np.arange(np.ceil(low), np.floor(high) + 1)
-        others = [float(other) for other in np.setdiff1d([low, high, *whole], d)]
-        there = [instant_mirror(other).taps for other in others]
-        taps = [polysub(one, hardware.mirror_taps).astype(np.float64) for one in there]
-        return list(zip(others, taps, strict=True))
-
-    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
-        """Return the convex constraints at the points of a grid."""
-        f = grid.points_hz
-        rows = channel.command_rows(f)
-        powers = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None] ** np.arange(102)
-        return tuple(
-            discs(f, (powers[:, : taps.size] @ taps)[:, None] * rows, 0.0, 1 - ROOM)
-            for _, taps in self._differences(channel.hardware)
-        )
-
-    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
-        """Check the real loop."""
-        checks = []
-        for other, taps in self._differences(loop.hardware):
-            change = hinf_norm(append_taps(loop.parameter, taps)).upper
-            name = f"loop change by a delay of {other:g} frames"
-            checks.append(Check(name, change, 1.0, LEVEL_SETS))
-        return tuple(checks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,4 +207,4 @@ class MirrorUncertainty(Band):
         return (self.check(name, self.relative * self.peak(loop.complementary), 1.0),)
 
 
-Uncertainty: TypeAlias = SensorGainRange | MovingSensorGain | DelayError | MirrorUncertainty
+Uncertainty: TypeAlias = LoopErrors | MovingSensorGain | MirrorUncertainty

@@ -20,7 +20,7 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.design.shaping.channel import Channel, laguerre_basis
 from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
 from lbt_synth.design.shaping.specification import Specification
-from lbt_synth.design.shaping.uncertainty import SensorGainRange
+from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain
 from lbt_synth.interop.proof import ROUNDOFF
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
@@ -166,7 +166,7 @@ def mode_loop(
             line[s] = np.hypot(line[s], np.where(covered, term.rms_nm, 0.0))
             evenly = np.where(covered, width, 0.0)
             spread[s] += term.rms_nm**2 * evenly / np.sum(evenly)
-    ranges = [d for d in specification.demands if isinstance(d, SensorGainRange)]
+    ranges = [d for d in specification.demands if isinstance(d, LoopErrors | MovingSensorGain)]
     taps = sensor * np.concatenate([[0.0], single.mirror_taps])
     powers = np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(max(order + 1, taps.size))))
     return DirectFormLoop(

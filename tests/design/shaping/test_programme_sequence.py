@@ -26,7 +26,7 @@ def test_terms_at_other_sensor_gains_are_lowered_step_by_step():
     unaware = solve_sequence(
         spec(
             lbt.design.shaping.ModulusMargin(at_least=0.4),
-            lbt.design.shaping.SensorGainRange(low=0.4, high=1),
+            lbt.design.shaping.LoopErrors(low=0.4, high=1),
         ),
         channel(16),
     )
@@ -61,7 +61,7 @@ def test_a_smallest_set_of_clashing_demands_is_named():
     ) as caught:
         lbt.design.shape(
             ONE,
-            spec(idle, deep, lbt.design.shaping.SensorGainRange(low=0.9, high=1.1), stiff),
+            spec(idle, deep, lbt.design.shaping.LoopErrors(low=0.9, high=1.1), stiff),
             functions=16,
             states=None,
         )

@@ -43,7 +43,7 @@ def test_an_integrator_violates_what_its_margins_say(design):
     assert lbt.loop_margins(lbt.close_loop(design.hardware, high.controller)).modulus < 0.45
     assert broken == (
         "modulus margin of at least 0.45",
-        "stability for sensor gains 0.5 to 1.5",
+        "stability for sensor gains 0.5 to 1.5 and delay errors up to 0.1 frames",
     )
 
 
@@ -59,7 +59,7 @@ def test_a_filter_with_poles_outside_the_circle_on_one_axis_is_judged_on_each(de
     if margins.modulus < 0.45:
         expected.append("modulus margin of at least 0.45")
     if margins.gain_low > 0.5 or margins.gain_high < 1.5:
-        expected.append("stability for sensor gains 0.5 to 1.5")
+        expected.append("stability for sensor gains 0.5 to 1.5 and delay errors up to 0.1 frames")
     assert list(violated(design, controller)) == expected
 
 

@@ -21,7 +21,7 @@ def test_a_loop_is_stable_at_every_delay_within_its_error(delay, error):
     eager = lbt.design.shaping.ResidualVariance(turbulence=SLOW, noise_nm=1.0)
     design = lbt.design.shape(
         path,
-        spec(lbt.design.shaping.DelayError(frames=error), objective=eager),
+        spec(lbt.design.shaping.LoopErrors(delay_frames=error), objective=eager),
         functions=20,
         states=None,
     )
@@ -46,7 +46,7 @@ def shape_for_a_gain(kind, low, high):
 
 def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
     """The circle criterion, on a loop that a switch between stable gains breaks without it."""
-    still, failed = shape_for_a_gain("SensorGainRange", 0.3, 1.5)
+    still, failed = shape_for_a_gain("LoopErrors", 0.3, 1.5)
     moves, passed = shape_for_a_gain("MovingSensorGain", 0.3, 1.5)
     assert passed.passed
     assert not failed.passed
@@ -67,7 +67,7 @@ def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
 @pytest.mark.parametrize(("low", "high"), [(0.3, 1.0), (1.0, 1.5)])
 def test_a_gain_that_moves_on_one_side_costs_nothing(low, high):
     """The disc is a half-plane then, the same as for a constant gain."""
-    still, check = shape_for_a_gain("SensorGainRange", low, high)
+    still, check = shape_for_a_gain("LoopErrors", low, high)
     assert check.passed
     moves, _ = shape_for_a_gain("MovingSensorGain", low, high)
     assert moves.objective_nm == pytest.approx(still.objective_nm, rel=1e-6)

@@ -193,13 +193,13 @@ def test_rounding_is_bounded_by_a_loop_in_that_arithmetic(path):
     assert 0 < np.std(single[:, 0] - double[:, 0]) < 3 * bound * np.std(double[:, 0])
 
 
-@pytest.mark.parametrize("kind", ["Attenuation", "DelayError", "MirrorUncertainty"])
+@pytest.mark.parametrize("kind", ["Attenuation", "LoopErrors", "MirrorUncertainty"])
 def test_demands_are_moved_by_what_is_left_out(kind):
     """The value of each demand in the certificate is above that of the loop around the taps."""
     shaping = lbt.design.shaping
     options = {
         "Attenuation": {"low_hz": 0, "high_hz": 2, "at_most": 0.2, "sensor_gain": 0.7},
-        "DelayError": {"frames": 0.2},
+        "LoopErrors": {"delay_frames": 0.2},
         "MirrorUncertainty": {"relative": 0.4, "low_hz": 150, "high_hz": 250},
     }
     demand = getattr(shaping, kind)(**options[kind])
