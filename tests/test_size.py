@@ -21,7 +21,7 @@ LINES = {
     "identification": 14397,
     "interop": 4940,
     "linear": 6078,
-    "loop": 5039,
+    "loop": 5475,
     "methods": 1109,
     "models": 4550,
     "report": 5797,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -18,7 +17,8 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
-from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop.loop_errors import FRAGILE_DB, FRAGILE_FRAMES
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import Wording, design_request
 from lbt_synth.models import LoopHardware
@@ -51,8 +51,6 @@ def run(arguments: Namespace) -> Report:
 
 
 _SMALL_MODULUS = 0.3
-_FRAGILE_FRAMES = 0.1  # of delay: what a camera's clock or a busy computer adds
-_FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
 
 
 def describe_design(design: Design, *, matrices: bool = False) -> Report:
@@ -71,7 +69,9 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
         if not design.other_sensors:
             margins = [loop_margins(close_loop(design.hardware, design))]
             report.data["margins"] = json_record(*margins)
+            report.opening.append(_survival(*margins))
         report.notes += _loop_notes(design, design.hardware, report.data)
+        report.notes += [note for each in margins for note in _fragile_notes(each)]
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
@@ -112,22 +112,44 @@ def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
     return facts
 
 
-def _fragile_notes(margins: Mapping[str, float]) -> list[str]:
+def _survival(margins: LoopMargins) -> str:
+    """Say which errors of the loop a design survives, each alone and together."""
+
+    def size(value: float, unit: str) -> str:
+        return f"{value:.2g} {unit}".strip() if np.isfinite(value) else "any"
+
+    with np.errstate(divide="ignore"):  # no gain is too low
+        low_db, high_db = 20 * np.abs(np.log10([margins.gain_low, margins.gain_high]))
+    alone = (
+        f"survives {size(margins.delay_frames, 'frames')} more delay or "
+        f"{size(margins.early_frames, 'frames')} less, {size(high_db, 'dB')} more sensor gain or "
+        f"{size(low_db, 'dB')} less"
+    )
+    if np.isnan(margins.together):
+        return f"{alone}; at once is not known for a mirror with dynamics."
+    frames, decibels = margins.together * FRAGILE_FRAMES, margins.together * FRAGILE_DB
+    return f"{alone}; at once {frames:.2g} frames and {decibels:.2g} dB either way (proved)."
+
+
+def _fragile_notes(margins: LoopMargins) -> list[str]:
     """Warn of a delay or a gain that is hardly off and makes the loop unstable."""
-    if not margins:
-        return []
-    notes = []
-    if margins["delay_frames"] < _FRAGILE_FRAMES:
-        microseconds = 1e6 * margins["delay_s"]
-        notes.append(
-            f"warning: {margins['delay_frames']:.2g} frames ({microseconds:.2g} us) more delay "
-            "make this loop unstable. Do not close it so: take another method, or robust with "
-            "delay_error_frames."
-        )
-    decibels = 20 * np.log10([margins["gain_high"], 1 / max(margins["gain_low"], 1e-300)])
-    if (least := float(np.min(decibels))) < _FRAGILE_DB:
+    notes, frame_us = [], 1e6 * margins.delay_s / margins.delay_frames
+    for frames, word in ((margins.delay_frames, "more"), (margins.early_frames, "less")):
+        if frames < FRAGILE_FRAMES:
+            notes.append(
+                f"warning: {frames:.2g} frames ({frames * frame_us:.2g} us) {word} delay make this "
+                "loop unstable. Do not close it so: take another method, or robust with "
+                "delay_error_frames."
+            )
+    decibels = 20 * np.log10([margins.gain_high, 1 / max(margins.gain_low, 1e-300)])
+    if (least := float(np.min(decibels))) < FRAGILE_DB:
         notes.append(
             f"warning: a sensor gain that is off by {least:.2g} dB makes this loop unstable."
+        )
+    if not notes and margins.together < 1:
+        notes.append(
+            f"warning: {FRAGILE_FRAMES:g} frames of delay and {FRAGILE_DB:g} dB of sensor gain at "
+            "once are more than this loop is proved to survive. robust demands both together."
         )
     return notes
 
@@ -145,7 +167,6 @@ def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) ->
             f"note: the modulus margin {modulus:.3g} is small; a loop is usually asked for "
             f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
         )
-    notes += _fragile_notes(data.get("margins", {}))
     if not np.array_equal(hardware.sensor, np.eye(len(hardware.sensor))):
         notes.append(
             "note: sensor gains here are factors on the gain that the design assumes, which is in "

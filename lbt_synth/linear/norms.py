@@ -146,22 +146,25 @@ def level_angles(G: StateSpace, level: float) -> FloatArray:
 
 
 def largest_real_part(system: StateSpace) -> float:
-    """Largest real part of a stable scalar system's response over all frequencies.
+    """Largest real part of a stable square system's response over all frequencies.
 
-    As the norm, by the level sets of ``G(z) + G(1/z) = 2 level``.
+    It is the largest eigenvalue of ``(G + G*) / 2``, found as the norm, by the level sets of
+    ``G(z) + G(1/z)' = 2 level``.
     """
     G = system.balanced()
     size = max(float(hinf_norm(G)), 1e-300)
     # the response moved by its own size is positive, and so are its levels
-    moved = StateSpace(A=G.A, B=G.B, C=G.C, D=G.D + 2 * size, dt_s=G.dt_s)
+    moved = replace(G, D=G.D + 2 * size * np.eye(len(G.D)))
 
     def largest(angles: FloatArray) -> tuple[float, float]:
-        values = np.real(pointwise_response(moved, np.exp(1j * angles))[:, 0, 0])
+        response = pointwise_response(moved, np.exp(1j * angles))
+        values = np.linalg.eigvalsh(response + response.conj().transpose(0, 2, 1))[:, -1] / 2
         best = int(np.argmax(values))
         return float(values[best]), float(angles[best])
 
     def pencil(level: float) -> FloatArray:
-        return popov_angles(G.A, G.B, np.zeros_like(G.A), G.C, 2 * (moved.D - level))
+        R = moved.D + moved.D.T - 2 * level * np.eye(len(G.D))
+        return popov_angles(G.A, G.B, np.zeros_like(G.A), G.C, R)
 
     peak, _ = _climb(G, 0.0, np.pi, largest, pencil)
     return peak * (1 + 2 * _TOLERANCE) - 2 * size
@@ -280,7 +283,7 @@ def popov_angles(
 
     ``z [x; A'p + Q x + S'w; 0] = [A x + B w; p; S x + B'p + R w]`` with the adjoint state p. For
     a singular value sigma, ``Q = C'C``, ``S = D'C`` and ``R = D'D - sigma^2 I``; for a level of
-    the real part of a scalar response, ``Q = 0``, ``S = C`` and ``R = 2 (D - level)``.
+    the real part of a response, ``Q = 0``, ``S = C`` and ``R = D + D' - 2 level I``.
     """
     (n, m), zero = B.shape, np.zeros
     E = np.block([[np.eye(n), zero((n, n + m))], [Q, A.T, S.T], [zero((m, 2 * n + m))]])

@@ -16,6 +16,7 @@ from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import close_loops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
+from lbt_synth.loop.loop_errors import errors_together
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -67,6 +68,16 @@ class LoopMargins(Summarised):
     delay_s: float = column(unit="s", help="Least further delay of the loop that destabilises")
     delay_frames: float = column(
         "delay margin", unit="frames", help="The same; inf if the longest delay is stable"
+    )
+    early_frames: float = column(
+        "early delay margin",
+        unit="frames",
+        help="Least delay less that destabilises; inf if a delay of one frame is stable",
+    )
+    together: float = column(
+        "of 0.1 frames and 2 dB together",
+        help="How many times both errors at once, either way, are proved to leave the loop stable, "
+        "at most 10; nan for a mirror with dynamics",
     )
     crossover_hz: float = column(
         "highest crossover",
@@ -122,7 +133,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
     broken = broken_loops(loop)
     crossovers = [point.frequency_hz for one in broken for point in one.gain_crossings]
-    delay = _delay_margin_frames(loop)
+    delay, early = (_delay_margin_frames(loop, sign=sign) for sign in (1, -1))
     disk = _disk_margin(loop)
     return LoopMargins(
         modulus=1 / float(hinf_norm(loop.output_sensitivity())),
@@ -131,6 +142,8 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
         phase_deg=phase_margin_deg(broken),
         delay_s=delay / loop.hardware.frame_rate_hz,
         delay_frames=delay,
+        early_frames=early,
+        together=errors_together(loop),
         crossover_hz=max(crossovers, default=0.0),
         disk=disk,
         disk_gain_low=max(2 - disk, 0.0) / (2 + disk),
@@ -283,30 +296,34 @@ def channel_scales(response: FloatArray) -> FloatArray:
     return np.asarray(np.clip(scales / scales.max(), 1 / _MOST_RATIO, 1.0))
 
 
-def _delay_margin_frames(loop: ClosedLoop) -> float:
-    """Least further delay at which the loop, as it is simulated, is unstable [frames].
+def _delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
+    """Least change of the delay at which the loop, as it is simulated, is unstable [frames].
 
-    A part of a frame is no phase lag: an exposure then sees two commands. So poles decide.
+    It is late with the sign 1, early with -1. A part of a frame is no phase lag: an exposure then
+    sees two commands. So poles decide.
     """
     hardware, matrices = loop.hardware, textbook_matrices([loop.controller])
+    d = hardware.delay_frames
+    longest = _LONGEST - d if sign > 0 else d - 1
     # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
-    whole = np.arange(np.floor(hardware.delay_frames) + 1, _LONGEST + 1) - hardware.delay_frames
+    whole = np.abs(np.arange(1, _LONGEST + 1) - d)
 
     def first_unstable(low: float, high: float) -> tuple[float, float] | None:
         """Return the step of an equal division in which the loop becomes unstable, or None."""
         peaks = whole[(whole > low) & (whole < high)]
         further = np.unique(np.concatenate([np.linspace(low, high, _DIVISION + 1), peaks]))
         gains = np.full(further.size - 1, loop.sensor_gain)
-        delays = hardware.delay_frames + further[1:]
-        stable, _ = close_loops(matrices, hardware, gains, delays)
+        stable, _ = close_loops(matrices, hardware, gains, d + sign * further[1:])
         unstable = np.flatnonzero(~stable)
         return None if unstable.size == 0 else tuple(further[unstable[0] : unstable[0] + 2])
 
-    low, high, longest = 0.0, 1.0, _LONGEST - hardware.delay_frames
-    while (step := first_unstable(low, min(high, longest))) is None:
+    if longest <= 0:
+        return np.inf
+    low, high = 0.0, min(1.0, longest)
+    while (step := first_unstable(low, high)) is None:
         if high >= longest:
             return np.inf
-        low, high = high, 2 * high
+        low, high = high, min(2 * high, longest)
     for _ in range(_DIVISIONS):
         step = first_unstable(*step) or step
     return float(step[0])

@@ -38,7 +38,7 @@ def test_simulate_writes_its_first_case(tmp_path, capsys, gain):
     seen = lbt.files.load_telemetry(out)
     assert seen.commands.shape == (300, 2)
     rms = np.sqrt(np.sum(np.mean(seen.residual_nm**2, axis=0)))
-    assert rms == pytest.approx(data["residual_nm"][0])
+    assert 0.99 * rms < data["residual_nm"][0] < 1.2 * rms  # and what moves within frames
     assert seen.strehl == pytest.approx(data["strehl"][0])
     assert (seen.seed, seen.controller_name, seen.sensor_gain) == (3, "integrator", 0.7)
     assert seen.controller_digest == hashlib.sha256(gain.read_bytes()).hexdigest()

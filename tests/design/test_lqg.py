@@ -167,7 +167,13 @@ def test_means_over_frames_are_those_of_a_simulation():
     design = lbt.lqg(plant)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
     run = lbt.simulate(
-        design.controller, truth, hardware=plant.hardware, frames=40_000, seed=4, cases=4
+        design.controller,
+        truth,
+        hardware=plant.hardware,
+        frames=40_000,
+        seed=4,
+        cases=4,
+        frame_means=True,
     )
     loop = lbt.close_loop(plant.hardware, design.controller)
     exact = lbt.residual_budget(loop, truth, frame_means=True)

@@ -178,6 +178,19 @@ def test_peaks_of_a_band_and_of_the_real_part_against_a_dense_grid(seed):
     assert low <= found.peak_frequency_hz <= high
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_real_part_of_several_channels_is_the_largest_eigenvalue(seed):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(5, 5))
+    A *= 0.9 / np.max(np.abs(np.linalg.eigvals(A)))
+    B, C, D = rng.normal(size=(5, 3)), rng.normal(size=(3, 5)), rng.normal(size=(3, 3))
+    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D)
+    response = system.frequency_response(np.linspace(0, 0.5, 20001))
+    hermitian = (response + response.conj().transpose(0, 2, 1)) / 2
+    dense = np.max(np.linalg.eigvalsh(hermitian))
+    assert dense - 1e-9 <= largest_real_part(system) <= dense + 1e-3 * abs(dense)
+
+
 def test_norms_over_a_band():
     lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.01)
     assert band_norm(lag, 0.0, 50.0).value == pytest.approx(lbt.hinf_norm(lag).value, rel=1e-12)

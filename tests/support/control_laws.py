@@ -40,7 +40,8 @@ class SteppedLaw:
 
 def run_law(controller, *, frames=6000, seed=1, truth=TRUTH, hardware=PATH):
     """Measurements and commands of a loop, (frames, 2) each."""
-    run = lbt.simulate(controller, truth, hardware=hardware, frames=frames, seed=seed)
+    options = {"frames": frames, "seed": seed, "frame_means": True}
+    run = lbt.simulate(controller, truth, hardware=hardware, **options)
     return run.measurements[0], run.commands[0]
 
 

@@ -77,5 +77,5 @@ def hidden_gain_loop(seed: int) -> tuple[np.ndarray, np.ndarray]:
     )
     path = lbt.LoopHardware(frame_rate_hz=RATE)
     law = lbt.integrator(path, gain=gain).controller
-    run = lbt.simulate(law, truth, hardware=path, frames=31_000, seed=seed)
+    run = lbt.simulate(law, truth, hardware=path, frames=31_000, seed=seed, frame_means=True)
     return run.measurements[0, 1000:], run.commands[0, 1000:]

@@ -38,7 +38,7 @@ def integrator_loop(
         sensor_gain=sensor_gain,
     )
     controller = lbt.integrator(path, gain=gain).controller
-    run = lbt.simulate(controller, truth, hardware=path, frames=frames, seed=seed)
+    run = lbt.simulate(controller, truth, hardware=path, frames=frames, seed=seed, frame_means=True)
     return run.measurements[0][2:], run.commands[0][:-2]
 
 
@@ -101,7 +101,9 @@ def drifting_record(seed: int = 337, *, gain: float = 0.4062) -> lbt.identificat
     total = lbt.models.SumSpectrum(parts=[air, drift])
     truth = lbt.Truth(turbulence=total, vibrations=(line,), noise_nm=3.403, sensor_gain=0.5859)
     law, frames = lbt.integrator(path, gain=gain).controller, int(15 * rate_hz)
-    run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000)
+    run = lbt.simulate(
+        law, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000, frame_means=True
+    )
     return lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=rate_hz, delay_frames=2, unit="nm"
     )
@@ -140,7 +142,9 @@ def _directed_record(
         sensor_gain=sensor_gain,
     )
     law, frames = lbt.integrator(path, gain=gain).controller, int(30 * rate_hz)
-    run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=500)
+    run = lbt.simulate(
+        law, truth, hardware=path, frames=frames, seed=seed, settle_frames=500, frame_means=True
+    )
     return lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=rate_hz, delay_frames=2, unit="nm"
     )

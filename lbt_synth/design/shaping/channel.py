@@ -32,7 +32,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 
@@ -234,16 +233,3 @@ def mode_loop(hardware: LoopHardware, parameter: Controller) -> SingleModeLoop:
     """Close the loop of one mode around its Youla parameter."""
     single = hardware.single_mode()
     return SingleModeLoop(hardware=single, controller=youla_controller(single, parameter))
-
-
-def append_taps(system: StateSpace, taps: FloatArray) -> StateSpace:
-    """Return a system of one output followed by ``taps[0] + taps[1] z^-1 + ...``."""
-    late = tapped_mirror(taps)
-    entry, none = late.B[:, None], np.zeros((system.n_states, late.n_states))
-    return StateSpace(
-        A=np.block([[system.A, none], [entry @ system.C, late.A]]),
-        B=np.vstack([system.B, entry @ system.D]),
-        C=np.hstack([late.D * system.C, late.C[None]]),
-        D=late.D * system.D,
-        dt_s=system.dt_s,
-    )

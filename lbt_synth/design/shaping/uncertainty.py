@@ -6,18 +6,17 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, TypeAlias
 
 import numpy as np
-from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, append_taps
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
 from lbt_synth.design.shaping.frequencies import LEVEL_SETS, ROOM, Band, CheckedFields, Grid, discs
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
 from lbt_synth.linear.norms import largest_real_part
+from lbt_synth.loop.loop_errors import LoopChange, append_taps, loop_changes
 from lbt_synth.loop.moving_gain import CIRCLE_LIMIT, circle_norm
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.mirror.frame_rate_system import instant_mirror
-from lbt_synth.validation import FloatArray, Positive
+from lbt_synth.validation import Positive
 
 _HOLDS_ONE = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
 
@@ -70,33 +69,21 @@ class LoopErrors(CheckedFields):
         late = f"delay errors up to {self.delay_frames:g} frames" * (self.delay_frames > 0)
         return f"stability for {' and '.join(text for text in (gains, late) if text)}"
 
-    def _changes(self, hardware: LoopHardware) -> list[tuple[float, float, FloatArray]]:
-        """Return the loops that stand for all: gain, delay, and taps of ``z^-1 (M_d - g M)``."""
-        d, gains = hardware.delay_frames, sorted({self.low, self.high})
-        if not self.delay_frames:
-            taps = np.concatenate([[0.0], hardware.mirror_taps])
-            return [(g, d, (1 - g) * taps) for g in gains if g != 1]
-        if hardware.mirror is not None:
+    def _changes(self, hardware: LoopHardware) -> list[LoopChange]:
+        """Return the loops that stand for all."""
+        if self.delay_frames and hardware.mirror is not None:
             raise ProblemError(
                 "a bound for all delay errors needs a mirror that settles at once, whose response "
                 "is piecewise linear in the delay; got one with dynamics. Try MirrorUncertainty, "
                 "or a design for mirror=None and its map at delay errors."
             )
-        early, late = max(d - self.delay_frames, 1.0), d + self.delay_frames
-        delays = {early, late, d, *np.arange(np.ceil(early), np.floor(late) + 1).tolist()}
-        own = hardware.mirror_taps
-        return [
-            (g, other, np.concatenate([[0.0], polysub(own, g * instant_mirror(other).taps)]))
-            for g in gains
-            for other in sorted(delays)
-            if (g, other) != (1, d)
-        ]
+        return loop_changes(hardware, low=self.low, high=self.high, delay_frames=self.delay_frames)
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.points_hz
         rows = channel.command_rows(f)
-        changes = [taps for _, _, taps in self._changes(channel.hardware)]
+        changes = [change.taps for change in self._changes(channel.hardware)]
         turns = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None]
         powers = turns ** np.arange(max(taps.size for taps in changes))
         bounds = np.full(f.size, 1 - ROOM)
@@ -109,12 +96,13 @@ class LoopErrors(CheckedFields):
         """Check the real loop, over all frequencies."""
         return tuple(
             Check(
-                f"loop change by a sensor gain of {gain:g} and a delay of {delay:g} frames",
-                largest_real_part(append_taps(loop.parameter, taps)),
+                f"loop change by a sensor gain of {change.gain:g} and a delay of "
+                f"{change.delay_frames:g} frames",
+                largest_real_part(append_taps(loop.parameter, change.taps)),
                 1.0,
                 LEVEL_SETS,
             )
-            for gain, delay, taps in self._changes(loop.hardware)
+            for change in self._changes(loop.hardware)
         )
 
 

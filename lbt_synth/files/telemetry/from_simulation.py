@@ -10,7 +10,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files.telemetry.fields import Scalar
 from lbt_synth.files.telemetry.telemetry import Telemetry
-from lbt_synth.loop import Imaging, Simulation, series_strehl
+from lbt_synth.loop import Imaging, Simulation
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import integer, require_instance
 
@@ -93,7 +93,7 @@ def telemetry_from_simulation(
             gains = np.full(hardware.n_commands, gain)
     residual, strehl = simulation.residual_nm[case], None
     if imaging is not None and residual.shape[1] <= 2:  # the jitter of an image has two axes
-        strehl = float(np.clip(series_strehl(residual, imaging), 0, 1))  # a mean of cosines
+        strehl = float(np.clip(simulation.strehl(imaging)[case], 0, 1))  # a mean of cosines
     return Telemetry(
         frame_rate_hz=simulation.frame_rate_hz,
         delay_frames=hardware.delay_frames,

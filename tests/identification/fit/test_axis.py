@@ -162,7 +162,9 @@ def test_a_rough_gain_has_rivals(gain: float, seed: int) -> None:
     )
     path = lbt.LoopHardware(frame_rate_hz=rate, modes=1)
     law = lbt.integrator(path, gain=gain).controller
-    run = lbt.simulate(law, truth, hardware=path, frames=2590, seed=seed, settle_frames=2000)
+    run = lbt.simulate(
+        law, truth, hardware=path, frames=2590, seed=seed, settle_frames=2000, frame_means=True
+    )
     y, u = run.measurements[0, :, 0], run.commands[0, :, 0]
     found = lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=rate)
     if found.sensor_gain_error is None:
