@@ -151,6 +151,9 @@ def largest_real_part(system: StateSpace) -> float:
     It is the largest eigenvalue of ``(G + G*) / 2``, found as the norm, by the level sets of
     ``G(z) + G(1/z)' = 2 level``.
     """
+    _, inputs, outputs = system_parts(system.A, system.B, system.C, system.D)
+    if np.array_equal(inputs, outputs) and np.any(inputs):  # each part is square
+        return max(largest_real_part(part) for part in independent_parts(system))
     G = system.balanced()
     size = max(float(hinf_norm(G)), 1e-300)
     # the response moved by its own size is positive, and so are its levels

@@ -99,13 +99,15 @@ def residual_budget(loop: ClosedLoop, truth: Truth, *, frame_means: bool = False
     lines = stationary_vibrations(truth.vibrations)
     amplitudes: list[ComplexArray] = []
     moving = _motions(loop, truth.motions, len(lines))
+    resonances = []
     for line, motion in zip(lines, moving, strict=True):
         if isinstance(line, Vibration):
-            vibration += view.of_line(line, motion, of_means=frame_means)
+            resonances.append((line, motion))
         else:
             harmonics, within = view.of_sinusoid(line, motion)
             vibration[1] += within
             amplitudes += list(harmonics)
+    vibration += view.of_lines(resonances, of_means=frame_means)
     return _make_budget(turbulence, vibration, view.of_noise(np.diag(noise_nm)), amplitudes)
 
 
@@ -172,12 +174,12 @@ def plant_budget(
     """Return what a plant's disturbances and noise leave in any loop, at its own sensor gain."""
     loop.require_stable()
     view = _view(loop, frame_means=frame_means)
-    turbulence, vibration = np.zeros((2, 2, loop.hardware.modes, loop.hardware.modes))
+    turbulence = np.zeros((2, loop.hardware.modes, loop.hardware.modes))
     for mode, model in enumerate(plant.turbulence):
         turbulence += view.of_spectrum(model, _entry(loop, [mode]))
     moving = _motions(loop, plant.motions, len(plant.vibrations))
-    for line, motion in zip(plant.vibrations, moving, strict=True):
-        vibration += view.of_line(line, motion, of_means=True)
+    pairs = list(zip(plant.vibrations, moving, strict=True))
+    vibration = view.of_lines(pairs, of_means=True)
     return _make_budget(turbulence, vibration, view.of_noise(plant.own_noise_factor), [])
 
 
@@ -198,7 +200,7 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 
 def line_covariance(loop: ClosedLoop, line: Vibration) -> FloatArray:
     """Covariance (n, n) of the residual that a line leaves, in means over frames."""
-    return np.asarray(_view(loop, frame_means=True).of_line(line, {}, of_means=True)[0])
+    return np.asarray(_view(loop, frame_means=True).of_lines([(line, {})], of_means=True)[0])
 
 
 def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
@@ -252,14 +254,29 @@ class _View:
         kinks = breakpoints_below(spectrum, self.loop.hardware.frame_rate_hz / 2)
         return self._integral(density, kinks)
 
-    def of_line(
-        self, line: Vibration, motion: Mapping[str, Motion], *, of_means: bool
+    def of_lines(
+        self, lines: Sequence[tuple[Vibration, Mapping[str, Motion]]], *, of_means: bool
     ) -> FloatArray:
-        """Return what a resonance leaves, whose rms is of means over frames, or of all moments."""
-        if not (of_means or _moved_rows(self.loop, motion)):
-            share = float(np.sinc(line.frequency_hz / self.loop.hardware.frame_rate_hz))
-            line = replace(line, rms_nm=share * line.rms_nm)
-        return self.of_process(*_shaken(self.loop, line, motion))
+        """Return what resonances leave, whose rms is of means over frames, or of all moments.
+
+        Those of one direction that no channel sees are one process.
+        """
+        n = self.loop.hardware.modes
+        out = np.zeros((2, n, n))
+        shared: dict[bytes, tuple[FloatArray, list[StateSpace]]] = {}
+        for line, motion in lines:
+            seen = bool(_moved_rows(self.loop, motion))
+            if not (of_means or seen):
+                share = float(np.sinc(line.frequency_hz / self.loop.hardware.frame_rate_hz))
+                line = replace(line, rms_nm=share * line.rms_nm)
+            process, entry = _shaken(self.loop, line, motion)
+            if seen:
+                out += self.of_process(process, entry)
+            else:
+                shared.setdefault(entry.tobytes(), (entry, []))[1].append(process)
+        for entry, processes in shared.values():
+            out += self.of_process(_sum_of(processes), entry)
+        return out
 
     def of_process(self, process: StateSpace, entry: FloatArray) -> FloatArray:
         """Return what a process of means over frames leaves, the first of what enters."""
@@ -276,8 +293,12 @@ class _View:
             mean = process.phase_response(frequency)[:, :1, 0]  # (f, 1, drives), of each phase
             moving = mean / np.sinc(frequency / rate)[:, None, None]
             means, rest = self._phase_means(frequency)
+            alone = np.sum(np.abs(moving) ** 2, axis=(1, 2))
             if self.pieces is None:
                 pieces = np.zeros((*moving.shape[:2], 1, n, moving.shape[2]))
+            elif entry.shape[1] == 1 and process.period == 1:  # the phase is all that enters
+                unit = self._powers(*self._residuals(frequency, entry), entry)
+                return np.asarray(2 / rate * alone[:, None, None, None] * unit)
             else:
                 response = driven.phase_response(frequency)
                 positions = response.reshape(*response.shape[:2], -1, n, response.shape[-1])
@@ -388,6 +409,13 @@ def _view(loop: ClosedLoop, *, frame_means: bool) -> _View:
 def _balanced(system: StateSpace) -> StateSpace:
     """Return a system in states of comparable units, in which its response keeps its digits."""
     return system.balanced() if system.period == 1 else system
+
+
+def _sum_of(processes: Sequence[StateSpace]) -> StateSpace:
+    """Return the sum of processes of one output, each with its own drive."""
+    A, B = (block_diag(*(getattr(one, name) for one in processes)) for name in "AB")
+    C = np.hstack([one.C for one in processes])
+    return replace(processes[0], A=A, B=B, C=C, D=np.zeros((1, B.shape[1])))
 
 
 def _entry(loop: ClosedLoop, modes: Sequence[int]) -> FloatArray:

@@ -45,10 +45,9 @@ def loop_changes(
     The mirror settles at once if the delay has an error. A delay below one frame does not occur.
     """
     d, own = hardware.delay_frames, hardware.mirror_taps
-    delays = {d}
-    if delay_frames:
-        early, late = max(d - delay_frames, 1.0), d + delay_frames
-        delays |= {early, late, *np.arange(np.ceil(early), np.floor(late) + 1).tolist()}
+    early, late = max(d - delay_frames, 1.0), d + delay_frames
+    whole = np.arange(np.ceil(early), np.floor(late) + 1).tolist()
+    delays = {early, late, *whole} if delay_frames else {d}
     changes = []
     for gain in sorted({low, high}):
         for delay in sorted(delays):
