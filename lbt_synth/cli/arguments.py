@@ -163,7 +163,8 @@ def rehearse(parser: ArgumentParser) -> None:
     add_option(parser, "--record", str, text, metavar="FILE", dest="file")
     _add_missing_facts(parser)
     _add_repairs(parser)
-    add_option(parser, "--sensor-gain", float, "sensor gain of the record", 1.0)
+    text = "sensor gain of the record (default: the one that the gain file assumes)"
+    add_option(parser, "--sensor-gain", float, text)
     add_shared(parser, "--stroke")
     add_option(parser, "--frames", int, "frames to draw where there is no record (default 8000)")
     add_option(parser, "--seed", int, "seed of what is drawn", 1)
@@ -197,8 +198,8 @@ def plot(parser: ArgumentParser) -> None:
     )
     add_option(parser, "kind", ("sigma", "bode", "nyquist", "nichols", "step"), text)
     add_gains(parser, "+")
-    text = "real sensor gain, as a factor on the one that each design assumes"
-    add_option(parser, "--sensor-gain", float, text, 1.0)
+    text = "factor on the sensor gain that each design assumes, at which the loops are closed"
+    add_option(parser, "--gain-factor", float, text, 1.0)
     add_shared(parser, "--output")
 
 

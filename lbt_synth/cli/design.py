@@ -167,11 +167,6 @@ def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) ->
             f"note: the modulus margin {modulus:.3g} is small; a loop is usually asked for "
             f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
         )
-    if not np.array_equal(hardware.sensor, np.eye(len(hardware.sensor))):
-        notes.append(
-            "note: sensor gains here are factors on the gain that the design assumes, which is in "
-            "its sensor matrix."
-        )
     if alone > 1:
         notes.append(
             f"note: the controller alone has a pole of modulus {alone:.4g}; with the loop open its "

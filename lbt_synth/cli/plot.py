@@ -69,7 +69,7 @@ def run(arguments: Namespace) -> Report:
     """Print the margins of designs, and write their figure and their points."""
     figure, points, kind = _VIEWS[arguments.kind]
     require_outputs(arguments.output, inputs=arguments.gains)
-    designs, gain = load_designs(arguments.gains), arguments.sensor_gain
+    designs, gain = load_designs(arguments.gains), arguments.gain_factor
     choose_design_unit(arguments, *designs.values())
     report = Report()
     with show_spinner("drawing", quiet=arguments.json):
@@ -77,8 +77,8 @@ def run(arguments: Namespace) -> Report:
         drawn = points(designs, gain)
         if not drawn:
             raise UnstableLoopError(
-                f"no loop is stable at sensor gain {gain:g}, and there is nothing to draw; "
-                "lbt-synth show prints the gains that are stable."
+                f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
+                "there is nothing to draw; lbt-synth show prints the factors that are stable."
             )
         report.data["curves"] = _curves(drawn)
         report.data["units"] |= json_units(kind)
@@ -104,18 +104,18 @@ def _curves(points: Sequence[Any]) -> dict[str, dict[str, list[float]]]:
     }
 
 
-def _add_margins(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:
+def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
     """Add the margins of designs, side by side."""
-    margins = {name: _margins(design, sensor_gain) for name, design in designs.items()}
+    margins = {name: _margins(design, gain_factor) for name, design in designs.items()}
     physical = all(design.hardware is not None for design in designs.values())
     units = json_units(LoopMargins) | ({"gamma": "nm", "rms": "nm"} if physical else {})
-    report.data |= {"designs": margins, "units": units, "sensor_gain": sensor_gain}
+    report.data |= {"designs": margins, "units": units, "gain_factor": gain_factor}
     unit, factor = shown_unit(units.get("gamma", ""))
     norms = [factor * record["gamma"] if "gamma" in record else None for record in margins.values()]
     quantities = [("stable", "stable", "")]
     quantities += [(c.heading, c.key, c.shown_unit) for c in columns(LoopMargins) if c.heading]
     report.add_table(
-        f"Margins at sensor gain {sensor_gain:g}",
+        f"Margins at {gain_factor:g} times the sensor gain that each design assumes",
         ("quantity", *margins, "unit"),
         [("norm", *norms, unit)]
         + [
@@ -125,13 +125,13 @@ def _add_margins(report: Report, designs: Mapping[str, Design], sensor_gain: flo
     )
 
 
-def _margins(design: Design, sensor_gain: float) -> dict[str, Any]:
+def _margins(design: Design, gain_factor: float) -> dict[str, Any]:
     """Return the method of a design, its norm in its model, and the margins of its loop."""
     record: dict[str, Any] = {"method": design.method}
     if design.is_estimator:
         record |= {"gamma": design.gamma, "rms": design.rms}
     if design.hardware is not None:
-        loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
+        loop = close_loop(design.hardware, design.controller, sensor_gain=gain_factor)
         record["stable"] = loop.is_stable
         if loop.is_stable:
             record |= json_record(loop_margins(loop))
@@ -147,21 +147,21 @@ def _points(kind: type[Any], design: str, *series: FloatArray) -> list[Any]:
     ]
 
 
-def _loop_points(designs: Mapping[str, Design], sensor_gain: float) -> list[LoopPoint]:
+def _loop_points(designs: Mapping[str, Design], gain_factor: float) -> list[LoopPoint]:
     """Return the points of the loops of designs."""
     return [
         point
-        for loop in open_loops(designs, sensor_gain=sensor_gain)
+        for loop in open_loops(designs, sensor_gain=gain_factor)
         for *curves, response in [loop.points]
         for point in _points(LoopPoint, loop.name, *curves, response.real, response.imag)
     ]
 
 
-def _sigma_points(designs: Mapping[str, Design], sensor_gain: float) -> list[SigmaPoint]:
+def _sigma_points(designs: Mapping[str, Design], gain_factor: float) -> list[SigmaPoint]:
     """Return the points of the curves of designs."""
     return [
         point
-        for name, (f, *parts) in sigma_curves(designs, sensor_gain=sensor_gain).items()
+        for name, (f, *parts) in sigma_curves(designs, sensor_gain=gain_factor).items()
         for point in _points(
             SigmaPoint, name, f, *(np.full(f.size, np.nan) if p is None else p for p in parts)
         )
@@ -169,17 +169,17 @@ def _sigma_points(designs: Mapping[str, Design], sensor_gain: float) -> list[Sig
 
 
 def _named_steps(
-    designs: Mapping[str, Design], sensor_gain: float, frames: int = SHOWN_FRAMES
+    designs: Mapping[str, Design], gain_factor: float, frames: int = SHOWN_FRAMES
 ) -> list[tuple[str, LoopStep]]:
     """Return the step responses of designs, named with their axes where these differ."""
     return [
         (axes_name(name, [step.axis], alone=len(steps) == 1), step)
-        for name, steps in design_steps(designs, sensor_gain=sensor_gain, frames=frames).items()
+        for name, steps in design_steps(designs, sensor_gain=gain_factor, frames=frames).items()
         for step in steps
     ]
 
 
-def _add_step_facts(report: Report, designs: Mapping[str, Design], sensor_gain: float) -> None:
+def _add_step_facts(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
     """Add how the loops follow a step."""
     percent = {"unit": "%", "format": ".1f"}
     ms = {"unit": "ms", "scale": 1e3, "format": ".2f"}
@@ -189,16 +189,16 @@ def _add_step_facts(report: Report, designs: Mapping[str, Design], sensor_gain: 
             overshoot_percent=fact(step.overshoot_percent, "overshoot", **percent),
             settling_s=fact(step.settling_s, "settling time, to 5 %", **ms),
         )
-        for name, step in _named_steps(designs, sensor_gain, frames=_SETTLING_FRAMES)
+        for name, step in _named_steps(designs, gain_factor, frames=_SETTLING_FRAMES)
     ]
     report.add_rows("steps", "After a step of the wavefront", rows)
 
 
-def _step_points(designs: Mapping[str, Design], sensor_gain: float) -> list[StepPoint]:
+def _step_points(designs: Mapping[str, Design], gain_factor: float) -> list[StepPoint]:
     """Return the points of the step responses."""
     return [
         point
-        for name, step in _named_steps(designs, sensor_gain)
+        for name, step in _named_steps(designs, gain_factor)
         for point in _points(StepPoint, name, step.time_s, step.residual, step.command)
     ]
 

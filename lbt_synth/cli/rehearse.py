@@ -28,7 +28,7 @@ from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import simulation_figure
 from lbt_synth.storage.rows import Facts, fact, facts
-from lbt_synth.validation import FloatArray, integer
+from lbt_synth.validation import FloatArray, integer, number
 
 _FRAMES = 8000  # of a drawn disturbance
 _DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
@@ -55,7 +55,8 @@ def run(arguments: Namespace) -> Report:
     _refuse_idle_options(arguments)
     design = load_design(arguments.gain)
     with show_spinner("rehearsing", quiet=arguments.json):
-        series = _drawn(arguments, design) if arguments.file is None else _recorded(arguments)
+        recorded = arguments.file is not None
+        series = (_recorded if recorded else _drawn)(arguments, design)
         found = rehearse(
             design,
             arguments.target,
@@ -145,26 +146,43 @@ def _refuse_idle_options(arguments: Namespace) -> None:
             raise ProblemError(f"{option} goes {'with' if drawn else 'without'} --record.")
 
 
-def _recorded(arguments: Namespace) -> _Series:
-    """Return the pseudo-open-loop series of a record, in its longest stretch of usable frames."""
+def _recorded(arguments: Namespace, design: Design) -> _Series:
+    """Return the pseudo-open-loop series of a record, in its longest stretch of usable frames.
+
+    Its sensor gain is the one that the design assumes, unless another is given.
+    """
     record = require_series(load_series(arguments), "a rehearsal runs on").bridged()
     require_length(record, frames=_FEWEST, seconds=0)
     choose_unit(arguments, record.diameter_m)
-    gain = arguments.sensor_gain
+    gains = _assumed_gains(design, record.axes)
+    if arguments.sensor_gain is not None:
+        gains = np.full(record.axes, number(arguments.sensor_gain, "--sensor-gain", above=0))
     start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
     commands = record.commands
     ran = None
     if commands is not None:
-        ran = (record.measurements[start:stop] / gain, commands[start:stop])
+        ran = (record.measurements[start:stop] / gains, commands[start:stop])
     return _Series(
         source=f"{stop - start} frames of {Path(arguments.file).name}",
         disturbance=Disturbance(
-            phase_nm=record.pseudo_open_loop(gain)[start:stop], sensor_gain=gain, frame_means=True
+            phase_nm=record.pseudo_open_loop(gains)[start:stop], frame_means=True
         ),
-        hardware=record.hardware,
+        hardware=replace(record.hardware, sensor_matrix=np.diag(gains)),
         imaging=record_imaging(arguments, record),
         ran=ran,
     )
+
+
+def _assumed_gains(design: Design, axes: int) -> FloatArray:
+    """Return what the measurements of each axis show of a unit of phase, as a design assumes."""
+    sensor = np.eye(axes) if design.hardware is None else design.hardware.sensor
+    gains = np.diag(sensor)
+    if sensor.shape != (axes, axes) or not np.array_equal(sensor, np.diag(gains)):
+        raise ProblemError(
+            f"a rehearsal on a record takes a measurement for each of its {axes} axes; the gain "
+            f"file assumes a sensor matrix {sensor.tolist()}. Design for the axes of the record."
+        )
+    return gains
 
 
 def _drawn(arguments: Namespace, design: Design) -> _Series:

@@ -153,8 +153,8 @@ class FilterDesign(Design):
         Column(name="sensors", heading="sensors and channels"),
         Column(name="period", heading="common period", unit="frames"),
         Column(name="loop_radius", heading="spectral radius of the loop, over a period"),
-        Column(name="gain_low", heading="stable sensor gains, from", format=".4g"),
-        Column(name="gain_high", heading="stable sensor gains, to", format=".4g"),
+        Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
+        Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
         Column(
             name="dwell_frames",
             heading="stable if sensors fail or return no sooner than after",

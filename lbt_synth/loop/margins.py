@@ -55,10 +55,12 @@ class LoopMargins(Summarised):
         help="Least distance of the loop from instability, ``1 / ||(I + loop)^-1||_inf``",
     )
     gain_low: float = column(
-        "stable sensor gains, from", help="Least factor on the loop gain that keeps it stable"
+        "stable gain factors, from",
+        help="Least factor on the sensor gain that keeps it stable",
     )
     gain_high: float = column(
-        "stable sensor gains, to", help="Largest factor on the loop gain; inf at an open end"
+        "stable gain factors, to",
+        help="Largest factor on the sensor gain; inf at an open end",
     )
     phase_deg: float = column(
         "phase margin",
@@ -89,10 +91,10 @@ class LoopMargins(Summarised):
         help="Size of the symmetric disks of gains and phases that keep the loop stable",
     )
     disk_gain_low: float = column(
-        "stable gain of each axis, from", help="Least factors, each axis with its own"
+        "stable factors of each axis, from", help="Least factors, each axis with its own"
     )
     disk_gain_high: float = column(
-        "stable gain of each axis, to", help="Largest factors, each axis with its own"
+        "stable factors of each axis, to", help="Largest factors, each axis with its own"
     )
     disk_phase_deg: float = column(
         "stable phase of each axis, up to", unit="deg", help="Each axis with its own"

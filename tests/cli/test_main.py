@@ -40,7 +40,7 @@ BAD = [
     ("plot sigma DAMAGED.fits -o OUT.png", 2, "damaged"),
     ("plot sigma KALMAN -o OUT.gif", 2, "must end in .csv, .png"),
     ("plot sigma KALMAN KALMAN -o OUT.png", 2, "given once"),
-    ("plot sigma KALMAN --sensor-gain -1 -o OUT.png", 2, "above 0"),
+    ("plot sigma KALMAN --gain-factor -1 -o OUT.png", 2, "above 0"),
     ("simulate CONFIG KALMAN --frames 0", 2, "at least 1"),
     ("simulate CONFIG KALMAN --frames many", 2, "invalid int"),
     ("simulate CONFIG KALMAN -o OUT.doc", 2, "must end in .png"),

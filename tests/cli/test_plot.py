@@ -52,10 +52,10 @@ def test_overshoot_and_settling_time(capsys, gains):
 def test_without_a_stable_loop_there_is_nothing_to_draw(tmp_path, capsys, gains):
     out = tmp_path / "bode.csv"
     status, _, error = run(
-        capsys, "plot", "bode", gains["integrator"], "--sensor-gain", 3, "-o", out
+        capsys, "plot", "bode", gains["integrator"], "--gain-factor", 3, "-o", out
     )
     assert (status, out.exists()) == (1, False)
-    assert "no loop is stable at sensor gain 3" in error
+    assert "no loop is stable at 3 times the sensor gain" in error
 
 
 def test_sigma(tmp_path, capsys, gains):

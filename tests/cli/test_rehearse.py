@@ -43,6 +43,26 @@ def test_a_record_is_rehearsed_beside_what_ran(capsys, files):
     assert 0 < data["difference_rms_nm"] < data["difference_largest_nm"] < 0.01
 
 
+def test_the_file_that_made_a_record_leaves_what_ran(tmp_path, capsys):
+    """The gain is what the raw measurement shows, in the file and in the record: 0.6, not 1."""
+    config = tmp_path / "gain.yaml"
+    text = LBT_YAML.read_text().replace("  sensor_gain: 1.0 ", "  sensor_gain: 0.6 ")
+    config.write_text(text.replace("    kind: ar1\n", "    kind: ar1\n  sensor_gain: 0.6\n"))
+    gain, night = tmp_path / "k.fits", tmp_path / "night.fits"
+    assert run(capsys, "design", config, "--method", "kalman", "-o", gain)[0] == 0
+    words = ("simulate", config, gain, "--frames", 6000, "--cases", 1, "--telemetry", night)
+    assert run(capsys, *words)[0] == 0
+    rehearsed = run(capsys, "rehearse", gain, "--for", "c", "--record", night, "--json")
+    target, _, ran = json.loads(rehearsed[1])["loops"]
+    assert target["residual_nm"] == pytest.approx(ran["residual_nm"], rel=1e-3)
+    found = json.loads(run(capsys, "diagnose", night, gain, "--json")[1])
+    rows = {row["name"]: row["data_nm"] for row in found["residuals"]}
+    assert rows["k"] == pytest.approx(rows["what ran"], rel=2e-3)
+    identified = lbt.identify(lbt.load_record(night))
+    for axis in identified.axes:
+        assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
+
+
 def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files):
     gain, figure = files[0] / "gain.fits", tmp_path / "a.png"
     words = ("rehearse", gain, "--for", "dao", "--frames", 1500, "--stroke", 900)

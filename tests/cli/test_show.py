@@ -16,7 +16,7 @@ from lbt_synth.files.gain_file.store import load_with_digest
 def test_show_and_verify(capsys, gains, name):
     status, text, _ = run(capsys, "show", gains[name], "--matrices")
     assert status == 0
-    assert "stable sensor gains, from" in text
+    assert "stable gain factors, from" in text
     lines = text.splitlines()
     assert lines[lines.index("A =") + 1].startswith("[[")
     assert lines[lines.index("D =") + 2].startswith(" [0.")

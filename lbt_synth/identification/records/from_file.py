@@ -173,7 +173,9 @@ def record_from_telemetry(
     """Make a record of tip and tilt from telemetry.
 
     Measurements become modes by the inverse of the interaction matrix, commands by the
-    influence matrix, where there are such.
+    influence matrix, where there are such. A matrix of gains alone, one for each mode, is no
+    mixture: these measurements stay as they were recorded, and the sensor gain of the record is
+    what they show of a unit of phase.
 
     Parameters
     ----------
@@ -268,7 +270,7 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
             "coefficients. Multiply them by the reconstructor of the loop.",
             in_python="As Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R).",
         )
-    if response is None or np.array_equal(response, np.eye(n)):
+    if response is None or _is_gains(response, seen):
         return None
     if q < n or np.linalg.cond(response) > _CONDITION:
         raise ProblemError(
@@ -276,6 +278,16 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
             f"tell {n} modes apart. Give telemetry of tip and tilt alone."
         )
     return np.asarray(np.linalg.pinv(response), dtype=np.float64)
+
+
+def _is_gains(response: FloatArray, seen: Telemetry) -> bool:
+    """Whether a response is a gain for each mode; units of other programs are in their matrix."""
+    if response.shape != (seen.modes, seen.modes):
+        return False
+    gains = np.diag(response)
+    one = np.array_equal(response, np.eye(seen.modes))
+    plain = np.array_equal(response, np.diag(gains)) and bool(np.all(gains > 0))
+    return one or (plain and _FOREIGN not in seen.metadata)
 
 
 def _influence(seen: Telemetry) -> FloatArray | None:
