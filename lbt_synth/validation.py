@@ -53,7 +53,12 @@ def frozen_copy(array: npt.ArrayLike) -> FloatArray:
 
 
 def float_array(value: Any, name: str) -> FloatArray:
-    """Return a float64 array of any shape, finite or not, without a copy if possible."""
+    """Return a float64 array of any shape, finite or not, without a copy if possible.
+
+    What a masked array hides is nan.
+    """
+    if np.ma.is_masked(value):
+        value = value.astype(np.float64).filled(np.nan)
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:

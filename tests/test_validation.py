@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lbt_synth import errors, validation
+from lbt_synth.identification import loop_record
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -158,3 +159,15 @@ def test_an_error_keeps_its_data_and_knows_no_other():
     assert (str(error), error.gamma, error.gamma_least, error.conflict) == ("no", 2.0, None, ("a",))
     with pytest.raises(TypeError, match="no attribute 'size'"):
         errors.InfeasibleError("no", size=1)
+
+
+def test_what_a_mask_hides_is_no_number():
+    hidden = np.ma.array([[0.5, 1.0], [2.0, 3.0]], mask=[[0, 1], [0, 0]])
+    assert np.isnan(validation.float_array(hidden, "x")[0, 1])
+    with pytest.raises(errors.NonFiniteError, match="got nan at index"):
+        validation.real_array(hidden, "x")
+    record = np.ma.array(np.ones((600, 1)), mask=np.arange(600)[:, None] % 100 == 7)
+    seen = loop_record(record, frame_rate_hz=100, unit="nm")
+    assert int(np.sum(~seen.usable)) >= 6
+    whole = np.ma.array([1.0, 2.0])
+    np.testing.assert_array_equal(validation.real_array(whole, "x"), [1.0, 2.0])

@@ -98,6 +98,11 @@ class EstimationProblem(LinearSystem):
             raise DimensionError("a problem without states has nothing to estimate; got A (0, 0).")
         L = matrix(self.L, "L", cols=(self.n_states, f"to match A {self.A.shape}"))
         q = self.n_measurements
+        if not q or not len(L):
+            raise DimensionError(
+                "a problem needs something measured and something to estimate; got C with "
+                f"{q} rows and L with {len(L)}."
+            )
         given = np.full((1, q), True) if self.read is None else self.read
         read = np.array(given, dtype=np.bool_, ndmin=2)
         if len(read) > 1:  # the schedule alone may have the period

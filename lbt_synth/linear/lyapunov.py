@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.linalg import matrix_balance
 
+from lbt_synth.errors import UnstableLoopError
 from lbt_synth.linear.matrix_functions import (
     complex_schur,
     frobenius_norms,
@@ -30,8 +31,8 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Solve ``X = A X A' + Q`` for a stable A, with iterative refinement.
 
     By squaring, or by squaring the triangular form of A if that leaves a smaller residual: its
-    powers keep the eigenvalues of a matrix that is far from normal. That the spectral radius of A
-    (n, n) is below 1 is not checked; Q (n, n) is symmetric.
+    powers keep the eigenvalues of a matrix that is far from normal. A is (n, n), Q symmetric; an A
+    whose spectral radius is not below 1 raises an UnstableLoopError.
     """
     squared, residuals = stationary_covariances(A[None], Q[None])
     if residuals[0] < _SOLVED:
@@ -45,6 +46,13 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
                 X + (back @ smith_sum(triangle[None], rest[None])[0] @ back.conj().T).real
             )
     left = lyapunov_residual(A, Q, X)
+    if not (np.isfinite(X).all() or np.isfinite(squared).all()):
+        radius = float(np.max(np.abs(np.linalg.eigvals(A))))
+        raise UnstableLoopError(
+            "a stationary covariance needs a stable system; got a pole of modulus "
+            f"{radius:.9g}, whose covariance grows without end.",
+            spectral_radius=radius,
+        )
     return X if left < residuals[0] or np.isnan(residuals[0]) else np.asarray(squared[0])
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
 from scipy.sparse.csgraph import connected_components
 
-from lbt_synth.errors import NumericalError, UnstableLoopError
+from lbt_synth.errors import DimensionError, NumericalError, UnstableLoopError
 from lbt_synth.linear.state_space import StateSpace, pointwise_response, schur_response
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
@@ -62,7 +62,7 @@ def hinf_norm(system: Any) -> HinfNorm:
     Raises
     ------
     ProblemError
-        If the system is not one, or is in continuous time.
+        If the system is not one, is in continuous time, or has no input or no output.
     UnstableLoopError
         If it is not stable: the norm is then infinite.
     NumericalError
@@ -76,6 +76,11 @@ def hinf_norm(system: Any) -> HinfNorm:
     (2.0, 0.0)
     """
     G = StateSpace.of(system)
+    if not (G.B.shape[-1] and G.C.shape[-2]):
+        raise DimensionError(
+            "a norm needs a system with at least one input and one output; got "
+            f"{G.B.shape[-1]} inputs and {G.C.shape[-2]} outputs."
+        )
     radius = G.spectral_radius
     if not radius < 1:
         raise UnstableLoopError(

@@ -130,3 +130,16 @@ def test_the_problem_over_a_period_has_the_readings_of_a_period():
 def test_problems_that_are_none(changes, error, words):
     with pytest.raises(error, match=words):
         EstimationProblem(**(WALK | changes))
+
+
+@pytest.mark.parametrize(("rows", "said"), [((0, 1), "C with 0 rows"), ((1, 0), "L with 0")])
+def test_something_is_measured_and_something_estimated(rows, said):
+    q, p = rows
+    with pytest.raises(lbt.errors.DimensionError, match=said):
+        lbt.EstimationProblem(
+            A=0.5,
+            B=[[1, 0]],
+            C=np.ones((q, 1)),
+            D=[[0, 1]] * q or np.zeros((0, 2)),
+            L=np.ones((p, 1)),
+        )

@@ -83,3 +83,9 @@ def test_a_stack_holds_loops_whose_squaring_loses_the_digits():
             exact = mpmath.lu_solve(whole, mpmath.matrix(drive.ravel().tolist()))
             left = float(exact[6 * 2 + 2])  # of the measurement
         assert found[2, 2] == pytest.approx(left, rel=1e-7)
+
+
+@pytest.mark.parametrize("pole", [1.0, 1.2, -1.5])
+def test_an_unstable_system_has_no_stationary_covariance(pole):
+    with pytest.raises(lbt.errors.UnstableLoopError, match=f"a pole of modulus {abs(pole):g}"):
+        stationary_covariance(np.diag([0.5, pole]), np.eye(2))

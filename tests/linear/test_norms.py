@@ -235,3 +235,9 @@ def test_a_pencil_without_eigenvalues_is_refused_in_words(monkeypatch):
     monkeypatch.setattr("lbt_synth.linear.norms.eigvals", fail)
     with pytest.raises(lbt.errors.NumericalError, match="scale the states"):
         lbt.hinf_norm(lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0, dt_s=1.0))
+
+
+def test_a_system_without_inputs_or_outputs_has_no_norm():
+    blind = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=np.zeros((0, 1)), D=np.zeros((0, 1)))
+    with pytest.raises(lbt.errors.DimensionError, match="one output; got 1 inputs and 0 outputs"):
+        lbt.hinf_norm(blind)
