@@ -111,6 +111,8 @@ class Method:
         Rank among the methods that studies compare designs with; None if it is not one.
     reference_options : mapping
         Options that it has when designs are compared.
+    compared_options : mapping
+        Further ones where it stands beside a design in the truth of a configuration.
 
     Examples
     --------
@@ -134,6 +136,7 @@ class Method:
     slow: bool = False
     reference_rank: int | None = None
     reference_options: Mapping[str, Any] = field(default_factory=dict)
+    compared_options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def kind(self) -> type[Design]:

@@ -241,8 +241,8 @@ class TruthComparison:
 def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComparison:
     """Compare designs in the truth of a configuration with its reference designs.
 
-    The reference designs are made for the configuration: the best integrator, the Kalman filter
-    and the H-infinity filter.
+    The reference designs are made for the configuration: the best integrator with a phase margin of
+    45 degrees, which a telescope would run, the Kalman filter and the H-infinity filter.
 
     Parameters
     ----------
@@ -273,9 +273,10 @@ def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComp
     references: dict[str, Design] = {}
     notes = []
     for method in reference_methods():
+        options = {**method.reference_options, **method.compared_options}
         name = f"{method.name} (reference)" if method.name in designs else method.name
         try:
-            references[name] = config.design(method.name, **method.reference_options)
+            references[name] = config.design(method.name, **options)
         except LbtSynthError as error:
             notes.append(f"{method.name} is left out: {error}")
     study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
