@@ -55,7 +55,7 @@ def run(arguments: Namespace) -> Report:
 
 def _config_designs(config: Config) -> dict[str, Design]:
     return {
-        method.name: config.design(method.name, **method.reference_options)
+        method.name: config.design(method.name, **method.in_comparison)
         for method in reference_methods()
     }
 

@@ -273,10 +273,9 @@ def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComp
     references: dict[str, Design] = {}
     notes = []
     for method in reference_methods():
-        options = {**method.reference_options, **method.compared_options}
         name = f"{method.name} (reference)" if method.name in designs else method.name
         try:
-            references[name] = config.design(method.name, **options)
+            references[name] = config.design(method.name, **method.in_comparison)
         except LbtSynthError as error:
             notes.append(f"{method.name} is left out: {error}")
     study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
