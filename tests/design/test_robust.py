@@ -119,5 +119,5 @@ def test_demands_hold_together():
         path = replace(plant.hardware, delay_frames=delay)
         assert lbt.close_loop(path, design.controller, sensor_gain=gain).is_stable
     checks = [c for c in design.certificate.checks if c.name.startswith("loop change by")]
-    assert len(checks) == 6
+    assert len(checks) == 4  # the corners: no whole delay lies between
     assert all(check.passed for check in checks)
