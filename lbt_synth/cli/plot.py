@@ -161,7 +161,7 @@ def _sigma_points(designs: Mapping[str, Design], gain_factor: float) -> list[Sig
     """Return the points of the curves of designs."""
     return [
         point
-        for name, (f, *parts) in sigma_curves(designs, sensor_gain=gain_factor).items()
+        for name, (_, f, *parts) in sigma_curves(designs, sensor_gain=gain_factor).items()
         for point in _points(
             SigmaPoint, name, f, *(np.full(f.size, np.nan) if p is None else p for p in parts)
         )

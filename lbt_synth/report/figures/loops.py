@@ -149,8 +149,8 @@ def sigma_figure(
     -------
     matplotlib.figure.Figure
         One panel per transfer function, the vibration frequencies marked. A loop that is
-        unstable at this sensor gain is named and not drawn. With several axes the
-        largest singular value is that of the worst one.
+        unstable at this sensor gain is named and not drawn. Axes that do not mix have a curve each;
+        of others the largest singular value is that of the worst direction.
 
     Raises
     ------
@@ -168,26 +168,38 @@ def sigma_figure(
     """
     if not designs:
         raise ProblemError("a sigma plot needs at least one design; got none.")
-    names, lines_hz = list(designs), _vibration_frequencies(designs.values())
+    lines_hz = _vibration_frequencies(designs.values())
     norms = sigma_curves(designs, sensor_gain=sensor_gain, unit_weights=unit_weights)
-    errors = {name: (f, error) for name, (f, error, *_) in norms.items() if error is not None}
-    rejections, noises = (
-        {name: (norms[name][0], norms[name][i]) for name in names if designs[name].hardware}
-        for i in (2, 3)
-    )
+    names = list(norms)
+    errors = {name: (f, error) for name, (_, f, error, *_) in norms.items() if error is not None}
+    split = {design for name, (design, *_) in norms.items() if name != design}
+    closed = [
+        name
+        for name, (design, *_) in norms.items()
+        if designs[design].hardware is not None and name not in split
+    ]
+    rejections = {name: (norms[name][1], norms[name][3]) for name in closed}
+    noises = {name: (norms[name][1], norms[name][4]) for name in closed}
     physical = all(designs[name].hardware is not None for name in errors)
     unit = "nm" if physical and not unit_weights else "-"
-    title = f"closed loops at sensor gain {sensor_gain:g}"
+    factor = "" if sensor_gain == 1 else f" at {sensor_gain:g} times the sensor gain"
+    title = f"closed loops{factor}"
     more: dict[str, Any] = {"unit": unit, "title": title, "axes": axes}
     return draw_sigma(errors, rejections, noises, names, lines_hz, **more)
 
 
+_APART = 1e-12  # of a response, that another axis has by rounding
+_Curves: TypeAlias = tuple[str, FloatArray, FloatArray | None, FloatArray | None, FloatArray | None]
+
+
 def sigma_curves(
     designs: Mapping[str, Design], *, sensor_gain: float = 1.0, unit_weights: bool = False
-) -> dict[str, tuple[FloatArray, FloatArray | None, FloatArray | None, FloatArray | None]]:
-    """Return of each design frequencies [Hz], and singular values of error, rejection and noise.
+) -> dict[str, _Curves]:
+    """Return of each curve its design, frequencies [Hz], and values of error, rejection and noise.
 
-    Frequencies are dense around vibrations.
+    They are largest singular values. Axes that do not mix have a curve each, unless they are equal:
+    the largest of both would be that of the other axis at a line of one. Frequencies are dense
+    around vibrations.
     """
     lines_hz, curves = _vibration_frequencies(designs.values()), {}
     for name, design in designs.items():
@@ -200,10 +212,25 @@ def sigma_curves(
         if design.hardware is not None:
             loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
             if loop.is_stable:
-                rejection = spectral_norms(loop.sensitivity(grid))
-                noise = spectral_norms(loop.noise_transfer(grid))
-        curves[name] = grid, error, rejection, noise
+                S, N = loop.sensitivity(grid), loop.noise_transfer(grid)
+                axes = [np.abs(part.diagonal(axis1=1, axis2=2)).T for part in (S, N)]
+                if _are_apart(S) and _are_apart(N) and not np.allclose(axes[0], axes[0][0]):
+                    for axis, pair in enumerate(zip(*axes, strict=True)):
+                        curves[axes_name(name, [axis], alone=False)] = name, grid, None, *pair
+                    if error is not None:
+                        curves[name] = name, grid, error, None, None
+                    continue
+                rejection, noise = spectral_norms(S), spectral_norms(N)
+        curves[name] = name, grid, error, rejection, noise
     return curves
+
+
+def _are_apart(response: ComplexArray) -> bool:
+    """Whether a response (f, n, n) is diagonal, but for rounding."""
+    if response.shape[1] != response.shape[2]:
+        return False
+    others = np.abs(response[:, ~np.eye(response.shape[1], dtype=np.bool_)])
+    return bool(np.max(others, initial=0.0) <= _APART * np.max(np.abs(response)))
 
 
 def _vibration_frequencies(designs: Iterable[Design]) -> list[float]:

@@ -1,12 +1,14 @@
 """Figures of loops: curves of closed forms, margins where they are, loops that are unstable."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.figures import legend
 
 import lbt_synth as lbt
 from lbt_synth.report.draw import drawing
-from lbt_synth.report.figures.loops import draw_transfer, frequency_grid
+from lbt_synth.report.figures.loops import draw_transfer, frequency_grid, sigma_curves
 
 FIGURES = lbt.report.figures
 PATH = lbt.LoopHardware(frame_rate_hz=800)
@@ -136,7 +138,7 @@ def test_curves_differ_in_grey(designs):
 
 def test_a_sigma_plot_names_an_unstable_loop(designs):
     _, rejection, noise = lbt.report.figures.sigma_figure(designs, sensor_gain=0.4).axes
-    assert "sensor gain 0.4" in rejection.get_title(loc="left")
+    assert "0.4 times the sensor gain" in rejection.get_title(loc="left")
     for axis in (rejection, noise):
         assert "H-infinity: unstable" in legend(axis)
         curves = {line.get_label(): len(line.get_xdata()) for line in axis.get_lines()}
@@ -173,3 +175,27 @@ def test_a_grid_is_fine_around_lines_and_below_nyquist(near):
         assert distances[0] == 0
         assert distances[1] == pytest.approx(1e-4, rel=1e-6)
         assert np.max(np.diff(distances[distances < 0.1])) < 0.035
+
+
+def test_axes_that_do_not_mix_have_a_curve_each():
+    """At a line of one axis the largest of both is that of the other, which rejects nothing."""
+    lines = [
+        lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=200, direction=along)
+        for f, along in ((20, (1, 0)), (47, (0, 1)))
+    ]
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20, frame_rate_hz=800)
+    plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, vibrations=lines, noise_nm=10.0)
+    curves = sigma_curves({"kalman": lbt.kalman(plant)})
+    assert list(curves) == ["kalman, axis 1", "kalman, axis 2", "kalman"]
+    for axis, line in ((1, 20), (2, 47)):
+        own, other = (curves[f"kalman, axis {i}"] for i in (axis, 3 - axis))
+        at = np.argmin(np.abs(own[1] - line))
+        assert own[3][at] < 0.3 * other[3][at]
+    assert curves["kalman"][2] is not None
+    mixed = lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        turbulence=slow,
+        vibrations=[replace(lines[0], direction=(1, 1))],
+        noise_nm=10.0,
+    )
+    assert list(sigma_curves({"kalman": lbt.kalman(mixed)})) == ["kalman"]
