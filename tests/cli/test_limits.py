@@ -26,7 +26,7 @@ def test_limits_command(tmp_path, capsys, config):
     assert status == 0
     data = json.loads(out)
     assert data["limit_nm"] == pytest.approx(37.7777, abs=1e-4)
-    assert data["band_limit_nm"] == pytest.approx(33.4853, abs=1e-4)
+    assert data["band_limit_nm"] == pytest.approx(43.8561, abs=1e-4)
     assert data["band_hz"] == [16.5, 23.5]
     rows = {row["design"]: row for row in data["rows"]}
     assert list(rows) == ["integrator", "kalman", "hinf", "kalman (file)"]

@@ -38,9 +38,10 @@ class BandLimit:
     """The least worst residual with a sinusoid anywhere in a band."""
 
     rms_nm: float  # no linear controller has a smaller worst residual over the band [nm rms]
-    # worst residual of the filter that was found (of infinite order) [nm rms]; what can be had lies
-    # between the two, which are within 1e-8, for bands of almost all frequencies within some
-    # percent
+    # bound on the worst residual of the filter that was found (of infinite order) [nm rms]; what
+    # can be had lies between the two. In means over frames they are within 1e-8, for bands of
+    # almost all frequencies within some percent; in the image the floor, which rises over the band,
+    # parts them
     achieved_nm: float
     variance_nm2: FloatArray  # (n,): the limit by direction, that of the sinusoid included [nm^2]
     # (n, n): directions over the modes, one per row, along which the loop decouples
@@ -62,8 +63,9 @@ def least_worst_residual(
     """Least worst residual of any linear controller with a sinusoid anywhere in a band.
 
     The controller knows the truth, the band, and the size and direction of the sinusoid, but
-    not its frequency; what counts is the frequency that is worst for it. In the image the sinusoid
-    counts with its least mean over a frame, and its least motion within one, over the band.
+    not its frequency; what counts is the frequency that is worst for it. In the image the limit is
+    the larger of two: with the least mean over a frame and the least motion within one, over the
+    band; and with all of the mean rejected, and the motion within a frame at the upper end.
 
     Parameters
     ----------
@@ -114,17 +116,17 @@ def least_worst_residual(
     directions, modes = truth_modes(hardware, truth, (along,), in_image=not frame_means)
     own = int(np.argmax(np.abs(directions @ along)))
     ends = low / nyquist, high / nyquist
-    least_mean, least_within = 1.0, 0.0  # parts of its power
-    if not frame_means:
-        least_mean, least_within = np.sinc(ends[1] / 2) ** 2, 1 - np.sinc(ends[0] / 2) ** 2
-    power = line.rms_nm**2
-    lower, gap, x, weight = _find_saddle(modes[own], ends, least_mean * power)
-    variance = np.array([lower if m is modes[own] else mode_limit(m)[0] for m in modes])
+    most, least = (1.0, 1.0) if frame_means else np.sinc(np.array(ends) / 2) ** 2
+    power = line.rms_nm**2  # of which these parts are in the mean over a frame, at either end
+    saddle, gap, x, weight = _find_saddle(modes[own], ends, least * power)
+    variance = np.array([mode_limit(mode)[0] for mode in modes])
+    lower = max(saddle + (1 - most) * power, variance[own] + (1 - least) * power)
+    upper = max((saddle + gap) * most / least + (1 - least) * power, lower)
+    variance[own] = lower
     variance = variance + [mode.within_frames_nm2() for mode in modes]
-    variance[own] += least_within * power
     return BandLimit(
         rms_nm=float(np.sqrt(variance.sum())),
-        achieved_nm=float(np.sqrt(variance.sum() + gap)),
+        achieved_nm=float(np.sqrt(variance.sum() + upper - lower)),
         variance_nm2=frozen_copy(variance),
         directions=frozen_copy(directions),
         frequency_hz=frozen_copy(x * nyquist),

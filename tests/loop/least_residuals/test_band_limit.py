@@ -21,16 +21,18 @@ def test_band_of_the_example(config):
     assert limit.weight.sum() == pytest.approx(1)
     assert limit.weight.min() >= 0
     assert 16.5 < limit.frequency_hz.min() < limit.frequency_hz.max() < 23.5
-    # in the image: its least mean, and its least motion within a frame, over the band
+    # in the image no loop leaves less than the motion within a frame at the upper end
     known = lbt.loop.least_residual(config.hardware, replace(config.truth, vibrations=()))
-    floor = line.rms_nm**2 * (1 - np.sinc(16.5 / RATE) ** 2)
+    floor = line.rms_nm**2 * (1 - np.sinc(23.5 / RATE) ** 2)
     own = line.rms_nm**2 * (1 - np.sinc(line.frequency_hz / RATE) ** 2)  # of the truth's own line
     moving = lbt.loop.least_worst_residual(
         config.hardware, config.truth, band_hz=(16.5, 23.5), rms_nm=line.rms_nm
     )
+    assert moving.rms_nm**2 == pytest.approx(known.rms_nm**2 + floor + own)
+    # what rejects the means leaves little more: their own limit takes the place of no line at all
     within = floor + own + known.within_nm2.sum()
-    assert moving.rms_nm**2 - within == pytest.approx(limit.rms_nm**2, rel=0.01)
-    assert moving.rms_nm**2 - within < limit.rms_nm**2
+    assert moving.achieved_nm**2 == pytest.approx(limit.rms_nm**2 + within, rel=1e-3)
+    assert moving.rms_nm < moving.achieved_nm
 
 
 def test_the_density_found_is_the_hardest(config):
@@ -72,7 +74,7 @@ def test_designs_stay_above_the_band_limit(delay, frame_means):
             lbt.loop.least_worst_residual(plant.hardware, still, **known)
         return
     limit = lbt.loop.least_worst_residual(plant.hardware, still, **known)
-    assert limit.achieved_nm < limit.rms_nm * (1 + 1e-7)
+    assert limit.rms_nm <= limit.achieved_nm < limit.rms_nm * (1 + (1e-7 if frame_means else 0.02))
     for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.1, route="riccati")):
         worst = max(
             budget(
@@ -121,7 +123,7 @@ def test_band_without_noise():
     calm = lbt.Truth(turbulence=None)
     silent = lbt.loop.least_worst_residual(path(), calm, **known, frame_means=True)
     assert silent.rms_nm == 0.0
-    floor = 100 * np.sqrt(1 - np.sinc(15 / RATE) ** 2)
+    floor = 100 * np.sqrt(1 - np.sinc(25 / RATE) ** 2)
     assert lbt.loop.least_worst_residual(path(), calm, **known).rms_nm == pytest.approx(floor)
 
 
