@@ -187,6 +187,7 @@ def _terminate(*_: object) -> None:
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
     gc.set_threshold(200_000, 50, 50)  # what imports and charts make stays until the end
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # reads all packages for them
     for stream in (sys.stdout, sys.stderr):  # no character that an encoding lacks ends a command
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:

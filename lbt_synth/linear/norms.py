@@ -109,6 +109,12 @@ def independent_parts(G: StateSpace) -> list[StateSpace]:
     return list(parts.values()) or [G]
 
 
+def square_parts(G: StateSpace) -> list[StateSpace]:
+    """Return the parts of a square system that share nothing, each of the same channels."""
+    _, inputs, outputs = system_parts(G.A, G.B, G.C, G.D)
+    return independent_parts(G) if np.array_equal(inputs, outputs) else [G]
+
+
 def system_parts(
     A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
 ) -> tuple[IntArray, IntArray, IntArray]:
@@ -156,10 +162,10 @@ def largest_real_part(system: StateSpace) -> float:
     It is the largest eigenvalue of ``(G + G*) / 2``, found as the norm, by the level sets of
     ``G(z) + G(1/z)' = 2 level``.
     """
-    _, inputs, outputs = system_parts(system.A, system.B, system.C, system.D)
-    if np.array_equal(inputs, outputs) and np.any(inputs):  # each part is square
-        return max(largest_real_part(part) for part in independent_parts(system))
-    G = system.balanced()
+    parts = square_parts(system)
+    if len(parts) > 1:
+        return max(largest_real_part(part) for part in parts)
+    G = parts[0].balanced()
     size = max(float(hinf_norm(G)), 1e-300)
     # the response moved by its own size is positive, and so are its levels
     moved = replace(G, D=G.D + 2 * size * np.eye(len(G.D)))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.norms import largest_real_part
+from lbt_synth.linear.norms import largest_real_part, square_parts
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror
@@ -86,7 +86,9 @@ def errors_together(loop: ClosedLoop) -> float:
     rate = hardware.frame_rate_hz
     f = np.concatenate([np.geomspace(1e-3, 1, _POINTS // 4), np.linspace(0.01, 1, _POINTS)])
     f = np.concatenate([f, np.abs(np.angle(answer.poles)) / np.pi]) * rate / 2
-    response = answer.frequency_response(np.maximum(f, 1e-9 * rate))
+    points = np.maximum(f, 1e-9 * rate)
+    parts = square_parts(answer)
+    responses = [part.frequency_response(points) for part in parts]
     turns = np.exp(-2j * np.pi * f / rate)[:, None]
 
     def changes(scale: float) -> list[LoopChange]:
@@ -97,10 +99,10 @@ def errors_together(loop: ClosedLoop) -> float:
     def seems_stable(scale: float) -> bool:
         for change in changes(scale):
             shift = turns ** np.arange(change.taps.size) @ change.taps
-            X = shift[:, None, None] * response
-            hermitian = X + X.conj().transpose(0, 2, 1)
-            if np.max(np.linalg.eigvalsh(hermitian)) >= 2:
-                return False
+            for response in responses:
+                X = shift[:, None, None] * response
+                if np.max(np.linalg.eigvalsh(X + X.conj().transpose(0, 2, 1))) >= 2:
+                    return False
         return True
 
     low, high = 0.0, _MOST
@@ -109,8 +111,8 @@ def errors_together(loop: ClosedLoop) -> float:
         low, high = (middle, high) if seems_stable(middle) else (low, middle)
     scale = high if seems_stable(high) else low
     while scale > 1e-3:
-        parts = (append_taps(answer, change.taps) for change in changes(scale))
-        if all(largest_real_part(part) < 1 for part in parts):
+        pairs = ((part, change) for change in changes(scale) for part in parts)
+        if all(largest_real_part(append_taps(part, change.taps)) < 1 for part, change in pairs):
             return scale
         scale *= _SHRINK
     return 0.0
