@@ -112,7 +112,7 @@ class Method:
     reference_options : mapping
         Options that it has when designs are compared.
     compared_options : mapping
-        Further ones where it stands beside a design in the truth of a configuration.
+        Further ones where it stands for what a telescope would run, beside the limits.
 
     Examples
     --------
@@ -140,7 +140,7 @@ class Method:
 
     @property
     def in_comparison(self) -> dict[str, Any]:
-        """Options of the design that stands beside others in the truth of a configuration."""
+        """Options of the design that stands beside others and the limits."""
         return {**self.reference_options, **self.compared_options}
 
     @property

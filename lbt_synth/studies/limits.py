@@ -241,8 +241,8 @@ class TruthComparison:
 def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComparison:
     """Compare designs in the truth of a configuration with its reference designs.
 
-    The reference designs are made for the configuration: the best integrator with a phase margin of
-    45 degrees, which a telescope would run, the Kalman filter and the H-infinity filter.
+    The reference designs are made for the configuration: the integrator of least residual, the
+    Kalman filter and the H-infinity filter.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComp
     for method in reference_methods():
         name = f"{method.name} (reference)" if method.name in designs else method.name
         try:
-            references[name] = config.design(method.name, **method.in_comparison)
+            references[name] = config.design(method.name, **method.reference_options)
         except LbtSynthError as error:
             notes.append(f"{method.name} is left out: {error}")
     study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
