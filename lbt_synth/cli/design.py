@@ -71,7 +71,7 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
             report.data["margins"] = json_record(*margins)
             report.opening.append(_survival(*margins))
         report.notes += _loop_notes(design, design.hardware, report.data)
-        report.notes += [note for each in margins for note in _fragile_notes(each)]
+        report.notes += [note for each in margins for note in _fragile_notes(each, design.hardware)]
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
@@ -118,8 +118,7 @@ def _survival(margins: LoopMargins) -> str:
     def size(value: float, unit: str) -> str:
         return f"{value:.2g} {unit}".strip() if np.isfinite(value) else "any"
 
-    with np.errstate(divide="ignore"):  # no gain is too low
-        low_db, high_db = 20 * np.abs(np.log10([margins.gain_low, margins.gain_high]))
+    low_db, high_db = _gain_errors_db(margins)
     alone = (
         f"survives {size(margins.delay_frames, 'frames')} more delay or "
         f"{size(margins.early_frames, 'frames')} less, {size(high_db, 'dB')} more sensor gain or "
@@ -131,9 +130,16 @@ def _survival(margins: LoopMargins) -> str:
     return f"{alone}; at once {frames:.2g} frames and {decibels:.2g} dB either way (proved)."
 
 
-def _fragile_notes(margins: LoopMargins) -> list[str]:
+def _gain_errors_db(margins: LoopMargins) -> tuple[float, float]:
+    """Return how much less and how much more sensor gain a loop survives [dB]; inf for any."""
+    with np.errstate(divide="ignore"):  # no gain is too low
+        low_db, high_db = 20 * np.abs(np.log10([margins.gain_low, margins.gain_high]))
+    return float(low_db), float(high_db)
+
+
+def _fragile_notes(margins: LoopMargins, hardware: LoopHardware) -> list[str]:
     """Warn of a delay or a gain that is hardly off and makes the loop unstable."""
-    notes, frame_us = [], 1e6 * margins.delay_s / margins.delay_frames
+    notes, frame_us = [], 1e6 * hardware.dt_s
     for frames, word in ((margins.delay_frames, "more"), (margins.early_frames, "less")):
         if frames < FRAGILE_FRAMES:
             notes.append(
@@ -141,8 +147,7 @@ def _fragile_notes(margins: LoopMargins) -> list[str]:
                 "loop unstable. Do not close it so: take another method, or robust with "
                 "delay_error_frames."
             )
-    decibels = 20 * np.log10([margins.gain_high, 1 / max(margins.gain_low, 1e-300)])
-    if (least := float(np.min(decibels))) < FRAGILE_DB:
+    if (least := min(_gain_errors_db(margins))) < FRAGILE_DB:
         notes.append(
             f"warning: a sensor gain that is off by {least:.2g} dB makes this loop unstable."
         )

@@ -308,7 +308,7 @@ def _delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
     d = hardware.delay_frames
     longest = _LONGEST - d if sign > 0 else d - 1
     # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
-    whole = np.abs(np.arange(1, _LONGEST + 1) - d)
+    whole = sign * (np.arange(1, _LONGEST + 1) - d)
 
     def first_unstable(low: float, high: float) -> tuple[float, float] | None:
         """Return the step of an equal division in which the loop becomes unstable, or None."""

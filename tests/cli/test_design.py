@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from support.plants import LBT_YAML, ROOT, lbt_axis_plant
 from support.robust_config import SMALL, robust_writer
 
 import lbt_synth as lbt
+from lbt_synth.cli.design import describe_design
 from lbt_synth.cli.main import main
 
 CONFIG = str(LBT_YAML)
@@ -203,3 +205,14 @@ def test_a_fragile_design_does_not_pass_without_a_word(tmp_path, capsys):
     )
     status, out, _ = run(capsys, "design", LBT_YAML, "--method", "integrator", "-o", gain)
     assert "a sensor gain that is off by 0.78 dB makes this loop unstable" in out
+
+
+@pytest.mark.parametrize("late", [0.0, np.inf])
+def test_the_time_of_a_fragile_delay_needs_no_margin_on_the_other_side(monkeypatch, late):
+    def fragile(loop):
+        return replace(lbt.loop_margins(loop), delay_frames=late, delay_s=late, early_frames=0.04)
+
+    monkeypatch.setattr("lbt_synth.cli.design.loop_margins", fragile)
+    hardware = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
+    notes = describe_design(lbt.integrator(hardware, gain=0.5)).notes
+    assert any("0.04 frames (40 us) less delay make this loop unstable" in note for note in notes)
