@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -101,10 +102,8 @@ class LoopStack:
         first, second = (_mirror_response(one, z)[:, None] * measured for one in self.mirrors)
         arrival = measured * z[:, None] ** -(self.start[0] - late[0])
         power = command.real**2 + command.imag**2
-        if command.shape[1] == 1:
-            left, size = _shared_powers(first, second - first, arrival, z, gain, late)
-        else:
-            left, size = _squares(first, second - first, arrival, z, gain, late)
+        squares = _shared_squares if command.shape[1] == 1 else _squares
+        left, size = squares((first, second - first, arrival, np.angle(z)[:, None]), gain, late)
         return np.divide(left, size, out=left), np.divide(power, size, out=size)
 
     def responses(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
@@ -313,35 +312,34 @@ def _are_stable(poles: ComplexArray) -> BoolArray:
     return np.asarray(np.max(np.abs(poles), axis=-1) < 1 - STABILITY_MARGIN)
 
 
-def _squares(
-    first: ComplexArray,
-    change: ComplexArray,
-    arrival: ComplexArray,
-    z: ComplexArray,
-    gain: FloatArray,
-    late: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """``|1 + g w|^2`` and ``|1 + g L|^2``, (f, k), of open loops ``L = first + late change``."""
+# of open loops: at fraction 0, how it changes to 1, at its arrival at 0, and angles of z, (f, 1)
+_Paths: TypeAlias = tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray]
+
+
+def _path_pair(paths: _Paths, late: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Open loops L at fractions of the delay, (f, k), and what each is beyond L at its arrival."""
+    first, change, arrival, turn = paths
     through = first + late * change
-    beyond = through - arrival * np.exp(-1j * np.angle(z)[:, None] * late)
+    return through, through - arrival * np.exp(-1j * turn * late)
+
+
+def _squares(paths: _Paths, gain: FloatArray, late: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``|1 + g w|^2`` and ``|1 + g L|^2``, (f, k)."""
+    through, beyond = _path_pair(paths, late)
     pair = (1 + gain * (beyond if np.any(late) else 0 * beyond), 1 + gain * through)
     left, size = (np.asarray(one.real**2 + one.imag**2) for one in pair)
     return left, size
 
 
-def _shared_powers(
-    first: ComplexArray,
-    change: ComplexArray,
-    arrival: ComplexArray,
-    z: ComplexArray,
-    gain: FloatArray,
-    late: FloatArray,
+def _shared_squares(
+    paths: _Paths, gain: FloatArray, late: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return :func:`_squares` of loops of one controller, (f, 1), by products of two matrices.
 
     The second is a polynomial of gain and fraction; the first is one of the gain, whose
     coefficients are interpolated between fractions.
     """
+    first, change, *_ = paths
     cross = 2 * (first * change.conj()).real
     terms = [np.ones_like(cross), 2 * first.real, 2 * change.real]
     terms += [np.abs(first) ** 2, cross, np.abs(change) ** 2]
@@ -352,8 +350,7 @@ def _shared_powers(
         middle, half = (late.max() + late.min()) / 2, (late.max() - late.min()) / 2 or 1.0
         angle = np.pi * (np.arange(_FRACTIONS) + 0.5) / _FRACTIONS
         places = middle + half * np.cos(angle)
-        beyond = first + places * change
-        beyond = beyond - arrival * np.exp(-1j * np.angle(z)[:, None] * places)
+        _, beyond = _path_pair(paths, places)
         degrees = np.arange(_FRACTIONS)[:, None]
         turns = np.arccos(np.clip((late - middle) / half, -1, 1))
         weights = np.linalg.solve(np.cos(degrees * angle), np.cos(degrees * turns))
@@ -361,8 +358,7 @@ def _shared_powers(
         left += coefficients @ np.vstack([weights * gain, weights * gain**2])
     poor = np.min(size, axis=0) < _CANCELS  # next to instability
     if np.any(poor):
-        some = _squares(first, change, arrival, z, gain[poor], late[poor])
-        left[:, poor], size[:, poor] = some
+        left[:, poor], size[:, poor] = _squares(paths, gain[poor], late[poor])
     return left, size
 
 

@@ -66,17 +66,18 @@ def spectral_covariances(
     edges = [graded_edges(stack.poles.ravel()) * nyquist]
     edges += [breakpoints_below(spectrum, nyquist) for spectrum in spectra]
     panels = np.unique(np.concatenate(edges))
-    if stack.is_single and (in_image or stack.holds_are_frames):
-        own = [spectra[i] for i, _, _ in ways]
-        means, within = _of_single(stack, own, panels, nyquist, in_image=in_image)
+    single = stack.is_single and (in_image or stack.holds_are_frames)
+    within = np.zeros((1, 0, n, n))
+    if single:
+        means = _of_single(stack, [spectra[i] for i, _, _ in ways], panels, nyquist, in_image)
     elif plain:
-        means, within = adaptive_integral(integrand, panels), np.zeros((1, 0, n, n))
-        if in_image and ways:
-            powers = [_power_within(spectrum, panels, nyquist) for spectrum in spectra]
-            parts = [powers[i][:, None, None] * _unit(n, j)[..., 0, 0] for i, j, _ in ways]
-            within = np.stack(np.broadcast_arrays(*parts), axis=1)
+        means = adaptive_integral(integrand, panels)
     else:
         means, within = np.split(adaptive_integral(integrand, panels), 2, axis=1)
+    if (single or plain) and in_image and ways:
+        powers = [_power_within(spectrum, panels, nyquist) for spectrum in spectra]
+        parts = [powers[i][:, None, None] * _unit(n, j)[..., 0, 0] for i, j, _ in ways]
+        within = np.stack(np.broadcast_arrays(*parts), axis=1)
     out = np.zeros((stack.rows.size, 3, hardware.modes, hardware.modes))
     for own, inputs in zip(part.modes, part.measurements, strict=True):
         at = np.ix_(own, own)
@@ -97,10 +98,9 @@ def _of_single(
     spectra: list[Turbulence],
     panels: FloatArray,
     nyquist_hz: float,
-    *,
     in_image: bool,
-) -> tuple[FloatArray, FloatArray]:
-    """Covariances (k, s + 1, 1, 1) that spectra and unit noise leave, and (k, s, 1, 1) within."""
+) -> FloatArray:
+    """Covariances (k, s + 1, 1, 1) of what spectra and unit noise leave of means over frames."""
 
     def integrand(frequency: FloatArray) -> FloatArray:
         phase, noise = stack.single_powers(np.exp(1j * np.pi * frequency / nyquist_hz))
@@ -116,12 +116,7 @@ def _of_single(
     factors = [_factored(spectrum, panels[1:2])[2] for spectrum in spectra]
     for i, factor in enumerate(factors):
         means[:, i, 0, 0] *= factor
-    if not in_image:
-        return means, np.zeros((1, 0, 1, 1))
-    within = np.zeros((stack.rows.size, len(spectra), 1, 1))
-    for i, spectrum in enumerate(spectra):
-        within[:, i, 0, 0] = _power_within(spectrum, panels, nyquist_hz)
-    return means, within
+    return means
 
 
 def _power_within(spectrum: Turbulence, panels: FloatArray, nyquist_hz: float) -> FloatArray:
