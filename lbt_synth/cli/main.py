@@ -1,7 +1,7 @@
 """The entry point of ``lbt-synth``: it runs a command and turns errors into exit codes.
 
 Exit status: 0 done, 1 a design or a verification failed, 2 wrong usage or bad input.
-Nothing heavy is imported before a command runs.
+Nothing heavy is imported for help.
 
 Errors name the arguments of functions in three forms: ``name=value``, a name before "must" or after
 "give", and names of several words. The option of the command that has such a name is said instead.
@@ -56,6 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = sys.argv[1:] if argv is None else list(argv)
     named = next((word for word in words if not word.startswith("-")), "")
+    if any(word.endswith(".fits") for word in words):
+        importlib.import_module("astropy.io.fits")  # which looks through all modules: few as yet
     arguments = build_parser(named).parse_args(words)
     try:
         run = _find_command(arguments.command)
@@ -187,7 +189,7 @@ def _terminate(*_: object) -> None:
 
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
-    gc.set_threshold(200_000, 50, 50)  # what imports and charts make stays until the end
+    gc.set_threshold(1_000_000, 50, 50)  # what imports and charts make stays until the end
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # reads all packages for them
     for stream in (sys.stdout, sys.stderr):  # no character that an encoding lacks ends a command
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

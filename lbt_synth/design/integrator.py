@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from numpy.polynomial.chebyshev import Chebyshev, chebpts2
 
 from lbt_synth.design.claims import Claim
 from lbt_synth.design.integrator_law import LAW_CLAIMS, PURE, IntegratorLaw
@@ -26,6 +26,9 @@ TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as fractions of the 
 # A line far above the bandwidth leaves one minimum with its amplification and one without: the
 # trials are as close as these where the loop is fast.
 _TRIALS = np.concatenate([np.geomspace(TRIED_GAINS[0], 0.1, 12), np.linspace(0.1, 0.999, 46)[1:]])
+_NODES = chebpts2(12)  # of the last search, in an interval from -1 to 1
+_CONVERGED = 1e-8  # last coefficients of a polynomial, over the range of its values
+_ROUNDS = 12
 _BISECTIONS = 27  # from a trial to the next one; 1e-9 of the gain
 _LEAST_GAIN = 1e-3  # as a part of that of a usual loop: two integrators are stable there or never
 
@@ -376,19 +379,34 @@ def _least_residual(
     walls = np.concatenate([[np.inf], left(trials), [np.inf]])
     low = np.flatnonzero((walls[1:-1] < walls[:-2]) & (walls[1:-1] <= walls[2:])).tolist()
     pairs = [[max(i - 1, 0), min(i + 1, trials.size - 1)] for i in low]
-    with np.errstate(invalid="ignore"):  # beside an unstable gain its parabola has no vertex
-        refined = [
-            minimize_scalar(
-                lambda log_gain: float(left(np.array([log_gain]))[0]),
-                bounds=trials[pair].tolist(),
-                options={"xatol": 1e-7},
-            )
-            for pair in pairs
-        ]
-    best = int(np.argmin([result.fun for result in refined]))
+    refined = [_least_between(left, *trials[pair].tolist()) for pair in pairs]
+    best = int(np.argmin([value for _, value in refined]))
     limit = "the margin demanded" if law.demands else "stability at unit sensor gain"
     ends = {trials.size - 1: f"limited by {limit}"}
     if not law.demands:
         ends[0] = "limited by the least gain tried: a loop that hardly acts leaves least"
-    gain, status = float(np.exp(refined[best].x)), ends.get(low[best], "least residual")
+    gain, status = float(np.exp(refined[best][0])), ends.get(low[best], "least residual")
     return _design_with_gain(hardware, gain, law, route="search", status=status)
+
+
+def _least_between(
+    values: Callable[[FloatArray], FloatArray], low: float, high: float
+) -> tuple[float, float]:
+    """Return where values are least between two points, and the value.
+
+    It is the vertex of their Chebyshev polynomial, on an interval where that has converged.
+    """
+    for _ in range(_ROUNDS):
+        points = (low + high) / 2 + (high - low) / 2 * _NODES
+        there = values(points)
+        best = int(np.argmin(there))
+        low, high = points[max(best - 1, 0)], points[min(best + 1, _NODES.size - 1)]
+        if not np.isfinite(there).all():  # beside an unstable gain
+            continue
+        polynomial = Chebyshev.fit(points, there, _NODES.size - 1)
+        if np.max(np.abs(polynomial.coef[-2:])) <= _CONVERGED * np.ptp(there):
+            roots = polynomial.deriv().roots()
+            vertices = [x for x in roots[np.isreal(roots)].real.tolist() if low < x < high]
+            where = min(vertices, key=polynomial, default=float(points[best]))
+            return where, float(polynomial(where))
+    return float(points[best]), float(there[best])

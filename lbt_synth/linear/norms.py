@@ -81,6 +81,14 @@ def hinf_norm(system: Any) -> HinfNorm:
             "a norm needs a system with at least one input and one output; got "
             f"{G.B.shape[-1]} inputs and {G.C.shape[-2]} outputs."
         )
+    _require_stable(G)
+    G = G if G.period == 1 else G.lifted_compactly()
+    found = [_peak(part.balanced(), 0.0, np.pi) for part in independent_parts(G)]
+    return max(found, key=float)
+
+
+def _require_stable(G: StateSpace) -> None:
+    """Require all poles inside the unit circle."""
     radius = G.spectral_radius
     if not radius < 1:
         raise UnstableLoopError(
@@ -88,9 +96,6 @@ def hinf_norm(system: Any) -> HinfNorm:
             f"{radius:.9g}. An unstable system has no finite norm.",
             spectral_radius=radius,
         )
-    G = G if G.period == 1 else G.lifted_compactly()
-    found = [_peak(part.balanced(), 0.0, np.pi) for part in independent_parts(G)]
-    return max(found, key=float)
 
 
 def independent_parts(G: StateSpace) -> list[StateSpace]:
@@ -120,7 +125,7 @@ def system_parts(
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Return the numbers of the parts of a system's states (n,), inputs (m,) and outputs (p,)."""
     (n, m), p = B.shape, len(C)
-    links = np.zeros((n + m + p, n + m + p), dtype=np.bool_)
+    links = np.zeros((n + m + p, n + m + p))  # of floats, as scipy makes them else
     links[:n, : n + m] = np.hstack([A, B]) != 0
     links[n + m :, : n + m] = np.hstack([C, D]) != 0
     _, parts = connected_components(links)
@@ -156,32 +161,38 @@ def level_angles(G: StateSpace, level: float) -> FloatArray:
     return popov_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
 
 
-def largest_real_part(system: StateSpace) -> float:
-    """Largest real part of a stable square system's response over all frequencies.
+def largest_real_part(system: StateSpace, *, least: float = -np.inf) -> float:
+    """Largest real part of a stable square system's response over all frequencies, or ``least``.
 
     It is the largest eigenvalue of ``(G + G*) / 2``, found as the norm, by the level sets of
-    ``G(z) + G(1/z)' = 2 level``.
+    ``G(z) + G(1/z)' = 2 level``. One level is enough where nothing exceeds ``least``.
     """
-    parts = square_parts(system)
-    if len(parts) > 1:
-        return max(largest_real_part(part) for part in parts)
-    G = parts[0].balanced()
-    size = max(float(hinf_norm(G)), 1e-300)
-    # the response moved by its own size is positive, and so are its levels
-    moved = replace(G, D=G.D + 2 * size * np.eye(len(G.D)))
+    _require_stable(system)
+    return max(_largest_real_part(part.balanced(), least) for part in square_parts(system))
+
+
+def _largest_real_part(G: StateSpace, least: float) -> float:
+    """Largest real part of a balanced system's response, or ``least``."""
+    seeds = pointwise_response(G, np.exp(1j * _seeds(G, 0.0, np.pi)))
+    size = float(np.max(np.abs(seeds)))
 
     def largest(angles: FloatArray) -> tuple[float, float]:
-        response = pointwise_response(moved, np.exp(1j * angles))
+        response = pointwise_response(G, np.exp(1j * angles))
         values = np.linalg.eigvalsh(response + response.conj().transpose(0, 2, 1))[:, -1] / 2
         best = int(np.argmax(values))
         return float(values[best]), float(angles[best])
 
     def pencil(level: float) -> FloatArray:
-        R = moved.D + moved.D.T - 2 * level * np.eye(len(G.D))
+        R = G.D + G.D.T - 2 * level * np.eye(len(G.D))
         return popov_angles(G.A, G.B, np.zeros_like(G.A), G.C, R)
 
-    peak, _ = _climb(G, 0.0, np.pi, largest, pencil)
-    return peak * (1 + 2 * _TOLERANCE) - 2 * size
+    peak, _ = _climb(G, 0.0, np.pi, largest, pencil, size=size, least=least)
+    return peak + 2 * _TOLERANCE * max(size, abs(peak))
+
+
+def _seeds(G: StateSpace, low: float, high: float) -> FloatArray:
+    """Return the angles at which peaks are sought first."""
+    return fold_angles(np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)]), low, high)
 
 
 def _climb(
@@ -190,16 +201,20 @@ def _climb(
     high: float,
     largest: Callable[[FloatArray], tuple[float, float]],
     level_angles: Callable[[float], FloatArray],
+    *,
+    size: float = 0.0,
+    least: float = -np.inf,
 ) -> tuple[float, float]:
     """Find the peak between two angles by raising a level until nothing lies above it.
 
-    ``largest`` returns the largest value at some angles, at least 0, and its angle.
-    ``level_angles`` returns the angles between which values may lie above a level.
+    ``largest`` returns the largest value at some angles and its angle. ``level_angles`` returns the
+    angles between which values may lie above a level. Levels rise relative to the peak, or to the
+    size of what the values are parts of; the first is ``least`` if that is above the seeds.
     """
-    seeds = np.concatenate([np.angle(G.poles), np.linspace(low, high, 33)])
-    peak, angle = largest(fold_angles(seeds, low, high))
-    if peak == 0:
-        return peak, angle
+    peak, angle = largest(_seeds(G, low, high))
+    if peak == size == 0:
+        return max(peak, least), angle
+    peak = max(peak, least)
     if not np.isfinite(peak):
         raise NumericalError(
             f"the response at {angle / (2 * np.pi * G.dt_s):.6g} Hz is not finite to working "
@@ -207,7 +222,7 @@ def _climb(
             status="level sets",
         )
     for _ in range(100):
-        level = peak * (1 + _TOLERANCE)
+        level = peak + _TOLERANCE * max(size, abs(peak))
         angles = fold_angles(level_angles(level), low, high)
         new_peak, new_angle = largest(np.concatenate([angles, (angles[1:] + angles[:-1]) / 2]))
         if new_peak > peak:

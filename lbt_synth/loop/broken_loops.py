@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize.elementwise import find_root
@@ -45,9 +46,43 @@ class BrokenLoop:
     # (f,): frequencies up to half the frame rate [Hz], more of them around resonances
     frequency_hz: FloatArray
     response: ComplexArray  # (f,): the loop gain; the loop is critical where it is -1
-    gain_crossings: tuple[MarginPoint, ...]  # where the gain is one, with increasing frequency
-    # where the phase is -180 degrees, with increasing frequency
-    phase_crossings: tuple[MarginPoint, ...]
+    at: Callable[[FloatArray], ComplexArray]  # the same at other frequencies
+
+    @property
+    def gain_crossings(self) -> tuple[MarginPoint, ...]:
+        """Where the gain is one, with increasing frequency."""
+        return tuple(self._crossings(lambda response: np.abs(response) - 1, last=True))
+
+    @property
+    def phase_crossings(self) -> tuple[MarginPoint, ...]:
+        """Where the phase is -180 degrees, with increasing frequency."""
+        across = self._crossings(lambda response: response.imag, last=False)
+        for end in (0.0, float(self.frequency_hz[-1])):  # where a response is real
+            with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator's is inf
+                response = complex(self.at(np.array([end]))[0]).real
+            across.append(MarginPoint(frequency_hz=end, response=response))
+        points = (p for p in across if 1 / _LARGEST < -p.response.real < _LARGEST)
+        return tuple(sorted(points, key=lambda point: point.frequency_hz))
+
+    def _crossings(
+        self, value: Callable[[ComplexArray], FloatArray], *, last: bool
+    ) -> list[MarginPoint]:
+        """Refine where a value of the response changes its sign, at the last frequency or not."""
+        grid, level = self.frequency_hz, value(self.response[: None if last else -1])
+        (starts,) = np.nonzero(level[1:] * level[:-1] < 0)
+        if not starts.size:
+            return []
+        ends = grid[starts], grid[starts + 1]
+
+        def level_at(frequency_hz: FloatArray) -> FloatArray:
+            return value(self.at(frequency_hz))
+
+        root = find_root(level_at, ends, tolerances={"xatol": 1e-12, "xrtol": 0.0})
+        sizes = [np.abs(level_at(end)) for end in ends]
+        nearer = np.where(sizes[0] <= sizes[1], *ends)  # where only rounding had changed the sign
+        frequency_hz = np.where(root.success, root.x, nearer)
+        pairs = zip(frequency_hz.tolist(), self.at(frequency_hz).tolist(), strict=True)
+        return [MarginPoint(frequency_hz=f, response=response) for f, response in pairs]
 
     @property
     def gain_db(self) -> FloatArray:
@@ -125,6 +160,9 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
         sensitivity = system.frequency_response(frequency_hz)
         return np.asarray(1 / np.diagonal(sensitivity, axis1=1, axis2=2) - 1)
 
+    def broken_at(measurement: int, frequency_hz: FloatArray) -> ComplexArray:
+        return broken(frequency_hz)[:, measurement]
+
     grid, responses = _refine_turns(broken, np.unique(np.concatenate([nodes, uniform])))
     shared: list[list[int]] = []
     for index, own in enumerate(responses.T):
@@ -134,7 +172,15 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
             shared.append([index])
         else:
             group.append(index)
-    return tuple(_examine(broken, grid, responses, group) for group in shared)
+    return tuple(
+        BrokenLoop(
+            measurements=tuple(group),
+            frequency_hz=grid,
+            response=read_only(responses[:, group[0]].copy()),
+            at=partial(broken_at, group[0]),
+        )
+        for group in shared
+    )
 
 
 def _refine_turns(
@@ -157,52 +203,6 @@ def phase_margin_deg(loops: tuple[BrokenLoop, ...]) -> float:
     """Return the least phase margin of broken loops [deg]; inf without a gain crossing."""
     points = (point for broken in loops for point in broken.gain_crossings)
     return min((point.phase_deg for point in points), default=np.inf)
-
-
-def _examine(
-    broken: Callable[[FloatArray], ComplexArray],
-    grid: FloatArray,
-    responses: ComplexArray,
-    group: list[int],
-) -> BrokenLoop:
-    """Return the broken loop of measurements with the same response."""
-    own = responses[:, group[0]]
-
-    def at(frequency_hz: FloatArray) -> ComplexArray:
-        return broken(frequency_hz)[:, group[0]]
-
-    def crossings(
-        value: Callable[[ComplexArray], FloatArray], level: FloatArray
-    ) -> list[MarginPoint]:
-        """Refine where a value of the response, (f,) on the grid, changes its sign."""
-        (starts,) = np.nonzero(level[1:] * level[:-1] < 0)
-        if not starts.size:
-            return []
-        ends = grid[starts], grid[starts + 1]
-        root = find_root(lambda f: value(at(f)), ends, tolerances={"xatol": 1e-12, "xrtol": 0.0})
-        sizes = [np.abs(value(at(end))) for end in ends]
-        nearer = np.where(sizes[0] <= sizes[1], *ends)  # where only rounding had changed the sign
-        frequency_hz = np.where(root.success, root.x, nearer)
-        pairs = zip(frequency_hz.tolist(), at(frequency_hz).tolist(), strict=True)
-        return [MarginPoint(frequency_hz=f, response=response) for f, response in pairs]
-
-    across = crossings(lambda response: response.imag, own.imag[:-1])
-    for end in (0.0, float(grid[-1])):  # where a response is real
-        with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is infinite
-            response = complex(at(np.array([end]))[0]).real
-        across.append(MarginPoint(frequency_hz=end, response=response))
-    return BrokenLoop(
-        measurements=tuple(group),
-        frequency_hz=grid,
-        response=read_only(own.copy()),
-        gain_crossings=tuple(crossings(lambda response: np.abs(response) - 1, np.abs(own) - 1)),
-        phase_crossings=tuple(
-            sorted(
-                (point for point in across if 1 / _LARGEST < -point.response.real < _LARGEST),
-                key=lambda point: point.frequency_hz,
-            )
-        ),
-    )
 
 
 def _is_same(own: ComplexArray, other: ComplexArray) -> bool:

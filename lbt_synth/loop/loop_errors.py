@@ -25,6 +25,7 @@ FRAGILE_FRAMES = 0.1  # of delay: what a camera's clock or a busy computer adds
 FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
 _MOST = 10.0  # times these errors: one frame, and a factor of 10
 _POINTS = 400  # frequencies at which a box is sought, before it is proved
+_LEVEL = 1 - 1e-6  # of the real part, below which one is proved to stay
 _SHRINK = 0.97  # of a box that is not proved
 
 
@@ -112,7 +113,8 @@ def errors_together(loop: ClosedLoop) -> float:
     scale = high if seems_stable(high) else low
     while scale > 1e-3:
         pairs = ((part, change) for change in changes(scale) for part in parts)
-        if all(largest_real_part(append_taps(part, change.taps)) < 1 for part, change in pairs):
+        systems = (append_taps(part, change.taps) for part, change in pairs)
+        if all(largest_real_part(system, least=_LEVEL) < 1 for system in systems):
             return scale
         scale *= _SHRINK
     return 0.0

@@ -12,7 +12,7 @@ from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.held_controller import HasController
 from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
 from lbt_synth.linear.state_space import pointwise_response
-from lbt_synth.loop.broken_loops import broken_loops, phase_margin_deg
+from lbt_synth.loop.broken_loops import broken_loops
 from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
 from lbt_synth.loop.ensemble.closed_loops import close_loops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
@@ -133,20 +133,19 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
-    broken = broken_loops(loop)
-    crossovers = [point.frequency_hz for one in broken for point in one.gain_crossings]
+    crossings = [point for broken in broken_loops(loop) for point in broken.gain_crossings]
     delay, early = (_delay_margin_frames(loop, sign=sign) for sign in (1, -1))
     disk = _disk_margin(loop)
     return LoopMargins(
         modulus=1 / float(hinf_norm(loop.output_sensitivity())),
         gain_low=low / loop.sensor_gain,
         gain_high=high / loop.sensor_gain,
-        phase_deg=phase_margin_deg(broken),
+        phase_deg=min((point.phase_deg for point in crossings), default=np.inf),
         delay_s=delay / loop.hardware.frame_rate_hz,
         delay_frames=delay,
         early_frames=early,
         together=errors_together(loop),
-        crossover_hz=max(crossovers, default=0.0),
+        crossover_hz=max((point.frequency_hz for point in crossings), default=0.0),
         disk=disk,
         disk_gain_low=max(2 - disk, 0.0) / (2 + disk),
         disk_gain_high=(2 + disk) / (2 - disk) if disk < 2 else np.inf,
