@@ -40,7 +40,8 @@ def run(arguments: Namespace) -> Report:
     path = save_gain(arguments.output, design)
     report = describe_design(design)
     with show_spinner("comparing in the truth", quiet=arguments.json):
-        add_truth(report, design, config)
+        alike = () if given else (request.method.name,)
+        add_truth(report, design, config, without=alike)
     if design.method != request.method.name:
         title = design_title(design.method)
         report.notes.append(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from lbt_synth.cli.output import Report
 from lbt_synth.config import Config
 from lbt_synth.design import Design
@@ -30,15 +32,20 @@ def say_limit(limit: ResidualLimit, config: Config) -> str:
     )
 
 
-def add_truth(report: Report, design: Design, config: Config) -> None:
-    """Add what a design leaves in the truth, beside reference designs and the limit."""
+def add_truth(
+    report: Report, design: Design, config: Config, *, without: Collection[str] = ()
+) -> None:
+    """Add what a design leaves in the truth, beside reference designs and the limit.
+
+    A reference design that the design is itself is left out.
+    """
     if config.truth.drifts:
         report.notes.append(
             "note: a vibration of the truth drifts, so that its residual has no exact value; "
             "lbt-synth simulate runs it."
         )
         return
-    found = compare_in_truth({_NAME: design}, config)
+    found = compare_in_truth({_NAME: design}, config, without=without)
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
     report.add_rows("truth", caption, found.rows, without=_WITHOUT)
     report.data |= {

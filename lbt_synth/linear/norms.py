@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,13 @@ from scipy.linalg import eigvals
 from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, NumericalError, UnstableLoopError
-from lbt_synth.linear.state_space import StateSpace, pointwise_response, schur_response
+from lbt_synth.linear.state_space import (
+    SchurForm,
+    StateSpace,
+    pointwise_response,
+    schur_form,
+    schur_response,
+)
 from lbt_synth.validation import ComplexArray, FloatArray, IntArray
 
 _TOLERANCE = 2e-11
@@ -143,9 +150,8 @@ def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
 
 def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
     """Largest singular value of a balanced system between two angles, by level sets."""
-    peak, angle = _climb(
-        G, low, high, lambda angles: _largest(G, angles), lambda level: level_angles(G, level)
-    )
+    largest = partial(_largest, G, schur_form(G))
+    peak, angle = _climb(G, low, high, largest, lambda level: level_angles(G, level))
     return HinfNorm(
         value=peak,
         lower=peak,
@@ -296,10 +302,10 @@ def fold_angles(angles: FloatArray, low: float, high: float) -> FloatArray:
     return np.unique(np.concatenate([np.clip(inside, low, high), [low, high]]))
 
 
-def _largest(G: StateSpace, angles: FloatArray) -> tuple[float, float]:
+def _largest(G: StateSpace, form: SchurForm, angles: FloatArray) -> tuple[float, float]:
     """Largest singular value and its angle; the highest few are computed again with care."""
     z = np.exp(1j * angles)
-    high = np.argsort(spectral_norms(schur_response(G, z)))[-_CAREFUL:]
+    high = np.argsort(spectral_norms(schur_response(form, z)))[-_CAREFUL:]
     careful = spectral_norms(pointwise_response(G, z[high]))
     best = int(np.argmax(careful))
     return float(careful[best]), float(angles[high[best]])

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,6 +37,9 @@ from lbt_synth.validation import (
     set_fields,
     square,
 )
+
+# T, C U, U* B and D, and whether they are those of the dual system; see schur_form
+SchurForm: TypeAlias = tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray, bool]
 
 _PROBES = 5  # points at which partial fractions are checked by solving linear systems
 _AGREEMENT = 1e-9
@@ -174,6 +177,8 @@ class StateSpace(LinearSystem):
     >>> float(abs(lag.frequency_response([0.0])[0, 0, 0]))
     2.0
     """
+
+    _schur_form: SchurForm | None = field(default=None, init=False, repr=False)  # once asked for
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:
@@ -363,8 +368,12 @@ class StateSpace(LinearSystem):
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         # a few points are solved one by one, which is more accurate next to a pole
-        few = z.size <= self.n_states
-        response = pointwise_response(self, z) if few else schur_response(self.balanced(), z)
+        if z.size <= self.n_states:
+            response = pointwise_response(self, z)
+        else:
+            form = self._schur_form or schur_form(self.balanced())
+            set_fields(self, _schur_form=form)
+            response = schur_response(form, z)
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -405,20 +414,28 @@ def pointwise_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
     return np.where(np.isnan(response), np.inf, response)
 
 
-def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
-    """Transfer matrices at points z, by one Schur form and one substitution per point.
+def schur_form(system: StateSpace) -> SchurForm:
+    """Return ``T, C U, U* B, D`` with ``A = U T U*``, and whether they are those of the dual.
 
-    U is unitary, so nothing is lost when A is defective, as with every delay. The smaller of inputs
-    and outputs is carried through. The system should be balanced; at a pole nothing is finite.
+    U is unitary, so nothing is lost when A is defective, as with every delay. The dual has the
+    smaller number of outputs. The system should be balanced.
     """
-    if not system.n_states:
-        return np.broadcast_to(system.D.astype(np.complex128), (z.size, *system.D.shape))
-    if len(system.C) > system.B.shape[1]:
-        dual = StateSpace(A=system.A.T, B=system.C.T, C=system.B.T, D=system.D.T)
-        return np.swapaxes(schur_response(dual, z), 1, 2)
-    T, U = complex_schur(system.A)
-    rows, B = system.C @ U, U.conj().T @ system.B
+    A, B, C, D = system.A, system.B, system.C, system.D
+    is_dual = bool(len(C) > B.shape[1])
+    if is_dual:
+        A, B, C, D = A.T, C.T, B.T, D.T
+    T, U = complex_schur(A) if len(A) else 2 * (A.astype(np.complex128),)
+    return T, C @ U, U.conj().T @ B, D, is_dual
+
+
+def schur_response(form: SchurForm, z: ComplexArray) -> ComplexArray:
+    """Transfer matrices at points z, by one substitution per point; at a pole nothing is finite."""
+    T, rows, B, D, is_dual = form
+    if is_dual:
+        return np.swapaxes(schur_response((T, rows, B, D, False), z), 1, 2)
     p, n = rows.shape
+    if not n:
+        return np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
     out = np.empty((z.size, p, B.shape[1]), dtype=np.complex128)
     step = max(1, _CHUNK // (n * p))
     with np.errstate(all="ignore"):  # the caller reports a pole among the points
@@ -429,7 +446,7 @@ def schur_response(system: StateSpace, z: ComplexArray) -> ComplexArray:
                 sums = rows[:, i, None] + (T[:i, i] @ left[:i]).reshape(p, part.size)
                 left[i] = (sums / (part - T[i, i])).ravel()
             solved = left.reshape(n, p, part.size).transpose(2, 1, 0)
-            out[start : start + step] = solved @ B + system.D
+            out[start : start + step] = solved @ B + D
     return out
 
 
@@ -441,7 +458,7 @@ def stacked_response(matrices: tuple[FloatArray, ...], z: ComplexArray) -> Compl
     """
     A, B, C, D = matrices
     if len(A) == 1 and A.size:
-        return schur_response(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0]), z)[:, None]
+        return schur_response(schur_form(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0])), z)[:, None]
     planes = np.zeros((*D.shape[1:], z.size, len(A)), dtype=np.complex128)
     planes += np.moveaxis(D, 0, -1)[:, :, None]
     out = np.moveaxis(planes, (0, 1), (2, 3))

@@ -26,6 +26,7 @@ FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
 _MOST = 10.0  # times these errors: one frame, and a factor of 10
 _POINTS = 400  # frequencies at which a box is sought, before it is proved
 _LEVEL = 1 - 1e-6  # of the real part, below which one is proved to stay
+_CLOSE = 0.99  # of a box whose sides touch the border, between the points, too
 _SHRINK = 0.97  # of a box that is not proved
 
 
@@ -110,7 +111,7 @@ def errors_together(loop: ClosedLoop) -> float:
     for _ in range(12):
         middle = (low + high) / 2
         low, high = (middle, high) if seems_stable(middle) else (low, middle)
-    scale = high if seems_stable(high) else low
+    scale = high if seems_stable(high) else low * _CLOSE
     while scale > 1e-3:
         pairs = ((part, change) for change in changes(scale) for part in parts)
         systems = (append_taps(part, change.taps) for part, change in pairs)

@@ -217,7 +217,7 @@ def stable_interval(
             ends.append(open_end)
             continue
         inner, outer = gains[first - 1], gains[first]
-        for _ in range(60):
+        for _ in range(40):
             middle = (inner + outer) / 2
             inner, outer = (middle, outer) if is_stable(middle) else (inner, middle)
         ends.append(float(inner))

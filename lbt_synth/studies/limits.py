@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
@@ -238,7 +238,9 @@ class TruthComparison:
     notes: tuple[str, ...]  # why reference designs are missing
 
 
-def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComparison:
+def compare_in_truth(
+    designs: Mapping[str, Design], config: Config, *, without: Collection[str] = ()
+) -> TruthComparison:
     """Compare designs in the truth of a configuration with its reference designs.
 
     The reference designs are made for the configuration: the integrator of least residual, the
@@ -250,6 +252,8 @@ def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComp
         Designs by name.
     config : Config
         The configuration; its truth must be stationary.
+    without : collection of str, optional
+        Methods whose reference designs are left out, since the designs are those already.
 
     Returns
     -------
@@ -273,13 +277,14 @@ def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComp
     references: dict[str, Design] = {}
     notes = []
     for method in reference_methods():
+        if method.name in without:
+            continue
         name = f"{method.name} (reference)" if method.name in designs else method.name
         try:
             references[name] = config.design(method.name, **method.reference_options)
         except LbtSynthError as error:
             notes.append(f"{method.name} is left out: {error}")
     study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
-    means_nm = {name: _means_nm(design, config) for name, design in designs.items()}
     ours, theirs = study.rows[: len(designs)], study.rows[len(designs) :]
     there = np.array([row.residual_nm for row in ours])
     others = [row for row in theirs if not np.any(np.abs(row.residual_nm - there) <= _SAME * there)]
@@ -288,32 +293,30 @@ def compare_in_truth(designs: Mapping[str, Design], config: Config) -> TruthComp
         rows=(*ours, *others),
         limit=study.limit,
         warnings={
-            row.design: tuple(_warnings(designs[row.design], row, means_nm[row.design], better))
-            for row in ours
+            row.design: tuple(_warnings(designs[row.design], row, config, better)) for row in ours
         },
         notes=tuple(notes),
     )
 
 
 def _means_nm(design: Design, config: Config) -> float:
-    """Return what a design leaves in means over frames, as it expects it; nan if unstable."""
+    """Return what a design leaves in means over frames, as it expects it."""
     loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
-    if not loop.is_stable:
-        return np.nan
     return residual_budget(loop, config.truth, frame_means=True).rms_nm
 
 
 def _warnings(
-    design: Design, row: LimitRow, means_nm: float, others: Mapping[str, tuple[Design, float]]
+    design: Design, row: LimitRow, config: Config, others: Mapping[str, tuple[Design, float]]
 ) -> Iterator[str]:
-    """Yield what is wrong with a design in the truth, where it leaves some mean over frames."""
+    """Yield what is wrong with a design in the truth of a configuration."""
     if not row.stable:
         yield "the loop is unstable in the truth"
         return
-    expected_nm = design.expected_residual_nm
-    surprises = False
-    if expected_nm is not None and means_nm > _SURPRISING * expected_nm:
-        surprises = True
+    expected_nm, means_nm = design.expected_residual_nm, 0.0
+    if expected_nm is not None and row.residual_nm > _SURPRISING * expected_nm:
+        means_nm = _means_nm(design, config)  # at most the residual
+    surprises = expected_nm is not None and means_nm > _SURPRISING * expected_nm
+    if expected_nm is not None and surprises:
         yield (
             f"the truth leaves {nm_text(means_nm)} in means over frames, where the design expects "
             f"{nm_text(expected_nm)}: it has power that the design was not made for"
