@@ -16,7 +16,7 @@ import lbt_synth as lbt
 from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.report.draw import save_figure
 
-MODES, RATE_HZ, FRAMES = 672, 800.0, 4000
+MODES, RATE_HZ = 672, 800.0
 
 
 def timed(call, repeats=9):
@@ -46,8 +46,8 @@ def main() -> None:
 
     def integrators(gains):
         control = lbt.design.modal.MixedController(gains=gains)
-        loop = lbt.design.modal.modal_loop(control, hardware=optimised.hardware)
-        return loop.residual_rms_nm(modes, noise_nm=noise)
+        path = optimised.hardware
+        return lbt.design.modal.modal_residuals(control, modes, noise_nm=noise, hardware=path)
 
     best = minimize_scalar(
         lambda g: total(integrators(np.full(MODES, g))), bounds=(0.01, 0.9), method="bounded"
@@ -78,14 +78,12 @@ def main() -> None:
     tilt = lbt.design.modal.modal_filters(
         [modes.model(0), modes.model(1)], noise_nm=noise[:2], vibrations=shaken
     )
-    mixed = lbt.design.modal.modal_loop(
-        lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
-    )
+    mixed = lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
     every = lbt.design.modal.modal_filters(modes, noise_nm=noise, vibrations=shaken)
     rows_shaken = {
         "integrators, optimised gains": gains.rms_nm,
-        "mixed: tip/tilt Kalman, the rest so": mixed.residual_rms_nm(
-            modes, noise_nm=noise, vibrations=shaken
+        "mixed: tip/tilt Kalman, the rest so": lbt.design.modal.modal_residuals(
+            mixed, modes, noise_nm=noise, vibrations=shaken
         ),
         "Kalman filters": every.rms_nm,
     }
@@ -97,21 +95,8 @@ def main() -> None:
         lambda: lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
     )
     print(f"design of {MODES} certified filters: {design:.0f} ms; optimised gains: {search:.0f} ms")
-    loop = lbt.design.modal.modal_loop(filters)
-    series = np.random.default_rng(0).standard_normal((2, MODES, FRAMES))
-    run, copy = timed(lambda: loop.run(*series)), timed(lambda: [part.copy() for part in series])
-    print(
-        f"loop of {MODES} filters over {FRAMES} frames: {run:.0f} ms, "
-        f"{MODES * FRAMES / run / 1e3:.0f} million mode-frames a second; "
-        f"a copy of its two series: {copy:.0f} ms"
-    )
-    matrices, states = np.ones((5, 5, MODES)), np.ones((5, MODES))
-    turned, columns = np.ones((MODES, 5, 5)), np.ones((MODES, 5, 1))
-    last = timed(lambda: [np.einsum("jis,js->is", matrices, states) for _ in range(1000)])
-    first = timed(lambda: [turned @ columns for _ in range(1000)])
-    print(
-        f"a step of {MODES} states of 5: modes last {last:.1f} us, batched products {first:.1f} us"
-    )
+    left = timed(lambda: lbt.design.modal.modal_residuals(filters, modes, noise_nm=noise))
+    print(f"residuals of {MODES} filters in the image: {left:.0f} ms")
     if output:
         figure = lbt.report.figures.modal_figure(
             rows, gains=optimised.gains, turbulence_nm=modes.rms_nm

@@ -22,17 +22,20 @@ def main() -> None:
     exact = lbt.design.modal.modal_gains(air, noise_nm=NOISE_NM, frame_rate_hz=RATE_HZ)
     print(f"exact: gain {exact.gains[0]:.4f}, {exact.rms_nm[0]:.2f} nm")
     print("| frames | gain | rms_nm, noise given | rms_nm, noise found |\n|---:|---:|---:|---:|")
-    loop = lbt.design.modal.modal_loop(
-        lbt.design.modal.MixedController(gains=np.full(MODES, 0.1)), hardware=exact.hardware
-    )
+    integrator = lbt.integrator(exact.hardware, gain=0.1)
     for frames in (2048, 8192, 40_000):
         white = rng.standard_normal((MODES, frames + SETTLE))
         total = lfilter([1.0], [1.0, -POLE], white, axis=1)[:, SETTLE:]
-        run = loop.run(total, NOISE_NM * rng.standard_normal(total.shape), all_series=True)
+        noise_nm = NOISE_NM * rng.standard_normal(total.shape)
+        series = lbt.loop.Disturbance(phase_nm=total[..., None], noise=noise_nm[..., None])
+        run = lbt.simulate(integrator, series, hardware=exact.hardware)  # a case a mode
         cells = []
         for noise in (NOISE_NM, None):
             found = lbt.design.modal.modal_gains_from_telemetry(
-                run.measurements.T, run.commands.T, frame_rate_hz=RATE_HZ, noise_nm=noise
+                run.measurements[..., 0].T,
+                run.commands[..., 0].T,
+                frame_rate_hz=RATE_HZ,
+                noise_nm=noise,
             )
             if not cells:
                 cells.append(f"{found.gains.mean():.4f} ± {found.gains.std():.4f}")

@@ -7,16 +7,9 @@ import scipy.linalg
 from harness import Row, paired, seconds, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.design.modal import (
-    MixedController,
-    ModalFilters,
-    ModalLoop,
-    modal_filters,
-    modal_loop,
-)
+from lbt_synth.design.modal import MixedController, ModalFilters, modal_filters, modal_residuals
 
 RATE_HZ = 800.0
-LOOP_FRAMES = 4000
 NOISE_NM = 10.0
 
 
@@ -47,46 +40,14 @@ def controllers(modes: int, kind: str) -> MixedController | ModalFilters:
     )
 
 
-def series_row(modes: int, kind: str, repeats: int) -> Row:
-    """The loop over given series, and a copy of these series."""
-    rng = np.random.default_rng(0)
-    controller = controllers(modes, kind)
-    loop = modal_loop(controller, hardware=lbt.LoopHardware(frame_rate_hz=RATE_HZ))
-    total, noise = rng.standard_normal((2, modes, LOOP_FRAMES))
-    _checked(controller, loop, total, noise)
-    row = paired(lambda: loop.run(total, noise), lambda: (total.copy(), noise.copy()), repeats)
-    rate = modes * LOOP_FRAMES / row["ours_s"] / 1e6
-    return row | {"status": f"{rate:.0f} million mode-frames/s"}
-
-
-def _checked(
-    controller: MixedController | ModalFilters,
-    loop: ModalLoop,
-    total: np.ndarray,
-    noise: np.ndarray,
-) -> None:
-    frames = 200
-    path = lbt.LoopHardware(frame_rate_hz=RATE_HZ, modes=len(total))
-    running = controller.start() if isinstance(controller, ModalFilters) else controller
-    some = total[:, :frames], noise[:, :frames]
-    series = lbt.loop.Disturbance(phase_nm=some[0].T, noise=some[1].T, frame_means=True)
-    expected = lbt.simulate(running, series, hardware=path).residual_nm[0]
-    error = np.max(np.abs(loop.run(*some).residual_nm - expected.T)) / np.max(np.abs(expected))
-    assert error < 1e-10, error
-
-
-def loops_by_modes() -> dict[int, Row]:
-    return with_growth({n: series_row(n, "AR1", 7) for n in (42, 168, 672)})
-
-
-def loops_by_order() -> dict[int, Row]:
-    """The size is the number of states of a controller."""
+def residuals() -> dict[int, Row]:
+    """Exact residuals of all modes in the image, each with a filter of its own."""
     rows = {}
-    for kind in ("integrator", "AR1", "AR2", "line"):
-        controller = controllers(672, kind)
-        is_stack = isinstance(controller, ModalFilters)
-        states = controller.design(0).controller.n_states if is_stack else 1
-        rows[states] = series_row(672, kind, 7)
+    for count in (42, 168, 672):
+        air, filters = turbulence(count), controllers(count, "AR1")
+        rows[count] = {
+            "ours_s": seconds(lambda a=air, f=filters: modal_residuals(f, a, noise_nm=NOISE_NM), 5)
+        }
     return with_growth(rows)
 
 
@@ -145,8 +106,7 @@ def steps() -> dict[int, Row]:
 
 
 MODAL = (
-    (f"loop of modes, {LOOP_FRAMES} frames (a copy of its series)", "modes", loops_by_modes),
-    ("the same with 672 modes, by states of a controller", "states", loops_by_order),
+    ("residuals of all modes in the image", "modes", residuals),
     ("filters of all modes, whole design (scipy, equations alone)", "modes", designs),
     ("integrator gains of all modes, from spectra", "modes", gains),
     ("1000 steps of a mixed controller (a reconstructor's product)", "modes", steps),

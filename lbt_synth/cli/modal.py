@@ -15,7 +15,7 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
-from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_loop
+from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
 from lbt_synth.errors import ConfigError
 from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.report.figures import modal_figure
@@ -88,8 +88,9 @@ def _design_controllers(
 
     def integrator_rms(gain: float) -> FloatArray:
         control = MixedController(gains=np.full(noise.size, gain))
-        loop = modal_loop(control, hardware=hardware, sensor_gain=config.sensor_gain)
-        return loop.residual_rms_nm(air, **seen)
+        return modal_residuals(
+            control, air, hardware=hardware, sensor_gain=config.sensor_gain, **seen
+        )
 
     best = minimize_scalar(
         lambda gain: _total_rms(integrator_rms(gain)),

@@ -2,9 +2,7 @@
 
 Within a block of b frames the outputs are a matrix times (state at the block's
 beginning, inputs of the block); the states at the beginnings obey a recursion
-with ``A^b``. One system, of any size, has many cases of inputs, and its recursion is
-solved by blocks again; many small systems have one case each, and their recursion
-goes block by block, all systems at once. The result is that of the frame-by-frame
+with ``A^b``, which is solved by blocks again. The result is that of the frame-by-frame
 recursion up to rounding.
 """
 
@@ -18,11 +16,9 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.validation import FloatArray, real_array
 
 _BLOCK = 8
-_BATCH_BLOCK = 32  # for many small systems: their products are small, their recursion is slow
 _STEPS = 16  # blocks per block of the recursion
 _CACHED = 500_000  # input and output values worked on at once
 
@@ -44,7 +40,7 @@ def filter_series(system: StateSpace, inputs: ArrayLike) -> FloatArray:
     lead, frames = u.shape[:-2], u.shape[-2]
     cases = int(np.prod(lead))
     u = u.reshape(cases, frames, m)
-    operators = _block_operators(system.A, system.B, system.C, system.D, _BLOCK)
+    operators = _block_operators(system.A, system.B, system.C, system.D)
     out = np.empty((cases, frames, p))
     # as many cases at once as fit into the processor's cache
     batch = max(1, _CACHED // max(1, frames * (m + p)))
@@ -83,66 +79,8 @@ def last_state(A: FloatArray, drive: FloatArray) -> FloatArray:
     return drive[0] if len(drive) else np.zeros(len(A))
 
 
-class BatchedSystems:
-    """Small systems (N, n, n), (N, n, m), (N, p, n), (N, p, m) that filter one series each."""
-
-    def __init__(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
-        self._operators = _block_operators(A, B, C, D, _BATCH_BLOCK)
-        self._outputs, self._inputs = D.shape[-2:]
-
-    def filter(self, inputs: FloatArray, *, in_place: bool = False) -> FloatArray:
-        """Compute the outputs (N, frames, p) of inputs (N, frames, m) from zero states."""
-        u, op, block = inputs, self._operators, _BATCH_BLOCK
-        count, frames, m = u.shape
-        p, n = self._outputs, op.step.shape[-1]
-        whole, tail = divmod(frames, block)
-        out = u if in_place else np.empty((count, frames, p))
-        full = u[:, : whole * block].reshape(count, whole, block * m)
-        last = np.zeros((count, block, m))  # the last block, when it is not full
-        last[:, :tail] = u[:, whole * block :]
-        last = last.reshape(count, 1, block * m)
-        # as many systems at once as fit into the processor's cache
-        batch = min(count, max(1, _CACHED // max(1, frames * (m + p))))
-        parts = [slice(start, start + batch) for start in range(0, count, batch)]
-
-        drive = np.zeros((whole + 1, n, count))
-        for part in parts:
-            drive[:whole, :, part] = (full[part] @ op.reach[part]).transpose(1, 2, 0)
-        states = _block_states(op.step, drive)
-        product, more = np.empty((2, batch, whole, block * p))
-        for part in parts:
-            some = full[part]
-            size = len(some)
-            before = np.ascontiguousarray(states[:whole, :, part].transpose(2, 0, 1))
-            np.matmul(some, op.toeplitz[part], out=product[:size])
-            np.matmul(before, op.observe[part], out=more[:size])
-            target = out[part, : whole * block].reshape(size, whole, block * p)
-            np.add(product[:size], more[:size], out=target)
-        if tail:
-            ends = last @ op.toeplitz + states[whole].T[:, None] @ op.observe
-            out[:, whole * block :] = ends.reshape(count, block, p)[:, :tail]
-        return out
-
-
-def _block_states(step: FloatArray, drive: FloatArray) -> FloatArray:
-    """States at the blocks' beginnings, (blocks, n, N), one block after the other.
-
-    The systems are the last axis: the products of all small matrices are then a few sums over
-    long rows.
-    """
-    matrices = np.ascontiguousarray(step.transpose(2, 1, 0))  # (column, row, system)
-    states = np.zeros_like(drive)
-    for j in range(len(drive) - 1):
-        np.einsum("jis,js->is", matrices, states[j], out=states[j + 1])
-        states[j + 1] += drive[j]
-    return states
-
-
 class _BlockOperators(NamedTuple):
-    """Matrices of a block of frames, transposed for row vectors, of one system or of each of many.
-
-    Only ``step`` is not transposed.
-    """
+    """Matrices of a block of frames, transposed for row vectors but for ``step``."""
 
     step: FloatArray  # advances the state by a block
     reach: FloatArray  # from the block's inputs to the state after it
@@ -150,26 +88,21 @@ class _BlockOperators(NamedTuple):
     toeplitz: FloatArray  # from the block's inputs to its outputs
 
 
-def _block_operators(
-    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, block: int
-) -> _BlockOperators:
-    lead, (p, m) = D.shape[:-2], D.shape[-2:]
-    rows, columns = [C], [B]  # C A^i, A^i B
-    for _ in range(block - 1):
+def _block_operators(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> _BlockOperators:
+    (p, m), rows, columns = D.shape, [C], [B]  # C A^i, A^i B
+    for _ in range(_BLOCK - 1):
         rows.append(rows[-1] @ A)
         columns.append(A @ columns[-1])
-    markov = np.zeros((*lead, 2 * block - 1, p, m))  # zeros, D, C B, C A B, ...
-    markov[..., block - 1, :, :] = D
-    for i in range(block - 1):
-        markov[..., block + i, :, :] = rows[i] @ B
+    markov = np.zeros((2 * _BLOCK - 1, p, m))  # zeros, D, C B, C A B, ...
+    markov[_BLOCK - 1] = D
+    markov[_BLOCK:] = np.array(rows[:-1]) @ B
     # entry (j, output, input, i) is that of lag i - j
-    late = sliding_window_view(markov, block, axis=-3)[..., ::-1, :, :, :]
-    axes = [*range(len(lead)), *(len(lead) + i for i in (0, 2, 3, 1))]
+    late = sliding_window_view(markov, _BLOCK, axis=0)[::-1]
     return _BlockOperators(
-        step=np.linalg.matrix_power(A, block),
-        reach=np.concatenate([transpose(column) for column in reversed(columns)], axis=-2),
-        observe=np.concatenate([transpose(row) for row in rows], axis=-1),
-        toeplitz=np.ascontiguousarray(late.transpose(axes)).reshape(*lead, block * m, block * p),
+        step=np.linalg.matrix_power(A, _BLOCK),
+        reach=np.concatenate([column.T for column in reversed(columns)]),
+        observe=np.concatenate([row.T for row in rows], axis=1),
+        toeplitz=np.reshape(late.transpose(0, 2, 3, 1), (_BLOCK * m, _BLOCK * p)),
     )
 
 

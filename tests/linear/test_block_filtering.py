@@ -6,32 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.linear.block_filtering import BatchedSystems, filter_series, last_state
-
-
-@given(
-    count=st.integers(1, 4),
-    n=st.integers(1, 5),
-    m=st.integers(1, 2),
-    p=st.integers(1, 3),
-    frames=st.integers(1, 200),
-    seed=st.integers(0, 100),
-)
-def test_stacked_series_are_the_recursion(count, n, m, p, frames, seed):
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((count, n, n))
-    A *= (0.999 / np.abs(np.linalg.eigvals(A)).max(axis=1))[:, None, None]
-    B, C = rng.standard_normal((count, n, m)), rng.standard_normal((count, p, n))
-    D, u = rng.standard_normal((count, p, m)), rng.standard_normal((count, frames, m))
-    out = BatchedSystems(A, B, C, D).filter(u)
-    for i in range(count):
-        system = lbt.linear.StateSpace(A=A[i], B=B[i], C=C[i], D=D[i])
-        expected = filter_series(system, u[i])
-        assert np.allclose(out[i], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
-    if m == p:
-        again = u.copy()
-        assert BatchedSystems(A, B, C, D).filter(again, in_place=True) is again
-        assert np.array_equal(again, out)
+from lbt_synth.linear.block_filtering import filter_series, last_state
 
 
 @given(

@@ -35,10 +35,33 @@ def single_plant(air, mode, lines, noise, gain, **path):
     )
 
 
-def integrator_loop(gains, *, sensor_gain=1.0, **path):
-    """Loop of all modes around an integrator for each."""
-    return lbt.design.modal.modal_loop(
+def integrator_residuals(gains, air, *, noise_nm, vibrations=None, sensor_gain=1.0, **path):
+    """Return what an integrator for each mode leaves, (n,)."""
+    return lbt.design.modal.modal_residuals(
         lbt.design.modal.MixedController(gains=gains),
+        air,
+        noise_nm=noise_nm,
+        vibrations=vibrations,
         hardware=lbt.LoopHardware(**({"frame_rate_hz": RATE} | path)),
         sensor_gain=sensor_gain,
+    )
+
+
+def integrator_run(gains, total, noise, *, sensor_gain=1.0, **path):
+    """Return measurements and commands, (frames, n) each, of an integrator for each mode."""
+    hardware = lbt.LoopHardware(**({"frame_rate_hz": RATE, "modes": 1} | path))
+    sensor_gains = np.broadcast_to(sensor_gain, len(total))
+    runs = [
+        lbt.simulate(
+            lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=hardware.dt_s),
+            lbt.loop.Disturbance(
+                phase_nm=phase[:, None], noise=own[:, None], sensor_gain=real, frame_means=True
+            ),
+            hardware=hardware,
+        )
+        for gain, phase, own, real in zip(gains, total, noise, sensor_gains, strict=True)
+    ]
+    return tuple(
+        np.stack([getattr(run, name)[0, :, 0] for run in runs], axis=1)
+        for name in ("measurements", "commands")
     )

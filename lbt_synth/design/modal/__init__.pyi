@@ -1,10 +1,9 @@
 from .filters import modal_filters as modal_filters
 from .gains import modal_gains as modal_gains
-from .loop import ModalLoop as ModalLoop
-from .loop import modal_loop as modal_loop
 from .mixed_controller import MixedController as MixedController
 from .reconstructor import Reconstructor as Reconstructor
 from .reconstructor import project_out as project_out
 from .reconstructor import reconstructor as reconstructor
+from .residuals import modal_residuals as modal_residuals
 from .stack import ModalFilters as ModalFilters
 from .telemetry_gains import modal_gains_from_telemetry as modal_gains_from_telemetry

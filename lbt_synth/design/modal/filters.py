@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 from lbt_synth.design.certificate import VARIANCE_TOLERANCE, Check
 from lbt_synth.design.filter_design import FilterDesign
 from lbt_synth.design.kalman import kalman
-from lbt_synth.design.modal.loop import modal_loop
 from lbt_synth.design.modal.per_mode import (
     Vibrations,
     lines_per_mode,
     name_modes,
     number_per_mode,
 )
+from lbt_synth.design.modal.residuals import modal_residuals
 from lbt_synth.design.modal.stack import ModalFilters
 from lbt_synth.design.result import UNCERTIFIED
 from lbt_synth.errors import LbtSynthError
@@ -55,7 +55,7 @@ def modal_filters(
     noise_nm : float or (n,) array_like
         Standard deviation of the measurement noise of each mode per frame [nm].
     vibrations : mapping of int to Vibration or list of them, optional
-        Vibrations of some modes; their directions play no part.
+        Vibrations of some modes, as means over frames; their directions play no part.
     delay_frames : float, optional
         Total delay of the loop [frames], at least 1, fractions allowed.
     sensor_gain : float or (n,) array_like, optional
@@ -86,7 +86,7 @@ def modal_filters(
     >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
     >>> filters = lbt.design.modal.modal_filters(air, noise_nm=15.5, vibrations={0: [line]})
     >>> filters.rms_nm.round(1).tolist(), filters.design(1).certificate.passed
-    ([135.9, 30.6], True)
+    ([142.5, 31.6], True)
     """
     if not isinstance(turbulence, ModalTurbulence):
         turbulence = ModalTurbulence.of(turbulence)
@@ -115,7 +115,7 @@ def modal_filters(
         )
         design = _design_filter(plant, modes)
         which[modes] = len(designs)
-        rms_nm[modes] = _loop_residual(design, plant)
+        rms_nm[modes] = model_budget(design.close(plant.hardware), plant).rms_nm
         designs.append(design)
     filters = ModalFilters(
         designs=tuple(designs),
@@ -123,8 +123,9 @@ def modal_filters(
         rms_nm=read_only(rms_nm),
         certificate=UNCERTIFIED,
     )
-    loop = modal_loop(filters, sensor_gain=gain)
-    left = loop.residual_rms_nm(turbulence, noise_nm=noise, vibrations=vibrations)
+    left = modal_residuals(
+        filters, turbulence, noise_nm=noise, vibrations=vibrations, sensor_gain=gain
+    )
     errors = frozen_copy(np.array([design.rms for design in designs])[which])
     joined = replace(UNCERTIFIED, checks=(joining_check(left, rms_nm),), rms_per_output=errors)
     return replace(filters, certificate=joined.require("Scale these modes to sizes that occur."))
@@ -137,14 +138,6 @@ def _design_filter(plant: TipTiltPlant, modes: list[int]) -> FilterDesign:
     except LbtSynthError as error:
         error.args = (f"the filter of {name_modes(modes)}: {error}",)
         raise
-
-
-def _loop_residual(design: FilterDesign, plant: TipTiltPlant) -> float:
-    """Residual of a design's loop under its model: its error, if the mirror does as it says."""
-    hardware = plant.hardware
-    if hardware.mirror is None and hardware.delay_frames % 1 == 0:
-        return design.rms
-    return model_budget(design.close(hardware), plant, frame_means=True).rms_nm
 
 
 def joining_check(stacked: FloatArray, alone: FloatArray) -> Check:

@@ -13,15 +13,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.polynomial import polyadd, polyval
+from numpy.polynomial.polynomial import polyadd
 from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
+from lbt_synth.design.integrator_law import PURE
 from lbt_synth.design.modal.per_mode import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
+from lbt_synth.loop.ensemble.closed_loops import LoopStack, close_loops
+from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Spectrum
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, read_only
@@ -46,7 +49,7 @@ class ModalGains:
     # (n,): integrator gain of each mode. 1e-4 of the stability limit is the least that is tried: a
     # mode that has it is better left alone
     gains: FloatArray
-    rms_nm: FloatArray  # (n,): residual that they leave [nm rms]
+    rms_nm: FloatArray  # (n,): residual that they leave in the image [nm rms]
     # (n,): largest gain that was allowed: the margin below the stability limit, at unit sensor gain
     # and at the mode's own
     limit: FloatArray
@@ -77,7 +80,7 @@ def modal_gains(
     frame_rate_hz : float
         Frame rate [Hz].
     vibrations : mapping of int to Vibration or list of them, optional
-        Vibrations of some modes; their directions play no part.
+        Vibrations of some modes, as means over frames; their directions play no part.
     delay_frames : float, optional
         Total delay [frames], at least 1, fractions allowed.
     sensor_gain : float or (n,) array_like, optional
@@ -136,7 +139,7 @@ def modal_gains(
 def _spectra_per_mode(
     spectra: ModalTurbulence | Sequence[Spectrum], path: LoopHardware
 ) -> tuple[Density, int, list[FloatArray]]:
-    """Return the function from frequencies (f,) to all spectra (n, f), n, and edges of panels.
+    """Return the function from frequencies (f,) to spectra of means (n, f), n, edges of panels.
 
     The edges are where spectra have peaks or kinks, over the Nyquist frequency.
     """
@@ -159,6 +162,9 @@ def _spectra_per_mode(
 
     def evaluate(frequency: FloatArray) -> FloatArray:
         known = {i: np.asarray(one.psd(frequency), np.float64) for i, one in distinct.items()}
+        for i, one in distinct.items():
+            if not isinstance(one, ARModel):  # of means already
+                known[i] = known[i] * np.sinc(frequency / rate) ** 2
         return np.stack([known[id(one)] for one in each])
 
     return evaluate, len(each), edges
@@ -194,15 +200,15 @@ def _checked_spectra(
 
 
 def _transfers(
-    path: LoopHardware, frequency_hz: FloatArray, loop_gains: FloatArray, *, differenced: bool
+    stack: LoopStack, frequency_hz: FloatArray, frame_rate_hz: float, *, differenced: bool
 ) -> list[FloatArray]:
-    """Squared moduli (gains, f) of spectra and of noise over sensor gain to the residual."""
-    delay = np.exp(-2j * np.pi * (frequency_hz / path.frame_rate_hz))
-    mirror: ComplexArray = polyval(delay, path.mirror_taps)
-    difference = 1 - delay
-    power = np.abs(difference + np.outer(loop_gains, delay * mirror)) ** 2
-    rejection = (1.0 if differenced else np.abs(difference) ** 2) / power
-    return [rejection, np.outer(loop_gains**2, np.abs(mirror) ** 2) / power]
+    """Powers (gains, f) that spectra of means, and noise over sensor gain, leave in the image."""
+    f = frequency_hz / frame_rate_hz
+    phase, noise = stack.image_powers(np.exp(2j * np.pi * f))
+    spectrum = np.sinc(f) ** 2  # of unit phases, as means over frames
+    if differenced:
+        spectrum *= 4 * np.sin(np.pi * f) ** 2
+    return [(phase / spectrum[:, None]).T, (noise * stack.sensor_gains**2).T]
 
 
 def find_gains(
@@ -217,8 +223,9 @@ def find_gains(
 ) -> ModalGains:
     """Find the gains on finer and finer panels, until residuals and gains no longer change.
 
-    The spectra are those of the phases, or of their differences of two frames; they have edges of
-    panels, over the Nyquist frequency. The path is that of one mode, the gain (n,) the sensor's.
+    The spectra are those of means over frames, or of their differences of two frames; they have
+    edges of panels, over the Nyquist frequency. The path is that of one mode, the gain (n,) the
+    sensor's.
     """
     least, most = TRIED_GAINS
     rate, limit = path.frame_rate_hz, hardware_gain_limit(path)
@@ -231,6 +238,9 @@ def find_gains(
             "margin and sensor_gain must leave room for a gain; got gains of at most "
             f"{np.min(highest / gain):.3g} at a sensor gain of {np.min(gain):.3g}."
         )
+    unit = textbook_matrices([PURE.controller(path, 1.0)])
+    delays = np.full(loop_gains.size, path.delay_frames)
+    _, ((stack,),) = close_loops(unit, path, loop_gains, delays)
     # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
     path_taps = np.append(0.0, path.mirror_taps)
     poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
@@ -239,7 +249,7 @@ def find_gains(
     last = np.full((2, gain.size), np.inf)  # gains and variances
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
-        rejection, propagation = _transfers(path, nodes, loop_gains, differenced=differenced)
+        rejection, propagation = _transfers(stack, nodes, rate, differenced=differenced)
         propagated = propagation @ weights * 2 / rate
         spectra = _checked_spectra(density, nodes, differenced=differenced)
         variances = (spectra * weights) @ rejection.T

@@ -29,7 +29,7 @@ class ModalFilters:
     which : (n,) ndarray of int
         Design of each mode.
     rms_nm : (n,) ndarray
-        Residual that each mode's loop leaves under its own model [nm rms].
+        Residual that each mode's loop leaves in the image under its own model [nm rms].
     certificate : Certificate
         That the stack is what its designs are: the loops of all modes, closed as arrays, leave
         what each design's loop leaves. ``rms_per_output`` is each mode's estimation error.

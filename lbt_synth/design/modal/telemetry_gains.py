@@ -93,15 +93,14 @@ def modal_gains_from_telemetry(
     >>> import numpy as np
     >>> import lbt_synth as lbt
     >>> rng = np.random.default_rng(0)
-    >>> noise = 5.0 * rng.standard_normal((1, 20_000))
-    >>> walk = 0.99 * np.cumsum(rng.standard_normal((1, 20_000)), axis=1)
-    >>> loop = lbt.design.modal.modal_loop(
-    ...     lbt.design.modal.MixedController(gains=[0.3]),
-    ...     hardware=lbt.LoopHardware(frame_rate_hz=800),
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> walk = lbt.loop.Disturbance(
+    ...     phase_nm=0.99 * np.cumsum(rng.standard_normal((20_000, 1)), axis=0),
+    ...     noise=5.0 * rng.standard_normal((20_000, 1)),
     ... )
-    >>> run = loop.run(walk, noise, all_series=True)
+    >>> run = lbt.simulate(lbt.integrator(path, gain=0.3), walk, hardware=path)
     >>> found = lbt.design.modal.modal_gains_from_telemetry(
-    ...     run.measurements.T, run.commands.T, frame_rate_hz=800
+    ...     run.measurements[0], run.commands[0], frame_rate_hz=800
     ... )
     >>> bool(abs(found.noise_nm[0] - 5) < 0.5), bool(0.1 < found.gains[0] < 0.25)
     (True, True)

@@ -106,6 +106,16 @@ class LoopStack:
         left, size = squares((first, second - first, arrival, np.angle(z)[:, None]), gain, late)
         return np.divide(left, size, out=left), np.divide(power, size, out=size)
 
+    def image_powers(self, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Powers (f, k) that a unit phase of all moments and unit noise leave, for one mode."""
+        commands, positions, means, late = self._over_holds(z)
+        command, weights = commands[0, 0], (self.hold or _STILL).weights
+        mirrored = command * self._turn(z) * self.part.sensor[0, 0]
+        squares = (np.abs(positions) ** 2 @ weights)[:, None]
+        crossed = (positions * means.conj() @ weights)[:, None] * late.conj()
+        of_phase = 1 - 2 * np.real(crossed * mirrored) + squares * np.abs(mirrored) ** 2
+        return of_phase, squares * np.abs(command) ** 2
+
     def responses(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
         """Rejection (n, n, f, k) at f points and negative response to noise (n, q, f, k).
 
@@ -126,19 +136,10 @@ class LoopStack:
         f, k) and to noise (n, q, f, k). Return also the part of the phase's power that moves within
         the pieces, (f, k).
         """
-        unit, _, rejection, denominator = self._parts(z)
-        n, f = len(unit), np.angle(z) / (2 * np.pi)
-        commands = sum(rejection[:, j, None] * unit[j] for j in range(n)) / denominator
-        turn = np.sinc(f)[:, None] * self.sensor_gains / z[:, None]
-        of_phase = np.einsum("nq...,qm->nm...", commands, self.part.sensor) * turn
-        hold = self.hold or _STILL
-        core = hold.C.shape[1]  # the first states of the mirror
-        A, B = self.mirrors[0].A[:core, :core], self.mirrors[0].B[:core, None]
-        parts = (A, B, hold.C, hold.D[:, None])
-        positions = stacked_response(tuple(part[None] for part in parts), z)[:, 0, :, 0]
-        means = hold.phase_means(f)
+        commands, positions, means, late = self._over_holds(z)
+        n, hold = len(commands), self.hold or _STILL
+        of_phase = np.einsum("nq...,qm->nm...", commands, self.part.sensor) * self._turn(z)
         rest = 1 - np.abs(means) ** 2 @ hold.weights
-        late = np.exp(2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
 
         def pieces() -> Iterator[tuple[float, ComplexArray, ComplexArray]]:
             for g, weight in enumerate(hold.weights):
@@ -148,6 +149,27 @@ class LoopStack:
                 yield float(weight), phase - position * of_phase, -position * commands
 
         return pieces(), np.broadcast_to(rest[:, None], late.shape)
+
+    def _over_holds(
+        self, z: ComplexArray
+    ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
+        """Return commands (n, q, f, k) for unit noise, and mirror and phase in pieces of a hold.
+
+        Those are (f, g) each; the hold begins late by a factor (f, k).
+        """
+        unit, _, rejection, denominator = self._parts(z)
+        commands = sum(rejection[:, j, None] * unit[j] for j in range(len(unit))) / denominator
+        f, hold = np.angle(z) / (2 * np.pi), self.hold or _STILL
+        core = hold.C.shape[1]  # the first states of the mirror
+        A, B = self.mirrors[0].A[:core, :core], self.mirrors[0].B[:core, None]
+        parts = (A, B, hold.C, hold.D[:, None])
+        positions = stacked_response(tuple(part[None] for part in parts), z)[:, 0, :, 0]
+        late = np.exp(2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
+        return np.asarray(commands), positions, hold.phase_means(f), late
+
+    def _turn(self, z: ComplexArray) -> ComplexArray:
+        """Return what a phase of all moments is in a measurement of one frame later, (f, k)."""
+        return np.sinc(np.angle(z) / (2 * np.pi))[:, None] * self.sensor_gains / z[:, None]
 
     def _parts(
         self, z: ComplexArray

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.modal import RATE, integrator_loop
+from support.modal import RATE, integrator_residuals, integrator_run
 from support.series import ar_series
 
 import lbt_synth as lbt
@@ -23,31 +23,25 @@ def test_telemetry_finds_what_the_models_say():
     for k in range(frames):
         state = poles * state + white[:, k]
         total[:, k] = state
-    loop = integrator_loop(
-        np.full(n, 0.2),
-        delay_frames=2.5,
-        sensor_gain=gain,
-    )
-    run = loop.run(total, noise * rng.standard_normal((n, frames)), all_series=True)
+    seen = noise * rng.standard_normal((n, frames))
+    series = integrator_run(np.full(n, 0.2), total, seen, delay_frames=2.5, sensor_gain=gain)
     known = {"frame_rate_hz": RATE, "delay_frames": 2.5, "sensor_gain": gain}
     exact = modal_gains(air, noise_nm=noise, **known)
-    found = modal_gains_from_telemetry(run.measurements.T, run.commands.T, noise_nm=noise, **known)
+    found = modal_gains_from_telemetry(*series, noise_nm=noise, **known)
 
     def cost(gains):
-        closed = integrator_loop(gains, delay_frames=2.5, sensor_gain=gain)
-        return closed.residual_rms_nm(air, noise_nm=noise)
+        path = {"delay_frames": 2.5, "sensor_gain": gain}
+        return integrator_residuals(gains, air, noise_nm=noise, **path)
 
     # what is lost by gains from telemetry, in residual; less where the segments are longer,
     # which tell the modes that are best left alone from those that wander
     assert np.max(cost(found.gains) / exact.rms_nm - 1) < 0.02
-    longer = modal_gains_from_telemetry(
-        run.measurements.T, run.commands.T, noise_nm=noise, segment_frames=4096, **known
-    )
+    longer = modal_gains_from_telemetry(*series, noise_nm=noise, segment_frames=4096, **known)
     assert np.max(cost(longer.gains) / exact.rms_nm - 1) < 0.01
     assert np.median(np.abs(found.gains / exact.gains - 1)) < 0.1
     # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high, and
     # nothing is lost by that
-    guessed = modal_gains_from_telemetry(run.measurements.T, run.commands.T, **known)
+    guessed = modal_gains_from_telemetry(*series, **known)
     assert np.all(guessed.noise_nm > 0.97 * noise)
     assert np.max(cost(guessed.gains) / exact.rms_nm - 1) < 0.02
 
@@ -63,13 +57,11 @@ def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
         coefficients=[[pole]], driving_rms_nm=[driving], frame_rate_hz=RATE
     )
     exact = modal_gains(air, noise_nm=noise, frame_rate_hz=RATE)
-    loop = integrator_loop(np.full(modes, 0.1))
-    run = loop.run(
+    series = integrator_run(
+        np.full(modes, 0.1),
         ar_series([pole], driving, modes, frames, rng),
         noise * rng.standard_normal((modes, frames)),
-        all_series=True,
     )
-    series = run.measurements.T, run.commands.T
     found = modal_gains_from_telemetry(*series, frame_rate_hz=RATE, noise_nm=noise)
     variances, truth = found.rms_nm**2, exact.rms_nm[0] ** 2
     error = max(np.std(variances) / np.sqrt(modes), 2e-3 * truth)
@@ -92,11 +84,9 @@ def test_a_steep_spectrum_does_not_leak(segment_frames):
     )
     exact = modal_gains(air, noise_nm=2.0, frame_rate_hz=RATE)
     total = ar_series([0.9999], 1.0, 6, 40_000, rng)
-    loop = integrator_loop(np.full(6, 0.2))
-    run = loop.run(total, 2.0 * rng.standard_normal(total.shape), all_series=True)
+    series = integrator_run(np.full(6, 0.2), total, 2.0 * rng.standard_normal(total.shape))
     found = modal_gains_from_telemetry(
-        run.measurements.T,
-        run.commands.T,
+        *series,
         frame_rate_hz=RATE,
         noise_nm=2.0,
         segment_frames=segment_frames,
@@ -110,11 +100,11 @@ def test_residuals_are_at_least_the_propagated_noise():
     rng = np.random.default_rng(4)
     y = 5.0 * rng.standard_normal((5000, 3))
     found = modal_gains_from_telemetry(y, 0 * y, frame_rate_hz=RATE, noise_nm=6.0)
-    loop = integrator_loop(found.gains)
     nothing = lbt.models.ModalTurbulence(
         coefficients=np.zeros((3, 1)), driving_rms_nm=np.full(3, 1e-9), frame_rate_hz=RATE
     )
-    assert np.allclose(found.rms_nm, loop.residual_rms_nm(nothing, noise_nm=6.0), rtol=1e-3)
+    least = integrator_residuals(found.gains, nothing, noise_nm=6.0)
+    assert np.allclose(found.rms_nm, least, rtol=1e-3)
 
 
 def test_noise_from_a_quiet_band():
@@ -122,10 +112,8 @@ def test_noise_from_a_quiet_band():
     frames, noise = 40_000, np.array([[3.0], [30.0]])
     k = np.arange(frames)
     slow = 300 * np.sin(2 * np.pi * 0.5 * k / RATE) + 100 * np.sin(2 * np.pi * 3.1 * k / RATE)
-    loop = integrator_loop([0.3, 0.3])
-    run = loop.run(
-        np.stack([slow, slow]), noise * rng.standard_normal((2, frames)), all_series=True
-    )
-    found = modal_gains_from_telemetry(run.measurements.T, run.commands.T, frame_rate_hz=RATE)
+    seen = noise * rng.standard_normal((2, frames))
+    series = integrator_run([0.3, 0.3], np.stack([slow, slow]), seen)
+    found = modal_gains_from_telemetry(*series, frame_rate_hz=RATE)
     assert np.allclose(found.noise_nm, noise[:, 0], rtol=0.02)
     assert found.gains[0] > found.gains[1]
