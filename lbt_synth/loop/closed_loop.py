@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +22,8 @@ from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance
+
+AffinePart: TypeAlias = tuple[FloatArray, FloatArray]  # A0 and A1 of ``A0[t] + g A1[t]``
 
 # A loop whose slowest pole is closer to the unit circle than this is called marginal.
 STABILITY_MARGIN = 1e-9
@@ -257,40 +261,48 @@ def _system_of_sensors(
 def radii_by_gain(
     hardware: LoopHardware, controller: Controller | HasController
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,).
+    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
+    return partial(affine_radii, parts_by_gain(hardware, controller))
 
-    Each phase of a loop is affine in the gain of the own sensor: two loops give all.
+
+def parts_by_gain(
+    hardware: LoopHardware, controller: Controller | HasController
+) -> list[AffinePart]:
+    """Return the parts of a loop, each phase of which is affine in the gain of the own sensor.
+
+    Two loops give all.
     """
     plain = as_controller(controller, any_period=bool(hardware.suite.sensors))
     if not reads_others(hardware, plain):
         A0, A1, *_ = checked_loop_matrices(hardware, plain)
-        return affine_radii(A0[None], A1[None])
+        return affine_parts(A0[None], A1[None])
     one, two = (_system_of_sensors(hardware, plain, g, ()).stacks()[0] for g in (1.0, 2.0))
-    return affine_radii(2 * one - two, two - one)
+    return affine_parts(2 * one - two, two - one)
 
 
-def affine_radii(A0: FloatArray, A1: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from gains (g,) to spectral radii (g,) over the phases of a loop.
+def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
+    """Split matrices ``A0[t] + g A1[t]``, (N, n, n), into parts whose states act on one another.
 
-    The loop's transition at phase t is ``A0[t] + gain A1[t]``, (N, n, n). The eigenvalues are those
-    of the parts whose states act on one another; equal parts count once.
+    They have the eigenvalues of the whole; equal parts are returned once.
     """
     links = np.any((A0 != 0) | (A1 != 0), axis=0)
     count, label = connected_components(links, connection="strong")
     parts = (np.ix_(range(len(A0)), label == i, label == i) for i in range(count))
-    different = {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}
+    return list(
+        {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}.values()
+    )
 
-    def radii(sensor_gains: FloatArray) -> FloatArray:
-        gains = np.asarray(sensor_gains)[:, None, None]
-        eigenvalues = []
-        for start, slope in different.values():
-            whole = np.eye(start.shape[1])
-            for A, B in zip(start, slope, strict=True):
-                whole = (A + gains * B) @ whole
-            eigenvalues.append(np.linalg.eigvals(whole))
-        return np.asarray(np.max(np.abs(np.concatenate(eigenvalues, axis=1)), axis=1))
 
-    return radii
+def affine_radii(parts: list[AffinePart], gains: FloatArray) -> FloatArray:
+    """Return the spectral radius at each gain (g,), of the transition over all phases."""
+    factors = np.asarray(gains)[:, None, None]
+    eigenvalues = []
+    for start, slope in parts:
+        whole = np.eye(start.shape[1])
+        for A, B in zip(start, slope, strict=True):
+            whole = (A + factors * B) @ whole
+        eigenvalues.append(np.linalg.eigvals(whole))
+    return np.asarray(np.max(np.abs(np.concatenate(eigenvalues, axis=1)), axis=1))
 
 
 def checked_loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,18 +12,16 @@ from lbt_synth.linear.held_controller import HasController
 from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
 from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.loop.broken_loops import broken_loops
-from lbt_synth.loop.closed_loop import ClosedLoop, radii_by_gain
+from lbt_synth.loop.closed_loop import ClosedLoop, parts_by_gain
 from lbt_synth.loop.ensemble.closed_loops import close_loops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.loop.loop_errors import errors_together
+from lbt_synth.loop.stable_range import stable_range
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray, number, require_instance
 
-_STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
-_WIDEST = 1e4
-_AT_ONCE = 32  # gains, whose loops are in memory together
 _DIVISION, _DIVISIONS = 64, 3  # of the delays in which the delay margin is sought
 _DISK_TOLERANCE = 1e-4  # of the disk margin, relative
 _GRID = 65  # angles at which the search for the least disk margin begins
@@ -158,8 +155,9 @@ def stable_sensor_gains(
 ) -> tuple[float, float]:
     """Interval of sensor gains around a nominal one for which the loop is stable.
 
-    The spectral radius is followed in steps of 1 % from the nominal gain, and
-    each end is refined by bisection.
+    Modes that do not mix have exact ends, from all gains at which a pole is on the unit circle.
+    Where modes mix or other sensors are read, the spectral radius is followed in steps of 1 % from
+    the nominal gain, and each end is refined by bisection.
 
     Parameters
     ----------
@@ -190,38 +188,7 @@ def stable_sensor_gains(
     >>> low, round(high, 6)  # 0.618034 / 0.5
     (0.0, 1.236068)
     """
-    return stable_interval(radii_by_gain(hardware, controller), number(nominal, "nominal", above=0))
-
-
-def stable_interval(
-    radii: Callable[[FloatArray], FloatArray], nominal: float = 1.0
-) -> tuple[float, float]:
-    """Return the interval around a gain in which radii (g,) of gains (g,) are below 1.
-
-    It is sought as :func:`stable_sensor_gains` says.
-    """
-
-    def is_stable(gain: float) -> bool:
-        return float(radii(np.array([gain]))[0]) < 1
-
-    if not is_stable(nominal):
-        return float("nan"), float("nan")
-    ends = []
-    for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
-        count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
-        gains = np.asarray(nominal * ratio ** np.arange(count + 1), dtype=np.float64)
-        parts = (range(i, min(i + _AT_ONCE, count + 1)) for i in range(0, count + 1, _AT_ONCE))
-        outside = (part[i] for part in parts for i in np.flatnonzero(radii(gains[part]) >= 1))
-        first = next(outside, None)
-        if first is None:
-            ends.append(open_end)
-            continue
-        inner, outer = gains[first - 1], gains[first]
-        for _ in range(40):
-            middle = (inner + outer) / 2
-            inner, outer = (middle, outer) if is_stable(middle) else (inner, middle)
-        ends.append(float(inner))
-    return ends[0], ends[1]
+    return stable_range(parts_by_gain(hardware, controller), number(nominal, "nominal", above=0))
 
 
 def _disk_margin(loop: ClosedLoop) -> float:

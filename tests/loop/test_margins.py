@@ -10,7 +10,7 @@ from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.linear import StateSpace
-from lbt_synth.loop.margins import channel_norm, channel_scales, stable_interval
+from lbt_synth.loop.margins import channel_norm, channel_scales
 
 
 def test_marginal_and_unstable_loops_have_no_residual():
@@ -264,20 +264,3 @@ def test_a_delay_margin_may_be_longer_than_any_delay():
     limit = 0.5 + np.pi / (4 * np.arcsin(0.03 / 2))  # delay at which the gain is the limit
     assert mean + margin == pytest.approx(limit, abs=0.1)
     assert margin > 20
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "nominal"),
-    [(0.35, 1.9, 1.0), (0.0, 1.2, 1.0), (0.97, np.inf, 1.0), (0.4, 5.0, 2.0)],
-)
-def test_ends_of_a_stable_interval(low, high, nominal):
-    found = stable_interval(lambda g: np.where((low < g) & (g < high), 0.5, 1.5), nominal)
-    assert found == pytest.approx((low, high), rel=1e-12)
-
-
-def test_a_stable_interval_ends_at_a_narrow_hole():
-    def radii(gains):
-        return np.where((gains > 1.3) & (gains < 1.32), 1.5, 0.5)
-
-    assert stable_interval(radii) == pytest.approx((0.0, 1.3), rel=1e-12)
-    assert np.all(np.isnan(stable_interval(radii, 1.31)))
