@@ -16,7 +16,7 @@ from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.mirror.frame_rate_system import Response
+from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
 from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
@@ -278,6 +278,20 @@ def parts_by_gain(
         return affine_parts(A0[None], A1[None])
     one, two = (_system_of_sensors(hardware, plain, g, ()).stacks()[0] for g in (1.0, 2.0))
     return affine_parts(2 * one - two, two - one)
+
+
+def parts_by_fraction(loop: ClosedLoop, whole: int) -> list[AffinePart]:
+    """Return the parts of a loop, affine in how far its delay is beyond so many whole frames.
+
+    The mirror settles at once. The change from one whole delay to the next is ``A1``.
+    """
+    k, hardware, ends = loop.controller.to_statespace(), loop.hardware, []
+    for arrival in (whole - 1, whole):
+        mirror = tapped_mirror(np.eye(whole + 1)[arrival])
+        path = {"sensor": hardware.sensor, "influence": hardware.influence}
+        A0, A1, *_ = loop_matrices(k.A, k.B, k.C, k.D, mirror=mirror, **path)
+        ends.append(A0 + loop.sensor_gain * A1)
+    return affine_parts(ends[0][None], (ends[1] - ends[0])[None])
 
 
 def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:

@@ -12,17 +12,20 @@ from lbt_synth.linear.held_controller import HasController
 from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
 from lbt_synth.linear.state_space import pointwise_response
 from lbt_synth.loop.broken_loops import broken_loops
-from lbt_synth.loop.closed_loop import ClosedLoop, parts_by_gain
+from lbt_synth.loop.closed_loop import ClosedLoop, parts_by_fraction, parts_by_gain
 from lbt_synth.loop.ensemble.closed_loops import close_loops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
 from lbt_synth.loop.loop_errors import errors_together
-from lbt_synth.loop.stable_range import stable_range
+from lbt_synth.loop.stable_range import exact_range, stable_range
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray, number, require_instance
 
-_DIVISION, _DIVISIONS = 64, 3  # of the delays in which the delay margin is sought
+_EXACT = 3  # frames of delay for which the margin is exact; later ones have too many states
+_INSIDE = 1e-7  # part of an exact margin by which it is less, so that the loop is stable there
+_DIVISION = 64  # of delays in which the delay margin is sought
+_FINER, _DIVISIONS = 8, 6  # of the step in which it is found
 _DISK_TOLERANCE = 1e-4  # of the disk margin, relative
 _GRID = 65  # angles at which the search for the least disk margin begins
 _MOST_INTERVALS = 5000  # of angles; a loop of two axes needs some ten
@@ -268,30 +271,46 @@ def _delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
     """Least change of the delay at which the loop, as it is simulated, is unstable [frames].
 
     It is late with the sign 1, early with -1. A part of a frame is no phase lag: an exposure then
-    sees two commands. So poles decide.
+    sees two commands. So poles decide: exactly for some frames where modes do not mix and the
+    mirror settles at once, in steps else.
     """
+    d, reached = loop.hardware.delay_frames, 0.0
+    longest = _LONGEST - d if sign > 0 else d - 1
+    while loop.hardware.mirror is None and reached < min(_EXACT, longest):
+        at = d + sign * reached
+        whole = int(np.floor(at) if sign > 0 else np.ceil(at) - 1)
+        ranges = [exact_range(part, at - whole) for part in parts_by_fraction(loop, whole)]
+        exact = [one for one in ranges if one is not None]
+        if len(exact) < len(ranges):
+            break
+        end = min(high for _, high in exact) if sign > 0 else max(low for low, _ in exact)
+        if 0 <= end <= 1:
+            return abs(whole + end - d) * (1 - _INSIDE)
+        reached = abs(whole + (sign > 0) - d)
+    return _stepped_delay_margin(loop, reached, longest, sign) if reached < longest else np.inf
+
+
+def _stepped_delay_margin(loop: ClosedLoop, reached: float, longest: float, sign: int) -> float:
+    """Follow the poles in steps from a change of the delay at which the loop is stable."""
     hardware, matrices = loop.hardware, textbook_matrices([loop.controller])
     d = hardware.delay_frames
-    longest = _LONGEST - d if sign > 0 else d - 1
     # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
     whole = sign * (np.arange(1, _LONGEST + 1) - d)
 
-    def first_unstable(low: float, high: float) -> tuple[float, float] | None:
+    def first_unstable(low: float, high: float, steps: int) -> tuple[float, float] | None:
         """Return the step of an equal division in which the loop becomes unstable, or None."""
         peaks = whole[(whole > low) & (whole < high)]
-        further = np.unique(np.concatenate([np.linspace(low, high, _DIVISION + 1), peaks]))
+        further = np.unique(np.concatenate([np.linspace(low, high, steps + 1), peaks]))
         gains = np.full(further.size - 1, loop.sensor_gain)
         stable, _ = close_loops(matrices, hardware, gains, d + sign * further[1:])
         unstable = np.flatnonzero(~stable)
         return None if unstable.size == 0 else tuple(further[unstable[0] : unstable[0] + 2])
 
-    if longest <= 0:
-        return np.inf
-    low, high = 0.0, min(1.0, longest)
-    while (step := first_unstable(low, high)) is None:
+    low, high = reached, min(reached + 1.0, longest)
+    while (step := first_unstable(low, high, _DIVISION)) is None:
         if high >= longest:
             return np.inf
         low, high = high, min(2 * high, longest)
     for _ in range(_DIVISIONS):
-        step = first_unstable(*step) or step
+        step = first_unstable(*step, _FINER) or step
     return float(step[0])

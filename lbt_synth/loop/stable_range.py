@@ -41,10 +41,19 @@ def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]
 
 
 def _range_of_part(part: AffinePart, nominal: float) -> tuple[float, float]:
+    stepped = partial(affine_radii, [part])
+    return exact_range(part, nominal) or stable_interval(stepped, nominal)
+
+
+def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
+    """Return between which numbers a part that is stable at the nominal one stays stable.
+
+    It is None where the matrices repeat with a longer period or change by a higher rank.
+    """
     start, slope = part
     U, sizes, V = np.linalg.svd(slope[0])
     if len(start) > 1 or np.any(sizes[1:] > _RANK * sizes[0]):
-        return stable_interval(partial(affine_radii, [part]), nominal)
+        return None
     if sizes[0] == 0:
         return -np.inf, np.inf
     b, c = U[:, :1] * sizes[0], V[:1]
