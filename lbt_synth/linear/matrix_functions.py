@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import LinAlgError, rsf2csf, schur
+from scipy.sparse.csgraph import connected_components
 
-from lbt_synth.validation import ComplexArray, Entry, FloatArray
+from lbt_synth.validation import ComplexArray, Entry, FloatArray, IntArray
 
 
 def transpose(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
@@ -63,6 +64,22 @@ def semidefinite_root(M: FloatArray) -> FloatArray:
     """Return R (n, n) with ``R R' = M``, for a semidefinite M but for rounding."""
     values, vectors = np.linalg.eigh(symmetrise(M))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
+
+
+def part_labels(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the numbers of the parts of a system's states (n,), inputs (m,) and outputs (p,).
+
+    Parts share no state, input or output.
+    """
+    (n, m), p = B.shape, len(C)
+    links = np.zeros((n + m + p, n + m + p))  # of floats, as scipy makes them else
+    links[:n, : n + m] = np.hstack([A, B]) != 0
+    links[n + m :, : n + m] = np.hstack([C, D]) != 0
+    _, parts = connected_components(links)
+    label = parts.astype(np.int64)
+    return label[:n], label[n : n + m], label[n + m :]
 
 
 def complex_schur(A: FloatArray) -> tuple[ComplexArray, ComplexArray]:

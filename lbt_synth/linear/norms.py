@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, NumericalError, UnstableLoopError
+from lbt_synth.linear.matrix_functions import part_labels
 from lbt_synth.linear.state_space import (
     SchurForm,
     StateSpace,
@@ -28,7 +28,7 @@ from lbt_synth.linear.state_space import (
     schur_form,
     schur_response,
 )
-from lbt_synth.validation import ComplexArray, FloatArray, IntArray
+from lbt_synth.validation import ComplexArray, FloatArray
 
 _TOLERANCE = 2e-11
 _CAREFUL = 8
@@ -107,7 +107,7 @@ def _require_stable(G: StateSpace) -> None:
 
 def independent_parts(G: StateSpace) -> list[StateSpace]:
     """Return the parts of a system that share no state, input or output, equal ones once."""
-    labels = system_parts(G.A, G.B, G.C, G.D)
+    labels = part_labels(G.A, G.B, G.C, G.D)
     parts = {}
     for part in range(np.max(np.concatenate(labels)) + 1):
         states, inputs, outputs = (np.flatnonzero(label == part) for label in labels)
@@ -123,21 +123,8 @@ def independent_parts(G: StateSpace) -> list[StateSpace]:
 
 def square_parts(G: StateSpace) -> list[StateSpace]:
     """Return the parts of a square system that share nothing, each of the same channels."""
-    _, inputs, outputs = system_parts(G.A, G.B, G.C, G.D)
+    _, inputs, outputs = part_labels(G.A, G.B, G.C, G.D)
     return independent_parts(G) if np.array_equal(inputs, outputs) else [G]
-
-
-def system_parts(
-    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the numbers of the parts of a system's states (n,), inputs (m,) and outputs (p,)."""
-    (n, m), p = B.shape, len(C)
-    links = np.zeros((n + m + p, n + m + p))  # of floats, as scipy makes them else
-    links[:n, : n + m] = np.hstack([A, B]) != 0
-    links[n + m :, : n + m] = np.hstack([C, D]) != 0
-    _, parts = connected_components(links)
-    label = parts.astype(np.int64)
-    return label[:n], label[n : n + m], label[n + m :]
 
 
 def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
@@ -179,14 +166,20 @@ def largest_real_part(system: StateSpace, *, least: float = -np.inf) -> float:
 
 def _largest_real_part(G: StateSpace, least: float) -> float:
     """Largest real part of a balanced system's response, or ``least``."""
-    seeds = pointwise_response(G, np.exp(1j * _seeds(G, 0.0, np.pi)))
+    form = schur_form(G)
+    seeds = schur_response(form, np.exp(1j * _seeds(G, 0.0, np.pi)))
     size = float(np.max(np.abs(seeds)))
 
-    def largest(angles: FloatArray) -> tuple[float, float]:
-        response = pointwise_response(G, np.exp(1j * angles))
+    def hermitian(response: ComplexArray) -> FloatArray:
         values = np.linalg.eigvalsh(response + response.conj().transpose(0, 2, 1))[:, -1] / 2
-        best = int(np.argmax(values))
-        return float(values[best]), float(angles[best])
+        return np.asarray(values, dtype=np.float64)
+
+    def largest(angles: FloatArray) -> tuple[float, float]:
+        z = np.exp(1j * angles)
+        high = np.argsort(hermitian(schur_response(form, z)))[-_CAREFUL:]
+        careful = hermitian(pointwise_response(G, z[high]))
+        best = int(np.argmax(careful))
+        return float(careful[best]), float(angles[high[best]])
 
     def pencil(level: float) -> FloatArray:
         R = G.D + G.D.T - 2 * level * np.eye(len(G.D))

@@ -22,7 +22,13 @@ from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.lyapunov import join_roots, stationary_covariance, stationary_root
-from lbt_synth.linear.matrix_functions import as_stack, complex_schur, solve_stack, transpose
+from lbt_synth.linear.matrix_functions import (
+    as_stack,
+    complex_schur,
+    part_labels,
+    solve_stack,
+    transpose,
+)
 from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
@@ -31,6 +37,7 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
+    IntArray,
     matrix,
     number,
     real_array,
@@ -178,7 +185,10 @@ class StateSpace(LinearSystem):
     2.0
     """
 
-    _schur_form: SchurForm | None = field(default=None, init=False, repr=False)  # once asked for
+    # once they are asked for: outputs, inputs and Schur form of each part, see part_labels
+    _parts: tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...] = field(
+        default=(), init=False, repr=False
+    )
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:
@@ -367,13 +377,13 @@ class StateSpace(LinearSystem):
         self.require_one_phase("a transfer matrix", "phase_response(...), or lifted()")
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
-        # a few points are solved one by one, which is more accurate next to a pole
-        if z.size <= self.n_states:
-            response = pointwise_response(self, z)
-        else:
-            form = self._schur_form or schur_form(self.balanced())
-            set_fields(self, _schur_form=form)
-            response = schur_response(form, z)
+        response = np.empty((z.size, *self.D.shape), dtype=np.complex128)
+        response[:] = self.D
+        for outputs, inputs, part, form in self._independent_parts():
+            # a few points are solved one by one, which is more accurate next to a pole
+            few = z.size <= self.n_states
+            own = pointwise_response(part, z) if few else schur_response(form, z)
+            response[:, outputs[:, None], inputs] = own
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -381,6 +391,23 @@ class StateSpace(LinearSystem):
                 "and no response there; leave that frequency out."
             )
         return response
+
+    def _independent_parts(
+        self,
+    ) -> tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...]:
+        """Return outputs, inputs, system and Schur form of the parts with all of them."""
+        if self._parts or not self.n_states:
+            return self._parts
+        labels, parts = part_labels(self.A, self.B, self.C, self.D), []
+        for i in range(np.max(np.concatenate(labels)) + 1):
+            x, inputs, outputs = (np.flatnonzero(label == i) for label in labels)
+            if x.size and inputs.size and outputs.size:
+                A, B = self.A[np.ix_(x, x)], self.B[np.ix_(x, inputs)]
+                C, D = self.C[np.ix_(outputs, x)], self.D[np.ix_(outputs, inputs)]
+                part = replace(self, A=A, B=B, C=C, D=D)
+                parts.append((outputs, inputs, part, schur_form(part.balanced())))
+        set_fields(self, _parts=tuple(parts))
+        return tuple(parts)
 
 
 def sigma_sparkline(system: StateSpace, caption: str) -> Sparkline:

@@ -17,7 +17,7 @@ from scipy.optimize.elementwise import find_root
 
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.norms import fold_angles
-from lbt_synth.linear.state_space import pointwise_response
+from lbt_synth.linear.state_space import schur_form, schur_response
 from lbt_synth.loop.closed_loop import AffinePart, affine_radii
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -80,8 +80,10 @@ def real_responses(T: StateSpace) -> FloatArray:
     values = values[np.isfinite(values) & (values != 0)]
     angles = fold_angles(np.angle(values), 0.0, np.pi)
 
+    form = schur_form(T)
+
     def response(at: FloatArray) -> ComplexArray:
-        return np.asarray(pointwise_response(T, np.exp(1j * at))[:, 0, 0])
+        return np.asarray(schur_response(form, np.exp(1j * at))[:, 0, 0])
 
     def imaginary(at: FloatArray) -> FloatArray:
         return response(at).imag

@@ -26,8 +26,7 @@ from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, 
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
 from lbt_synth.linear.lmi.conic_data import require_optimum
 from lbt_synth.linear.lmi.programmes import solve, symmetric_variable, symmetrise
-from lbt_synth.linear.matrix_functions import semidefinite_root
-from lbt_synth.linear.norms import system_parts
+from lbt_synth.linear.matrix_functions import part_labels, semidefinite_root
 from lbt_synth.validation import FloatArray, IntArray, frozen_copy
 
 
@@ -188,7 +187,7 @@ def _parts(problem: EstimationProblem) -> tuple[IntArray, IntArray]:
     """
     outputs = np.vstack([problem.C, problem.L])
     direct = np.vstack([problem.D, np.zeros((len(problem.L), problem.D.shape[1]))])
-    return system_parts(problem.A, problem.B, outputs, direct)[:2]
+    return part_labels(problem.A, problem.B, outputs, direct)[:2]
 
 
 def _invisible_basis(problem: EstimationProblem) -> tuple[FloatArray, IntArray]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear.riccati.equations import Equations, Solutions
@@ -140,8 +141,51 @@ def solve_dare(
     [1.618034, 2.732051, 6.872983]
     """
     equations, lead = _stack_arguments(A, B, Q, R, S)
+    parts = _independent_parts(equations) if not lead else []
     with np.errstate(all="ignore"):  # anything not finite is refused
-        return _solve_stack(equations, lead)
+        if len(parts) < 2:
+            return _solve_stack(equations, lead)
+        return _join_parts(equations, parts)
+
+
+def _independent_parts(equations: Equations) -> list[tuple[IntArray, IntArray]]:
+    """Return the states and inputs of parts of an equation that share none; none if one lacks them.
+
+    The parts of modes that do not mix are much smaller than the whole.
+    """
+    A, B, Q, R, S = (getattr(equations, name)[0] for name in "ABQRS")
+    entry = (B != 0) | (S != 0)
+    among = np.block([[(A != 0) | (Q != 0), entry], [entry.T, R != 0]]).astype(np.float64)
+    count, label = connected_components(among)
+    x, u = np.split(label, [len(A)])
+    parts = [(np.flatnonzero(x == i), np.flatnonzero(u == i)) for i in range(count)]
+    return parts if all(states.size and inputs.size for states, inputs in parts) else []
+
+
+def _join_parts(equations: Equations, parts: list[tuple[IntArray, IntArray]]) -> DareSolution:
+    """Solve the parts of an equation, equal ones once, and put their solutions side by side."""
+    X, gain = np.zeros_like(equations.Q[0]), np.zeros_like(equations.B[0].T)
+    solved: dict[tuple[bytes, ...], DareSolution] = {}
+    joined = []
+    for x, u in parts:
+        places = {"A": (x, x), "B": (x, u), "Q": (x, x), "R": (u, u), "S": (x, u)}
+        part = {name: getattr(equations, name)[0][np.ix_(*at)] for name, at in places.items()}
+        key = tuple(matrix.tobytes() for matrix in part.values())
+        if key not in solved:
+            one = Equations(**{name: matrix[None] for name, matrix in part.items()})
+            solved[key] = _solve_stack(one, ())
+        X[np.ix_(x, x)], gain[np.ix_(u, x)] = solved[key].X, solved[key].gain_feedback
+        joined.append(solved[key])
+    return DareSolution(
+        X=read_only(X),
+        gain_feedback=read_only(gain),
+        poles=read_only(np.concatenate([part.poles for part in joined])),
+        residuals=read_only(np.max([part.residuals for part in joined], axis=0)),
+        errors=read_only(np.max([part.errors for part in joined], axis=0)),
+        negative=read_only(np.sum([part.negative for part in joined], axis=0)),
+        iterations=max(part.iterations for part in joined),
+        attempts=max((part.attempts for part in joined), key=len),
+    )
 
 
 def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:

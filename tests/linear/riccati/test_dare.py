@@ -310,3 +310,31 @@ def test_ten_times_better_than_the_peers(example):
     ours = error_in_digits(lbt.solve_dare(example.A, example.B, example.Q, example.R).X, exact)
     best = min(error_in_digits(X, exact) for X in peers(example).values())
     assert 10 * ours <= best
+
+
+def test_parts_that_share_nothing_are_solved_apart():
+    """Mixed up by a permutation, two equal parts and another: the solution is that of each."""
+    rng = np.random.default_rng(5)
+    one, other = (
+        (rng.standard_normal((n, n)), rng.standard_normal((n, 1)), np.eye(n), np.eye(1))
+        for n in (3, 4)
+    )
+    parts = (one, other, one)
+    A, B, Q, R = (scipy.linalg.block_diag(*matrices) for matrices in zip(*parts, strict=True))
+    order = rng.permutation(len(A))
+    place = np.ix_(order, order)
+    whole = lbt.solve_dare(A[place], B[order], Q[place], R)
+    alone = [lbt.solve_dare(*part) for part in parts]
+    assert np.allclose(
+        whole.X, scipy.linalg.block_diag(*(part.X for part in alone))[place], rtol=1e-12
+    )
+    gain = scipy.linalg.block_diag(*(part.gain_feedback for part in alone))[:, order]
+    assert np.allclose(whole.gain_feedback, gain, rtol=1e-12)
+    radii = np.sort(np.abs(np.concatenate([part.poles for part in alone])))
+    assert np.allclose(np.sort(np.abs(whole.poles)), radii)
+    assert whole.residual == max(part.residual for part in alone)
+    # a state that no input reaches keeps the whole together
+    A0, B0 = scipy.linalg.block_diag(A, 0.5), np.vstack([B, 0 * B[:1]])
+    joined = lbt.solve_dare(A0, B0, scipy.linalg.block_diag(Q, 1.0), R)
+    assert np.allclose(joined.X[:-1, :-1][place], whole.X, rtol=1e-9)
+    assert joined.X[-1, -1] == pytest.approx(1 / (1 - 0.25))
