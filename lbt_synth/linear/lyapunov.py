@@ -11,6 +11,7 @@ from lbt_synth.errors import UnstableLoopError
 from lbt_synth.linear.matrix_functions import (
     complex_schur,
     frobenius_norms,
+    part_labels,
     semidefinite_root,
     symmetrise,
     transpose,
@@ -127,8 +128,20 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
     By squaring, with sums of roots by QR: variances of outputs are sums of squares, with the error
     of their rms a share of the largest rms of a state, where a covariance has that of its square.
     The triangular form of A keeps its eigenvalues in every power. Like any squaring, it loses
-    digits as A nears the unit circle.
+    digits as A nears the unit circle. States that share no input and do not act on one another are
+    apart.
     """
+    label, inputs, _ = part_labels(A, B, np.zeros((0, len(A))), np.zeros((0, B.shape[1])))
+    roots = [np.zeros((len(A), min(B.shape[1], 1)))]  # of states that no input reaches
+    for part in np.unique(label):
+        x, u = label == part, inputs == part
+        root = _root_of_part(A[np.ix_(x, x)], B[np.ix_(x, u)])
+        roots.append(np.zeros((len(A), root.shape[1])))
+        roots[-1][x] = root
+    return np.hstack(roots)
+
+
+def _root_of_part(A: FloatArray, B: FloatArray) -> FloatArray:
     triangle, into, back = _triangular_form(A)
     root = into @ B
     with np.errstate(all="ignore"):

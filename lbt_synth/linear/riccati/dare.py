@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear.riccati.equations import Equations, Solutions
@@ -141,25 +140,11 @@ def solve_dare(
     [1.618034, 2.732051, 6.872983]
     """
     equations, lead = _stack_arguments(A, B, Q, R, S)
-    parts = _independent_parts(equations) if not lead else []
+    parts = [] if lead else equations.independent_parts()
     with np.errstate(all="ignore"):  # anything not finite is refused
         if len(parts) < 2:
             return _solve_stack(equations, lead)
         return _join_parts(equations, parts)
-
-
-def _independent_parts(equations: Equations) -> list[tuple[IntArray, IntArray]]:
-    """Return the states and inputs of parts of an equation that share none; none if one lacks them.
-
-    The parts of modes that do not mix are much smaller than the whole.
-    """
-    A, B, Q, R, S = (getattr(equations, name)[0] for name in "ABQRS")
-    entry = (B != 0) | (S != 0)
-    among = np.block([[(A != 0) | (Q != 0), entry], [entry.T, R != 0]]).astype(np.float64)
-    count, label = connected_components(among)
-    x, u = np.split(label, [len(A)])
-    parts = [(np.flatnonzero(x == i), np.flatnonzero(u == i)) for i in range(count)]
-    return parts if all(states.size and inputs.size for states, inputs in parts) else []
 
 
 def _join_parts(equations: Equations, parts: list[tuple[IntArray, IntArray]]) -> DareSolution:
@@ -168,12 +153,10 @@ def _join_parts(equations: Equations, parts: list[tuple[IntArray, IntArray]]) ->
     solved: dict[tuple[bytes, ...], DareSolution] = {}
     joined = []
     for x, u in parts:
-        places = {"A": (x, x), "B": (x, u), "Q": (x, x), "R": (u, u), "S": (x, u)}
-        part = {name: getattr(equations, name)[0][np.ix_(*at)] for name, at in places.items()}
-        key = tuple(matrix.tobytes() for matrix in part.values())
+        part = equations.part(x, u)
+        key = tuple(getattr(part, name).tobytes() for name in "ABQRS")
         if key not in solved:
-            one = Equations(**{name: matrix[None] for name, matrix in part.items()})
-            solved[key] = _solve_stack(one, ())
+            solved[key] = _solve_stack(part, ())
         X[np.ix_(x, x)], gain[np.ix_(u, x)] = solved[key].X, solved[key].gain_feedback
         joined.append(solved[key])
     return DareSolution(

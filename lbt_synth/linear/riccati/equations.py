@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.lyapunov import smith_sum
 from lbt_synth.linear.matrix_functions import (
@@ -54,6 +55,29 @@ class Equations:
     def take(self, which: IntArray) -> Equations:
         """Return some of the equations."""
         return Equations(**{name: getattr(self, name)[which] for name in "ABQRS"})
+
+    def independent_parts(self) -> list[tuple[IntArray, IntArray]]:
+        """Return the states and inputs of parts of the first equation that share none.
+
+        The parts of modes that do not mix are much smaller than the whole; it is the only part
+        where a part has no states or no inputs.
+        """
+        A, B, Q, R, S = (getattr(self, name)[0] for name in "ABQRS")
+        entry = (B != 0) | (S != 0)
+        links = np.block([[(A != 0) | (Q != 0), entry], [entry.T, R != 0]])
+        count, label = connected_components(links.astype(np.float64))
+        x, u = np.split(label, [len(A)])
+        parts = [(np.flatnonzero(x == i), np.flatnonzero(u == i)) for i in range(count)]
+        complete = all(states.size and inputs.size for states, inputs in parts)
+        return parts if complete else [(np.arange(len(x)), np.arange(len(u)))]
+
+    def part(self, states: IntArray, inputs: IntArray) -> Equations:
+        """Return the first equation of some states and inputs."""
+        x, u = states, inputs
+        places = {"A": (x, x), "B": (x, u), "Q": (x, x), "R": (u, u), "S": (x, u)}
+        return Equations(
+            **{name: getattr(self, name)[0][np.ix_(*at)][None] for name, at in places.items()}
+        )
 
     def scaled(self) -> tuple[Equations, FloatArray, FloatArray]:
         """Divide the weights by factors (N,), the states by units (N, n), all powers of two.

@@ -248,8 +248,11 @@ class GammaEquation:
             R=weight[None],
             S=np.zeros((1, n, len(outputs))),
         )
-        refined = equation.refine(trial.P[None], np.array([trial.iterations]))
-        P, residual = refined.X[0], float(refined.residuals[0])
+        P, residual = np.zeros((n, n)), 0.0
+        for x, u in equation.independent_parts():
+            own = np.ix_(x, x)
+            refined = equation.part(x, u).refine(trial.P[own][None], np.array([trial.iterations]))
+            P[own], residual = refined.X[0], max(residual, float(refined.residuals[0]))
         if residual > _RESIDUAL_LIMIT:
             raise NumericalError(
                 f"the gamma-Riccati equation at gamma = {gamma:.9g} was solved only to a relative "
@@ -261,7 +264,7 @@ class GammaEquation:
         # the first block column of P outputs' Re^-1, with Re the indefinite covariance of the
         # innovations of y and of z / gamma: Pt itself may be unbounded
         innovations = outputs @ P @ outputs.T + weight
-        gain_filter = np.linalg.solve(innovations, outputs @ P)[:q].T
+        gain_filter = np.asarray(np.linalg.solve(innovations, outputs @ P)[:q].T)
         gain = self.A @ gain_filter + self.injection
         if not is_stable(problem.A - gain @ problem.C):
             return None

@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.matrix_functions import frobenius_norms, solve_stack, symmetrise, transpose
 from lbt_synth.linear.riccati.equations import Equations
@@ -115,8 +116,18 @@ def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, I
     doi:10.1080/00207170410001714988. After j steps the iterate holds 2^j steps of the Riccati
     recursion; the convergence is quadratic. G need not be semidefinite. Return X, nan where the
     iteration did not converge, and the steps made (N,). An equation leaves the stack as soon as it
-    has converged or diverged.
+    has converged or diverged. The parts of one whose states do not act on one another are apart.
     """
+    count, label = connected_components(np.any((A != 0) | (G != 0) | (H != 0), axis=0) * 1.0)
+    found, steps = np.zeros_like(H), np.zeros(len(A), dtype=np.int64)
+    for part in range(count):
+        own = np.ix_(range(len(A)), label == part, label == part)
+        found[own], made = _doubling_of_part(A[own], G[own], H[own])
+        steps = np.maximum(steps, made)
+    return found, steps
+
+
+def _doubling_of_part(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, IntArray]:
     X, going, n = H, np.arange(len(A)), A.shape[-1]
     one = np.eye(n)
     found, steps = np.full_like(H, np.nan), np.zeros(len(A), dtype=np.int64)
