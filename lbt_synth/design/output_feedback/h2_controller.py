@@ -67,7 +67,7 @@ def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
             method="h2",
             route="riccati",
             regularised=share,
-            claims={} if share else {"rms_least": _least_rms(equations)},
+            claims={} if share else {"rms_least": _least_rms(equations) / scaled.unit},
         )
 
     return first_certified(scaled, design)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from lbt_synth.design.hinf import checked_bounds
 from lbt_synth.design.output_feedback.result import (
+    SMALLER_SHARES,
     CheckedLoop,
     ControllerDesign,
     certified_controller,
@@ -30,6 +32,7 @@ _SAME_REASON = 0.99  # of the least level, at which a looser proof has the same 
 _LOOSE = 1e-7  # a proof further from the least level is tried by the inequality as well
 _LARGEST_LMI = 20  # states
 _APART = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # of levels tried next to the least
+_FAR = 0.1  # and of the least shares, whose level is above that of the plant in any case
 
 
 def hinf_controller(
@@ -104,12 +107,12 @@ def hinf_controller(
     scaled = scaled_plant(plant)
 
     def design(equations: TwoRiccati, share: float) -> ControllerDesign:
-        bracket = Bracket(scaled, equations, route)
+        bracket = Bracket(scaled, equations, route, share)
         requested = bracket.least * (gamma_ratio or 1.0) if gamma is None else gamma
         bracket.require(requested)
         above = None
         if requested > bracket.least * (1 + _AT_LEAST):
-            above = _central(equations, requested)
+            above = _central(equations, requested * scaled.unit)
         return certified_controller(
             scaled,
             bracket.reached if above is None else checked_loop(scaled, above),
@@ -131,19 +134,29 @@ def hinf_controller(
 class Bracket:
     """The least gamma between the norm of a controller and a level that is proved infeasible."""
 
-    def __init__(self, scaled: ScaledPlant, equations: TwoRiccati, route: str = "riccati") -> None:
+    def __init__(
+        self,
+        scaled: ScaledPlant,
+        equations: TwoRiccati,
+        route: str = "riccati",
+        share: float = 0.0,
+    ) -> None:
         solution = equations.least_level()
-        self.reached = _least_controller(scaled, equations, solution.gamma)
+        aparts = (*_APART, _FAR) if share in SMALLER_SHARES else _APART
+        self.reached = _least_controller(scaled, equations, solution.gamma, aparts)
         self.least = self.reached.certificate.gamma
         candidates = [NO_PROOF, *equations.proofs(solution, scaled.plant)]
-        levels = [(infeasible_control_level(scaled.plant, each), each) for each in candidates]
+        unit = scaled.unit
+        levels = [
+            (infeasible_control_level(scaled.plant, each) / unit, each) for each in candidates
+        ]
         proofs = [max(levels, key=lambda each: each[0])]
         loose = proofs[0][0] < self.least * (1 - _LOOSE)
         if route == "lmi":
-            proofs.append(_inequality_proof(scaled.plant, solution.gamma))
+            proofs.append(_inequality_proof(scaled, solution.gamma))
         elif loose and len(scaled.plant.A) <= _LARGEST_LMI:
             with suppress(NumericalError):
-                proofs.append(_inequality_proof(scaled.plant, solution.gamma))
+                proofs.append(_inequality_proof(scaled, solution.gamma))
         proved, self.witness = max(proofs, key=lambda each: each[0])
         if proofs[0][0] > _SAME_REASON * self.least:  # an inequality gives no reason in words
             self.witness = replace(self.witness, reason=proofs[0][1].reason)
@@ -167,18 +180,20 @@ class Bracket:
             )
 
 
-def _inequality_proof(plant: GeneralizedPlant, gamma: float) -> tuple[float, ControlWitness]:
+def _inequality_proof(scaled: ScaledPlant, level: float) -> tuple[float, ControlWitness]:
     """Return the level that the dual of the matrix inequalities proves, and the proof."""
     from lbt_synth.linear.lmi.output_feedback import least_level_lmi
 
-    _, witness = least_level_lmi(plant, gamma)
-    return infeasible_control_level(plant, witness), witness
+    _, witness = least_level_lmi(scaled.plant, level)
+    return infeasible_control_level(scaled.plant, witness) / scaled.unit, witness
 
 
-def _least_controller(scaled: ScaledPlant, equations: TwoRiccati, least: float) -> CheckedLoop:
+def _least_controller(
+    scaled: ScaledPlant, equations: TwoRiccati, least: float, aparts: Sequence[float]
+) -> CheckedLoop:
     """Return the loop next to the least level, as near as its numbers allow."""
     best: CheckedLoop | None = None
-    for apart in _APART:
+    for apart in aparts:
         controller = _central(equations, least * (1 + apart))
         if controller is None:
             continue
@@ -188,7 +203,7 @@ def _least_controller(scaled: ScaledPlant, equations: TwoRiccati, least: float) 
                 continue
             if best is None or found.certificate.gamma < best.certificate.gamma:
                 best = found
-            if found.certificate.gamma <= least * (1 + 2 * apart):
+            if found.certificate.gamma * scaled.unit <= least * (1 + 2 * apart):
                 break
     if best is None:
         raise NumericalError(

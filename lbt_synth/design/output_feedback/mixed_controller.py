@@ -100,13 +100,13 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
     """Return the controller of least variance below a level, if there is one."""
     bracket = Bracket(scaled, equations)
     bracket.require(gamma)
-    loop = free_parameter(equations)
+    loop, level = free_parameter(equations), gamma * scaled.unit
     frequency_hz = np.linspace(0, 0.5 / loop.T11.dt_s, _POINTS)
     from lbt_synth.linear.lmi.output_feedback import least_variance_below
 
     for _ in range(_ROUNDS):
         try:
-            found = least_variance_below(loop, gamma * (1 - _INSIDE), taps, frequency_hz)
+            found = least_variance_below(loop, level * (1 - _INSIDE), taps, frequency_hz)
         except NumericalError as error:
             raise InfeasibleError(
                 f"no controller with {taps} taps was found below gamma = {gamma:.6g}; the "
@@ -117,7 +117,7 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
             ) from error
         controller = loop.controller(found)
         peak = hinf_norm(scaled.plant.closed_loop(controller))
-        if peak.upper <= gamma:
+        if peak.upper <= level:
             break
         frequency_hz = np.unique(np.append(frequency_hz, peak.peak_frequency_hz))
     return controller

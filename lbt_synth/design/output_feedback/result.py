@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
@@ -39,6 +40,8 @@ from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.summaries import Summary
 
 _SHARES = (0.0, 1e-6, 1e-5, 1e-4)  # of the errors and disturbances, added in turn
+SMALLER_SHARES = (1e-7, 1e-8)  # for plants of which the others leave more than there is
+_LESS = 0.99  # of what is left, so that a smaller share is better
 
 
 def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
@@ -57,7 +60,8 @@ def _check_least_rms(evidence: Evidence, least: float) -> Iterator[Check]:
 def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     """Check that the witness proves the level."""
     design = evidence.design
-    proved = infeasible_control_level(scaled_plant(design.problem).plant, design.witness)
+    scaled = scaled_plant(design.problem)
+    proved = infeasible_control_level(scaled.plant, design.witness) / scaled.unit
     above = level / max(proved, 1e-300) - 1
     how = "pairs that no measurement shows and no control moves"
     name = "infeasible level over the level proved, less 1"
@@ -143,13 +147,19 @@ def checked_loop(scaled: ScaledPlant, controller: StateSpace) -> CheckedLoop:
     return CheckedLoop(controller=K, loop=loop, certificate=certificate)
 
 
+def _level(design: ControllerDesign) -> float:
+    """Return what a design minimises."""
+    return float(design.claims.get("gamma_least", design.rms))
+
+
 def first_certified(
     scaled: ScaledPlant, design: Callable[[TwoRiccati, float], ControllerDesign]
 ) -> ControllerDesign:
     """Return the design of the first equations that lead to one, the plant's own or next to it.
 
     Equations are singular where a control costs nothing or a measurement has no noise. Where
-    perfect control leaves rounding alone, no norm can be certified either.
+    perfect control leaves rounding alone, no norm can be certified either. What was added may be
+    what is left: a smaller share is taken where it leaves less.
     """
     refusal: ValueError | SynthesisError
     for share in _SHARES:
@@ -159,9 +169,15 @@ def first_certified(
             refusal = error
             continue
         try:
-            return design(equations, share)
+            best = design(equations, share)
         except (NumericalError, CertificateError, np.linalg.LinAlgError) as error:
             refusal = error
+            continue
+        for smaller in SMALLER_SHARES if share else ():
+            with suppress(ProblemError, SynthesisError, np.linalg.LinAlgError):
+                other = design(scaled.equations(smaller), smaller)
+                best = other if _level(other) < _LESS * _level(best) else best
+        return best
     if isinstance(refusal, np.linalg.LinAlgError):
         raise NumericalError(
             f"the plant and all next to it are singular to working accuracy: {refusal}. Scale "

@@ -15,6 +15,7 @@ from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _LISTED = 4  # states that a message names
+_PART = 1e-10  # of the largest singular value, below which a channel cancels nothing
 _SHARE = 1e-6  # of the largest entry, below which a state has no part in a mode
 
 
@@ -23,7 +24,8 @@ class ScaledPlant:
     """A plant as it was given, and as it is solved."""
 
     given: GeneralizedPlant
-    plant: GeneralizedPlant  # states, u and y scaled by powers of two
+    plant: GeneralizedPlant  # states and signals scaled by powers of two
+    unit: float  # a level of the scaled plant over that of the given one
     controls: FloatArray  # (m2,) u of a unit of the scaled u
     measurements: FloatArray  # (p2,) scaled y of a unit of y
 
@@ -41,11 +43,22 @@ class ScaledPlant:
 def scaled_plant(plant: GeneralizedPlant) -> ScaledPlant:
     """Return the form in which a plant is solved; DetectabilityError if nothing stabilises it.
 
-    States are balanced, and controls and measurements have size one, so that no unit is singular.
+    States are balanced, and errors, disturbances, controls and measurements have size one, so that
+    no unit is singular. What a control may cancel, D11, has no part in the sizes.
     """
     require_instance(plant, GeneralizedPlant, "plant")
     require_stabilisable(plant)
-    P = plant.with_whole(plant.whole.balanced())
+    sizes = _size(plant.C1, plant.D12), _size(plant.B1, plant.D21)
+    z, w = (1 / float(nearest_powers_of_two(np.array([size]))[0]) for size in sizes)
+    P = replace(
+        plant,
+        B1=w * plant.B1,
+        C1=z * plant.C1,
+        D11=z * w * plant.D11,
+        D12=z * plant.D12,
+        D21=w * plant.D21,
+    )
+    P = P.with_whole(P.whole.balanced())
     controls, measurements = _units(P.B2, P.D12), _units(P.C2.T, P.D21.T)
     y = measurements[:, None]
     scaled = replace(
@@ -56,7 +69,9 @@ def scaled_plant(plant: GeneralizedPlant) -> ScaledPlant:
         D21=y * P.D21,
         D22=y * P.D22 * controls,
     )
-    return ScaledPlant(given=plant, plant=scaled, controls=controls, measurements=measurements)
+    return ScaledPlant(
+        given=plant, plant=scaled, unit=z * w, controls=controls, measurements=measurements
+    )
 
 
 def _units(into: FloatArray, through: FloatArray) -> FloatArray:
@@ -69,19 +84,34 @@ def regularise(plant: GeneralizedPlant, share: float) -> GeneralizedPlant:
     """Return the plant with small errors of each control and state, and small disturbances of both.
 
     ``share`` is their part of the plant's own errors and disturbances. A controller leaves no
-    less in the regularised plant than in the plant itself, and in the limit as much.
+    less in the regularised plant than in the plant itself, and in the limit as much. Where a
+    constant control ``u = K y`` cancels much of D11, the errors are those of the distance from it,
+    and it makes nothing of the disturbances of the measurements: they are relative to what is left.
     """
     P, n = plant, len(plant.A)
     m1, m2, p1, p2 = P.sizes
-    error = share * _size(P.C1, P.D12, P.D11)
-    push = share * _size(P.B1, P.D21, P.D11)
-    C1 = np.vstack([P.C1, np.zeros((m2, n)), error * np.eye(n)])
+    K = _cancelling(P)
+    error = share * _size(P.C1 + P.D12 @ K @ P.C2, P.D12, P.D11 + P.D12 @ K @ P.D21)
+    push = share * _size(P.B1 + P.B2 @ K @ P.D21, P.D21, P.D11 + P.D12 @ K @ P.D21)
+    C1 = np.vstack([P.C1, -error * K @ P.C2, error * np.eye(n)])
     D12 = np.vstack([P.D12, error * np.eye(m2), np.zeros((n, m2))])
-    B1 = np.hstack([P.B1, np.zeros((n, p2)), push * np.eye(n)])
+    B1 = np.hstack([P.B1, -push * P.B2 @ K, push * np.eye(n)])
     D21 = np.hstack([P.D21, push * np.eye(p2), np.zeros((p2, n))])
     D11 = np.zeros((len(C1), B1.shape[1]))
-    D11[:p1, :m1] = P.D11
+    D11[:p1] = np.hstack([P.D11, -push * P.D12 @ K, np.zeros((p1, n))])
+    D11[p1 : p1 + m2, : m1 + p2] = np.hstack([-error * K @ P.D21, -error * push * K])
     return replace(P, B1=B1, C1=C1, D11=D11, D12=D12, D21=D21)
+
+
+def _cancelling(plant: GeneralizedPlant) -> FloatArray:
+    """Return the constant control (m2, p2) that leaves least of D11, if it makes nothing larger."""
+    P = plant
+    K = -np.linalg.pinv(P.D12, rcond=_PART) @ P.D11 @ np.linalg.pinv(P.D21, rcond=_PART)
+    through = P.D11 + P.D12 @ K @ P.D21
+    cancelled = _size(P.C1 + P.D12 @ K @ P.C2, P.D12, through)
+    cancelled *= _size(P.B1 + P.B2 @ K @ P.D21, P.D21, through)
+    left = _size(P.C1, P.D12, P.D11) * _size(P.B1, P.D21, P.D11)
+    return K if cancelled < left else 0 * K
 
 
 def _size(*parts: FloatArray) -> float:
