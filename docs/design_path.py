@@ -1,4 +1,4 @@
-"""Draw the path of a design for the architecture page: ``python docs/design_path.py``."""
+"""Draw the path of a design, and that of a sensor gain: ``python docs/design_path.py``."""
 
 from pathlib import Path
 
@@ -8,27 +8,35 @@ mpl.use("Agg")
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-STEPS = (
-    ("configuration", "YAML, units in keys", "config"),
-    ("plant", "turbulence, vibrations,\nsensor, delay, mirror", "models"),
-    ("gain", "Riccati, LMI or SDP", "linear"),
-    ("certificate", "by other means\nthan the solver", "design"),
-    ("gain file", "FITS, NPZ", "files"),
-    ("loop", "residual, margins,\nStrehl in the truth", "loop"),
+# title, detail and what stands below of each box
+DESIGN = (
+    ("configuration", "YAML, units in keys", "lbt.config"),
+    ("plant", "turbulence, vibrations,\nsensor, delay, mirror", "lbt.models"),
+    ("gain", "Riccati, LMI or SDP", "lbt.linear"),
+    ("certificate", "by other means\nthan the solver", "lbt.design"),
+    ("gain file", "FITS, NPZ", "lbt.files"),
+    ("loop", "residual, margins,\nStrehl in the truth", "lbt.loop"),
+)
+GAIN = (
+    ("residual phase", "1 nm rms wavefront", "in the truth"),
+    ("sensor", "shows g nm of it:\nits optical gain", "truth.sensor_gain"),
+    ("raw measurement y", "g nm, in records and\nin real-time computers", "--sensor-gain"),
+    ("controller", "its matrices hold the\ngain that it assumes", "model.sensor_gain"),
+    ("loop", "stable for the factors\ng over the assumed gain", "stable gain factors"),
 )
 WIDTH, HEIGHT, GAP = 1.75, 1.15, 0.45
 INK, PAPER, ACCENT = "#222222", "#f4f4f0", "#0072b2"
 
 
-def draw() -> Figure:
-    """Return the figure: six boxes, left to right, with the room of each below."""
-    total = len(STEPS) * WIDTH + (len(STEPS) - 1) * GAP
+def draw(steps: tuple[tuple[str, str, str], ...]) -> Figure:
+    """Return the figure: boxes, left to right, with a name below each."""
+    total = len(steps) * WIDTH + (len(steps) - 1) * GAP
     figure = Figure(figsize=(total + 0.3, HEIGHT + 0.75), dpi=110)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set_xlim(-0.15, total + 0.15)
     axes.set_ylim(-0.6, HEIGHT + 0.15)
     axes.set_axis_off()
-    for i, (title, detail, room) in enumerate(STEPS):
+    for i, (title, detail, name) in enumerate(steps):
         left = i * (WIDTH + GAP)
         axes.add_patch(
             FancyBboxPatch(
@@ -44,9 +52,7 @@ def draw() -> Figure:
         middle = left + WIDTH / 2
         axes.text(middle, HEIGHT - 0.25, title, ha="center", va="center", weight="bold", color=INK)
         axes.text(middle, 0.4, detail, ha="center", va="center", fontsize=8.5, color=INK)
-        axes.text(
-            middle, -0.28, f"lbt.{room}", ha="center", va="center", family="monospace", color=ACCENT
-        )
+        axes.text(middle, -0.28, name, ha="center", va="center", family="monospace", color=ACCENT)
         if i:
             axes.annotate(
                 "",
@@ -58,6 +64,7 @@ def draw() -> Figure:
 
 
 if __name__ == "__main__":
-    target = Path(__file__).parent / "figures" / "design_path.png"
-    draw().savefig(target)
-    print(target)
+    for name, steps in (("design_path", DESIGN), ("sensor_gain", GAIN)):
+        target = Path(__file__).parent / "figures" / f"{name}.png"
+        draw(steps).savefig(target)
+        print(target)

@@ -17,8 +17,7 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
-from lbt_synth.loop import LoopMargins, close_loop, loop_margins
-from lbt_synth.loop.loop_errors import FRAGILE_DB, FRAGILE_FRAMES
+from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import Wording, design_request
 from lbt_synth.models import LoopHardware
@@ -70,9 +69,9 @@ def describe_design(design: Design, *, matrices: bool = False) -> Report:
         if not design.other_sensors:
             margins = [loop_margins(close_loop(design.hardware, design))]
             report.data["margins"] = json_record(*margins)
-            report.opening.append(_survival(*margins))
+            report.opening += [each.survival for each in margins]
         report.notes += _loop_notes(design, design.hardware, report.data)
-        report.notes += [note for each in margins for note in _fragile_notes(each, design.hardware)]
+        report.notes += [f"warning: {text}" for each in margins for text in each.fragilities]
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
@@ -111,53 +110,6 @@ def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
         settling_s = hardware.mirror.step_response().settling_s
         report.data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
     return facts
-
-
-def _survival(margins: LoopMargins) -> str:
-    """Say which errors of the loop a design survives, each alone and together."""
-
-    def size(value: float, unit: str) -> str:
-        return f"{value:.2g} {unit}".strip() if np.isfinite(value) else "any"
-
-    low_db, high_db = _gain_errors_db(margins)
-    alone = (
-        f"survives {size(margins.delay_frames, 'frames')} more delay or "
-        f"{size(margins.early_frames, 'frames')} less, {size(high_db, 'dB')} more sensor gain or "
-        f"{size(low_db, 'dB')} less"
-    )
-    if np.isnan(margins.together):
-        return f"{alone}; at once is not known for a mirror with dynamics."
-    frames, decibels = margins.together * FRAGILE_FRAMES, margins.together * FRAGILE_DB
-    return f"{alone}; at once {frames:.2g} frames and {decibels:.2g} dB either way (proved)."
-
-
-def _gain_errors_db(margins: LoopMargins) -> tuple[float, float]:
-    """Return how much less and how much more sensor gain a loop survives [dB]; inf for any."""
-    with np.errstate(divide="ignore"):  # no gain is too low
-        low_db, high_db = 20 * np.abs(np.log10([margins.gain_low, margins.gain_high]))
-    return float(low_db), float(high_db)
-
-
-def _fragile_notes(margins: LoopMargins, hardware: LoopHardware) -> list[str]:
-    """Warn of a delay or a gain that is hardly off and makes the loop unstable."""
-    notes, frame_us = [], 1e6 * hardware.dt_s
-    for frames, word in ((margins.delay_frames, "more"), (margins.early_frames, "less")):
-        if frames < FRAGILE_FRAMES:
-            notes.append(
-                f"warning: {frames:.2g} frames ({frames * frame_us:.2g} us) {word} delay make this "
-                "loop unstable. Do not close it so: take another method, or robust with "
-                "delay_error_frames."
-            )
-    if (least := min(_gain_errors_db(margins))) < FRAGILE_DB:
-        notes.append(
-            f"warning: a sensor gain that is off by {least:.2g} dB makes this loop unstable."
-        )
-    if not notes and margins.together < 1:
-        notes.append(
-            f"warning: {FRAGILE_FRAMES:g} frames of delay and {FRAGILE_DB:g} dB of sensor gain at "
-            "once are more than this loop is proved to survive. robust demands both together."
-        )
-    return notes
 
 
 def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:

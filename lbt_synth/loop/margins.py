@@ -15,7 +15,7 @@ from lbt_synth.loop.broken_loops import broken_loops
 from lbt_synth.loop.closed_loop import ClosedLoop, parts_by_fraction, parts_by_gain
 from lbt_synth.loop.ensemble.closed_loops import close_loops
 from lbt_synth.loop.ensemble.evaluation import textbook_matrices
-from lbt_synth.loop.loop_errors import errors_together
+from lbt_synth.loop.loop_errors import FRAGILE_DB, FRAGILE_FRAMES, errors_together
 from lbt_synth.loop.stable_range import exact_range, stable_range
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import column, fact_table, table_row
@@ -100,6 +100,53 @@ class LoopMargins(Summarised):
         "stable phase of each axis, up to", unit="deg", help="Each axis with its own"
     )
 
+    dt_s: float = column(unit="s", help="Frame period of the loop")
+
+    @property
+    def gain_errors_db(self) -> tuple[float, float]:
+        """How much less and how much more sensor gain the loop survives [dB]; inf for any."""
+        with np.errstate(divide="ignore"):  # no gain is too low
+            low_db, high_db = 20 * np.abs(np.log10([self.gain_low, self.gain_high]))
+        return float(low_db), float(high_db)
+
+    @property
+    def survival(self) -> str:
+        """Which errors the loop survives, each alone and together, in a sentence."""
+        low_db, high_db = self.gain_errors_db
+        alone = (
+            f"survives {_size(self.delay_frames, 'frames')} more delay or "
+            f"{_size(self.early_frames, 'frames')} less, {_size(high_db, 'dB')} more sensor gain "
+            f"or {_size(low_db, 'dB')} less"
+        )
+        if np.isnan(self.together):
+            return f"{alone}; at once is not known for a mirror with dynamics."
+        frames, decibels = self.together * FRAGILE_FRAMES, self.together * FRAGILE_DB
+        return f"{alone}; at once {frames:.2g} frames and {decibels:.2g} dB either way (proved)."
+
+    @property
+    def fragilities(self) -> tuple[str, ...]:
+        """Sentences on a delay or a gain that is hardly off and makes the loop unstable."""
+        texts = []
+        for frames, word in ((self.delay_frames, "more"), (self.early_frames, "less")):
+            if frames < FRAGILE_FRAMES:
+                texts.append(
+                    f"{frames:.2g} frames ({frames * 1e6 * self.dt_s:.2g} us) {word} delay make "
+                    "this loop unstable. Do not close it so: take another method, or robust with "
+                    "delay_error_frames."
+                )
+        if (least := min(self.gain_errors_db)) < FRAGILE_DB:
+            texts.append(f"a sensor gain that is off by {least:.2g} dB makes this loop unstable.")
+        if not texts and self.together < 1:
+            texts.append(
+                f"{FRAGILE_FRAMES:g} frames of delay and {FRAGILE_DB:g} dB of sensor gain at once "
+                "are more than this loop is proved to survive. robust demands both together."
+            )
+        return tuple(texts)
+
+
+def _size(value: float, unit: str) -> str:
+    return f"{value:.2g} {unit}".strip() if np.isfinite(value) else "any"
+
 
 def loop_margins(loop: ClosedLoop) -> LoopMargins:
     """Gain, phase, delay and modulus margin of a stable loop.
@@ -146,6 +193,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
         early_frames=early,
         together=errors_together(loop),
         crossover_hz=max((point.frequency_hz for point in crossings), default=0.0),
+        dt_s=loop.hardware.dt_s,
         disk=disk,
         disk_gain_low=max(2 - disk, 0.0) / (2 + disk),
         disk_gain_high=(2 + disk) / (2 - disk) if disk < 2 else np.inf,

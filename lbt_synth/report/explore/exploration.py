@@ -247,9 +247,9 @@ def judge(view: View) -> str:
         sentences.append(f"the {design_title(best.method)} leaves {least} here")
     sentences.append(
         f"Margins: modulus {number_text(margins.modulus, 3)}, phase "
-        f"{number_text(margins.phase_deg, 3)} degrees, delay "
-        f"{number_text(margins.delay_frames, 3)} frames, sensor gain times "
-        f"{number_text(margins.gain_low, 3)} to {number_text(margins.gain_high, 3)}"
+        f"{number_text(margins.phase_deg, 3)} degrees"
     )
+    sentences.append(f"it {margins.survival.removesuffix('.')}")
+    sentences += [f"WARNING: {text.removesuffix('.')}" for text in margins.fragilities]
     sentences += compared.warnings[view.name]
     return ". ".join(text[0].upper() + text[1:] for text in sentences) + f". {passed}"
