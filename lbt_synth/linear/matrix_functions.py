@@ -9,6 +9,8 @@ from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.validation import ComplexArray, Entry, FloatArray, IntArray
 
+MANY_STATES = 24  # from which on the parts of a system are worth looking for
+
 
 def transpose(stack: npt.NDArray[Entry]) -> npt.NDArray[Entry]:
     """Transpose each matrix of a stack."""

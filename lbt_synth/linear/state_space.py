@@ -23,6 +23,7 @@ from scipy.linalg import matrix_balance
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.lyapunov import join_roots, stationary_covariance, stationary_root
 from lbt_synth.linear.matrix_functions import (
+    MANY_STATES,
     as_stack,
     complex_schur,
     part_labels,
@@ -185,8 +186,9 @@ class StateSpace(LinearSystem):
     2.0
     """
 
-    # once they are asked for: outputs, inputs and Schur form of each part, see part_labels
-    _parts: tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...] = field(
+    # outputs, inputs, system and Schur form of each part once they are asked for, see part_labels;
+    # the system of the only one is None
+    _parts: tuple[tuple[IntArray, IntArray, StateSpace | None, SchurForm], ...] = field(
         default=(), init=False, repr=False
     )
 
@@ -377,13 +379,15 @@ class StateSpace(LinearSystem):
         self.require_one_phase("a transfer matrix", "phase_response(...), or lifted()")
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
-        response = np.empty((z.size, *self.D.shape), dtype=np.complex128)
-        response[:] = self.D
-        for outputs, inputs, part, form in self._independent_parts():
-            # a few points are solved one by one, which is more accurate next to a pole
-            few = z.size <= self.n_states
-            own = pointwise_response(part, z) if few else schur_response(form, z)
-            response[:, outputs[:, None], inputs] = own
+        few = z.size <= self.n_states  # solved one by one, which is more accurate next to a pole
+        if few and self.n_states < MANY_STATES:
+            response = pointwise_response(self, z)
+        else:
+            response = np.empty((z.size, *self.D.shape), dtype=np.complex128)
+            response[:] = self.D
+            for outputs, inputs, part, form in self._independent_parts():
+                own = pointwise_response(part or self, z) if few else schur_response(form, z)
+                response[:, outputs[:, None], inputs] = own
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -394,9 +398,13 @@ class StateSpace(LinearSystem):
 
     def _independent_parts(
         self,
-    ) -> tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...]:
+    ) -> tuple[tuple[IntArray, IntArray, StateSpace | None, SchurForm], ...]:
         """Return outputs, inputs, system and Schur form of the parts with all of them."""
-        if self._parts or not self.n_states:
+        if self._parts:
+            return self._parts
+        if self.n_states < MANY_STATES:
+            channels = np.arange(len(self.D)), np.arange(self.D.shape[1])
+            set_fields(self, _parts=((*channels, None, schur_form(self.balanced())),))
             return self._parts
         labels, parts = part_labels(self.A, self.B, self.C, self.D), []
         for i in range(np.max(np.concatenate(labels)) + 1):

@@ -90,14 +90,14 @@ def real_responses(T: StateSpace) -> FloatArray:
 
     middle = (angles[1:] + angles[:-1]) / 2
     signs = np.sign(imaginary(middle))
-    (turns,) = np.nonzero(signs[1:] * signs[:-1] < 0)
+    known = response(angles)
+    real = np.abs(known.imag) <= _REAL * np.abs(known)
+    (turns,) = np.nonzero((signs[1:] * signs[:-1] < 0) & ~real[1:-1])  # of an inaccurate angle
     crossed = np.zeros(0)
     if turns.size:
         ends = middle[turns], middle[turns + 1]
         crossed = find_root(imaginary, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
-    known = response(angles)
-    touched = np.abs(known.imag) <= _REAL * np.abs(known)
-    return np.concatenate([known[touched].real, response(crossed).real])
+    return np.concatenate([known[real].real, response(crossed).real])
 
 
 def stable_interval(
