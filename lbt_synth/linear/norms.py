@@ -27,6 +27,7 @@ from lbt_synth.linear.state_space import (
     pointwise_response,
     schur_form,
     schur_response,
+    split_into_parts,
 )
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -107,18 +108,11 @@ def _require_stable(G: StateSpace) -> None:
 
 def independent_parts(G: StateSpace) -> list[StateSpace]:
     """Return the parts of a system that share no state, input or output, equal ones once."""
-    labels = part_labels(G.A, G.B, G.C, G.D)
-    parts = {}
-    for part in range(np.max(np.concatenate(labels)) + 1):
-        states, inputs, outputs = (np.flatnonzero(label == part) for label in labels)
-        if inputs.size and outputs.size:
-            if not states.size:
-                return [G]
-            A, B = G.A[np.ix_(states, states)], G.B[np.ix_(states, inputs)]
-            C, D = G.C[np.ix_(outputs, states)], G.D[np.ix_(outputs, inputs)]
-            key = tuple(matrix.tobytes() for matrix in (A, B, C, D))
-            parts[key] = replace(G, A=A, B=B, C=C, D=D)
-    return list(parts.values()) or [G]
+    parts = [part for *_, part in split_into_parts(G)]
+    if not all(part.n_states for part in parts):
+        return [G]
+    different = {tuple(getattr(part, name).tobytes() for name in "ABCD"): part for part in parts}
+    return list(different.values()) or [G]
 
 
 def square_parts(G: StateSpace) -> list[StateSpace]:
@@ -138,7 +132,8 @@ def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
 def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
     """Largest singular value of a balanced system between two angles, by level sets."""
     largest = partial(_largest, G, schur_form(G))
-    peak, angle = _climb(G, low, high, largest, lambda level: level_angles(G, level))
+    seeds = _seeds(G, low, high)
+    peak, angle = _climb(G, seeds, largest, lambda level: level_angles(G, level))
     return HinfNorm(
         value=peak,
         lower=peak,
@@ -167,8 +162,8 @@ def largest_real_part(system: StateSpace, *, least: float = -np.inf) -> float:
 def _largest_real_part(G: StateSpace, least: float) -> float:
     """Largest real part of a balanced system's response, or ``least``."""
     form = schur_form(G)
-    seeds = schur_response(form, np.exp(1j * _seeds(G, 0.0, np.pi)))
-    size = float(np.max(np.abs(seeds)))
+    seeds = _seeds(G, 0.0, np.pi)
+    size = float(np.max(np.abs(schur_response(form, np.exp(1j * seeds)))))
 
     def hermitian(response: ComplexArray) -> FloatArray:
         values = np.linalg.eigvalsh(response + response.conj().transpose(0, 2, 1))[:, -1] / 2
@@ -185,7 +180,7 @@ def _largest_real_part(G: StateSpace, least: float) -> float:
         R = G.D + G.D.T - 2 * level * np.eye(len(G.D))
         return popov_angles(G.A, G.B, np.zeros_like(G.A), G.C, R)
 
-    peak, _ = _climb(G, 0.0, np.pi, largest, pencil, size=size, least=least)
+    peak, _ = _climb(G, seeds, largest, pencil, size=size, least=least)
     return peak + 2 * _TOLERANCE * max(size, abs(peak))
 
 
@@ -196,21 +191,21 @@ def _seeds(G: StateSpace, low: float, high: float) -> FloatArray:
 
 def _climb(
     G: StateSpace,
-    low: float,
-    high: float,
+    seeds: FloatArray,
     largest: Callable[[FloatArray], tuple[float, float]],
     level_angles: Callable[[float], FloatArray],
     *,
     size: float = 0.0,
     least: float = -np.inf,
 ) -> tuple[float, float]:
-    """Find the peak between two angles by raising a level until nothing lies above it.
+    """Find the peak between the outer seeds by raising a level until nothing lies above it.
 
     ``largest`` returns the largest value at some angles and its angle. ``level_angles`` returns the
     angles between which values may lie above a level. Levels rise relative to the peak, or to the
     size of what the values are parts of; the first is ``least`` if that is above the seeds.
     """
-    peak, angle = largest(_seeds(G, low, high))
+    low, high = float(seeds[0]), float(seeds[-1])
+    peak, angle = largest(seeds)
     if peak == size == 0:
         return max(peak, least), angle
     peak = max(peak, least)
@@ -305,17 +300,20 @@ def _largest(G: StateSpace, form: SchurForm, angles: FloatArray) -> tuple[float,
 
 
 def popov_angles(
-    A: FloatArray, B: FloatArray, Q: FloatArray, S: FloatArray, R: FloatArray
+    A: FloatArray, B: FloatArray, Q: FloatArray, S: FloatArray, R: FloatArray, *, sign: float = 1.0
 ) -> FloatArray:
     """Angles of the generalised eigenvalues of a symplectic pencil; no matrix is inverted.
 
     ``z [x; A'p + Q x + S'w; 0] = [A x + B w; p; S x + B'p + R w]`` with the adjoint state p. For
     a singular value sigma, ``Q = C'C``, ``S = D'C`` and ``R = D'D - sigma^2 I``; for a level of
-    the real part of a response, ``Q = 0``, ``S = C`` and ``R = D + D' - 2 level I``.
+    the real part of a response, ``Q = 0``, ``S = C`` and ``R = D + D' - 2 level I``. With the sign
+    -1 the term ``B'p`` is subtracted: for the imaginary part, ``R = D - D'``.
     """
     (n, m), zero = B.shape, np.zeros
     E = np.block([[np.eye(n), zero((n, n + m))], [Q, A.T, S.T], [zero((m, 2 * n + m))]])
-    F = np.block([[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, B.T, R]])
+    F = np.block(
+        [[A, zero((n, n)), B], [zero((n, n)), np.eye(n), zero((n, m))], [S, sign * B.T, R]]
+    )
     with np.errstate(all="ignore"):
         try:
             values = eigvals(F, E)

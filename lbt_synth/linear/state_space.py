@@ -406,16 +406,21 @@ class StateSpace(LinearSystem):
             channels = np.arange(len(self.D)), np.arange(self.D.shape[1])
             set_fields(self, _parts=((*channels, None, schur_form(self.balanced())),))
             return self._parts
-        labels, parts = part_labels(self.A, self.B, self.C, self.D), []
-        for i in range(np.max(np.concatenate(labels)) + 1):
-            x, inputs, outputs = (np.flatnonzero(label == i) for label in labels)
-            if x.size and inputs.size and outputs.size:
-                A, B = self.A[np.ix_(x, x)], self.B[np.ix_(x, inputs)]
-                C, D = self.C[np.ix_(outputs, x)], self.D[np.ix_(outputs, inputs)]
-                part = replace(self, A=A, B=B, C=C, D=D)
-                parts.append((outputs, inputs, part, schur_form(part.balanced())))
-        set_fields(self, _parts=tuple(parts))
-        return tuple(parts)
+        split = (parts for parts in split_into_parts(self) if parts[2].n_states)
+        set_fields(self, _parts=tuple((*p, schur_form(p[2].balanced())) for p in split))
+        return self._parts
+
+
+def split_into_parts(system: StateSpace) -> list[tuple[IntArray, IntArray, StateSpace]]:
+    """Return outputs, inputs and system of the parts that have both and share nothing."""
+    labels, parts = part_labels(system.A, system.B, system.C, system.D), []
+    for i in range(np.max(np.concatenate(labels)) + 1):
+        x, inputs, outputs = (np.flatnonzero(label == i) for label in labels)
+        if inputs.size and outputs.size:
+            A, B = system.A[np.ix_(x, x)], system.B[np.ix_(x, inputs)]
+            C, D = system.C[np.ix_(outputs, x)], system.D[np.ix_(outputs, inputs)]
+            parts.append((outputs, inputs, replace(system, A=A, B=B, C=C, D=D)))
+    return parts
 
 
 def sigma_sparkline(system: StateSpace, caption: str) -> Sparkline:

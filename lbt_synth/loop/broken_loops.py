@@ -110,8 +110,9 @@ class BrokenLoop:
     @property
     def gain_margins(self) -> tuple[MarginPoint, ...]:
         """The phase crossings from which a rise and a fall of the gain reach -1 first."""
-        rise = [point for point in self.phase_crossings if point.gain > 1]
-        fall = [point for point in self.phase_crossings if point.gain < 1]
+        crossings = self.phase_crossings
+        rise = [point for point in crossings if point.gain > 1]
+        fall = [point for point in crossings if point.gain < 1]
         return tuple(
             nearest(points, key=lambda point: point.gain)
             for nearest, points in ((max, fall), (min, rise))

@@ -12,11 +12,10 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from scipy.linalg import eigvals
 from scipy.optimize.elementwise import find_root
 
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.norms import fold_angles
+from lbt_synth.linear.norms import fold_angles, popov_angles
 from lbt_synth.linear.state_space import schur_form, schur_response
 from lbt_synth.loop.closed_loop import AffinePart, affine_radii
 from lbt_synth.validation import ComplexArray, FloatArray
@@ -51,8 +50,10 @@ def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
     It is None where the matrices repeat with a longer period or change by a higher rank.
     """
     start, slope = part
+    if len(start) > 1:
+        return None
     U, sizes, V = np.linalg.svd(slope[0])
-    if len(start) > 1 or np.any(sizes[1:] > _RANK * sizes[0]):
+    if np.any(sizes[1:] > _RANK * sizes[0]):
         return None
     if sizes[0] == 0:
         return -np.inf, np.inf
@@ -67,19 +68,10 @@ def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
 def real_responses(T: StateSpace) -> FloatArray:
     """Return the responses of a system of one input and output that are real, on the unit circle.
 
-    With ``p = z (A'p + c w)`` the adjoint state, ``T(z) = T(1/z)`` where ``c'x = b'p``. Between the
-    angles of the eigenvalues the imaginary part keeps its sign.
+    There ``T(z) = T(1/z)``; between the angles of the pencil the imaginary part keeps its sign.
     """
-    n = T.n_states
-    E, F = np.zeros((2, 2 * n + 1, 2 * n + 1))
-    x, p, w = slice(n), slice(n, 2 * n), slice(2 * n, None)
-    E[x, x], E[p, p], E[p, w] = np.eye(n), T.A.T, T.C.T
-    F[x, x], F[x, w], F[p, p], F[w, x], F[w, p] = T.A, T.B, np.eye(n), T.C, -T.B.T
-    with np.errstate(all="ignore"):
-        values = eigvals(F, E)
-    values = values[np.isfinite(values) & (values != 0)]
-    angles = fold_angles(np.angle(values), 0.0, np.pi)
-
+    found = popov_angles(T.A, T.B, np.zeros_like(T.A), T.C, np.zeros_like(T.D), sign=-1.0)
+    angles = fold_angles(found, 0.0, np.pi)
     form = schur_form(T)
 
     def response(at: FloatArray) -> ComplexArray:

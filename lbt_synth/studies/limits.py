@@ -312,11 +312,10 @@ def _warnings(
     if not row.stable:
         yield "the loop is unstable in the truth"
         return
-    expected_nm, means_nm = design.expected_residual_nm, 0.0
-    if expected_nm is not None and row.residual_nm > _SURPRISING * expected_nm:
-        means_nm = _means_nm(design, config)  # at most the residual
-    surprises = expected_nm is not None and means_nm > _SURPRISING * expected_nm
-    if expected_nm is not None and surprises:
+    expected_nm = np.inf if design.expected_residual_nm is None else design.expected_residual_nm
+    may_surprise = row.residual_nm > _SURPRISING * expected_nm  # means leave hardly more
+    means_nm = _means_nm(design, config) if may_surprise else 0.0
+    if surprises := means_nm > _SURPRISING * expected_nm:
         yield (
             f"the truth leaves {nm_text(means_nm)} in means over frames, where the design expects "
             f"{nm_text(expected_nm)}: it has power that the design was not made for"
