@@ -27,12 +27,20 @@ def chromium(profile, *hosts, requests=True):
 
 
 def opened(browser, address, screen=DESK):
-    """Open a page; its log begins with it."""
+    """Open a page and wait for all of it; its log begins with it.
+
+    The driver may return from a page that was open already while it is read again.
+    """
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    browser.get("about:blank")
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": screen["mobile"]})
     browser.get_log("browser")
     browser.get_log("performance")
     browser.get(address)
+    complete = "return location.href !== 'about:blank' && document.readyState === 'complete'"
+    WebDriverWait(browser, 60).until(lambda driver: driver.execute_script(complete))
 
 
 def chain(browser):
