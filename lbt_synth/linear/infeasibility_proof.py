@@ -22,7 +22,6 @@ from functools import reduce
 
 import numpy as np
 from scipy.linalg import eigh, null_space
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.estimation_problem import (
@@ -32,7 +31,7 @@ from lbt_synth.linear.estimation_problem import (
     scale_states,
 )
 from lbt_synth.linear.lyapunov import stationary_root
-from lbt_synth.linear.matrix_functions import as_stack
+from lbt_synth.linear.matrix_functions import as_stack, component_labels
 from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
@@ -158,7 +157,7 @@ def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArra
     """
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     spread = np.where(spread > 0, spread, 1.0)
-    _, label = connected_components(covariance != 0)
+    label = component_labels(covariance != 0)
     sizes: list[FloatArray] = []
     directions: list[FloatArray] = []
     for part in range(np.max(label) + 1):

@@ -9,7 +9,6 @@ from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.linear.matrix_functions import (
-    MANY_STATES,
     complex_schur,
     frobenius_norms,
     part_labels,
@@ -132,8 +131,6 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
     digits as A nears the unit circle. States that share no input and do not act on one another are
     apart.
     """
-    if len(A) < MANY_STATES:
-        return _root_of_part(A, B)
     label, inputs, _ = part_labels(A, B, np.zeros((0, len(A))), np.zeros((0, B.shape[1])))
     roots = [np.zeros((len(A), min(B.shape[1], 1)))]  # of states that no input reaches
     for part in np.unique(label):

@@ -23,7 +23,6 @@ from scipy.linalg import matrix_balance
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.lyapunov import join_roots, stationary_covariance, stationary_root
 from lbt_synth.linear.matrix_functions import (
-    MANY_STATES,
     as_stack,
     complex_schur,
     part_labels,
@@ -186,9 +185,8 @@ class StateSpace(LinearSystem):
     2.0
     """
 
-    # outputs, inputs, system and Schur form of each part once they are asked for, see part_labels;
-    # the system of the only one is None
-    _parts: tuple[tuple[IntArray, IntArray, StateSpace | None, SchurForm], ...] = field(
+    # outputs, inputs, system and Schur form of each part once they are asked for, see part_labels
+    _parts: tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...] = field(
         default=(), init=False, repr=False
     )
 
@@ -380,14 +378,11 @@ class StateSpace(LinearSystem):
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         few = z.size <= self.n_states  # solved one by one, which is more accurate next to a pole
-        if few and self.n_states < MANY_STATES:
-            response = pointwise_response(self, z)
-        else:
-            response = np.empty((z.size, *self.D.shape), dtype=np.complex128)
-            response[:] = self.D
-            for outputs, inputs, part, form in self._independent_parts():
-                own = pointwise_response(part or self, z) if few else schur_response(form, z)
-                response[:, outputs[:, None], inputs] = own
+        response = np.empty((z.size, *self.D.shape), dtype=np.complex128)
+        response[:] = self.D
+        for outputs, inputs, part, form in self._independent_parts():
+            block = pointwise_response(part, z) if few else schur_response(form, z)
+            response[:, outputs[:, None], inputs] = block
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -398,16 +393,11 @@ class StateSpace(LinearSystem):
 
     def _independent_parts(
         self,
-    ) -> tuple[tuple[IntArray, IntArray, StateSpace | None, SchurForm], ...]:
+    ) -> tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...]:
         """Return outputs, inputs, system and Schur form of the parts with all of them."""
-        if self._parts:
-            return self._parts
-        if self.n_states < MANY_STATES:
-            channels = np.arange(len(self.D)), np.arange(self.D.shape[1])
-            set_fields(self, _parts=((*channels, None, schur_form(self.balanced())),))
-            return self._parts
-        split = (parts for parts in split_into_parts(self) if parts[2].n_states)
-        set_fields(self, _parts=tuple((*p, schur_form(p[2].balanced())) for p in split))
+        if not self._parts:
+            split = (part for part in split_into_parts(self) if part[2].n_states)
+            set_fields(self, _parts=tuple((*p, schur_form(p[2].balanced())) for p in split))
         return self._parts
 
 

@@ -9,11 +9,11 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.held_controller import HasController, as_controller
+from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
@@ -300,8 +300,8 @@ def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
     They have the eigenvalues of the whole; equal parts are returned once.
     """
     links = np.any((A0 != 0) | (A1 != 0), axis=0)
-    count, label = connected_components(links, connection="strong")
-    parts = (np.ix_(range(len(A0)), label == i, label == i) for i in range(count))
+    label = component_labels(links, strong=True)
+    parts = (np.ix_(range(len(A0)), label == i, label == i) for i in np.unique(label))
     return list(
         {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}.values()
     )

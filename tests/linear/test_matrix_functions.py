@@ -1,11 +1,14 @@
-"""Roots of semidefinite matrices, stability, and the Schur form."""
+"""Roots of semidefinite matrices, stability, the Schur form, and parts of a graph."""
 
 import numpy as np
 import pytest
 import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear import matrix_functions
-from lbt_synth.linear.matrix_functions import is_stable, semidefinite_root
+from lbt_synth.linear.matrix_functions import component_labels, is_stable, semidefinite_root
 
 
 def test_root_of_a_matrix_of_rank_one():
@@ -37,3 +40,15 @@ def test_the_schur_form_gives_back_the_matrix(monkeypatch, fails):
         assert U @ T @ U.conj().T == pytest.approx(A, abs=1e-12)
         assert U @ U.conj().T == pytest.approx(np.eye(len(A)), abs=1e-12)
         assert not np.tril(T, -1).any()
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 12), density=st.floats(0, 0.4))
+def test_parts_are_those_of_scipy(seed, n, density):
+    """Elements have the same number where scipy finds them in the same component."""
+    links = np.random.default_rng(seed).random((n, n)) < density
+    for strong, connection in ((False, "weak"), (True, "strong")):
+        label = component_labels(links, strong=strong)
+        _, expected = connected_components(links, connection=connection)
+        assert np.array_equal(label[:, None] == label, expected[:, None] == expected)
+        firsts = [np.flatnonzero(label == i)[0] for i in range(np.max(label) + 1)]
+        assert firsts == sorted(firsts)

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, TypeAlias, get_args
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
@@ -32,6 +31,7 @@ from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain, U
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
+from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.loop import least_residual, least_worst_residual
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.least_residuals.band_limit import BandLimit
@@ -49,7 +49,7 @@ from lbt_synth.models import (
     Truth,
 )
 from lbt_synth.models.spectra import SumSpectrum
-from lbt_synth.validation import FloatArray, sequence, set_fields
+from lbt_synth.validation import BoolArray, FloatArray, sequence, set_fields
 
 Demand: TypeAlias = Bound | Uncertainty
 _ZERO = 1e-12  # of an entry, over the largest of its matrix
@@ -224,9 +224,9 @@ def _controller_of_mode(
     C = hardware.influence @ controller.C
     D = hardware.influence @ controller.D @ hardware.sensor
     n, modes = len(A), len(D)
-    whole = np.zeros((n + modes, n + modes))  # which state or mode acts on which
+    whole = np.zeros((n + modes, n + modes), dtype=np.bool_)  # which state or mode acts on which
     whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:] = map(_entries, (A, B, C, D))
-    _, label = connected_components(whole)
+    label = component_labels(whole)
     if np.count_nonzero(label[n:] == label[n + mode]) > 1:
         return None
     own = label[:n] == label[n + mode]
@@ -239,10 +239,10 @@ def _controller_of_mode(
     )
 
 
-def _entries(matrix: FloatArray) -> FloatArray:
-    """Return 1 where a matrix has an entry, and 0 where it has rounding."""
+def _entries(matrix: FloatArray) -> BoolArray:
+    """Return where a matrix has an entry that is more than rounding."""
     size = np.abs(matrix)
-    return np.asarray(size > _ZERO * np.max(size, initial=0.0), dtype=np.float64)
+    return np.asarray(size > _ZERO * np.max(size, initial=0.0))
 
 
 def specified_limit(

@@ -15,12 +15,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.estimation_problem import EstimationProblem
 from lbt_synth.linear.lmi.conic_data import require_optimum
 from lbt_synth.linear.lmi.programmes import norm_below, solve
 from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -131,7 +131,7 @@ def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int
     stacked = np.concatenate([N, E], axis=1)
     size = np.linalg.norm(stacked, axis=(0, 2))
     products = np.abs(stacked @ stacked.conj().swapaxes(1, 2)).sum(axis=0)
-    _, labels = connected_components(products > _APART * size[:, None] * size)
+    labels = component_labels(products > _APART * size[:, None] * size)
     q = N.shape[1]
     groups = []
     for label in np.unique(labels[q:]):

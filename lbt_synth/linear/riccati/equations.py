@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.lyapunov import smith_sum
 from lbt_synth.linear.matrix_functions import (
+    component_labels,
     frobenius_norms,
     nearest_powers_of_two,
     solve_stack,
@@ -65,9 +65,9 @@ class Equations:
         A, B, Q, R, S = (getattr(self, name)[0] for name in "ABQRS")
         entry = (B != 0) | (S != 0)
         links = np.block([[(A != 0) | (Q != 0), entry], [entry.T, R != 0]])
-        count, label = connected_components(links.astype(np.float64))
+        label = component_labels(links)
         x, u = np.split(label, [len(A)])
-        parts = [(np.flatnonzero(x == i), np.flatnonzero(u == i)) for i in range(count)]
+        parts = [(np.flatnonzero(x == i), np.flatnonzero(u == i)) for i in range(np.max(label) + 1)]
         complete = all(states.size and inputs.size for states, inputs in parts)
         return parts if complete else [(np.arange(len(x)), np.arange(len(u)))]
 

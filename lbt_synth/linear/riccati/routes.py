@@ -11,10 +11,9 @@ from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
-from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.matrix_functions import (
-    MANY_STATES,
+    component_labels,
     frobenius_norms,
     solve_stack,
     symmetrise,
@@ -124,11 +123,9 @@ def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, I
     iteration did not converge, and the steps made (N,). An equation leaves the stack as soon as it
     has converged or diverged. The parts of one whose states do not act on one another are apart.
     """
-    if A.shape[-1] < MANY_STATES:
-        return _doubling_of_part(A, G, H)
-    count, label = connected_components(np.any((A != 0) | (G != 0) | (H != 0), axis=0) * 1.0)
+    label = component_labels(np.any((A != 0) | (G != 0) | (H != 0), axis=0))
     found, steps = np.zeros_like(H), np.zeros(len(A), dtype=np.int64)
-    for part in range(count):
+    for part in range(np.max(label, initial=-1) + 1):
         own = np.ix_(range(len(A)), label == part, label == part)
         found[own], made = _doubling_of_part(A[own], G[own], H[own])
         steps = np.maximum(steps, made)

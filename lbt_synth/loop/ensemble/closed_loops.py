@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
+from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.state_space import stacked_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
 from lbt_synth.models import LoopHardware
@@ -251,10 +251,10 @@ def split_into_parts(
     controller = (x, x, A), (x, y, B), (u, x, C), (u, y, D)
     for rows, columns, entries in (*controller, (y, r, sensor[None]), (r, u, influence[None])):
         links[np.ix_(rows, columns)] = _nonzero_entries(entries)
-    count, label = connected_components(links)
+    label = component_labels(links)
     parts: dict[tuple[bytes, ...], LoopPart] = {}
     rest = []
-    for i in range(count):
+    for i in range(np.max(label) + 1):
         states, inputs, commands, modes = (np.flatnonzero(label[k] == i) for k in (x, y, u, r))
         entry, leaving = states[:, None], commands[:, None]
         own = A[:, entry, states], B[:, entry, inputs], C[:, leaving, states], D[:, leaving, inputs]
