@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import PANEL_IN, Panel, drawing
 from lbt_synth.report.page.blocks import (
@@ -29,6 +30,7 @@ from lbt_synth.report.page.blocks import (
     paragraph,
     read_source,
     source_section,
+    survival_blocks,
     time_text,
 )
 from lbt_synth.report.page.html import require_page_names, write_page
@@ -217,9 +219,26 @@ def _summary_section(
         blocks.append(Notice(text=text, tone="good"))
     blocks += [
         _verdict_text(statistics.controllers),
+        *survival_blocks(_design_margins(study, statistics)),
         summary.strehl_table(statistics),
     ]
     return Section(key="summary", title="Summary", blocks=(*blocks, *_distribution_chart(samples)))
+
+
+def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
+    """Return the margins of the designs of a study in the loops that they were made for.
+
+    A controller that is designed anew for each sample has none, nor has one of several sensors.
+    """
+    loops = {
+        name: close_loop(design.hardware, design)
+        for name in (each.controller for each in statistics.controllers)
+        if name in study.controllers
+        and (design := fixed_design(study.controllers[name])) is not None
+        and design.hardware is not None
+        and not design.other_sensors
+    }
+    return {name: loop_margins(loop) for name, loop in loops.items() if loop.is_stable}
 
 
 def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:

@@ -188,6 +188,22 @@ def test_a_page_from_a_study_file(study, tmp_path):
         assert words in html, words
 
 
+def test_each_design_says_which_errors_it_survives(study):
+    fast = lbt.integrator(study.config.hardware, gain=0.9)  # unstable above 1
+    names = (*study.controllers, "fast")
+    columns = {f"{name}.{what}": np.ones(2) for name in names for what in ("strehl", "stable")}
+    columns |= {f"{name}.residual_nm": np.ones(2) for name in names} | {"fixed": np.ones(2)}
+    designs = {**study.controllers, "fast": fast}
+    page = page_of(columns, names, ("fixed",), replace(study, controllers=designs))
+    blocks = page.sections[0].blocks
+    for name, design in designs.items():
+        margins = lbt.loop_margins(lbt.close_loop(design.hardware, design))
+        assert f"{name} {margins.survival}" in blocks
+        warned = [block.text for block in blocks if getattr(block, "text", "").startswith(name)]
+        assert warned == [f"{name}: {text}" for text in margins.fragilities]
+    assert "fast: a sensor gain that is off by 0.92 dB makes this loop unstable." in warned
+
+
 def test_digests_are_of_the_matrices(study):
     names = list(study.controllers)
     columns = {f"{name}.{what}": np.ones(2) for name in names for what in ("strehl", "stable")}

@@ -57,6 +57,7 @@ from lbt_synth.report.page.blocks import (
     read_source,
     require_letters,
     source_section,
+    survival_blocks,
     time_text,
 )
 from lbt_synth.report.page.html import require_page_names, write_page
@@ -164,6 +165,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
     return [
         *blocks,
         verdict(report),
+        *survival_blocks({one.name: one.margins for one in report.assessments if one.margins}),
         summary_table(report),
         truth_table(report),
         *(

@@ -24,6 +24,7 @@ from typing import TypeAlias
 
 import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
+from lbt_synth.loop import LoopMargins
 from lbt_synth.report.draw import Figure
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.rows import column, row_table, table_row
@@ -140,6 +141,19 @@ def chart(key: str, figure: Figure, *, group: str = "", **facts: object) -> Char
     if not group and number.isdigit():
         texts["title"] += " (continued)"
     return Chart(key=key, figure=figure, **texts)
+
+
+def survival_blocks(margins: Mapping[str, LoopMargins]) -> list[Block]:
+    """Say which errors the loop of each design survives, after warnings of those that it does not.
+
+    An error of the delay below 0.1 frames, or of the gain below 2 dB, is a warning.
+    """
+    notices = [
+        Notice(text=f"{name}: {text}")
+        for name, margin in margins.items()
+        for text in margin.fragilities
+    ]
+    return [*notices, *(f"{name} {margin.survival}" for name, margin in margins.items())]
 
 
 def paragraph(name: str, /, **facts: object) -> str:
