@@ -79,7 +79,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
                 {"label": "error", "unit": "Hz"}, {"label": "gain", "unit": "-"}, title=title
             )
             ends, gains = (float(title == "other"), 30.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4])
-            more = {"log": title == "other", "levels": (10, 20), "blank": "unstable"}
+            more = {"log": title == "other", "contours": True, "blank": "unstable"}
             panel.map(np.arange(6.0), gains, values, "ratio", "%", ends=ends, **more)
     words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
     maps = Chart(key="maps", title="Maps", figure=panels[0].figure, **words)

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-from bokeh.models import ColumnDataSource, FixedTicker, GridBox, HoverTool, PlainText, Range1d
+from bokeh.models import ColumnDataSource, GridBox, HoverTool, PlainText, Range1d
 from bokeh.plotting import figure as new_figure
 
 from lbt_synth.report.draw import colour, dashes
 from lbt_synth.report.explore.exploration import Shown
 from lbt_synth.report.figures.studies import strehl_axis
-from lbt_synth.report.scales import log_tick_texts, log_ticks
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.validation import FloatArray
 
@@ -128,8 +127,9 @@ class LivePanel:
                 if not all(np.array_equal(old[n], new[n], equal_nan=True) for n in new):
                     source.data = new
         if ends != self._ends:
-            self._ends = ends
-            self._set_scales(self.root.children[0][0], ends)
+            self._ends, figure = ends, self.root.children[0][0]
+            for scale, (start, end) in zip((figure.x_range, figure.y_range), ends, strict=True):
+                scale.update(start=start, end=end)
 
     def _drawn(self, y: FloatArray) -> FloatArray:
         return np.where(y > 0, y, np.nan) if "y" in self._log else y
@@ -152,12 +152,8 @@ class LivePanel:
         figure.toolbar.update(logo=None, active_drag=None, active_scroll=None)
         figure.grid.grid_line_color = "#e0e0e0"
         figure.outline_line_color = None
-        for axis, text, name in zip(
-            (figure.xaxis[0], figure.yaxis[0]), self._texts, "xy", strict=True
-        ):
+        for axis, text in zip((figure.xaxis[0], figure.yaxis[0]), self._texts, strict=True):
             axis.update(axis_label=PlainText(text=text), **_STYLE)
-            if name in self._log:
-                axis.ticker = FixedTicker()
         remaining = iter(self._sources)
         if ruled:
             dash = "6 3" if self._key == "explore-strehl" else "4 5"
@@ -194,13 +190,3 @@ class LivePanel:
         elif self._key == "explore-poles":
             turn = np.linspace(0, 2 * np.pi, 181)
             figure.line(np.cos(turn), np.sin(turn), **thin)
-
-    def _set_scales(self, figure: Any, ends: Ends) -> None:
-        scales = (figure.xaxis[0], figure.x_range), (figure.yaxis[0], figure.y_range)
-        for (axis, scale), (start, end), name in zip(scales, ends, "xy", strict=True):
-            scale.update(start=start, end=end)
-            if name in self._log:
-                ticks = log_ticks(start, end)
-                axis.ticker.ticks = ticks
-                texts = log_tick_texts(ticks)
-                axis.major_label_overrides = dict(zip(ticks, texts, strict=True))

@@ -16,8 +16,7 @@ from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop, broken_loops, close_loop, loop_margins, step_response
 from lbt_synth.loop.broken_loops import BrokenLoop
 from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
-from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing, square_in
-from lbt_synth.report.scales import shorten
+from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing, shorten, square_in
 from lbt_synth.validation import ComplexArray, FloatArray
 
 FREQUENCY = {"label": "frequency", "unit": "Hz", "log": True}

@@ -24,7 +24,6 @@ from lbt_synth.validation import FloatArray, real_array, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
 SHORT_FREQUENCY_ERROR = {"label": "frequency error", "unit": "Hz"}  # of narrow panels
-STREHL_LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
 _POINTS: dict[str, Any] = {"marker": "own", "size": 4.0}
 _RINGS: dict[str, Any] = {"line": False, "marker": "own", "filled": False, "size": 9.0}
 
@@ -198,7 +197,7 @@ def _draw_map(
     across, up = np.argsort(grid.errors_hz), np.argsort(grid.sensor_gains)
     errors_hz, gains = grid.errors_hz[across], grid.sensor_gains[up]
     values = 100 * grid.strehl[row][np.ix_(up, across)]
-    scale: dict[str, Any] = {"ends": ends, "levels": STREHL_LEVELS, "blank": "unstable loop"}
+    scale: dict[str, Any] = {"ends": ends, "contours": True, "blank": "unstable loop"}
     panel.map(errors_hz, gains, values, "Strehl ratio", "%", **scale)
     if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
         panel.rule("real sensor gain", real_gain, "y", dash=1)
