@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
-from support.figures import legend
 from support.pages import every_mark
 
 import lbt_synth as lbt
