@@ -16,7 +16,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.report import design_report, write_report
 from lbt_synth.report.designs.page import write_sensors_report
 from lbt_synth.report.designs.report import DesignAssessment
-from lbt_synth.report.designs.tables import AssessmentRow, assessment_row, good_range, verdict
+from lbt_synth.report.designs.tables import design_facts, good_range, verdict
 from lbt_synth.report.page.blocks import require_letters, time_text
 from lbt_synth.report.page.html import require_page_names
 from lbt_synth.storage.rows import json_record, json_units, row_table
@@ -40,18 +40,18 @@ def run(arguments: Namespace) -> Report:
     with show_spinner("report", quiet=arguments.json):
         found = design_report(config, designs, gain_files=files)
         written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
-    rows = [assessment_row(found, one, limits) for one, limits in found.rows]
+    rows = [design_facts(one) for one in found.assessments]
     report = Report(
         data={
             "designs": {
                 row.design: json_record(row, without=_IN_MARGINS) | _design_record(one)
                 for row, one in zip(rows, found.assessments, strict=True)
             },
-            "units": json_units(AssessmentRow),
+            "units": json_units(rows[0]),
             "verdict": verdict(found),
             "limit_nm": None if found.limits.limit is None else found.limits.limit.rms_nm,
             "sensor_gain": found.real_gain,
-            "sha256": {file.name: file.sha256 for file in found.files},
+            "sha256": {name: sha256 for name, _, sha256 in found.files},
             "made": time_text(found.made),
         },
         tables=[row_table(f"Designs in the loop of {config.source.name}", rows)],

@@ -16,13 +16,11 @@ from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.number_text import number_text
 from lbt_synth.report.page.blocks import (
     Block,
     Chart,
     Notice,
     Page,
-    Section,
     chart,
     creation_time,
     paragraph,
@@ -86,7 +84,7 @@ def _spectrum_charts(found: Diagnosis) -> list[Chart]:
     if found.model is None:
         return []
     designs = {} if found.best_design is None else {found.best: found.best_design}
-    lines = [f"{number_text(line.row.frequency_hz)} Hz" for line in found.lines]
+    lines = [f"{line.row.frequency_hz:.4g} Hz" for line in found.lines]
     figure = identification_figure(found.model, designs=designs)
     return [chart("identification", figure, lines=listing_text(lines) or "none")]
 
@@ -149,20 +147,16 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
     """Return the page of a diagnosis."""
     roles = ("record", "gain file")
     read = [read_source(Path(file), role)[0] for file, role in zip(files, roles, strict=False)]
-    name = read[0].name if read else found.record.source or "a record"
+    name = read[0][0] if read else found.record.source or "a record"
     record, tables = found.record, diagnosis_tables(found)
     disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(found)]
-    sections = (
-        Section(key="verdict", title="Verdict", blocks=_verdict_blocks(found, tables["verdict"])),
-        Section(key="record", title="Record", blocks=tables["record"]),
-        Section(key="loop", title="Loop that ran", blocks=(paragraph("law"), *tables["loop"])),
-        Section(
-            key="disturbance",
-            title="Disturbance",
-            blocks=disturbance or ["No model was identified."],
-        ),
-        source_section(read),
-    )
+    sections: dict[str, tuple[str, Sequence[Block]]] = {
+        "verdict": ("Verdict", _verdict_blocks(found, tables["verdict"])),
+        "record": ("Record", tables["record"]),
+        "loop": ("Loop that ran", (paragraph("law"), *tables["loop"])),
+        "disturbance": ("Disturbance", disturbance or ["No model was identified."]),
+        **source_section(read),
+    }
     return Page(
         title=f"Diagnosis of {name}",
         subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "

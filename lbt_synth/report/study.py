@@ -21,10 +21,9 @@ from lbt_synth.report.draw import PANEL_IN, Panel, drawing
 from lbt_synth.report.page.blocks import (
     Block,
     Chart,
-    Listing,
     Notice,
     Page,
-    Section,
+    Sections,
     chart,
     creation_time,
     paragraph,
@@ -169,16 +168,22 @@ def study_page(
             f"{statistics.samples} samples of {varying} parameters, "
             f"{count_text(len(statistics.controllers), 'controller')}. Made {made}."
         ),
-        sections=(
-            _summary_section(study, statistics, samples),
-            _samples_section(study, values, names),
-            _controllers_section(study, statistics, failures),
-            _comparison_section(statistics, samples),
-            _dependence_section(statistics, samples, values, names),
-            _worst_section(study, statistics, columns, names, folder),
-            Section(key="reading", title="How to read the figures", blocks=reading),
-            _origin_section(study, statistics, computing_s),
-        ),
+        sections={
+            "summary": ("Summary", _summary_blocks(study, statistics, samples)),
+            "samples": ("What was sampled", _samples_blocks(study, values, names)),
+            "controllers": ("Controllers", _controllers_blocks(study, statistics, failures)),
+            "comparison": (
+                "Comparison on the same samples",
+                _comparison_blocks(statistics, samples),
+            ),
+            "dependence": (
+                "What the Strehl ratio depends on",
+                _dependence_blocks(statistics, samples, values, names),
+            ),
+            "worst": ("Worst samples", _worst_blocks(study, statistics, columns, names, folder)),
+            "reading": ("How to read the figures", reading),
+            **_origin_section(study, statistics, computing_s),
+        },
     )
 
 
@@ -194,9 +199,9 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def _summary_section(
+def _summary_blocks(
     study: Study, statistics: StudyStatistics, samples: Sequence[ControllerSamples]
-) -> Section:
+) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
     unstable = [each for each in statistics.controllers if each.unstable]
     failed = [each for each in statistics.controllers if each.failed]
@@ -222,7 +227,7 @@ def _summary_section(
         *survival_blocks(_design_margins(study, statistics)),
         summary.strehl_table(statistics),
     ]
-    return Section(key="summary", title="Summary", blocks=(*blocks, *_distribution_chart(samples)))
+    return [*blocks, *_distribution_chart(samples)]
 
 
 def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
@@ -264,7 +269,7 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     return f"{text} {paragraph('regret', name=least.controller, loss=summary.percent(loss))}"
 
 
-def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Names) -> Section:
+def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
     """Show the parameters and their histograms."""
     distributions = {name: section.text for name, section in study.settings.parameters.items()}
     rows = tuple(
@@ -288,12 +293,7 @@ def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Name
         f"{study.samples} samples, {_SAMPLING[settings.sampling]}, seed {settings.seed}; "
         f"{_EVALUATION[settings.evaluation]}."
     )
-    blocks = (
-        opening,
-        table,
-        *(_histogram_chart(values, names) if rows else ()),
-    )
-    return Section(key="samples", title="What was sampled", blocks=blocks)
+    return [opening, table, *(_histogram_chart(values, names) if rows else ())]
 
 
 def _rounded_texts(values: FloatArray) -> list[str]:
@@ -303,9 +303,9 @@ def _rounded_texts(values: FloatArray) -> list[str]:
     return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
 
 
-def _controllers_section(
+def _controllers_blocks(
     study: Study, statistics: StudyStatistics, failures: Sequence[Failure]
-) -> Section:
+) -> list[Block]:
     """List the controllers, with digests of what is the same for all samples, and failures."""
     origins = {name: section.text for name, section in study.settings.controllers.items()}
     digests = {
@@ -338,52 +338,46 @@ def _controllers_section(
                 words=(1, 2),
             )
         )
-    return Section(key="controllers", title="Controllers", blocks=blocks)
+    return blocks
 
 
 def _count_cell(count: int) -> Cell:
     return Cell(text=str(count), tone="bad" if count else "plain")
 
 
-def _comparison_section(
+def _comparison_blocks(
     statistics: StudyStatistics, samples: Sequence[ControllerSamples]
-) -> Section:
+) -> list[Block]:
     """Compare the controllers on the same samples."""
     table = summary.comparison_table(statistics)
-    blocks: tuple[Block, ...] = (
-        *([table] if table.rows else []),
-        *_loss_chart(samples),
-        summary.residual_table(statistics),
-    )
-    return Section(key="comparison", title="Comparison on the same samples", blocks=blocks)
+    compared = [table] if table.rows else []
+    return [*compared, *_loss_chart(samples), summary.residual_table(statistics)]
 
 
-def _dependence_section(
+def _dependence_blocks(
     statistics: StudyStatistics,
     samples: Sequence[ControllerSamples],
     values: Mapping[str, FloatArray],
     names: Names,
-) -> Section:
+) -> list[Block]:
     """Show what the Strehl ratio depends on."""
     if not statistics.ranked:
-        blocks: tuple[Block, ...] = (Notice(text=paragraph("no-index")),)
-        return Section(key="dependence", title="Dependence", blocks=blocks)
-    blocks = (
+        return [Notice(text=paragraph("no-index"))]
+    return [
         *_sensitivity_chart(statistics, names),
         summary.sensitivity_table(statistics, names=names),
         *_conditional_charts(statistics, names),
         *_map_charts(statistics, samples, values, names),
-    )
-    return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)
+    ]
 
 
-def _worst_section(
+def _worst_blocks(
     study: Study,
     statistics: StudyStatistics,
     columns: Mapping[str, ArrayLike],
     names: Names,
     folder: Path,
-) -> Section:
+) -> list[Block]:
     """List the worst samples, and the commands that replay them."""
     blocks: list[Block] = []
     words = ["lbt-synth", "study", os.fspath(study.source), "-o", os.fspath(folder), "--row"]
@@ -401,13 +395,13 @@ def _worst_section(
         blocks.insert(0, paragraph("worst", count=_PARAMETERS))
     if commands:
         caption = "Commands that replay the first of each table; any other row likewise"
-        blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
-    return Section(key="worst", title="Worst samples", blocks=blocks)
+        blocks.append((caption, "\n".join(dict.fromkeys(commands))))
+    return blocks
 
 
 def _origin_section(
     study: Study, statistics: StudyStatistics, computing_s: float | None
-) -> Section:
+) -> Sections:
     """Name the files and programs that the page was made from."""
     rows = [
         ("samples with results", f"{statistics.samples} of {study.samples}"),
@@ -422,7 +416,7 @@ def _origin_section(
         source, content = read_source(path, role)
         sources.append(source)
         if place < len(roles):
-            texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8-sig", "replace")
+            texts[f"{role.capitalize()} {source[0]}"] = content.decode("utf-8-sig", "replace")
     return source_section(sources, texts=texts, about=about)
 
 

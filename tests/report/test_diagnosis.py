@@ -20,7 +20,7 @@ def page():
 
 
 def test_sections_and_charts(page):
-    assert [section.key for section in page.sections] == [
+    assert list(page.sections) == [
         "verdict",
         "record",
         "loop",
@@ -63,13 +63,13 @@ def test_files(tmp_path):
 def test_what_is_wrong_comes_first_and_loudly(tmp_path):
     found = lbt.identification.diagnose(short_record(-1.0))
     page = diagnosis_page(found)
-    first = page.sections[0].blocks[0]
+    first = page.blocks[0]
     assert (first.tone, first.text) == (
         "bad",
         "The commands are not those that the mirror followed: they have the opposite sign.",
     )
     assert page.charts == []
-    assert [section.key for section in page.sections][:3] == ["verdict", "record", "loop"]
+    assert list(page.sections)[:3] == ["verdict", "record", "loop"]
 
 
 def test_names(tmp_path):

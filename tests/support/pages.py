@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from lbt_synth.report.draw import PANEL_IN, drawing, square_in
-from lbt_synth.report.page.blocks import Chart, Listing, Notice, Page, Section
+from lbt_synth.report.page.blocks import Chart, Notice, Page
 from lbt_synth.storage.tables import Cell, Table
 
 HOSTILE = "</script><script>alert(1)</script><b>&\"'$x$ $$y$$ _z"
@@ -111,11 +111,10 @@ def whole_page(name: str = "first") -> Page:
     return Page(
         title=f"Page of {name}",
         subtitle=f"about {name}",
-        sections=(
-            Section(
-                key="summary",
-                title=f"Summary of {name}",
-                blocks=(
+        sections={
+            "summary": (
+                f"Summary of {name}",
+                (
                     f"Words of {name}. " * 20,
                     Notice(text=f"{name} is bad", tone="bad"),
                     Notice(text="note", tone="note"),
@@ -123,11 +122,7 @@ def whole_page(name: str = "first") -> Page:
                     wide,
                 ),
             ),
-            Section(key="charts", title="Charts", blocks=every_mark(name)),
-            Section(
-                key="listing",
-                title="Listing",
-                blocks=(Listing(caption=name, text=f"a: 1\n\tb: {name}\n" + 200 * "x"),),
-            ),
-        ),
+            "charts": ("Charts", every_mark(name)),
+            "listing": ("Listing", ((name, f"a: 1\n\tb: {name}\n" + 200 * "x"),)),
+        },
     )

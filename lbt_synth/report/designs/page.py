@@ -13,14 +13,13 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import largest_singular_values
-from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop.simulation.run import Drop
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport
-from lbt_synth.report.designs.tables import summary_table, truth_table, verdict
+from lbt_synth.report.designs.simulation import run_spectra
+from lbt_synth.report.designs.tables import summary_table, verdict
 from lbt_synth.report.draw import (
     Figure,
     count_columns,
@@ -29,12 +28,14 @@ from lbt_synth.report.draw import (
 )
 from lbt_synth.report.figures.loops import (
     FREQUENCY,
-    break_loops,
+    design_steps,
     draw_bode,
     draw_design,
     draw_sigma,
     draw_steps,
-    frequency_grid,
+    margins_text,
+    open_loops,
+    sigma_curves,
 )
 from lbt_synth.report.figures.records import SPECTRUM, TIME, sensor_failure_figure
 from lbt_synth.report.figures.studies import (
@@ -44,13 +45,11 @@ from lbt_synth.report.figures.studies import (
     strehl_axis,
     strehl_ends,
 )
-from lbt_synth.report.number_text import fixed_text, number_text, signed_text
 from lbt_synth.report.page.blocks import (
     Block,
     Chart,
     Notice,
     Page,
-    Section,
     chart,
     creation_time,
     paragraph,
@@ -69,7 +68,6 @@ from lbt_synth.studies.limits import TruthComparison
 from lbt_synth.studies.robustness import run_failures
 
 _PANELS = 6  # of one figure that has a panel per design: they fit a sheet
-_STEP_NM = 100.0
 _EXCERPT = 400  # frames of a simulated series
 
 
@@ -126,21 +124,22 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     if not heading:
         raise ProblemError("title must hold at least one letter; got an empty text.")
     require_letters(heading, "title")
-    count = len(report.assessments)
-    names = listing_text([one.name for one in report.assessments])
-    sections = [
-        Section(key="summary", title="Summary", blocks=_summary_blocks(report)),
-        Section(key="transfer", title="Transfer functions", blocks=_transfer_blocks(report)),
-        Section(key="errors", title="Robustness", blocks=_robustness_charts(report)),
-        Section(key="dynamics", title="Dynamics", blocks=_dynamics_charts(report)),
-        Section(key="simulation", title="Simulation", blocks=_simulation_blocks(report)),
-        Section(key="certificates", title="Certificates", blocks=_certificate_blocks(report)),
-        source_section(report.files, versions=report.versions, texts={source: report.config_text}),
-    ]
+    count, names = len(report.assessments), listing_text(report.names)
+    sections: dict[str, tuple[str, Sequence[Block]]] = {
+        "summary": ("Summary", _summary_blocks(report)),
+        "transfer": ("Transfer functions", _transfer_blocks(report)),
+        "errors": ("Robustness", _robustness_charts(report)),
+        "dynamics": ("Dynamics", _dynamics_charts(report)),
+        "simulation": ("Simulation", _simulation_blocks(report)),
+        "certificates": ("Certificates", _certificate_blocks(report)),
+        **source_section(
+            report.files, versions=report.versions, texts={source: report.config_text}
+        ),
+    }
     return Page(
         title=heading,
         subtitle=f"{count_text(count, 'design')}: {names}. Made {time_text(report.made)}.",
-        sections=tuple(sections),
+        sections=sections,
     )
 
 
@@ -151,13 +150,13 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             text = paragraph(
                 "unstable",
                 name=one.name,
-                radius=number_text(one.loop.spectral_radius, 6),
-                gain=number_text(report.real_gain),
+                radius=f"{one.loop.spectral_radius:.6g}",
+                gain=f"{report.real_gain:.4g}",
             )
             blocks.append(Notice(text=text, tone="bad"))
         if not one.certified:
             why = one.certificate_error or "; ".join(
-                f"{check.name} {number_text(check.value, 6)}, limit {number_text(check.limit, 6)}"
+                f"{check.name} {check.value:.6g}, limit {check.limit:.6g}"
                 for check in one.checks
                 if not check.passed
             )
@@ -167,13 +166,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
         verdict(report),
         *survival_blocks({one.name: one.margins for one in report.assessments if one.margins}),
         summary_table(report),
-        truth_table(report),
-        *(
-            Notice(text=f"{one.name}: {text}.")
-            for one in report.stable
-            for text in report.truth.warnings[one.name]
-        ),
-        *(Notice(text=note) for note in report.truth.notes),
+        *_truth_blocks(report.config, report.truth, ("method", "stable")),
         _situation_text(report),
         *(
             Notice(text=f"{one.name} was {note}")
@@ -183,25 +176,44 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
     ]
 
 
+def _truth_blocks(
+    config: Config, truth: TruthComparison, without: Sequence[str] = ()
+) -> list[Block]:
+    """Return the designs beside reference designs, and what is wrong with them in the truth."""
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    hidden = ("worst_nm", "above_band_limit_percent", *without)
+    stable = {row.design for row in truth.rows if row.stable}
+    return [
+        row_table(caption, truth.rows, without=hidden),
+        *(
+            Notice(text=f"{name}: {text}.")
+            for name, texts in truth.warnings.items()
+            if name in stable  # an unstable loop is named above
+            for text in texts
+        ),
+        *(Notice(text=note) for note in truth.notes),
+    ]
+
+
 def _situation_text(report: DesignReport) -> str:
     """Return the paragraph about the loop and its disturbances."""
     hardware, truth = report.config.hardware, report.config.truth
     lines = [
         f"a {'sinusoid' if isinstance(line, SinusoidalVibration) else 'resonance'} of "
-        f"{nm_text(line.rms_nm, '.6g', unit='nm rms')} at {number_text(line.frequency_hz)} Hz"
+        f"{nm_text(line.rms_nm, '.6g', unit='nm rms')} at {line.frequency_hz:.4g} Hz"
         for line in stationary_vibrations(truth.vibrations)
     ]
     noise = truth.noise_per_measurement(hardware.n_measurements)
     return paragraph(
         "situation",
         axes="1 axis" if hardware.modes == 1 else f"{hardware.modes} axes",
-        rate=number_text(hardware.frame_rate_hz),
-        delay=number_text(hardware.delay_frames),
+        rate=f"{hardware.frame_rate_hz:.6g}",
+        delay=f"{hardware.delay_frames:.4g}",
         mirror="that settles at once" if hardware.mirror is None else "with dynamics",
         turbulence=report.config.settings.true_turbulence.replace("_", " "),
         lines=listing_text(lines) or "no vibration",
         noise=listing_text([nm_text(float(value)) for value in np.unique(noise)]),
-        gain=number_text(report.real_gain),
+        gain=f"{report.real_gain:.4g}",
     )
 
 
@@ -219,47 +231,29 @@ def _certificate_blocks(report: DesignReport) -> list[Block]:
 
 def _transfer_blocks(report: DesignReport) -> list[Block]:
     """Return singular values of the estimation error and of the closed loops, and their margins."""
-    names, lines_hz = report.names, report.config.truth.lines_hz
-    f = frequency_grid(report.config.hardware.frame_rate_hz, lines_hz)
-    errors = {
-        one.name: (f, largest_singular_values(one.design.error_system(), f))
-        for one in report.assessments
-        if one.design.is_estimator
-    }
-    rejections, noises = (
-        {
-            one.name: (f, spectral_norms(getattr(one.loop, name)(f)) if one.stable else None)
-            for one in report.assessments
-            if report.stable
-        }
-        for name in ("sensitivity", "noise_transfer")
-    )
-    gain = number_text(report.real_gain)
+    lines_hz, gain = report.config.truth.lines_hz, f"{report.real_gain:.4g}"
+    designs = {one.name: one.design for one in report.assessments}
+    loops = {one.name: one.loop for one in report.assessments}
+    curves = sigma_curves(designs, loops, lines_hz=lines_hz)
     blocks: list[Block] = []
     if not report.stable:
+        loops = {}
         blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
-    if errors or report.stable:
+    if loops or any(error is not None for _, error, *_ in curves.values()):
         line = "true vibration" if len(lines_hz) == 1 else "true vibrations"
-        figure = draw_sigma(errors, rejections, noises, names, lines_hz, line=line)
-        largest = {
-            what: listing_text(
-                [
-                    f"{name} {number_text(factor * float(np.max(norm)), 3)}{unit and f' {unit}'}"
-                    for name, (_, norm) in norms.items()
-                    if norm is not None
-                ]
-            )
-            or "none"
-            for what, norms, (unit, factor) in (
-                ("peaks", errors, shown_unit("nm")),
-                ("rejection", rejections, ("", 1.0)),
-                ("noise", noises, ("", 1.0)),
-            )
-        }
-        blocks.append(chart("sigma", figure, gain=gain, **largest))
-    if report.stable:
-        loops = break_loops({one.name: one.loop for one in report.assessments})
-        margins = listing_text([f"{loop.name} {loop.margins}" for loop in loops])
+        figure = draw_sigma(curves, loops, lines_hz, line=line)
+        unit, factor = shown_unit("nm")
+        largest: dict[str, list[str]] = {"peaks": [], "rejection": [], "noise": []}
+        for name, (_, *norms) in curves.items():
+            for what, norm in zip(largest, norms, strict=True):
+                if norm is not None:
+                    scale, of = (factor, f" {unit}") if what == "peaks" else (1.0, "")
+                    largest[what].append(f"{name} {scale * np.max(norm):.3g}{of}")
+        said = {what: listing_text(texts) or "none" for what, texts in largest.items()}
+        blocks.append(chart("sigma", figure, gain=gain, **said))
+    if loops:
+        opened = open_loops(loops)
+        margins = listing_text([f"{name} {margins_text(broken)}" for name, *_, broken in opened])
         blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
     return blocks
 
@@ -287,8 +281,8 @@ def _sheets(items: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
 def _strehl_chart(report: DesignReport) -> Chart:
     worst = {one.name: one.curve.strehl[0, 0] for one in report.stable}
     ends = [
-        f"{name} falls to {fixed_text(100 * float(np.min(strehl)), 1)} % at "
-        f"{signed_text(float(report.errors_hz[np.argmin(strehl)]))} Hz"
+        f"{name} falls to {100 * np.min(strehl):.1f} % at "
+        f"{report.errors_hz[np.argmin(strehl)]:+.4g} Hz"
         for name, strehl in worst.items()
     ]
     with drawing([2.5]) as (panel,):
@@ -297,7 +291,7 @@ def _strehl_chart(report: DesignReport) -> Chart:
         for one in report.assessments:
             percents = 100 * one.curve.strehl[0, 0] if one.stable else None
             draw_design(panel, report.names, one.name, one.curve.errors_hz, percents)
-    gain = number_text(report.real_gain)
+    gain = f"{report.real_gain:.4g}"
     return chart("robustness", panel.figure, gain=gain, ends=listing_text(ends))
 
 
@@ -326,9 +320,8 @@ def _map_texts(assessments: Sequence[DesignAssessment]) -> str:
             texts.append(f"{one.name}: unstable everywhere.")
             continue
         texts.append(
-            f"{one.name}: {fixed_text(float(values.min()), 1)} to "
-            f"{fixed_text(float(values.max()), 1)} %, stable at {int(one.map.stable.sum())} of "
-            f"{one.map.stable.size} sensor gains."
+            f"{one.name}: {values.min():.1f} to {values.max():.1f} %, stable at "
+            f"{int(one.map.stable.sum())} of {one.map.stable.size} sensor gains."
         )
     return " ".join(texts)
 
@@ -352,24 +345,21 @@ def _dynamics_charts(report: DesignReport) -> list[Chart]:
         for one in report.assessments
     ]
     reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for pair in poles for values in pair))
-    radii = [f"{one.name} {number_text(one.loop.spectral_radius, 6)}" for one in report.assessments]
+    radii = [f"{one.name} {one.loop.spectral_radius:.6g}" for one in report.assessments]
     charts = [
         chart(f"poles{number}", _draw_poles(batch, reach), radii=listing_text(radii))
         for number, batch in _sheets(list(zip(report.assessments, poles, strict=True)))
     ]
     if not report.stable:
         return charts
-    steps = {one.name: (report.simulations[one.name].step,) for one in report.stable}
+    loops = {one.name: one.loop for one in report.stable}
     peaks = [
-        f"{name} {nm_text(_STEP_NM * float(np.max(np.abs(step.residual[5:]))), '.0f')}"
-        for name, (step,) in steps.items()
+        f"{name} {100 * np.max(np.abs(step.residual[5:])):.0f} %"
+        for name, steps in design_steps(loops).items()
+        for step in steps
     ]
-    facts = {
-        "step": nm_text(_STEP_NM, ".4g"),
-        "frame": number_text(1e3 / report.config.hardware.frame_rate_hz),
-        "peaks": listing_text(peaks),
-    }
-    return [*charts, chart("step", draw_steps(steps, height_nm=_STEP_NM), **facts)]
+    frame = f"{1e3 / report.config.hardware.frame_rate_hz:.4g}"
+    return [*charts, chart("step", draw_steps(loops), frame=frame, peaks=listing_text(peaks))]
 
 
 def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
@@ -395,36 +385,39 @@ def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
 def _simulation_blocks(report: DesignReport) -> list[Block]:
     """Return series and spectra of the simulated loops."""
     settings = report.config.settings.simulation
-    runs = [(name, report.simulations[name]) for name in report.simulations]
+    runs = [(one, one.run) for one in report.assessments if one.run is not None]
     if not runs:
         return ["No loop is stable, so none was simulated."]
-    _, frames, _ = runs[0][1].run.residual_nm.shape
-    residuals = [f"{name} {nm_text(one.residual_nm, '.1f', unit='nm rms')}" for name, one in runs]
-    series = {name: one.run.residual_nm[0, :_EXCERPT, 0] for name, one in runs}
-    time_s = np.arange(min(frames, _EXCERPT)) / report.config.hardware.frame_rate_hz
-    facts = {"duration": fixed_text(float(time_s[-1]), 2), "residuals": listing_text(residuals)}
-    reach = 1.05 * max(float(np.max(np.abs(y))) for y in series.values())
+    rate_hz, frames = runs[0][1].frame_rate_hz, runs[0][1].residual_nm.shape[1]
+    residuals = [
+        f"{one.name} {nm_text(float(np.sqrt(np.mean(run.rms_nm**2))), '.1f', unit='nm rms')}"
+        for one, run in runs
+    ]
+    time_s = np.arange(min(frames, _EXCERPT)) / rate_hz
+    facts = {"duration": f"{time_s[-1]:.2f}", "residuals": listing_text(residuals)}
+    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :_EXCERPT, 0]))) for _, run in runs)
     residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
     text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
-    blocks: list[Block] = [text]
+    series: list[Block] = []
+    spectra: list[Block] = []
     for number, batch in _sheets(runs):
         with drawing([0.95] * len(batch)) as panels:
-            for panel, (name, _) in zip(panels, batch, strict=True):
-                panel.set_axes(TIME, residual, title=name)
-                own: dict[str, Any] = {"look": report.names.index(name), "width": 0.9, "dash": 0}
-                panel.curve("residual", time_s, series[name], quiet=True, **own)
-        blocks.append(chart(f"series{number}", panels[0].figure, **facts))
-    for number, batch in _sheets(runs):
+            for panel, (one, run) in zip(panels, batch, strict=True):
+                panel.set_axes(TIME, residual, title=one.name)
+                style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
+                y = run.residual_nm[0, :_EXCERPT, 0]
+                panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
+        series.append(chart(f"series{number}", panels[0].figure, **facts))
         columns = count_columns(len(batch))
         with drawing([2.2] * len(batch), columns=columns) as panels:
-            for panel, (name, one) in zip(panels, batch, strict=True):
-                panel.set_axes(FREQUENCY, SPECTRUM, title=name)
-                f = one.frequency_hz
-                panel.curve("before the correction", f, one.open_nm2_hz, look=None, width=0.8)
-                panel.curve("residual, simulated", f, one.residual_nm2_hz, look=5, dash=0)
-                panel.curve("residual, exact", f, one.exact_nm2_hz, look=1, width=1.4)
-        blocks.append(chart(f"spectra{number}", panels[0].figure))
-    return blocks
+            for panel, (one, run) in zip(panels, batch, strict=True):
+                panel.set_axes(FREQUENCY, SPECTRUM, title=one.name)
+                f, opened, left, exact = run_spectra(run, one.loop, report.config.truth)
+                panel.curve("before the correction", f, opened, look=None, width=0.8)
+                panel.curve("residual, simulated", f, left, look=5, dash=0)
+                panel.curve("residual, exact", f, exact, look=1, width=1.4)
+        spectra.append(chart(f"spectra{number}", panels[0].figure))
+    return [text, *series, *spectra]
 
 
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again
@@ -449,8 +442,12 @@ def write_sensors_report(
     text = content.decode("utf-8-sig", errors="replace")
     gains = [read_source(file, f"gain file of {name}")[0] for name, file in gain_files.items()]
     files = [source, *gains]
-    found = compare_in_truth(designs, config)
-    sections = [_sensors_section(config, designs, found)]
+    compared = compare_in_truth(designs, config)
+    opening = _truth_blocks(config, compared, ("phase_margin_deg",))
+    if compared.limit is not None:
+        least = nm_text(compared.limit.rms_nm, ".1f", unit="nm rms")
+        opening.insert(0, f"No controller of the loop's own sensor alone leaves less than {least}.")
+    sections: dict[str, tuple[str, Sequence[Block]]] = {"summary": ("Summary", opening)}
     for number, (name, design) in enumerate(designs.items(), start=1):
         failures = design.tables()[0]
         blocks: tuple[Block, ...] = (
@@ -459,35 +456,13 @@ def write_sensors_report(
             _failure_chart(config, name, design, f"failures-{number}"),
             row_table("Certificate, computed again", design.recertify().checks),
         )
-        sections.append(Section(key=f"design-{number}", title=name, blocks=blocks))
-    sections.append(source_section(files, texts={source.name: text}))
+        sections[f"design-{number}"] = (name, blocks)
     page = Page(
         title=title or f"Several sensors for {config.source.name}",
         subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
-        sections=tuple(sections),
+        sections={**sections, **source_section(files, texts={source[0]: text})},
     )
-    return write_page(page, path, pdf), found
-
-
-def _sensors_section(
-    config: Config, designs: Mapping[str, Design], found: TruthComparison
-) -> Section:
-    """Open with what each design leaves in the truth, beside references."""
-    blocks: list[Block] = []
-    for name, design in designs.items():
-        own = next(row for row in found.rows if row.design == name)
-        others = listing_text(list(design.other_sensors))
-        text = f"{name} reads {others} beside the loop's own sensor, and leaves "
-        text += nm_text(own.residual_nm, ".1f", unit="nm rms")
-        if found.limit is not None:
-            least = nm_text(found.limit.rms_nm, ".1f", unit="nm rms")
-            text += f"; no controller of the own sensor alone leaves less than {least}"
-        blocks.append(f"{text}.")
-    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
-    hidden = ("worst_nm", "above_band_limit_percent", "phase_margin_deg")
-    blocks.append(row_table(caption, found.rows, without=hidden))
-    blocks += [Notice(text=note) for note in found.notes]
-    return Section(key="summary", title="Summary", blocks=blocks)
+    return write_page(page, path, pdf), compared
 
 
 def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:

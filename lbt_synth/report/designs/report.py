@@ -22,10 +22,12 @@ from lbt_synth.loop import (
     ClosedLoop,
     LoopMargins,
     ResidualBudget,
+    Simulation,
     close_loop,
     loop_margins,
     moving_gain,
     residual_budget,
+    simulate,
     stable_sensor_gains,
     strehl,
 )
@@ -34,9 +36,8 @@ from lbt_synth.loop.moving_gain import MovingGain
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
 from lbt_synth.report.page.blocks import (
-    SourceFile,
+    Source,
     creation_time,
     program_versions,
     read_source,
@@ -47,6 +48,7 @@ from lbt_synth.studies.limits import LimitStudy, TruthComparison
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")
+_MOST_FRAMES = 8192  # of a run
 _MOST_DESIGNS = 36  # more lines cannot be distinguished
 _GAINS = np.geomspace(0.01, 100.0, 400)  # where stable intervals are looked for
 
@@ -73,6 +75,9 @@ class DesignAssessment:
     cost: FrameCost  # arithmetic of one frame, as exported to C
     curve: RobustnessMap  # Strehl ratio over the frequency error at the real sensor gain
     map: RobustnessMap  # the same over frequency error and real sensor gain
+    limits: LimitRow  # its distance to what no linear controller goes below
+    run: Simulation | None  # in the simulated loop; None where it is unstable
+    run_strehls: FloatArray  # (cases,): Strehl ratios of the run
 
     @property
     def stable(self) -> bool:
@@ -91,13 +96,17 @@ class DesignAssessment:
 
 
 def assess_design(
-    name: str, design: Design, config: Config, errors_hz: FloatArray
+    design: Design,
+    loop: ClosedLoop,
+    limits: LimitRow,
+    config: Config,
+    errors_hz: FloatArray,
+    settle_frames: int,
 ) -> DesignAssessment:
     """Assess a design in the loop of a configuration, over frequency errors (e,)."""
     hardware, truth, assumed_gain = config.hardware, config.truth, config.sensor_gain
     sensor_gains = np.unique(config.settings.robustness.sensor_gains)
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    stable = loop.is_stable
+    stable, settings = loop.is_stable, config.settings.simulation
     budget = residual_budget(loop, truth) if stable else None
     margins = loop_margins(loop) if stable else None
     checks, complaint = _recertify(design)
@@ -107,8 +116,19 @@ def assess_design(
         for gains in ([truth.sensor_gain], sensor_gains / assumed_gain)
     )
     intervals = stable_intervals(loop, design.controller, margins)
+    run = None
+    if stable:
+        run = simulate(
+            design.controller,
+            truth,
+            hardware=hardware,
+            frames=min(settings.frames, _MOST_FRAMES),
+            cases=settings.cases,
+            seed=settings.seed,
+            settle_frames=max(settings.settle_frames, settle_frames),
+        )
     return DesignAssessment(
-        name=name,
+        name=limits.design,
         design=design,
         loop=loop,
         notes=() if design.hardware is None else tuple(loop_differences(design.hardware, hardware)),
@@ -122,6 +142,9 @@ def assess_design(
         cost=frame_cost(design),
         curve=curve,
         map=replace(grid, sensor_gains=frozen_copy(sensor_gains)),  # the real ones again
+        limits=limits,
+        run=run,
+        run_strehls=np.zeros(0) if run is None else run.strehl(config.imaging),
     )
 
 
@@ -187,20 +210,14 @@ class DesignReport:
     config: Config  # the configuration
     config_text: str  # its file as it was read
     assessments: tuple[DesignAssessment, ...]  # one per design, exact
-    simulations: Mapping[str, DesignSimulation]  # of the designs whose loop is stable
     # residuals over the frequency error, and what no linear controller goes below
     limits: LimitStudy
     truth: TruthComparison  # the designs beside reference designs, and what they were not made for
     # (e,): frequency errors, truth less design [Hz]; only 0 where the truth has no vibration
     errors_hz: FloatArray
-    files: tuple[SourceFile, ...]  # digests of the files that were read
+    files: tuple[Source, ...]  # digests of the files that were read
     versions: tuple[tuple[str, str], ...]  # programs and libraries
     made: datetime  # when
-
-    @property
-    def rows(self) -> tuple[tuple[DesignAssessment, LimitRow], ...]:
-        """Each design with its distance to the limits."""
-        return tuple(zip(self.assessments, self.limits.rows, strict=True))
 
     @property
     def names(self) -> list[str]:
@@ -274,20 +291,23 @@ def design_report(
     for name, path in (gain_files or {}).items():
         files.append(read_source(Path(path), f"gain file of {name}")[0])
     truth, hardware, errors = config.truth, config.hardware, frequency_errors(config)
-    assessments = tuple(assess_design(n, design, config, errors) for n, design in designs.items())
-    stable = [one for one in assessments if one.stable]
+    study = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
+    loops = [
+        close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        for design in designs.values()
+    ]
     # all settle as the slowest, so that one seed is the same weather for all
-    settle = max((settling_frames(one.loop.spectral_radius) for one in stable), default=0)
+    radii = [loop.spectral_radius for loop in loops if loop.is_stable]
+    settle_frames = max(map(settling_frames, radii), default=0)
     solved = any(design.solver.route in _CONVEX_ROUTES for design in designs.values())
     return DesignReport(
         config=config,
         config_text=content.decode("utf-8-sig", errors="replace"),
-        assessments=assessments,
-        simulations={
-            one.name: simulate_design(one.design, one.loop, config, settle_frames=settle)
-            for one in stable
-        },
-        limits=studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors)),
+        assessments=tuple(
+            assess_design(design, loop, row, config, errors, settle_frames)
+            for design, loop, row in zip(designs.values(), loops, study.rows, strict=True)
+        ),
+        limits=study,
         truth=studies.compare_in_truth(designs, config),
         errors_hz=errors,
         files=tuple(files),

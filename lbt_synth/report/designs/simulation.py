@@ -1,73 +1,32 @@
-"""Designs in a simulated loop: the same disturbances for all, and spectra with the exact ones."""
+"""Spectra of the residual of a loop: simulated ones, and the exact one."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import welch
 
-from lbt_synth.config import Config
-from lbt_synth.design import Design
-from lbt_synth.loop import ClosedLoop, Simulation, simulate, step_response
-from lbt_synth.loop.simulation.run import LoopStep
+from lbt_synth.loop import ClosedLoop, Simulation
 from lbt_synth.models import ARModel, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.validation import FloatArray
 
-_MOST_FRAMES = 8192  # of a run
 _SEGMENT = 2048  # frames of a segment of the spectra, at most
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DesignSimulation:
-    """One design in a simulated loop."""
+def run_spectra(
+    run: Simulation, loop: ClosedLoop, truth: Truth
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return frequencies [Hz], and spectra before the correction and after it, and the exact one.
 
-    run: Simulation
-    strehl: float  # mean Strehl ratio of the runs
-    scatter: float  # standard deviation of the Strehl ratio between runs; nan for a single one
-    residual_nm: float  # residual over all runs [nm rms]
-    frequency_hz: FloatArray  # (f,): frequencies of the spectra
-    # (f,): spectra by Welch's method, sums over the axes, before the correction and after it
-    open_nm2_hz: FloatArray
-    residual_nm2_hz: FloatArray
-    # (f,): residual's spectrum by the transfer functions, with the window's image of each sinusoid
-    exact_nm2_hz: FloatArray
-    step: LoopStep  # of the first axis, without other disturbances
-
-
-def simulate_design(
-    design: Design, loop: ClosedLoop, config: Config, *, settle_frames: int
-) -> DesignSimulation:
-    """Run a design in the loop of a configuration, which settles for at least so many frames."""
-    settings, hardware, truth = config.settings.simulation, config.hardware, config.truth
-    frames = min(settings.frames, _MOST_FRAMES)
-    run = simulate(
-        design.controller,
-        truth,
-        hardware=hardware,
-        frames=frames,
-        cases=settings.cases,
-        seed=settings.seed,
-        settle_frames=max(settings.settle_frames, settle_frames),
-    )
-    rate, length = hardware.frame_rate_hz, min(frames, _SEGMENT)
+    They are by Welch's method, means over the runs and sums over the axes [nm^2/Hz], (f,). The
+    exact one is by the transfer functions, with the window's image of each sinusoid.
+    """
+    length = min(run.residual_nm.shape[1], _SEGMENT)
     spectra = []
     for series in (run.total_nm, run.residual_nm):
-        frequency, density = welch(series, rate, nperseg=length, detrend=False, axis=1)
-        spectra.append(density.mean(axis=0).sum(axis=-1))
-    strehls = run.strehl(config.imaging)
-    return DesignSimulation(
-        run=run,
-        strehl=float(np.mean(strehls)),
-        scatter=float(np.std(strehls, ddof=1)) if settings.cases > 1 else float("nan"),
-        residual_nm=float(np.sqrt(np.mean(run.rms_nm**2))),
-        frequency_hz=frozen_copy(frequency[1:]),
-        open_nm2_hz=frozen_copy(spectra[0][1:]),
-        residual_nm2_hz=frozen_copy(spectra[1][1:]),
-        exact_nm2_hz=frozen_copy(exact_spectrum(loop, truth, frequency, length)[1:]),
-        step=step_response(loop),
-    )
+        f, density = welch(series, run.frame_rate_hz, nperseg=length, detrend=False, axis=1)
+        spectra.append(density.mean(axis=0).sum(axis=-1)[1:])
+    return f[1:], *spectra, exact_spectrum(loop, truth, f, length)[1:]
 
 
 def exact_spectrum(

@@ -4,94 +4,72 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.loop.least_residuals.band_limit import BandLimit
 from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport
-from lbt_synth.report.number_text import (
-    DASH,
-    NO_BREAK,
-    fixed_text,
-    interval_text,
-    number_text,
-    signed_text,
-)
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import (
-    column,
-    columns,
-    fill_row,
-    nm_column,
-    percent_column,
-    row_table,
-    table_row,
-)
+from lbt_synth.storage.rows import Facts, columns, fact, facts
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, listing_text
-from lbt_synth.studies import LimitRow
+
+_RMS: dict[str, Any] = {"unit": "nm rms", "format": ".1f"}
+_RATIO: dict[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
 
 
-@table_row
-class AssessmentRow:
-    """One design in the loop of the configuration; the page prints each column's help."""
-
-    design: str = column("design", help="design")
-    method: str = column("method", help="method")
-    route: str = column(help="computed by")
-    n_states: int = column(help="states of the controller")
-    multiplications: int = column(help="multiplications per frame")
-    gamma: float = column(
-        unit="nm",
-        format=".5g",
-        help="achieved gamma, norm of the error in its own model",
-    )
-    estimation_rms: float = nm_column("", unit="nm rms", help="error in its own model")
-    stable: bool = column("stable", help="closed loop")
-    certified: bool = column("certified", help="certificate, recomputed")
-    spectral_radius: float = column(format=".6g", help="largest modulus of its poles")
-    residual_nm: float = nm_column("residual", unit="nm rms", help="residual, exact")
-    turbulence_nm: float | None = nm_column(
-        "", unit="nm rms", help="of that turbulence", default=None
-    )
-    vibration_nm: float | None = nm_column(
-        "", unit="nm rms", help="of that vibration", default=None
-    )
-    noise_nm: float | None = nm_column("", unit="nm rms", help="of that noise", default=None)
-    within_nm: float | None = nm_column(
-        "", unit="nm rms", help="of that within frames", default=None
-    )
-    strehl: float = percent_column("Strehl", help="Strehl ratio, exact")
-    strehl_simulated: float | None = percent_column("", help="Strehl ratio, simulated")
-    worst_strehl: float = percent_column("worst Strehl", help="worst Strehl ratio")
-    worst_nm: float = nm_column("", unit="nm rms", help="worst residual")
-    above_limit_percent: float = column(unit="%", format=".0f")
-    above_band_limit_percent: float = column(unit="%", format=".0f")
-    modulus: float | None = column(
-        "modulus margin", format=".3f", help="modulus margin", default=None
-    )
-    phase_deg: float | None = column(unit="deg", format=".3g", help="phase margin", default=None)
-    delay_frames: float | None = column(
-        unit="frames", format=".3g", help="delay margin", default=None
-    )
-    crossover_hz: float | None = column(
-        unit="Hz", format=".3g", help="highest crossover", default=None
-    )
-
-
-def assessment_row(report: DesignReport, one: DesignAssessment, limits: LimitRow) -> AssessmentRow:
-    """Return the row of a design; numbers that an unstable loop lacks are None or nan."""
-    simulation = report.simulations.get(one.name)
-    return fill_row(
-        AssessmentRow,
-        *(one, one.loop, one.budget, one.margins, one.cost, limits, one.design, one.design.solver),
-        design=one.name,
-        estimation_rms=one.design.rms,
-        n_states=one.design.controller.n_states,
-        strehl_simulated=None if simulation is None else simulation.strehl,
-        worst_strehl=float(one.curve.strehl.min()) if one.stable else float("nan"),
+def design_facts(one: DesignAssessment) -> Facts:
+    """Return the numbers of a design; the page prints each column's help."""
+    design, limits = one.design, one.limits
+    parts = {
+        name: fact(getattr(one.budget, name, None), help=f"of that {word}", **_RMS)
+        for name, word in (
+            ("turbulence_nm", "turbulence"),
+            ("vibration_nm", "vibration"),
+            ("noise_nm", "noise"),
+            ("within_nm", "within frames"),
+        )
+    }
+    margins = {
+        name: fact(getattr(one.margins, name, None), help=text, format=".3g", unit=unit)
+        for name, text, unit in (
+            ("modulus", "modulus margin", ""),
+            ("phase_deg", "phase margin", "deg"),
+            ("delay_frames", "delay margin", "frames"),
+            ("crossover_hz", "highest crossover", "Hz"),
+        )
+    }
+    simulated = float(np.mean(one.run_strehls)) if one.run_strehls.size else None
+    worst = float(one.curve.strehl.min()) if one.stable else float("nan")
+    return facts(
+        design=fact(one.name, "design"),
+        method=fact(design.method, "method", help="method"),
+        route=fact(design.solver.route, help="computed by"),
+        n_states=fact(design.controller.n_states, help="states of the controller"),
+        multiplications=fact(one.cost.multiplications, help="multiplications per frame"),
+        gamma=fact(
+            design.gamma,
+            unit="nm",
+            format=".5g",
+            help="achieved gamma, norm of the error in its own model",
+        ),
+        estimation_rms=fact(design.rms, help="error in its own model", **_RMS),
+        stable=fact(one.stable, "stable", help="closed loop"),
+        certified=fact(one.certified, "certified", help="certificate, recomputed"),
+        spectral_radius=fact(
+            one.loop.spectral_radius, format=".6g", help="largest modulus of its poles"
+        ),
+        residual_nm=fact(one.residual_nm, "residual", help="residual, exact", **_RMS),
+        **parts,
+        strehl=fact(one.strehl, "Strehl", help="Strehl ratio, exact", **_RATIO),
+        strehl_simulated=fact(simulated, help="Strehl ratio, simulated", **_RATIO),
+        worst_strehl=fact(worst, "worst Strehl", help="worst Strehl ratio", **_RATIO),
+        worst_nm=fact(limits.worst_nm, help="worst residual", **_RMS),
+        above_limit_percent=fact(limits.above_limit_percent, unit="%", format=".0f"),
+        above_band_limit_percent=fact(limits.above_band_limit_percent, unit="%", format=".0f"),
+        **margins,
     )
 
 
@@ -124,7 +102,7 @@ def verdict(report: DesignReport) -> str:
     if report.stable:
         sentences.insert(0, _least_sentence(report))
     # a number stays in one line with its unit
-    return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", NO_BREAK, " ".join(sentences))
+    return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", "\u00a0", " ".join(sentences))
 
 
 def _least_sentence(report: DesignReport) -> str:
@@ -140,16 +118,14 @@ def _least_sentence(report: DesignReport) -> str:
     return (
         f"{f'Of {len(stable)} stable designs, ' if several else ''}{listing_text(equal)} "
         f"{verb} {'the least, ' if several else ''}{least} (Strehl ratio "
-        f"{fixed_text(100 * best.strehl, 1)} %){where if report.config.truth.vibrations else ''}."
+        f"{100 * best.strehl:.1f} %){where if report.config.truth.vibrations else ''}."
     )
 
 
 def _error_sentence(report: DesignReport) -> str:
     """Say which design keeps most of its Strehl ratio over all frequency errors."""
-    first, last = (signed_text(float(report.errors_hz[i])) for i in (0, -1))
-    worst = {
-        one.name: fixed_text(100 * float(np.min(one.curve.strehl)), 1) for one in report.stable
-    }
+    first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
+    worst = {one.name: f"{100 * np.min(one.curve.strehl):.1f}" for one in report.stable}
     most = max(worst.values(), key=float)
     tough = [name for name, percent in worst.items() if percent == most]
     if len(worst) == 1:
@@ -190,59 +166,46 @@ _LOOP = (
     *("within_nm", "strehl", "strehl_simulated"),
 )
 _GOOD = "within 10 % of its best Strehl ratio [Hz]"
+_MOVING = "proved while the gain moves at any speed"
 _MARGINS = (
     *("modulus", "gain margin, factors", "phase_deg", "delay_frames", "crossover_hz"),
-    *("stable real sensor gains", "proved while the gain moves at any speed"),
+    *("stable real sensor gains", _MOVING),
 )
 
 
 def summary_table(report: DesignReport) -> Table:
-    """All designs side by side: the columns of their rows, in groups."""
+    """All designs side by side: their numbers, words and intervals, in groups."""
     limits = report.limits
-    groups: list[tuple[str, Sequence[str]]] = [
-        ("Design", _DESIGN),
-        ("In the loop of the configuration", _LOOP),
-    ]
     titles = _limit_title("above_limit_percent", limits.limit, ", frequency known")
-    if titles:
-        groups.append(("Distance to the limit of any linear controller", list(titles)))
-    if report.errors_hz.size > 1:
-        ends = interval_text(float(report.errors_hz[0]), float(report.errors_hz[-1]))
-        band = _limit_title("above_band_limit_percent", limits.band, " for this range")
-        titles |= band
-        over = ("worst_nm", "worst_strehl", _GOOD, *band)
-        groups.append((f"Over frequency errors of {ends} Hz", over))
-    groups.append(("Margins at the real sensor gain", _MARGINS))
-    printed = {each.name: each for each in columns(AssessmentRow)}
-    designs = [
-        (assessment_row(report, one, row), _own_cells(report, one)) for one, row in report.rows
-    ]
+    band = _limit_title("above_band_limit_percent", limits.band, " for this range")
+    over = ("worst_nm", "worst_strehl", _GOOD, *band) if report.errors_hz.size > 1 else ()
+    ends = f"{report.errors_hz[0]:.4g} to {report.errors_hz[-1]:.4g} Hz"
+    groups: dict[str, Sequence[str]] = {
+        "Design": _DESIGN,
+        "In the loop of the configuration": _LOOP,
+        "Distance to the limit of any linear controller": tuple(titles),
+        f"Over frequency errors of {ends}": over,
+        "Margins at the real sensor gain": _MARGINS,
+    }
+    titles |= band
+    designs = []
+    for one in report.assessments:
+        row = design_facts(one)
+        for each in columns(row):
+            title = f"{each.help} [{each.shown_unit}]" if each.unit else each.help
+            titles.setdefault(each.name, title)
+        numbers: dict[str, str | Cell] = {each.name: each.text(row) for each in columns(row)}
+        designs.append(numbers | _word_cells(one, report.config.sensor_gain))
     lines: list[tuple[str | Cell, ...]] = []
-    for group, names in groups:
-        lines.append((group,))
-        for name in names:
-            each = printed.get(name)
-            title = name
-            if each is not None:
-                title = f"{each.help} [{each.shown_unit}]" if each.unit else each.help
-            cells = (
-                own[name] if name in own else replace(printed[name], missing=DASH).text(row)
-                for row, own in designs
-            )
-            lines.append((titles.get(name, title), *cells))
+    for group, names in groups.items():
+        lines += [(group,)] if names else []
+        lines += [(titles.get(n, n), *(cells[n] for cells in designs)) for n in names]
     return Table(
-        caption=f"Summary at a real sensor gain of {number_text(report.real_gain)}; "
+        caption=f"Summary at a real sensor gain of {report.real_gain:.4g}; "
         f"{report.config.imaging.label}",
         headings=("quantity", *report.names),
         rows=tuple(lines),
     )
-
-
-def truth_table(report: DesignReport) -> Table:
-    """Return the designs and reference designs in the truth of the configuration."""
-    caption = f"In the truth of {report.config.source.name}; {report.config.imaging.label}"
-    without = ("worst_nm", "above_band_limit_percent", "method", "stable")
-    return row_table(caption, report.truth.rows, without=without)
 
 
 def _limit_title(name: str, limit: ResidualLimit | BandLimit | None, where: str) -> dict[str, str]:
@@ -252,34 +215,29 @@ def _limit_title(name: str, limit: ResidualLimit | BandLimit | None, where: str)
     return {name: f"above the limit of {nm_text(limit.rms_nm, '.1f')}{where} [%]"}
 
 
-def _own_cells(report: DesignReport, one: DesignAssessment) -> dict[str, str | Cell]:
-    """Return the cells of a design that are not a number of its row: words and intervals."""
-    margins, run, good = one.margins, report.simulations.get(one.name), good_range(one)
-    if one.certified:
-        certified = Cell(text=f"passed, {count_text(len(one.checks), 'check')}", tone="good")
-    else:
+def _word_cells(one: DesignAssessment, sensor_gain: float) -> dict[str, str | Cell]:
+    """Return the cells of a design that are not a number of it: words and intervals."""
+    margins, moving, good = one.margins, one.moving, good_range(one)
+    certified = Cell(text=f"passed, {count_text(len(one.checks), 'check')}", tone="good")
+    if not one.certified:
         failed = sum(not check.passed for check in one.checks)
         text = "NOT COMPUTED" if one.certificate_error else f"FAILED, {failed} of {len(one.checks)}"
         certified = Cell(text=text, tone="bad")
-    simulated = DASH
-    if run is not None:
-        scatter = "" if np.isnan(run.scatter) else f" ± {fixed_text(100 * run.scatter, 2)}"
-        simulated = f"{fixed_text(100 * run.strehl, 2)}{scatter}"
-    gains: str | Cell = ", ".join(interval_text(*ends, 4) for ends in one.sensor_gains)
-    moving, gain = one.moving, report.config.sensor_gain
-    return {
+    cells: dict[str, str | Cell] = {
         "certified": certified,
         "stable": Cell(text="stable", tone="good")
         if one.stable
         else Cell(text="UNSTABLE", tone="bad"),
-        "strehl_simulated": simulated,
-        _GOOD: DASH if good is None else " to ".join(map(signed_text, good)),
-        "gain margin, factors": DASH
-        if margins is None
-        else interval_text(margins.gain_low, margins.gain_high, 3),
-        "stable real sensor gains": gains or Cell(text="none found", tone="bad"),
-        # in real sensor gains, as those above it
-        "proved while the gain moves at any speed": DASH
-        if moving is None or np.isnan(moving.moving_low)
-        else interval_text(gain * moving.moving_low, gain * moving.moving_high, 4),
     }
+    if one.run_strehls.size > 1:
+        mean, scatter = 100 * np.mean(one.run_strehls), 100 * np.std(one.run_strehls, ddof=1)
+        cells["strehl_simulated"] = f"{mean:.2f} ± {scatter:.2f}"
+    gains = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in one.sensor_gains)
+    cells["stable real sensor gains"] = gains or Cell(text="none found", tone="bad")
+    cells[_GOOD] = "-" if good is None else f"{good[0]:+.4g} to {good[1]:+.4g}"
+    low, high = (np.nan, np.nan) if margins is None else (margins.gain_low, margins.gain_high)
+    cells["gain margin, factors"] = "-" if np.isnan(low) else f"{low:.3g} to {high:.3g}"
+    low, high = (np.nan, np.nan) if moving is None else (moving.moving_low, moving.moving_high)
+    low, high = sensor_gain * low, sensor_gain * high  # real ones, as those above it
+    cells[_MOVING] = "-" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
+    return cells

@@ -27,7 +27,6 @@ from lbt_synth.report.explore.knobs import (
     shift_range_hz,
 )
 from lbt_synth.report.figures.loops import frequency_grid
-from lbt_synth.report.number_text import fixed_text, number_text
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.studies import compare_in_truth, robustness_map
@@ -222,7 +221,7 @@ def complete(one: Shown, name: str, design: Design, view: View, start: Config) -
 def describe_moves(exploration: Exploration, wish: Wish) -> str:
     """Return the sliders that a wish moved, as people read them; empty without any."""
     return ", ".join(
-        f"{knob.label} {number_text(value * knob.shown[1])} {knob.shown[0]}".rstrip()
+        f"{knob.label} {value * knob.shown[1]:.4g} {knob.shown[0]}".rstrip()
         for knob, value in wish.move(exploration.knobs).items()
     )
 
@@ -237,17 +236,16 @@ def judge(view: View) -> str:
     hardware, gain = view.config.hardware, view.config.truth.sensor_gain
     margins = loop_margins(close_loop(hardware, view.design.controller, sensor_gain=gain))
     residual, strehl = nm_text(own.residual_nm, ".1f", unit="nm rms"), 100 * own.strehl
-    sentences = [f"{view.name} leaves {residual}, Strehl ratio {fixed_text(strehl, 1)} %"]
+    sentences = [f"{view.name} leaves {residual}, Strehl ratio {strehl:.1f} %"]
     if compared.limit is not None:
-        above = fixed_text(own.above_limit_percent, 1)
+        above = f"{own.above_limit_percent:.1f}"
         sentences[0] += f", {above} % above the least of any linear controller"
     best = min(others, key=lambda row: row.residual_nm, default=own)
     if best.residual_nm < own.residual_nm:
         least = nm_text(best.residual_nm, ".1f")
         sentences.append(f"the {design_title(best.method)} leaves {least} here")
     sentences.append(
-        f"Margins: modulus {number_text(margins.modulus, 3)}, phase "
-        f"{number_text(margins.phase_deg, 3)} degrees"
+        f"Margins: modulus {margins.modulus:.3g}, phase {margins.phase_deg:.3g} degrees"
     )
     sentences.append(f"it {margins.survival.removesuffix('.')}")
     sentences += [f"WARNING: {text.removesuffix('.')}" for text in margins.fragilities]

@@ -27,12 +27,12 @@ from lbt_synth.errors import FileError, ProblemError
 from lbt_synth.loop import LoopMargins
 from lbt_synth.report.draw import Figure
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import TONES, Table
 from lbt_synth.validation import choice
 
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib")
 _WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+Source: TypeAlias = tuple[str, str, str]  # a file's name, what it is, and its SHA-256
 _KEY = re.compile(r"[a-z][a-z0-9-]*")
 
 
@@ -46,14 +46,6 @@ class Notice:
 
     def __post_init__(self) -> None:
         choice(self.tone, "tone", TONES)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Listing:
-    """A text as it is in a file, line by line."""
-
-    caption: str
-    text: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,19 +65,10 @@ class Chart:
                 raise ProblemError(f"a chart must have words for its {name}; got none.")
 
 
+Listing: TypeAlias = tuple[str, str]  # a caption, and a text as it is in a file, line by line
 Block: TypeAlias = str | Notice | Listing | Table | Chart  # a text is a paragraph
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Section:
-    """A section of a page."""
-
-    key: str  # Its anchor: small letters, digits and hyphens; unique in the page
-    title: str  # Its heading
-    blocks: Sequence[Block]  # What is in it
-
-    def __post_init__(self) -> None:
-        _require_key(self.key)
+# by their anchors: headings, and what is in them
+Sections: TypeAlias = Mapping[str, tuple[str, Sequence[Block]]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,20 +77,27 @@ class Page:
 
     title: str  # Its heading
     subtitle: str  # A line below, such as what it is about and when it was made
-    sections: tuple[Section, ...]
+    sections: Sections
 
     def __post_init__(self) -> None:
-        kept = tuple(section for section in self.sections if section.blocks)
+        kept = {key: section for key, section in self.sections.items() if section[1]}
         object.__setattr__(self, "sections", kept)
-        keys = [section.key for section in self.sections] + [c.key for c in self.charts]
+        keys = [*kept, *(chart.key for chart in self.charts)]
+        for key in kept:
+            _require_key(key)
         repeated = sorted({key for key in keys if keys.count(key) > 1})
         if repeated:
             raise ProblemError(f"keys of a page must be unique; got {', '.join(repeated)} twice.")
 
     @property
+    def blocks(self) -> list[Block]:
+        """All blocks, in their order."""
+        return [block for _, blocks in self.sections.values() for block in blocks]
+
+    @property
     def charts(self) -> list[Chart]:
         """All charts, in their order."""
-        return [b for section in self.sections for b in section.blocks if isinstance(b, Chart)]
+        return [block for block in self.blocks if isinstance(block, Chart)]
 
 
 def _require_key(key: str) -> None:
@@ -161,22 +151,12 @@ def paragraph(name: str, /, **facts: object) -> str:
     return words()["paragraphs"][name].format(**facts)
 
 
-@table_row
-class SourceFile:
-    """A file that a page was made from."""
-
-    name: str = column("file", help="Its name, without directories")
-    role: str = column("what it is", help="What it is")
-    sha256: str = column("SHA-256", help="SHA-256 of its bytes, 64 hexadecimal digits")
-
-
-def read_source(path: str | os.PathLike[str], role: str) -> tuple[SourceFile, bytes]:
-    """Read a file, and return its name and digest with its bytes."""
+def read_source(path: str | os.PathLike[str], role: str) -> tuple[Source, bytes]:
+    """Read a file that a page is made from, and return its name, role and digest with its bytes."""
     source = Path(path)
     require_letters(source.name, f"name of the {role}")
     content = read_bytes(source, FileError)
-    digest = hashlib.sha256(content).hexdigest()
-    return SourceFile(name=source.name, role=role, sha256=digest), content
+    return (source.name, role, hashlib.sha256(content).hexdigest()), content
 
 
 def require_letters(text: str, what: str) -> str:
@@ -218,34 +198,31 @@ def creator_name() -> str:
 
 def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
     """Return name and version of the programs that make a page, and of ``extra`` ones."""
-    found = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
+    installed = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
     for name in (*_DISTRIBUTIONS, *extra):
         try:
-            found.append((name, version(name)))
+            installed.append((name, version(name)))
         except PackageNotFoundError:
-            found.append((name, "not installed"))
-    return tuple(found)
+            installed.append((name, "not installed"))
+    return tuple(installed)
 
 
 def source_section(
-    sources: Sequence[SourceFile] = (),
+    sources: Sequence[Source] = (),
     *,
     versions: Sequence[tuple[str, str]] | None = None,
     texts: Mapping[str, str] = MappingProxyType({}),
     about: Table | None = None,
-) -> Section:
+) -> Sections:
     """Return the last section of a page: what it was made from, and by which programs.
 
     Texts are listed under their captions.
     """
-    made_with = tuple(program_versions() if versions is None else versions)
-    return Section(
-        key="sources",
-        title="Files and versions",
-        blocks=(
-            *([] if about is None else [about]),
-            *([row_table("Files that were read", sources)] if sources else []),
-            Table(caption="Made with", headings=("program", "version"), rows=made_with, words=(1,)),
-            *(Listing(caption=caption, text=text) for caption, text in texts.items()),
-        ),
+    headings = ("file", "what it is", "SHA-256")
+    read = Table(
+        caption="Files that were read", headings=headings, rows=tuple(sources), words=(1, 2)
     )
+    programs = tuple(program_versions() if versions is None else versions)
+    made = Table(caption="Made with", headings=("program", "version"), rows=programs, words=(1,))
+    tables = [*([] if about is None else [about]), *([read] if sources else []), made]
+    return {"sources": ("Files and versions", (*tables, *texts.items()))}

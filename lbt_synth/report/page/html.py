@@ -16,16 +16,17 @@ import numpy as np
 
 from lbt_synth.errors import MissingExtraError
 from lbt_synth.report.draw import Figure, Series, figure_series, house_style
-from lbt_synth.report.number_text import number_text, print_text, unbroken_text
 from lbt_synth.report.page.blocks import Chart, Page, creator_name
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_together
+from lbt_synth.storage.rows import cell_text
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.warning_filters import ignore_warnings
 
 _COLUMNS = 6  # that fit a sheet of paper beside the first one of a table
 _MOST_ROWS = 120  # of a table of numbers behind a figure
 _DETAILS = re.compile(r"<details>.*?</details>", re.DOTALL)
-_DIGITS = 5  # of such a number
+_FORMAT = ".5g"  # of such a number
+_MINUS = "\u2212"  # as long as a plus
 
 
 def page_html(page: Page) -> bytes:
@@ -52,6 +53,17 @@ def page_html(page: Page) -> bytes:
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
     style = (here / "page.css").read_text(encoding="utf-8")
     return template.render(page=page, creator=creator_name(), style=style).encode()
+
+
+def print_text(text: str) -> str:
+    """Return a text of the terminal with the signs of print; no line ends behind a minus."""
+    text = re.sub(r"\binf\b", "∞", text.replace("+-", "±"))
+    return re.sub(r"(?<![\w.])-(?=[\d.∞])|(?<=\de)-(?=\d)", _MINUS, text)
+
+
+def unbroken_text(text: str) -> str:
+    """Keep a number, its sign and its error, and the two ends of an interval, in one line."""
+    return re.sub(" (±|to) ", "\u00a0\\1\u00a0", print_text(text))
 
 
 def chart_svg(chart: Chart) -> str:
@@ -85,8 +97,8 @@ def number_tables(figure: Figure) -> Iterator[Table]:
     for group in _shared_abscissae(figure_series(figure)):
         rows, x = _kept_rows(group), group[0].x
         cells = [
-            [x[i] if isinstance(x, tuple) else number_text(float(x[i]), _DIGITS) for i in rows],
-            *([number_text(float(one.y[i]), _DIGITS) for i in rows] for one in group),
+            [x[i] if isinstance(x, tuple) else cell_text(float(x[i]), _FORMAT) for i in rows],
+            *([cell_text(float(one.y[i]), _FORMAT) for i in rows] for one in group),
         ]
         yield Table(
             caption=group[0].panel,

@@ -7,11 +7,11 @@ import pytest
 from matplotlib.figure import Figure
 
 import lbt_synth as lbt
-from lbt_synth.report.page.blocks import Chart, Page, Section, creation_time
+from lbt_synth.report.page.blocks import Chart, Page, creation_time
 from lbt_synth.storage.tables import Cell, Table
 
 WORDS = {"title": "t", "caption": "c", "alt": "a", "figure": Figure()}
-TWICE = (Section(key="a", title="a", blocks=("words",)),) * 2
+CHART = Chart(key="a", **WORDS)
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ TWICE = (Section(key="a", title="a", blocks=("words",)),) * 2
         (lambda: Table(caption="t", headings=("a", "b", "c"), rows=(("1", "2"),)), "1 or 3 cells"),
         (lambda: Cell(text="a", tone="loud"), "tone must be one of"),
         (
-            lambda: Page(title="t", subtitle="s", sections=TWICE),
+            lambda: Page(title="t", subtitle="s", sections={"a": ("a", [CHART])}),
             "keys of a page must be unique; got a twice",
         ),
     ],
@@ -33,8 +33,8 @@ def test_mistakes_are_refused(make, text):
 
 
 def test_a_section_without_blocks_is_left_out():
-    sections = (Section(key="a", title="a", blocks=()), TWICE[0])
-    assert Page(title="t", subtitle="s", sections=sections).sections == TWICE[:1]
+    sections = {"a": ("a", ()), "b": ("b", ("words",))}
+    assert list(Page(title="t", subtitle="s", sections=sections).sections) == ["b"]
 
 
 def test_the_creation_time(monkeypatch):

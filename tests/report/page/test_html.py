@@ -13,13 +13,13 @@ from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
 from lbt_synth.report.draw import drawing
-from lbt_synth.report.number_text import DASH
 from lbt_synth.report.page.html import (
     chart_svg,
     number_tables,
     page_html,
     print_html,
     require_page_names,
+    unbroken_text,
     write_page,
 )
 
@@ -88,9 +88,16 @@ def test_numbers_of_long_curves_keep_their_peaks():
     assert table.headings == ("x", "peak", "hole")
     assert 60 < len(table.rows) <= 120
     assert table.rows[0][0] == "0"
-    assert table.rows[-1] == ("1", table.rows[-1][1], DASH)
+    assert table.rows[-1] == ("1", table.rows[-1][1], "-")
     shown = [float(row[1]) for row in table.rows]
     assert max(shown) == pytest.approx(peak.max(), rel=1e-4)
+
+
+def test_a_number_and_its_error_stay_in_one_line():
+    assert unbroken_text("1 ± 2 (3 to 4)") == "1\u00a0±\u00a02 (3\u00a0to\u00a04)"
+    assert unbroken_text("-1 +- 2") == "\u22121\u00a0±\u00a02"
+    assert unbroken_text("-3.1e-08, 1e-6, a-b") == "\u22123.1e\u221208, 1e\u22126, a-b"
+    assert unbroken_text("-inf, tomorrow is not together") == "\u2212∞, tomorrow is not together"
 
 
 def test_drawings_keep_their_text():
