@@ -51,7 +51,7 @@ from lbt_synth.studies.study.statistics import (
 from lbt_synth.validation import FloatArray
 
 _UNSTABLE_PANELS = 4
-_POINTS = 200  # of a cumulative distribution
+_POINTS = 400  # of a cumulative distribution
 _BINS = 30  # of a histogram, at most
 _CELLS = 32  # along either axis of a map, at most
 _WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
@@ -422,23 +422,17 @@ def _origin_section(
 
 def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
     """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
-    medians = []
-    steps: list[tuple[str, int, FloatArray, FloatArray]] = []
-    for look, each in enumerate(samples):
-        values = each.strehl[each.evaluated]
-        if not values.size:
-            medians.append(f"{each.controller} has none")
-            continue
-        medians.append(f"{each.controller} has a median of {100 * np.median(values):.1f} %")
-        level, share = cumulative_points(values)
-        # from nothing just below the first value
-        steps.append(
-            (each.controller, look, 100 * np.append(level[:1], level), 100 * np.append(0.0, share))
-        )
-    if not steps:
+    strehls = {each.controller: each.strehl[each.evaluated] for each in samples}
+    if not any(values.size for values in strehls.values()):
         return []
-    top = max(float(x[-1]) for *_, x, _ in steps)
-    least = 100 / max(int(each.evaluated.sum()) for each in samples)
+    medians = [
+        f"{name} has a median of {100 * np.median(values):.1f} %"
+        if values.size
+        else f"{name} has none"
+        for name, values in strehls.items()
+    ]
+    top = 100 * max(float(np.max(values, initial=0.0)) for values in strehls.values())
+    least = 100 / max(values.size for values in strehls.values())
     low = min(10.0, 10.0 ** np.floor(np.log10(least)))
     x_axis = {"label": "Strehl ratio", "unit": "%", "low": 0}
     x_axis["high"] = min(100.0, max(1.02 * top, 1.0))
@@ -447,14 +441,19 @@ def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
         plain.set_axes(x_axis, y_axis | {"low": 0}, title="all samples")
         tail.set_axes(x_axis, y_axis | {"low": low, "log": True}, title="lower tail")
         plain.rule("half of the samples", 50, "y")
-        for name, look, x, y in steps:
-            _draw_steps(plain, name, x, y, look)
-            _draw_steps(tail, name, x[1:], y[1:], look)
+        for look, (name, values) in enumerate(strehls.items()):
+            if values.size:
+                level, share = cumulative_points(values)
+                # from nothing just below the first value
+                x, y = np.append(level[:1], level), np.append(0.0, share)
+                _draw_steps(plain, name, x, y, look)
+                _draw_steps(tail, name, level, share, look)
     return [chart("distribution", plain.figure, medians="; ".join(medians))]
 
 
 def _draw_steps(panel: Panel, name: str, x: FloatArray, y: FloatArray, look: int) -> None:
-    panel.curve(name, x, y, look=look, step="steps-post", width=1.8)
+    """Draw shares over values, both in percent."""
+    panel.curve(name, 100 * x, 100 * y, look=look, step="steps-post", width=1.8)
 
 
 def _loss_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
@@ -468,7 +467,7 @@ def _loss_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
         for look, (each, loss) in enumerate(zip(samples, losses, strict=True)):
             level, share = cumulative_points(loss)
             x, y = np.append(0.0, level), np.append(1.0, 1 - share)
-            _draw_steps(panel, each.controller, 100 * x, 100 * y, look)
+            _draw_steps(panel, each.controller, x, y, look)
     return [chart("loss", panel.figure)]
 
 
@@ -480,45 +479,36 @@ def _histogram_chart(parameters: Mapping[str, FloatArray], names: Names) -> list
     with drawing([1.7] * len(varying), columns=min(len(varying), 3)) as panels:
         for panel, (name, values) in zip(panels, varying.items(), strict=True):
             panel.set_axes({"label": names[name]}, {"label": "samples", "unit": "%", "low": 0})
-            listed = value_shares(values)
-            if listed is not None:
-                places, share = listed
-                x, y = np.repeat(places, 3), np.zeros(3 * len(places))
-                y[1::3] = 100 * share
-                x[2::3] = np.nan  # the stems are not joined
-                panel.curve("", x, y, dash=0, width=5)
-                panel.curve("samples [%]", places, 100 * share, line=False, marker="o", quiet=True)
-            else:
-                edges, share = histogram(values)
-                x = np.repeat(edges, 2)
-                y = np.concatenate(([0.0], np.repeat(100 * share, 2), [0.0]))
-                panel.area("", x, np.zeros_like(y), y)
-                panel.curve("samples [%]", x, y, dash=0, quiet=True)
+            edges, share = histogram(values)
+            x = np.repeat(edges, 2)
+            y = np.concatenate(([0.0], np.repeat(100 * share, 2), [0.0]))
+            panel.area("", x, np.zeros_like(y), y)
+            panel.curve("samples [%]", x, y, dash=0, quiet=True)
     listed_names = listing_text([names[name] for name in varying])
     return [chart("parameters", panels[0].figure, names=listed_names)]
 
 
 def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     """First-order indices as bars, one series per controller."""
-    varying = statistics.ranked
-    if not varying:
-        return []
     bars: dict[str, FloatArray] = {}
     intervals: dict[str, tuple[FloatArray, FloatArray]] = {}
     strongest = []
     for one in statistics.controllers:
-        value = 100 * np.array([one.sensitivity[name]["index"] for name in varying])
-        error = 200 * np.array([one.sensitivity[name]["index_error"] for name in varying])
-        bars[one.controller], low, high = np.maximum((value, value - error, value + error), 0)
+        rows = [one.sensitivity[name] for name in statistics.ranked]
+        value, error = (
+            100 * np.array([row[key] for row in rows]) for key in ("index", "index_error")
+        )
+        low, high = value - 2 * error, value + 2 * error
+        bars[one.controller], low, high = np.maximum((value, low, high), 0)
         intervals[one.controller] = low, high
         strongest += [
             f"{one.controller} depends most on {name}, {100 * one.sensitivity[name]['index']:.0f} %"
             for name in one.ranked[:1]
         ] or [f"{one.controller} has none"]
-    height_in = min(max(0.8, 0.24 * len(varying) * len(bars) + 0.2), 7.5)  # fits a sheet
+    height_in = min(max(0.8, 0.24 * len(statistics.ranked) * len(bars) + 0.2), 7.5)  # fits a sheet
     with drawing([height_in]) as (panel,):
         panel.set_axes({"label": "variance explained by itself", "unit": "%", "low": 0}, {})
-        panel.bars([names[name] for name in varying], bars, intervals)
+        panel.bars([names[name] for name in statistics.ranked], bars, intervals)
     return [chart("sensitivity", panel.figure, strongest="; ".join(strongest))]
 
 
@@ -527,57 +517,49 @@ def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart
 
     The latter are drawn over the parameters that their part changes most with.
     """
-    curves = {
-        name: [
-            (look, one.controller, one.curves[name])
-            for look, one in enumerate(statistics.controllers)
-            if name in one.curves
-        ]
+    groups = {
+        name: [one.curves[name] for one in statistics.controllers if name in one.curves]
         for name in statistics.ranked
     }
-    curves = {name: own for name, own in curves.items() if own}
-    if not curves:
+    groups = {name: curves for name, curves in groups.items() if curves}
+    if not groups:
         return []
-    style: dict[str, Any] = {"marker": "own", "width": 1.8}
-    with drawing([PANEL_IN] * len(curves), columns=min(len(curves), 2)) as panels:
-        for panel, (name, own) in zip(panels, curves.items(), strict=True):
-            least = min(100 * float(np.min(curve["low"])) for *_, curve in own)
-            y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0 if least < _HIGH else None}
-            panel.set_axes({"label": names[name]}, y_axis)
-            for look, controller, curve in own:
-                x, y = curve["parameter"], 100 * curve["mean"]
-                panel.curve(controller, x, y, look=look, **style)
-            for look, controller, curve in own:
-                label, y = f"{controller}, 10th percentile", 100 * curve["low"]
-                panel.curve(label, curve["parameter"], y, look=look, width=0.9, quiet=True)
-            panel.curve("10th percentile (thin)", [], [], look=None, width=0.9)
-    charts = [
-        chart("curves", panels[0].figure, names=listing_text([names[name] for name in curves]))
-    ]
-    unstable = {
-        name: [
-            (look, controller, curve) for look, controller, curve in own if curve["unstable"].any()
-        ]
-        for name, own in curves.items()
-    }
+    charts = [_parameter_chart("curves", statistics, list(groups), names)]
     spans = {
-        name: max(float(np.ptp(curve["unstable"])) for *_, curve in own)
-        for name, own in unstable.items()
-        if own
+        name: max(float(np.ptp(curve["unstable"])) for curve in curves)
+        for name, curves in groups.items()
+        if any(curve["unstable"].any() for curve in curves)
     }
-    if not spans:
-        return charts
     most = sorted(spans, key=lambda name: -spans[name])[:_UNSTABLE_PANELS]
-    with drawing([PANEL_IN] * len(most), columns=min(len(most), 2)) as panels:
-        for panel, name in zip(panels, most, strict=True):
-            panel.set_axes({"label": names[name]}, {"label": "unstable", "unit": "%", "low": 0})
-            for look, controller, curve in unstable[name]:
-                x, y = curve["parameter"], 100 * curve["unstable"]
-                panel.curve(controller, x, y, look=look, **style)
-    return [
-        *charts,
-        chart("unstable", panels[0].figure, names=listing_text([names[name] for name in most])),
-    ]
+    return [*charts, _parameter_chart("unstable", statistics, most, names)] if most else charts
+
+
+def _parameter_chart(
+    key: str, statistics: StudyStatistics, parameters: Sequence[str], names: Names
+) -> Chart:
+    """Draw the Strehl ratios, or the part of unstable loops, over some parameters."""
+    is_strehl, columns = key == "curves", min(len(parameters), 2)
+    label = "Strehl ratio" if is_strehl else "unstable"
+    with drawing([PANEL_IN] * len(parameters), columns=columns) as panels:
+        for panel, name in zip(panels, parameters, strict=True):
+            curves = {
+                (look, one.controller): one.curves[name]
+                for look, one in enumerate(statistics.controllers)
+                if name in one.curves and (is_strehl or one.unstable)
+            }
+            least = min(100 * float(np.min(curve["low"])) for curve in curves.values())
+            low = None if is_strehl and least >= _HIGH else 0
+            panel.set_axes({"label": names[name]}, {"label": label, "unit": "%", "low": low})
+            style: dict[str, Any] = {"marker": "own", "width": 1.8}
+            for (look, controller), curve in curves.items():
+                y = 100 * curve["mean" if is_strehl else "unstable"]
+                panel.curve(controller, curve["parameter"], y, look=look, **style)
+            for (look, controller), curve in curves.items() if is_strehl else ():
+                label_low, y = f"{controller}, 10th percentile", 100 * curve["low"]
+                panel.curve(label_low, curve["parameter"], y, look=look, width=0.9, quiet=True)
+            if is_strehl:
+                panel.curve("10th percentile (thin)", [], [], look=None, width=0.9)
+    return chart(key, panels[0].figure, names=listing_text([names[name] for name in parameters]))
 
 
 def _map_charts(
@@ -610,12 +592,9 @@ def _map_charts(
 def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return levels (k,) and the part of the values at or below each, denser in the tails."""
     ordered, n = np.sort(values), len(values)
-    ranks = np.arange(n)
-    if n > 2 * _POINTS:
-        tail = np.geomspace(1, n / 4, _POINTS // 4).astype(np.int64) - 1
-        even = np.linspace(0, n - 1, _POINTS).astype(np.int64)
-        ranks = np.concatenate((tail, n - 1 - tail, even))
-    level = np.unique(ordered[ranks])
+    tail = np.geomspace(1, n, _POINTS // 4)
+    ranks = np.concatenate((tail, n + 1 - tail, np.linspace(1, n, _POINTS // 2)))
+    level = np.unique(ordered[ranks.astype(np.int64) - 1])
     return level, np.searchsorted(ordered, level, side="right") / n
 
 
@@ -626,14 +605,6 @@ def histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return edges, counts / len(values)
 
 
-def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return the distinct values of a list parameter and their parts; None if it is no list."""
-    if not is_list(np.sort(values)):
-        return None
-    distinct, counts = np.unique(values, return_counts=True)
-    return distinct, counts / len(values)
-
-
 def binned_map(
     x: FloatArray, y: FloatArray, result: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -642,32 +613,24 @@ def binned_map(
     It is (ny, nx), nan in a cell without samples, and comes after the centres of the cells, or
     the values of a list, x (nx,) and y (ny,).
     """
-    cells = len(x) / _PER_CELL
-    lists = [value_shares(x), value_shares(y)]
-    for listed in lists:
-        cells /= 1 if listed is None else len(listed[0])
-    width = int(np.clip(cells ** (1 / max(lists.count(None), 1)), 3, _CELLS))
-    (columns, x_edges), (rows, y_edges) = (
-        _cells(values, listed, width) for values, listed in zip((x, y), lists, strict=True)
-    )
-    samples = np.histogram2d(y, x, bins=(y_edges, x_edges))[0]
-    sums = np.histogram2d(y, x, bins=(y_edges, x_edges), weights=result)[0]
-    mean = np.full(samples.shape, np.nan)
-    np.divide(sums, samples, out=mean, where=samples > 0)
-    return columns, rows, mean
+    from scipy.stats import binned_statistic_2d
+
+    cells = int(np.clip(np.sqrt(len(x) / _PER_CELL), 3, _CELLS))
+    (columns, x_edges), (rows, y_edges) = (_cells(values, cells) for values in (x, y))
+    mean = binned_statistic_2d(y, x, result, bins=(y_edges, x_edges)).statistic
+    return columns, rows, np.asarray(mean)
 
 
-def _cells(
-    values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
-) -> tuple[FloatArray, FloatArray]:
+def _cells(values: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
     """Return the centres of the cells along one axis, and their edges."""
-    if listed is not None:
-        centres = listed[0]
+    ordered = np.sort(values)
+    if is_list(ordered):
+        centres = np.unique(values)
         inner = (centres[:-1] + centres[1:]) / 2
     else:
-        low, high = np.percentile(values, _WITHIN)
+        low, high = np.percentile(ordered, _WITHIN)
         if not low < high:
-            low, high = float(np.min(values)), float(np.max(values))
+            low, high = ordered[0], ordered[-1]
         edges = np.linspace(low, high, cells + 1)
         centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
-    return centres, np.concatenate(([-np.inf], inner, [np.inf]))
+    return centres, np.concatenate(([ordered[0] - 1], inner, [ordered[-1] + 1]))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -28,43 +29,14 @@ from lbt_synth.report.explore.knobs import (
 )
 from lbt_synth.report.figures.loops import frequency_grid
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.storage.rows import fact, facts, row_table
+from lbt_synth.storage.tables import Table
 from lbt_synth.studies import compare_in_truth, robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _POINTS, _NEAR_A_LINE = 240, 28  # frequencies of a curve: in all, and on each side of a line
 _SHIFTS = 15
 _SEGMENT = 2048  # frames of a segment of the spectrum
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
-    """A method of synthesis, and the values of the knobs that were moved, by their keys."""
-
-    method: str = field(default_factory=default_method)
-    values: Mapping[str, float] = field(default_factory=dict)
-
-    def move(self, knobs: Sequence[Knob]) -> dict[Knob, float]:
-        """Return the knobs that it moves and that act on its design, with values in reach."""
-        return {
-            knob: min(max(float(self.values[knob.key]), knob.low), knob.high)
-            for knob in knobs
-            if knob.key in self.values and (knob.methods is None or self.method in knob.methods)
-        }
-
-    def shift_hz(self, knobs: Sequence[Knob]) -> float:
-        """Return by how much it moves the true lines [Hz]."""
-        return next((v for knob, v in self.move(knobs).items() if knob.key == SHIFT), 0.0)
-
-
-@table_row
-class ExploredRow:
-    """A design in the loop that the sliders make; what an unstable loop does not have is nan."""
-
-    design: str = column("design")
-    residual_nm: float = nm_column("residual", format=".1f", missing="unstable")
-    strehl: float = percent_column("Strehl ratio")
-    modulus: float = column("modulus margin", format=".3f")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,7 +50,8 @@ class Shown:
     spectrum_nm2_hz: FloatArray  # (f,): of the residual, sum over the axes
     broken: ComplexArray  # (q, f): loop gain of each measurement, the others closed
     poles: ComplexArray  # of the closed loop
-    row: ExploredRow | None = None  # what it leaves where the true lines are now
+    # residual [nm rms], Strehl ratio and modulus margin where the true lines are now
+    left: tuple[float, float, float] | None = None
     shift_hz: FloatArray | None = None  # (s,): by which the true lines are moved from the start
     strehls: FloatArray | None = None  # (s,): Strehl ratio there, in [0, 1]
 
@@ -94,9 +67,9 @@ class Exploration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """What a wish gives; the first of the designs on show is its own."""
+    """What a method and sliders give; the first of the designs on show is its own."""
 
-    wish: Wish
+    values: Mapping[str, float]  # of the knobs that were moved, by their keys
     config: Config
     request: DesignRequest
     shift_hz: float  # of the true lines
@@ -117,9 +90,25 @@ def explore(config: Config, designs: Mapping[str, Design]) -> Exploration:
     return Exploration(config=config, designs=designs, knobs=list_knobs(config))
 
 
-def fulfil(wish: Wish, knobs: Sequence[Knob], config: Config) -> tuple[Config, DesignRequest]:
-    """Return the configuration and the request of a wish; ConfigError where they do not fit."""
-    method, moved = method_named(wish.method), wish.move(knobs)
+def moved_knobs(
+    method: str, values: Mapping[str, float], knobs: Sequence[Knob]
+) -> dict[Knob, float]:
+    """Return the knobs that were moved and act on the designs of a method, with values in reach."""
+    return {
+        knob: min(max(float(values[knob.key]), knob.low), knob.high)
+        for knob in knobs
+        if knob.key in values and (knob.methods is None or method in knob.methods)
+    }
+
+
+def fulfil(
+    name: str, values: Mapping[str, float], knobs: Sequence[Knob], config: Config
+) -> tuple[Config, DesignRequest]:
+    """Return the configuration and the request of a method whose knobs were moved.
+
+    ConfigError where they do not fit.
+    """
+    method, moved = method_named(name), moved_knobs(name, values, knobs)
     content = config.settings.model_dump(exclude_unset=True)
     if method.section is not None and section_of(method, config) is not None:
         section_content(method, config, content)
@@ -130,31 +119,37 @@ def fulfil(wish: Wish, knobs: Sequence[Knob], config: Config) -> tuple[Config, D
     options = {
         knob.option: moved.get(knob, knob.value)
         for knob in knobs
-        if knob.option and wish.method in (knob.methods or ())
+        if knob.option and name in (knob.methods or ())
     }
-    request = design_request(wish.method, {**method.reference_options, **options})
+    request = design_request(name, {**method.reference_options, **options})
     return build_config(settings, config.source), request
 
 
-def quick_view(exploration: Exploration, wish: Wish, before: View | None = None) -> View:
+def quick_view(
+    exploration: Exploration,
+    method: str | None = None,
+    values: Mapping[str, float] = MappingProxyType({}),
+    before: View | None = None,
+) -> View:
     """Design, and return the view with its curves; the view before lends what is not yet known."""
-    config, request = fulfil(wish, exploration.knobs, exploration.config)
-    design = config.design(request)
-    label = request.method.label
+    name, knobs = method or default_method(), exploration.knobs
+    config, request = fulfil(name, values, knobs, exploration.config)
+    shifts = (v for knob, v in moved_knobs(name, values, knobs).items() if knob.key == SHIFT)
+    design, label = config.design(request), request.method.label
     own = f"{label} by the sliders" if label in exploration.designs else label
     shown = {
         name: loop_curves(one, config) for name, one in {own: design, **exploration.designs}.items()
     }
     if before is not None:
         shown = {
-            name: replace(one, row=last.row, shift_hz=last.shift_hz, strehls=last.strehls)
+            name: replace(one, left=last.left, shift_hz=last.shift_hz, strehls=last.strehls)
             for (name, one), last in zip(shown.items(), before.shown.values(), strict=True)
         }
     return View(
-        wish=wish,
+        values=values,
         config=config,
         request=request,
-        shift_hz=wish.shift_hz(exploration.knobs),
+        shift_hz=next(shifts, 0.0),
         design=design,
         shown=shown,
     )
@@ -187,13 +182,13 @@ def whole_view(exploration: Exploration, view: View) -> View:
     """Return a view with what its designs leave."""
     designs = (view.design, *exploration.designs.values())
     shown = {
-        name: complete(one, name, design, view, exploration.config)
+        name: complete(one, design, view, exploration.config)
         for (name, one), design in zip(view.shown.items(), designs, strict=True)
     }
     return replace(view, shown=shown, is_whole=True)
 
 
-def complete(one: Shown, name: str, design: Design, view: View, start: Config) -> Shown:
+def complete(one: Shown, design: Design, view: View, start: Config) -> Shown:
     """Return a design with what it leaves if the true lines move from where they are at start."""
     hardware, config = view.config.hardware, view.config
     lines = {n: getattr(start.truth, n) for n in ("vibrations", "frequency_errors_hz")}
@@ -209,20 +204,32 @@ def complete(one: Shown, name: str, design: Design, view: View, start: Config) -
     )
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     now = int(np.searchsorted(shifts, view.shift_hz))
-    row = ExploredRow(
-        design=name,
-        residual_nm=float(grid.residual_nm[0, 0, now]),
-        strehl=float(grid.strehl[0, 0, now]),
-        modulus=1 / float(hinf_norm(loop.output_sensitivity())) if loop.is_stable else np.nan,
-    )
-    return replace(one, row=row, shift_hz=shifts, strehls=grid.strehl[0, 0])
+    modulus = 1 / float(hinf_norm(loop.output_sensitivity())) if loop.is_stable else np.nan
+    left = float(grid.residual_nm[0, 0, now]), float(grid.strehl[0, 0, now]), modulus
+    return replace(one, left=left, shift_hz=shifts, strehls=grid.strehl[0, 0])
 
 
-def describe_moves(exploration: Exploration, wish: Wish) -> str:
-    """Return the sliders that a wish moved, as people read them; empty without any."""
+def explored_table(shown: Mapping[str, Shown]) -> Table:
+    """Return what designs leave; an unstable loop has no numbers."""
+    rows = [
+        facts(
+            design=fact(name, "design"),
+            residual_nm=fact(one.left[0], "residual", unit="nm", format=".1f", missing="unstable"),
+            strehl=fact(one.left[1], "Strehl ratio", unit="%", scale=100, format=".2f"),
+            modulus=fact(one.left[2], "modulus margin", format=".3f"),
+        )
+        for name, one in shown.items()
+        if one.left is not None
+    ]
+    return row_table("", rows)
+
+
+def describe_moves(exploration: Exploration, view: View) -> str:
+    """Return the sliders that were moved for a view, as people read them; empty without any."""
+    moved = moved_knobs(view.request.method.name, view.values, exploration.knobs)
     return ", ".join(
         f"{knob.label} {value * knob.shown[1]:.4g} {knob.shown[0]}".rstrip()
-        for knob, value in wish.move(exploration.knobs).items()
+        for knob, value in moved.items()
     )
 
 

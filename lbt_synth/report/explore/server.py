@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import copy_context
-from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from itertools import count
@@ -31,8 +30,8 @@ from lbt_synth.report.explore.exploration import (
     Exploration,
     Shown,
     View,
-    Wish,
     describe_moves,
+    explored_table,
     judge,
     quick_view,
     whole_view,
@@ -40,7 +39,6 @@ from lbt_synth.report.explore.exploration import (
 from lbt_synth.report.explore.panels import LivePanel, explore_numbers
 from lbt_synth.report.page.blocks import creator_name, words
 from lbt_synth.storage.atomic_files import write_together
-from lbt_synth.storage.rows import row_table
 
 
 class Lane:
@@ -98,7 +96,7 @@ def save_view(
         " ".join((*design, "-o", gain.name)),
         f"lbt-synth report {config.name} {gain.name} -o {stem}.html",
     )
-    moves = describe_moves(exploration, view.wish) or "nothing moved"
+    moves = describe_moves(exploration, view) or "nothing moved"
     head = f"{exploration.config.source.name!a} with {moves}; {creator_name()}"
     lines = ["#!/bin/sh", f"# {head}", "set -e", 'cd "$(dirname "$0")"', *commands, ""]
     text = config_text(view.config.settings, {"": "\n".join((head, *commands))})
@@ -157,7 +155,7 @@ class Session:
                 "charts": [{"key": key, **words()[key]} for key in keys],
                 "knobs": exploration.knobs,
                 "methods": {m.name: m.title for m in all_methods().values()},
-                "method": first.wish.method,
+                "method": first.request.method.name,
                 "folder": str(folder),
                 "style": (here / "page/page.css").read_text(encoding="utf-8") + style,
                 "script": script,
@@ -168,11 +166,11 @@ class Session:
         """Do what the page asks for."""
         match message["do"]:
             case "design":
-                wish = Wish(method=str(message["method"]), values=dict(message["values"]))
-                quick = self._seconds.get(wish.method, _QUICK_S) < _QUICK_S
+                method, number = str(message["method"]), int(message["number"])
+                quick = self._seconds.get(method, _QUICK_S) < _QUICK_S
                 lane = self._quick if quick else self._slow
-                number, final = int(message["number"]), bool(message["final"])
-                lane.submit(partial(self._work, lane, number, wish, final))
+                wish = number, method, dict(message["values"]), bool(message["final"])
+                lane.submit(partial(self._work, lane, *wish))
             case "keep":
                 self._keep()
             case "drop":
@@ -181,12 +179,14 @@ class Session:
             case "save":
                 self._save()
 
-    def _work(self, lane: Lane, number: int, wish: Wish, final: bool) -> None:
+    def _work(
+        self, lane: Lane, number: int, method: str, values: Mapping[str, float], final: bool
+    ) -> None:
         """Design in a thread: show the curves first, then what they leave, then the verdict."""
         exploration, start = self._exploration, time.thread_time()
         try:
-            view = quick_view(exploration, wish, self._view)
-            self._seconds[wish.method] = time.thread_time() - start
+            view = quick_view(exploration, method, values, self._view)
+            self._seconds[method] = time.thread_time() - start
             self._later(self._show_view, number, view)
             if lane.is_waiting:
                 return
@@ -219,12 +219,11 @@ class Session:
         lines_hz = view.config.truth.lines_hz
         for key, numbers in explore_numbers(shown, lines_hz, view.shift_hz).items():
             self._panels[key].show(numbers, looks)
-        rows = [replace(one.row, design=name) for name, one in shown.items() if one.row is not None]
-        table = row_table("", rows)
+        table = explored_table(shown)
         self._answer(
             number=number,
             whole=view.is_whole,
-            slow=self._seconds.get(view.wish.method, 0.0) > _QUICK_S,
+            slow=self._seconds.get(view.request.method.name, 0.0) > _QUICK_S,
             headings=table.headings,
             rows=[[cell.text for cell in row] for row in table.cells()],
             legend=[
@@ -259,7 +258,7 @@ class Session:
         """Keep the curves of the design that is shown."""
         exploration = self._exploration
         view = self._view if self._view.is_whole else whole_view(exploration, self._view)
-        moves = describe_moves(exploration, view.wish)
+        moves = describe_moves(exploration, view)
         name = f"{view.name}, {moves}" if moves else f"{view.name}, kept"
         self._kept.pop(name, None)
         if len(self._kept) == _MOST_KEPT:

@@ -10,13 +10,14 @@ from lbt_synth.linear import largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.report.designs.simulation import exact_spectrum
 from lbt_synth.report.explore.exploration import (
-    Wish,
     complete,
     describe_moves,
     explore,
+    explored_table,
     fulfil,
     judge,
     loop_curves,
+    moved_knobs,
     quick_view,
     whole_view,
 )
@@ -31,23 +32,23 @@ def exploration():
 
 
 def test_a_view_begins_with_its_own_design(exploration):
-    view = quick_view(exploration, Wish())
+    view = quick_view(exploration)
     assert list(view.shown) == ["Kalman", "old"]
     assert view.name == "Kalman"
     assert not view.is_whole
-    assert all(one.row is None for one in view.shown.values())
+    assert all(one.left is None for one in view.shown.values())
     whole = whole_view(exploration, view)
     assert whole.is_whole
-    assert [one.row.design for one in whole.shown.values()] == ["Kalman", "old"]
-    after = quick_view(exploration, Wish(method="hinf", values={"gain": 0.7}), whole)
-    lent = [one.row for one in after.shown.values()]
-    assert lent == [one.row for one in whole.shown.values()]
+    assert [row[0] for row in explored_table(whole.shown).rows] == ["Kalman", "old"]
+    after = quick_view(exploration, "hinf", {"gain": 0.7}, whole)
+    lent = [one.left for one in after.shown.values()]
+    assert lent == [one.left for one in whole.shown.values()]
     assert not after.is_whole
 
 
 def test_names_are_unique(exploration):
     again = explore(exploration.config, {"Kalman": lbt.kalman(exploration.config.plant)})
-    assert list(quick_view(again, Wish()).shown) == ["Kalman by the sliders", "Kalman"]
+    assert list(quick_view(again).shown) == ["Kalman by the sliders", "Kalman"]
 
 
 def test_a_design_for_another_loop_is_refused(exploration):
@@ -59,7 +60,7 @@ def test_a_design_for_another_loop_is_refused(exploration):
 
 
 def test_the_verdict(exploration):
-    view = quick_view(exploration, Wish())
+    view = quick_view(exploration)
     budget = lbt.residual_budget(
         lbt.close_loop(view.config.hardware, view.design.controller), view.config.truth
     )
@@ -68,51 +69,50 @@ def test_the_verdict(exploration):
     assert "above the least of any linear controller" in text
     assert "Margins: modulus 0." in text
     assert text.endswith("checks of its certificate passed.")
-    unstable = quick_view(exploration, Wish(method="kalman", values={"gain": 2.4}))
+    unstable = quick_view(exploration, "kalman", {"gain": 2.4})
     assert judge(unstable).startswith("Kalman is UNSTABLE in this loop.")
 
 
 def test_moves_in_words(exploration):
-    wish = Wish(method="hinf", values={"delay": 2.5, "hinf-gamma_ratio": 1.3, "robust-band": 1.0})
-    assert describe_moves(exploration, wish) == "total delay 2.5 frames, gamma ratio 1.3"
-    assert describe_moves(exploration, Wish()) == ""
+    wish = "hinf", {"delay": 2.5, "hinf-gamma_ratio": 1.3, "robust-band": 1.0}
+    moved = quick_view(exploration, *wish)
+    assert describe_moves(exploration, moved) == "total delay 2.5 frames, gamma ratio 1.3"
+    assert describe_moves(exploration, quick_view(exploration)) == ""
 
 
 def test_wavefronts_in_another_unit(exploration):
-    view = quick_view(exploration, Wish(method="kalman", values={"noise": 20.0}))
+    view = quick_view(exploration, "kalman", {"noise": 20.0})
     with own_display_unit():
         show_in(DisplayUnit(name="mas", nm=10.0))
-        assert describe_moves(exploration, view.wish) == "measurement noise 2 mas"
+        assert describe_moves(exploration, view) == "measurement noise 2 mas"
         assert " mas rms, Strehl ratio" in judge(view)
 
 
 def test_options_are_those_of_the_method(config):
     knobs, values = list_knobs(config), {"hinf-gamma_ratio": 1.7, "mixed-gamma_ratio": 2.0}
-    _, request = fulfil(Wish(method="hinf", values=values), knobs, config)
+    _, request = fulfil("hinf", values, knobs, config)
     assert request.given == {"route": "riccati", "gamma_ratio": 1.7}
-    _, request = fulfil(Wish(method="kalman", values=values), knobs, config)
+    _, request = fulfil("kalman", values, knobs, config)
     assert request.given == {}
 
 
 def test_a_value_stays_within_reach_of_its_slider(config):
     knobs = list_knobs(config)
-    after, _ = fulfil(Wish(method="kalman", values={"delay": 99.0, "magic": 1.0}), knobs, config)
+    after, _ = fulfil("kalman", {"delay": 99.0, "magic": 1.0}, knobs, config)
     assert after.hardware.delay_frames == 6.0
-    assert Wish(method="kalman", values={"shift": -9.0}).shift_hz(knobs) == -3.5
-    assert Wish(method="kalman").shift_hz(knobs) == 0.0
+    assert quick_view(explore(config, {}), "kalman", {"shift": -9.0}).shift_hz == -3.5
+    assert quick_view(explore(config, {}), "kalman").shift_hz == 0.0
 
 
 def test_sliders_of_other_methods_do_not_count(config):
     knobs = list_knobs(config)
-    wish = Wish(method="integrator", values={"damping": 0.01, "delay": 3.0})
-    assert [knob.key for knob in wish.move(knobs)] == ["delay"]
+    moved = moved_knobs("integrator", {"damping": 0.01, "delay": 3.0}, knobs)
+    assert [knob.key for knob in moved] == ["delay"]
 
 
 def test_the_configuration_that_was_read_stays_as_it_is(config):
     before = config.text
-    fulfil(
-        Wish(method="robust", values={"shift": 1.0, "damping": 0.01}), list_knobs(config), config
-    )
+    fulfil("robust", {"shift": 1.0, "damping": 0.01}, list_knobs(config), config)
     assert config.text == before
 
 
@@ -122,13 +122,13 @@ def start():
 
 
 def at(start, **values):
-    return fulfil(Wish(method="kalman", values=values), list_knobs(start), start)[0]
+    return fulfil("kalman", values, list_knobs(start), start)[0]
 
 
 def left_by(design, config, start, shift_hz):
     """What a design leaves in a loop whose true lines moved by a shift."""
     view = SimpleNamespace(config=config, shift_hz=shift_hz)
-    return complete(loop_curves(design, config), "K", design, view, start)
+    return complete(loop_curves(design, config), design, view, start)
 
 
 def test_curves_are_those_of_the_loop(start):
@@ -152,9 +152,9 @@ def test_performance_is_that_of_the_budget(start):
     found = left_by(design, config, start, shift)
     loop = lbt.close_loop(config.hardware, design.controller, sensor_gain=0.8)
     budget = lbt.residual_budget(loop, config.truth)
-    assert found.row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-6)
-    assert found.row.strehl == pytest.approx(lbt.strehl(budget, config.imaging), rel=1e-6)
-    assert found.row.modulus == pytest.approx(lbt.loop_margins(loop).modulus, rel=1e-6)
+    assert found.left[0] == pytest.approx(budget.rms_nm, rel=1e-6)
+    assert found.left[1] == pytest.approx(lbt.strehl(budget, config.imaging), rel=1e-6)
+    assert found.left[2] == pytest.approx(lbt.loop_margins(loop).modulus, rel=1e-6)
     still = at(start, gain=0.8)
     there = lbt.strehl(lbt.residual_budget(loop, still.truth), config.imaging)
     assert float(found.strehls[found.shift_hz == 0][0]) == pytest.approx(there, rel=1e-6)
@@ -168,7 +168,7 @@ def test_an_unstable_loop_has_poles_only(start):
     assert np.all(np.isnan(found.spectrum_nm2_hz))
     assert max(abs(found.poles)) > 1
     left = left_by(design, config, start, 0.0)
-    assert np.isnan([left.row.residual_nm, left.row.strehl, left.row.modulus]).all()
+    assert np.isnan(left.left).all()
     assert np.isnan(left.strehls).all()
 
 

@@ -7,7 +7,7 @@ from support.explore import five_lines
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.report.explore.exploration import Wish, fulfil
+from lbt_synth.report.explore.exploration import fulfil
 from lbt_synth.report.explore.knobs import list_knobs, shift_range_hz
 
 
@@ -58,7 +58,7 @@ def test_a_knob_at_its_value_changes_nothing(example):
         here = {
             knob.key: knob.value for knob in knobs if knob.methods is None or name in knob.methods
         }
-        moved, _ = fulfil(Wish(method=name, values=here), knobs, config)
+        moved, _ = fulfil(name, here, knobs, config)
         for matrix in "ABCDL":
             ours, theirs = getattr(moved.plant, matrix), getattr(config.plant, matrix)
             np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
@@ -73,7 +73,7 @@ def test_a_knob_at_its_value_changes_nothing(example):
 
 def moved(config, method="kalman", **values):
     values = {key.replace("__", "-"): value for key, value in values.items()}
-    return fulfil(Wish(method=method, values=values), list_knobs(config), config)[0]
+    return fulfil(method, values, list_knobs(config), config)[0]
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.report.explore.exploration import Wish, explore, quick_view, whole_view
+from lbt_synth.report.explore.exploration import explore, quick_view, whole_view
 from lbt_synth.report.explore.panels import LivePanel, explore_numbers
 
 LOOKS = {"Kalman": 0, "old": 1}
@@ -16,7 +16,7 @@ LOOKS = {"Kalman": 0, "old": 1}
 def view():
     config = lbt.load_config("examples/lbt.yaml")
     exploration = explore(config, {"old": lbt.integrator(config.hardware, gain=0.3)})
-    return whole_view(exploration, quick_view(exploration, Wish(values={"shift": 1.0})))
+    return whole_view(exploration, quick_view(exploration, values={"shift": 1.0}))
 
 
 @pytest.fixture(scope="module")

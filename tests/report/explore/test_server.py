@@ -18,7 +18,7 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.report.explore import server
-from lbt_synth.report.explore.exploration import Wish, explore, quick_view, whole_view
+from lbt_synth.report.explore.exploration import explore, quick_view, whole_view
 from lbt_synth.report.explore.server import Lane, Session, save_view
 from lbt_synth.storage.display_unit import DisplayUnit, nm_text, own_display_unit, show_in
 
@@ -63,7 +63,7 @@ def exploration():
 
 @pytest.fixture(scope="module")
 def first(exploration):
-    return whole_view(exploration, quick_view(exploration, Wish()))
+    return whole_view(exploration, quick_view(exploration))
 
 
 @pytest.fixture
@@ -398,8 +398,8 @@ def test_work_is_shown_in_the_unit_of_the_page():
 
 @pytest.mark.parametrize("method", ["kalman", "hinf"])
 def test_the_commands_make_the_files(exploration, tmp_path, monkeypatch, capsys, method):
-    wish = Wish(method=method, values={"delay": 2.5, "shift": 0.7, f"{method}-gamma_ratio": 1.4})
-    view = quick_view(exploration, wish)
+    wish = method, {"delay": 2.5, "shift": 0.7, f"{method}-gamma_ratio": 1.4}
+    view = quick_view(exploration, *wish)
     (config, gain, script), commands = save_view(exploration, view, tmp_path)
     assert lbt.load_config(config).text == view.config.text
     kept = lbt.load_gain(gain)
@@ -416,7 +416,7 @@ def test_the_commands_make_the_files(exploration, tmp_path, monkeypatch, capsys,
 
 
 def test_nothing_is_overwritten(exploration, tmp_path):
-    view = quick_view(exploration, Wish(method="kalman"))
+    view = quick_view(exploration, "kalman")
     first = save_view(exploration, view, tmp_path)
     (tmp_path / "explored-2.sh").write_text("mine")
     third = save_view(exploration, view, tmp_path)
@@ -427,7 +427,7 @@ def test_nothing_is_overwritten(exploration, tmp_path):
 
 
 def test_the_head_says_what_was_moved(exploration, tmp_path):
-    view = quick_view(exploration, Wish(method="kalman", values={"gain": 0.5}))
+    view = quick_view(exploration, "kalman", {"gain": 0.5})
     config = save_view(exploration, view, tmp_path)[0][0]
     head = config.read_text().splitlines()[:2]
     assert head[0].startswith("# 'lbt.yaml' with real sensor gain 0.5; lbt_synth ")
