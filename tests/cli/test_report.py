@@ -60,7 +60,7 @@ def test_command(folder, designs, capsys, monkeypatch):
     first = Path("r.html").read_bytes()
     status, out, _ = run(capsys, *command, "-o", "r.html")
     assert status == 0
-    assert "kalman leaves the least" in out
+    assert "Least residual: kalman" in out
     assert "written: r.html" in out
     assert Path("r.html").read_bytes() == first
 

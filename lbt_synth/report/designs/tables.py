@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,70 +94,56 @@ def good_range(one: DesignAssessment) -> tuple[float, float] | None:
 def verdict(report: DesignReport) -> str:
     """Return at most three sentences: which design leaves least, which is robust, what is proved.
 
-    The table of the report has the numbers of all designs.
+    Designs that show the same number as the best are as good. The table of the report has all.
     """
-    sentences = [_certificate_sentence(report)]
-    if report.stable and report.errors_hz.size > 1:
-        sentences.insert(0, _error_sentence(report))
+    sentences = []
     if report.stable:
-        sentences.insert(0, _least_sentence(report))
+        shown = {one.name: one.residual_nm for one in report.stable}
+        least, names = _leaders(
+            {n: nm_text(v, ".1f", unit="nm rms") for n, v in shown.items()}, shown
+        )
+        strehl = max(one.strehl for one in report.stable)
+        where = ", if the vibrations are where the configuration has them"
+        sentences.append(
+            f"Least residual: {names}, {least} (Strehl ratio {100 * strehl:.1f} %)"
+            f"{where if report.config.truth.vibrations else ''}."
+        )
+    if report.stable and report.errors_hz.size > 1:
+        worst = {one.name: -100 * float(np.min(one.curve.strehl)) for one in report.stable}
+        most, names = _leaders(
+            {name: f"{-percent:.1f} %" for name, percent in worst.items()}, worst
+        )
+        first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
+        sentences.append(
+            f"Highest Strehl ratio at worst, if their frequencies are wrong by {first} to {last} "
+            f"Hz: {names}, {most}."
+        )
+    sentences.append(_certificate_sentence(report))
     # a number stays in one line with its unit
     return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", "\u00a0", " ".join(sentences))
 
 
-def _least_sentence(report: DesignReport) -> str:
-    stable = report.stable
-    best = min(stable, key=lambda one: one.residual_nm)
-    shown = {one.name: nm_text(one.residual_nm, ".1f", unit="nm rms") for one in stable}
-    least = shown[best.name]
-    # designs that show the same number as the best are as good
-    equal = [name for name, text in shown.items() if text == least]
-    verb = "leave" if len(equal) > 1 else "leaves"
-    several = len(stable) > 1
-    where = ", if the vibrations are where the configuration has them"
-    return (
-        f"{f'Of {len(stable)} stable designs, ' if several else ''}{listing_text(equal)} "
-        f"{verb} {'the least, ' if several else ''}{least} (Strehl ratio "
-        f"{100 * best.strehl:.1f} %){where if report.config.truth.vibrations else ''}."
-    )
-
-
-def _error_sentence(report: DesignReport) -> str:
-    """Say which design keeps most of its Strehl ratio over all frequency errors."""
-    first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
-    worst = {one.name: f"{100 * np.min(one.curve.strehl):.1f}" for one in report.stable}
-    most = max(worst.values(), key=float)
-    tough = [name for name, percent in worst.items() if percent == most]
-    if len(worst) == 1:
-        who = "the"
-    elif len(tough) == len(worst):
-        who = "all do equally well: the"
-    else:
-        who = f"{listing_text(tough)} {'does' if len(tough) == 1 else 'do'} best: the"
-    return (
-        f"If their frequencies are wrong by {first} to {last} Hz, {who} Strehl ratio is still "
-        f"{most} % at worst."
-    )
+def _leaders(texts: Mapping[str, str], values: Mapping[str, float]) -> tuple[str, str]:
+    """Return the text of the least value, and the names of all designs that show the same."""
+    text = texts[min(values, key=lambda name: values[name])]
+    return text, listing_text([name for name, other in texts.items() if other == text])
 
 
 def _certificate_sentence(report: DesignReport) -> str:
     """Say which designs are unstable, and whether all certificates hold."""
-    unstable = [one.name for one in report.assessments if not one.stable]
-    failed = [one.name for one in report.assessments if not one.certified]
+    unstable = listing_text([one.name for one in report.assessments if not one.stable])
+    failed = listing_text([one.name for one in report.assessments if not one.certified])
     checks = sum(len(one.checks) for one in report.assessments)
-    parts = []
-    if unstable:
-        verb = "is" if len(unstable) == 1 else "are"
-        parts.append(f"{listing_text(unstable)} {verb} UNSTABLE in this loop")
+    parts = [f"UNSTABLE in this loop: {unstable}"] if unstable else []
     if failed:
-        parts.append(f"the certificate of {listing_text(failed)} does NOT hold")
+        parts.append(f"certificates that do NOT hold: {failed}")
     elif unstable:  # a proof about another loop must not be taken for one about this loop
         about = "they are about the loops that the designs were made for, not about this one"
         parts.append(f"all {checks} checks of the certificates passed, but {about}")
     else:
         parts.append(f"all {checks} checks of the certificates were recomputed and passed")
     sentence = "; ".join(parts)
-    return f"{sentence if unstable else sentence[0].upper() + sentence[1:]}."
+    return f"{sentence[0].upper()}{sentence[1:]}."
 
 
 _DESIGN = ("method", "route", "n_states", "multiplications", "gamma", "estimation_rms", "certified")

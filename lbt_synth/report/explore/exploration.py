@@ -23,7 +23,6 @@ from lbt_synth.report.explore.knobs import (
     SHIFT,
     Knob,
     list_knobs,
-    section_content,
     section_of,
     shift_range_hz,
 )
@@ -110,11 +109,12 @@ def fulfil(
     """
     method, moved = method_named(name), moved_knobs(name, values, knobs)
     content = config.settings.model_dump(exclude_unset=True)
-    if method.section is not None and section_of(method, config) is not None:
-        section_content(method, config, content)
+    section = None if method.section is None else section_of(method, config)
+    if section is not None and content.setdefault("design", {}).get(name) is None:
+        content["design"][name] = section.model_dump(exclude_unset=True)  # made for its plant
     for knob, value in moved.items():
         if knob.edit is not None:
-            knob.edit(config, content, value)
+            knob.edit(config, content, value, value / knob.value if knob.value else 1.0)
     settings = validate_sections(FileSection, content, config.source)
     options = {
         knob.option: moved.get(knob, knob.value)

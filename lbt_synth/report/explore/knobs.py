@@ -21,7 +21,8 @@ from lbt_synth.report.designs.report import frequency_errors
 from lbt_synth.storage.display_unit import shown_unit
 
 Content: TypeAlias = dict[str, Any]  # of a configuration file
-Edit: TypeAlias = Callable[[Config, Content, float], None]
+# puts a value into a file, given the factor on what it was
+Edit: TypeAlias = Callable[[Config, Content, float, float], None]
 SHIFT = "shift"  # key of the knob that moves the true lines
 _WIDEST_HZ = 4.0  # half width of a band
 _NEAR = 0.9  # of its frequency, half the widest band around a line
@@ -64,11 +65,19 @@ def shift_range_hz(config: Config) -> tuple[float, float]:
 def _loop_knobs(config: Config) -> Iterator[Knob]:
     """Yield the knobs of what the real loop meets."""
     delay, gain = config.settings.loop.delay_frames, config.truth.sensor_gain * config.sensor_gain
-    yield Knob("delay", "total delay", "frames", 1.0, max(6.0, delay), delay, _set_delay)
-    yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, _set_sensor_gain)
-    noise_nm = _mean_noise_nm(config)
+    yield Knob(
+        "delay",
+        "total delay",
+        "frames",
+        1.0,
+        max(6.0, delay),
+        delay,
+        _setter("loop", "delay_frames"),
+    )
+    yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, _scale_sensor_gain)
+    noise_nm = float(np.sqrt(np.mean(np.square(config.noise_nm))))
     if noise_nm > 0:
-        yield _factor_knob("noise", "measurement noise", "nm", noise_nm, 10.0, _set_noise)
+        yield _factor_knob("noise", "measurement noise", "nm", noise_nm, 10.0, _scale_noise)
     low, high = shift_range_hz(config)
     if low < high:
         label = "frequency error, true less assumed"
@@ -79,7 +88,7 @@ def _loop_knobs(config: Config) -> Iterator[Knob]:
             ("seeing", "seeing", "arcsec", "seeing_arcsec"),
             ("wind", "wind speed", "m/s", "wind_speed_m_s"),
         ):
-            edit = partial(_set_air, name)
+            edit = _setter("atmosphere", name)
             yield _factor_knob(key, label, unit, getattr(air, name), 4.0, edit)
 
 
@@ -95,8 +104,8 @@ def _model_knobs(config: Config) -> Iterator[Knob]:
         return
     filters = [method for method in all_methods().values() if method.estimator]
     methods = frozenset(method.name for method in filters)
-    damping = _mean_damping(config)
-    knob = _factor_knob("damping", "assumed damping", "", damping, 10.0, _set_damping)
+    damping = float(np.exp(np.mean(np.log([line.damping for line in lines]))))
+    knob = _factor_knob("damping", "assumed damping", "", damping, 10.0, _scale_damping)
     yield replace(knob, high=min(knob.high, 0.9), methods=methods)
     reach = min(_WIDEST_HZ, *(_NEAR * line.frequency_hz for line in lines))
     value = min(reach, *(line.spread_hz or 0.0 for line in lines))
@@ -117,11 +126,12 @@ def _method_knobs(method: Method, config: Config) -> Iterator[Knob]:
     if section is None:
         return
     for name, low, high in _declared_sliders(type(section)):
-        value, edit = float(getattr(section, name)), partial(_set_section_key, method, name)
+        value, edit = float(getattr(section, name)), _setter("design", method.name, name)
         key, label = f"{method.name}-{name}", _label(name)
         yield Knob(key, *label, low, high, value, edit, methods=methods)
     if getattr(section, "bands", None):
-        half, edit = _mean_half_width_hz(section), partial(_set_bands, method)
+        half = float(np.mean([band.high_hz - band.low_hz for band in section.bands])) / 2
+        edit = partial(_scale_bands, method.name)
         key, words = f"{method.name}-band", "half width of the bands"
         knob = _factor_knob(key, words, "Hz", half, 10.0, edit)
         yield replace(knob, high=max(_WIDEST_HZ, half), methods=methods)
@@ -150,103 +160,69 @@ def section_of(method: Method, config: Config) -> Any:
     return section
 
 
-def section_content(method: Method, config: Config, content: Content) -> Content:
-    """Return a method's section of a file, which gets the one made for its plant if need be."""
-    own = content.setdefault("design", {})
-    if own.get(method.name) is None:
-        own[method.name] = section_of(method, config).model_dump(exclude_unset=True)
-    return own[method.name]  # type: ignore[no-any-return]  # of a file
+def _setter(*keys: str) -> Edit:
+    """Return the edit that sets the number at a path of keys."""
+
+    def edit(_: Config, content: Content, value: float, factor: float) -> None:
+        for key in keys[:-1]:
+            content = content[key]
+        content[keys[-1]] = value
+
+    return edit
 
 
-def _set_delay(_: Config, content: Content, delay_frames: float) -> None:
-    content["loop"]["delay_frames"] = delay_frames
-
-
-def _set_air(name: str, _: Config, content: Content, value: float) -> None:
-    content["atmosphere"][name] = value
-
-
-def _set_sensor_gain(config: Config, content: Content, gain: float) -> None:
-    """Set the real sensor gain; gains of several measurements keep their proportions."""
+def _scale_sensor_gain(config: Config, content: Content, value: float, factor: float) -> None:
+    """Scale the real sensor gain; gains of several measurements keep their proportions."""
     truth = content.setdefault("truth", {})
-    factor = gain / (config.truth.sensor_gain * config.sensor_gain)
-    truth["sensor_gain"] = _scaled(truth.get("sensor_gain", 1.0), factor)
+    gain = truth.get("sensor_gain", 1.0)
+    truth["sensor_gain"] = [factor * g for g in gain] if isinstance(gain, list) else factor * gain
 
 
-def _set_noise(config: Config, content: Content, noise_nm: float) -> None:
-    """Set the noise, the root mean square of those of several measurements."""
+def _scale_noise(config: Config, content: Content, value: float, factor: float) -> None:
+    """Scale the noise of all measurements."""
     sensor = content["sensor"]
     for name in ("noise_mas", "pyramid"):
         sensor.pop(name, None)
-    sensor["noise_nm"] = _scaled(
-        np.asarray(config.noise_nm).tolist(), noise_nm / _mean_noise_nm(config)
-    )
+    sensor["noise_nm"] = (factor * np.asarray(config.noise_nm)).tolist()
 
 
-def _scaled(value: Any, factor: float) -> Any:
-    """Return a number, or each of a list, times a factor."""
-    return [factor * one for one in value] if isinstance(value, list) else factor * value
-
-
-def _mean_noise_nm(config: Config) -> float:
-    """Return the root mean square of the noise of all measurements [nm]."""
-    return float(np.sqrt(np.mean(np.square(config.noise_nm))))
-
-
-def _set_shift(config: Config, content: Content, shift_hz: float) -> None:
+def _set_shift(config: Config, content: Content, value: float, factor: float) -> None:
     """Move the true lines, the one that moves most by a shift; those of the model stay."""
     for line in _true_lines(config, content):
         place_hz = line["frequency_hz"]
         percent = line.pop("frequency_error_percent", None)
         if percent is not None:
             line["frequency_error_hz"] = place_hz * percent / 100  # so that it stays as it is
-        line["frequency_hz"] += config.truth.frequency_shift_hz(place_hz, shift_hz)
+        line["frequency_hz"] += config.truth.frequency_shift_hz(place_hz, value)
 
 
-def _set_damping(config: Config, content: Content, damping: float) -> None:
-    """Set the mean damping of the lines of the model; those of the truth stay."""
+def _scale_damping(config: Config, content: Content, value: float, factor: float) -> None:
+    """Scale the damping of the lines of the model; those of the truth stay."""
     _true_lines(config, content)
-    factor = damping / _mean_damping(config)
     for line in content["model"]["vibrations"]:
         line["damping"] = min(line["damping"] * factor, _MOST_DAMPING)
 
 
-def _mean_damping(config: Config) -> float:
-    """Return the geometric mean of the damping of the lines of the model."""
-    lines = config.settings.model.vibrations or ()
-    return float(np.exp(np.mean(np.log([line.damping for line in lines]))))
-
-
-def _set_spread(config: Config, content: Content, spread_hz: float) -> None:
+def _set_spread(config: Config, content: Content, value: float, factor: float) -> None:
     """Spread the lines of the model over bands of a half width; those of the truth stay."""
     _true_lines(config, content)
     for line in content["model"]["vibrations"]:
-        if spread_hz > 0:
-            line["spread_hz"] = spread_hz
+        if value > 0:
+            line["spread_hz"] = value
         else:
             line.pop("spread_hz", None)
             line.pop("lines", None)
 
 
-def _set_section_key(
-    method: Method, name: str, config: Config, content: Content, value: float
+def _scale_bands(
+    method: str, config: Config, content: Content, value: float, factor: float
 ) -> None:
-    section_content(method, config, content)[name] = value
-
-
-def _set_bands(method: Method, config: Config, content: Content, half_width_hz: float) -> None:
-    """Set the mean half width of the bands of a method's section; their middles stay."""
-    factor = half_width_hz / _mean_half_width_hz(section_of(method, config))
+    """Scale the half widths of the bands of a method's section; their middles stay."""
     highest = config.hardware.frame_rate_hz / 2
-    for band in section_content(method, config, content)["bands"]:
-        low, high = band["low_hz"], band["high_hz"]
-        middle, half = (low + high) / 2, factor * (high - low) / 2
+    for band in content["design"][method]["bands"]:
+        middle = (band["low_hz"] + band["high_hz"]) / 2
+        half = factor * (band["high_hz"] - band["low_hz"]) / 2
         band |= {"low_hz": max(middle - half, 0.0), "high_hz": min(middle + half, highest)}
-
-
-def _mean_half_width_hz(section: Any) -> float:
-    """Return the mean half width of the bands of a section [Hz]."""
-    return float(np.mean([band.high_hz - band.low_hz for band in section.bands])) / 2
 
 
 def _true_lines(config: Config, content: Content) -> list[Content]:
@@ -255,18 +231,13 @@ def _true_lines(config: Config, content: Content) -> list[Content]:
     if not isinstance(truth.get("vibrations", []), list):
         lines = stationary_vibrations(config.truth.vibrations)
         errors = config.truth.frequency_errors_hz or (None,) * len(lines)
-        truth["vibrations"] = [
-            _line_content(line) | ({} if error is None else {"frequency_error_hz": error})
-            for line, error in zip(lines, errors, strict=True)
-            if isinstance(line, Vibration)
-        ]
+        entries = truth["vibrations"] = []
+        for line, error in zip(lines, errors, strict=True):
+            if not isinstance(line, Vibration):
+                continue
+            names = ("frequency_hz", "damping", "rms_nm")
+            entry = {"kind": "resonance", **{n: float(getattr(line, n)) for n in names}}
+            if len(line.direction) == 2:
+                entry["direction_deg"] = float(np.degrees(np.arctan2(*line.direction[::-1])))
+            entries.append(entry if error is None else {**entry, "frequency_error_hz": error})
     return truth.setdefault("vibrations", [])  # type: ignore[no-any-return]  # of a file
-
-
-def _line_content(line: Vibration) -> Content:
-    """Return a resonance as the entry of a configuration."""
-    names = ("frequency_hz", "damping", "rms_nm")
-    entry = {"kind": "resonance", **{name: float(getattr(line, name)) for name in names}}
-    if len(line.direction) == 2:
-        entry["direction_deg"] = float(np.degrees(np.arctan2(line.direction[1], line.direction[0])))
-    return entry

@@ -16,7 +16,6 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, count_columns, drawing
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import EndToEndEntry, RobustnessMap, RobustnessRow, TradeoffPoint
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES
@@ -242,33 +241,12 @@ def draw_limits(
     *,
     axes: OwnAxes = None,
 ) -> Figure:
-    """Draw the residual of designs, and the limits, over an axis that begins at start_hz.
-
-    Designs of the same residual are one curve with all their names.
-    """
+    """Draw the residual of designs, and the limits, over an axis that begins at start_hz."""
     order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
     with drawing([2.5], axes=axes) as (panel,):
         panel.set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})
-        groups: list[tuple[int, FloatArray | None, list[str]]] = []
-        for look, (name, row) in enumerate(zip(names, study.rows, strict=True)):
-            curve = study.residual_nm[look][order] if row.stable else None
-            equal = [
-                group
-                for _, residual, group in groups
-                if curve is not None
-                and residual is not None
-                and np.allclose(curve, residual, rtol=1e-6, atol=0)
-            ]
-            if equal:
-                equal[0].append(name)
-            else:
-                groups.append((look, curve, [name]))
-        for look, curve, group in groups:
-            name = listing_text(list(dict.fromkeys(group)))
-            if curve is None:
-                panel.curve(f"{name}: unstable", [], [], look=look)
-            else:
-                panel.curve(name, places, curve, look=look)
+        for name, row, residual_nm in zip(names, study.rows, study.residual_nm, strict=True):
+            draw_design(panel, names, name, places, residual_nm[order] if row.stable else None)
         if study.limit is not None and study.limit.rms_nm > 0:
             panel.rule("limit, frequency known", study.limit.rms_nm, "y", dash=3)
         if study.band is not None:
@@ -450,19 +428,11 @@ def mirror_figure(
         response.rule(settled, settling_ms, dash=1)
         x_axis = {"label": "frames after the command", "low": -0.6, "high": count - 0.4}
         weights.set_axes(x_axis, {"label": "weight in the exposure"})
-        _draw_columns(weights, "this mirror", taps[:count], 0.0, look=0)
-        _draw_columns(weights, "settled at once", ideal[:count], -0.4, look=None)
+        for name, values, look in (("settled at once", ideal, None), ("this mirror", taps, 0)):
+            heights = np.zeros(count)
+            heights[: values.size] = values[:count]
+            weights.curve(name, np.arange(count), heights, look=look, step="steps-mid")
     return response.figure
-
-
-def _draw_columns(
-    panel: Panel, name: str, heights: FloatArray, offset: float, *, look: int | None
-) -> None:
-    """Draw upright bars of width 0.4 that begin at an offset from 0, 1 and so on."""
-    left = np.arange(heights.size) + offset
-    x = np.column_stack((left, left, left + 0.4, left + 0.4)).ravel()
-    high = np.column_stack((0 * heights, heights, heights, 0 * heights)).ravel()
-    panel.area(name, x, np.zeros(x.size), high, look=look, solid=look is not None)
 
 
 _SHOWN_MAS = 700.0  # from the centre of the image to its edges
@@ -506,16 +476,16 @@ def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
     with drawing([2.3] * len(methods), columns=len(methods)) as panels:
         for panel, method in zip(panels, methods, strict=True):
             panel.set_axes(x_axis, y_axis, title=design_label(method))
-            _draw_method(panel, [e for e in rows if e.method == method])
+            error, paper, modal, strehl, scatter = np.array(
+                [
+                    (e.error_hz, e.paper, e.modal, e.strehl, e.scatter)
+                    for e in rows
+                    if e.method == method
+                ],
+                dtype=float,
+            ).T
+            if not np.isnan(paper[0]):  # it published none of its own integrator
+                panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
+            panel.curve("modal, measured optical gain", error, modal, look=1)
+            panel.curve("end to end", error, strehl, error=scatter, look=0, **_POINTS)
     return panels[0].figure
-
-
-def _draw_method(panel: Panel, entries: Sequence[EndToEndEntry]) -> None:
-    """Draw the curves of one method; the paper's is left out where it published none."""
-    error, paper, modal, strehl, scatter = np.array(
-        [(e.error_hz, e.paper, e.modal, e.strehl, e.scatter) for e in entries], dtype=float
-    ).T
-    if not np.isnan(paper[0]):
-        panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
-    panel.curve("modal, measured optical gain", error, modal, look=1)
-    panel.curve("end to end", error, strehl, error=scatter, look=0, **_POINTS)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-import re
 import tomllib
 import unicodedata
 from collections.abc import Mapping, Sequence
@@ -33,7 +32,6 @@ from lbt_synth.validation import choice
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib")
 _WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 Source: TypeAlias = tuple[str, str, str]  # a file's name, what it is, and its SHA-256
-_KEY = re.compile(r"[a-z][a-z0-9-]*")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,12 +56,6 @@ class Chart:
     alt: str  # The same for those who do not see it: what is drawn, and what it shows
     figure: Figure
 
-    def __post_init__(self) -> None:
-        _require_key(self.key)
-        for name in ("title", "caption", "alt"):
-            if not getattr(self, name).strip():
-                raise ProblemError(f"a chart must have words for its {name}; got none.")
-
 
 Listing: TypeAlias = tuple[str, str]  # a caption, and a text as it is in a file, line by line
 Block: TypeAlias = str | Notice | Listing | Table | Chart  # a text is a paragraph
@@ -83,8 +75,6 @@ class Page:
         kept = {key: section for key, section in self.sections.items() if section[1]}
         object.__setattr__(self, "sections", kept)
         keys = [*kept, *(chart.key for chart in self.charts)]
-        for key in kept:
-            _require_key(key)
         repeated = sorted({key for key in keys if keys.count(key) > 1})
         if repeated:
             raise ProblemError(f"keys of a page must be unique; got {', '.join(repeated)} twice.")
@@ -98,15 +88,6 @@ class Page:
     def charts(self) -> list[Chart]:
         """All charts, in their order."""
         return [block for block in self.blocks if isinstance(block, Chart)]
-
-
-def _require_key(key: str) -> None:
-    """Refuse what cannot be an anchor."""
-    if not _KEY.fullmatch(key):
-        raise ProblemError(
-            f"a key must be of small letters, digits and hyphens, and start with a letter; "
-            f"got {key!r}."
-        )
 
 
 @cache

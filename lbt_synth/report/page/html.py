@@ -48,7 +48,6 @@ def page_html(page: Page) -> bytes:
         "unbroken": unbroken_text,
         "drawing_of": chart_svg,
         "numbers_of": lambda chart: list(number_tables(chart.figure)),
-        "rows_of": lambda chart: count_rows(figure_series(chart.figure)),
     }
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
     style = (here / "page.css").read_text(encoding="utf-8")
@@ -94,33 +93,23 @@ def number_tables(figure: Figure) -> Iterator[Table]:
 
     Of long curves it has rows at equal steps, and the least and the largest value of bands.
     """
-    for group in _shared_abscissae(figure_series(figure)):
+
+    def abscissae(one: Series) -> object:
+        return one.panel, one.heading, one.x if isinstance(one.x, tuple) else one.x.tobytes()
+
+    for _, curves in groupby(figure_series(figure), abscissae):
+        group = list(curves)
         rows, x = _kept_rows(group), group[0].x
         cells = [
             [x[i] if isinstance(x, tuple) else cell_text(float(x[i]), _FORMAT) for i in rows],
             *([cell_text(float(one.y[i]), _FORMAT) for i in rows] for one in group),
         ]
+        count = "" if len(rows) == len(x) else f" ({len(rows)} of {len(x)} rows)"
         yield Table(
-            caption=group[0].panel,
+            caption=f"{group[0].panel}{count}".strip(),
             headings=(group[0].heading, *(one.name for one in group)),
             rows=tuple(zip(*cells, strict=True)),
         )
-
-
-def count_rows(series: tuple[Series, ...]) -> tuple[int, int]:
-    """Return how many rows the tables of numbers have, and how many there would be of all."""
-    groups = _shared_abscissae(series)
-    return sum(len(_kept_rows(group)) for group in groups), sum(len(g[0].x) for g in groups)
-
-
-def _shared_abscissae(series: tuple[Series, ...]) -> list[list[Series]]:
-    """Return series, those that follow each other with the same abscissae together."""
-
-    def abscissae(one: Series) -> object:
-        x = one.x if isinstance(one.x, tuple) else one.x.tobytes()
-        return one.panel, one.heading, x
-
-    return [list(group) for _, group in groupby(series, abscissae)]
 
 
 def _kept_rows(group: list[Series]) -> list[int]:

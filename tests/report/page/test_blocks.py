@@ -17,8 +17,6 @@ CHART = Chart(key="a", **WORDS)
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: Chart(key="A b", **WORDS), "a key must be of small letters"),
-        (lambda: Chart(key="a", **WORDS | {"alt": " "}), "words for its alt"),
         (lambda: Table(caption="t", headings=("a", "b", "c"), rows=(("1", "2"),)), "1 or 3 cells"),
         (lambda: Cell(text="a", tone="loud"), "tone must be one of"),
         (

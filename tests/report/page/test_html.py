@@ -74,7 +74,7 @@ def test_figures_have_words_and_numbers(plain):
         for table in number_tables(chart.figure):
             for part in table.by_columns(6):
                 assert f">{part.caption or 'Numbers'}</caption>" in tables
-    assert reader.texts["summary"] == ["Numbers: 110 rows", "Numbers: 12 rows", "Numbers: 3 rows"]
+    assert reader.texts["summary"] == ["Numbers"] * len(charts)
 
 
 def test_numbers_of_long_curves_keep_their_peaks():
