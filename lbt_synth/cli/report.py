@@ -13,8 +13,8 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.report import design_report, write_report
-from lbt_synth.report.designs.page import write_sensors_report
+from lbt_synth.report import design_page, design_report, write_page
+from lbt_synth.report.designs.page import sensors_page
 from lbt_synth.report.designs.report import DesignAssessment
 from lbt_synth.report.designs.tables import design_facts, good_range, verdict
 from lbt_synth.report.page.blocks import require_letters, time_text
@@ -39,7 +39,8 @@ def run(arguments: Namespace) -> Report:
         return _report_sensors(arguments, config, designs, several, files)
     with show_spinner("report", quiet=arguments.json):
         found = design_report(config, designs, gain_files=files)
-        written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
+        page = design_page(found, title=arguments.title)
+        written = write_page(page, arguments.output, pdf=arguments.pdf)
     rows = [design_facts(one) for one in found.assessments]
     report = Report(
         data={
@@ -80,14 +81,8 @@ def _report_sensors(
             "takes both."
         )
     with show_spinner("report", quiet=arguments.json):
-        written, found = write_sensors_report(
-            config,
-            designs,
-            arguments.output,
-            gain_files=files,
-            pdf=arguments.pdf,
-            title=arguments.title,
-        )
+        page, found = sensors_page(config, designs, gain_files=files, title=arguments.title)
+        written = write_page(page, arguments.output, pdf=arguments.pdf)
     report = Report()
     caption = f"Designs in the loop of {config.source.name}; {config.imaging.label}"
     report.add_rows("rows", caption, found.rows, hidden=("worst_nm", "above_band_limit_percent"))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,6 @@ from lbt_synth.report.page.blocks import (
     survival_blocks,
     time_text,
 )
-from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.array_file import digest
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, duration_text, listing_text
@@ -70,17 +68,16 @@ _EVALUATION = {
 Names = Mapping[str, str]  # what each parameter is called
 
 
-def write_study_page(
+def study_page(
     study: Study,
     columns: Mapping[str, ArrayLike],
-    path: str | os.PathLike[str],
     *,
+    folder: str | os.PathLike[str] = ".",
     statistics: StudyStatistics | None = None,
     failures: Sequence[Failure] = (),
     computing_s: float | None = None,
-    pdf: str | os.PathLike[str] | None = None,
-) -> tuple[Path, ...]:
-    """Write the page of a study as one HTML file that opens offline, and as a PDF if wanted.
+) -> Page:
+    """Return the page of a study; :func:`write_page` writes it.
 
     Parameters
     ----------
@@ -88,67 +85,37 @@ def write_study_page(
         The study.
     columns : mapping of str to (n,) array_like
         Its results, all or those that there are so far.
-    path : path-like
-        File to write, that ends in .html, in the directory of the results.
+    folder : path-like, optional
+        Directory of the results, which is named in commands that replay them.
     statistics : StudyStatistics, optional
         Those of the columns, if they are known already.
     failures : sequence of (int, str, str), optional
         Row, controller and error of what failed.
     computing_s : float, optional
         Time of all its batches, of all processes together [s].
-    pdf : path-like, optional
-        File to write, that ends in .pdf.
 
     Returns
     -------
-    tuple of pathlib.Path
-        The files; all of them are written, or none.
+    Page
+        The page.
 
     Raises
     ------
     ProblemError
         If the columns are not those of the study.
-    OutputError
-        If a name ends in something else, or a file cannot be written.
 
     Examples
     --------
-    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> import lbt_synth as lbt
     >>> study = lbt.studies.load_study("examples/study.yaml")
     >>> values = study.values(0, 2)
     >>> columns = dict(zip(study.parameter_names, values.T))
     >>> columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = lbt.report.write_study_page(
-    ...         study, columns, pathlib.Path(folder) / "summary.html"
-    ...     )
-    >>> files[0].name
-    'summary.html'
+    >>> lbt.report.study_page(study, columns).title
+    'Robustness study study.yaml'
     """
-    require_page_names(path, pdf, inputs=study.inputs)
     if statistics is None:
         statistics = study_statistics(columns, study.parameter_names, list(study.controllers))
-    page = study_page(
-        study,
-        statistics,
-        columns,
-        folder=Path(path).parent,
-        failures=failures,
-        computing_s=computing_s,
-    )
-    return write_page(page, path, pdf)
-
-
-def study_page(
-    study: Study,
-    statistics: StudyStatistics,
-    columns: Mapping[str, ArrayLike],
-    *,
-    folder: Path,
-    failures: Sequence[Failure] = (),
-    computing_s: float | None = None,
-) -> Page:
-    """Return the page of a study's results; columns (n,) have one value per sample."""
     samples = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
     if any(len(each.strehl) != statistics.samples for each in samples):
         raise ProblemError(
@@ -180,7 +147,10 @@ def study_page(
                 "What the Strehl ratio depends on",
                 _dependence_blocks(statistics, samples, values, names),
             ),
-            "worst": ("Worst samples", _worst_blocks(study, statistics, columns, names, folder)),
+            "worst": (
+                "Worst samples",
+                _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
+            ),
             "reading": ("How to read the figures", reading),
             **_origin_section(study, statistics, computing_s),
         },
@@ -376,11 +346,11 @@ def _worst_blocks(
     statistics: StudyStatistics,
     columns: Mapping[str, ArrayLike],
     names: Names,
-    folder: Path,
+    folder: str,
 ) -> list[Block]:
     """List the worst samples, and the commands that replay them."""
     blocks: list[Block] = []
-    words = ["lbt-synth", "study", os.fspath(study.source), "-o", os.fspath(folder), "--row"]
+    words = ["lbt-synth", "study", os.fspath(study.source), "-o", folder, "--row"]
     commands = []
     most = 0
     for each in statistics.controllers:
@@ -425,12 +395,6 @@ def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
     strehls = {each.controller: each.strehl[each.evaluated] for each in samples}
     if not any(values.size for values in strehls.values()):
         return []
-    medians = [
-        f"{name} has a median of {100 * np.median(values):.1f} %"
-        if values.size
-        else f"{name} has none"
-        for name, values in strehls.items()
-    ]
     top = 100 * max(float(np.max(values, initial=0.0)) for values in strehls.values())
     least = 100 / max(values.size for values in strehls.values())
     low = min(10.0, 10.0 ** np.floor(np.log10(least)))
@@ -448,7 +412,7 @@ def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
                 x, y = np.append(level[:1], level), np.append(0.0, share)
                 _draw_steps(plain, name, x, y, look)
                 _draw_steps(tail, name, level, share, look)
-    return [chart("distribution", plain.figure, medians="; ".join(medians))]
+    return [chart("distribution", plain.figure)]
 
 
 def _draw_steps(panel: Panel, name: str, x: FloatArray, y: FloatArray, look: int) -> None:
@@ -492,7 +456,6 @@ def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]
     """First-order indices as bars, one series per controller."""
     bars: dict[str, FloatArray] = {}
     intervals: dict[str, tuple[FloatArray, FloatArray]] = {}
-    strongest = []
     for one in statistics.controllers:
         rows = [one.sensitivity[name] for name in statistics.ranked]
         value, error = (
@@ -501,15 +464,11 @@ def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]
         low, high = value - 2 * error, value + 2 * error
         bars[one.controller], low, high = np.maximum((value, low, high), 0)
         intervals[one.controller] = low, high
-        strongest += [
-            f"{one.controller} depends most on {name}, {100 * one.sensitivity[name]['index']:.0f} %"
-            for name in one.ranked[:1]
-        ] or [f"{one.controller} has none"]
     height_in = min(max(0.8, 0.24 * len(statistics.ranked) * len(bars) + 0.2), 7.5)  # fits a sheet
     with drawing([height_in]) as (panel,):
         panel.set_axes({"label": "variance explained by itself", "unit": "%", "low": 0}, {})
         panel.bars([names[name] for name in statistics.ranked], bars, intervals)
-    return [chart("sensitivity", panel.figure, strongest="; ".join(strongest))]
+    return [chart("sensitivity", panel.figure)]
 
 
 def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart]:
@@ -584,7 +543,7 @@ def _map_charts(
             label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
             panel.map(x, y, 100 * mean, ends=ends, blank="no sample", **label)
         facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
-        facts |= {"controller": each.controller, "low": f"{low:.1f}", "high": f"{high:.1f}"}
+        facts["controller"] = each.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
     return charts
 

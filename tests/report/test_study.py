@@ -152,7 +152,7 @@ def test_columns_that_make_no_page_are_refused():
         page_of({name: values[:0] for name, values in results().items()})
     statistics = lbt.studies.study_statistics(results(), PARAMETERS, CONTROLLERS)
     with pytest.raises(lbt.errors.ProblemError, match="300 samples of the statistics; got 200"):
-        study_page(night(), statistics, results(200), folder=Path("out"))
+        study_page(night(), results(200), statistics=statistics)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,8 @@ def test_a_page_from_a_study_file(study, tmp_path):
     columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
     folder = tmp_path / "a folder"
     folder.mkdir()
-    files = lbt.report.write_study_page(study, columns, folder / "summary.html")
+    page = lbt.report.study_page(study, columns, folder=folder)
+    files = lbt.report.write_page(page, folder / "summary.html")
     assert [file.name for file in files] == ["summary.html"]
     html = files[0].read_text(encoding="utf-8")
     for words in (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -14,10 +13,8 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop.simulation.run import Drop
-from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.sensor_suite import OWN_SENSOR
-from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.report.designs.report import DesignAssessment, DesignReport
+from lbt_synth.report.designs.report import DesignReport
 from lbt_synth.report.designs.simulation import run_spectra
 from lbt_synth.report.designs.tables import summary_table, verdict
 from lbt_synth.report.draw import (
@@ -28,13 +25,10 @@ from lbt_synth.report.draw import (
 )
 from lbt_synth.report.figures.loops import (
     FREQUENCY,
-    design_steps,
     draw_bode,
     draw_design,
     draw_sigma,
     draw_steps,
-    margins_text,
-    open_loops,
     sigma_curves,
 )
 from lbt_synth.report.figures.records import SPECTRUM, TIME, sensor_failure_figure
@@ -59,8 +53,7 @@ from lbt_synth.report.page.blocks import (
     survival_blocks,
     time_text,
 )
-from lbt_synth.report.page.html import require_page_names, write_page
-from lbt_synth.storage.display_unit import nm_text, shown_unit
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import compare_in_truth
@@ -71,54 +64,35 @@ _PANELS = 6  # of one figure that has a panel per design: they fit a sheet
 _EXCERPT = 400  # frames of a simulated series
 
 
-def write_report(
-    report: DesignReport,
-    path: str | os.PathLike[str],
-    *,
-    pdf: str | os.PathLike[str] | None = None,
-    title: str | None = None,
-) -> tuple[Path, ...]:
-    """Write a report as one HTML file that opens offline, and as a PDF if that is wanted.
+def design_page(report: DesignReport, *, title: str | None = None) -> Page:
+    """Return the page of a report; :func:`write_page` writes it.
 
     Parameters
     ----------
     report : DesignReport
         Result of :func:`design_report`.
-    path : path-like
-        File to write, that ends in .html.
-    pdf : path-like, optional
-        File to write, that ends in .pdf.
     title : str, optional
         Heading of the page; by default it names the configuration.
 
     Returns
     -------
-    tuple of pathlib.Path
-        The files; all of them are written, or none.
+    Page
+        The page.
 
     Raises
     ------
-    OutputError
-        If a name ends in something else, or a file cannot be written.
     ProblemError
         If the title is empty, or cannot be shown.
 
     Examples
     --------
-    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
     >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
     >>> report = lbt.report.design_report(config, {"integrator": slow})
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     [file.name for file in lbt.report.write_report(report, pathlib.Path(folder) / "a.html")]
-    ['a.html']
+    >>> lbt.report.design_page(report, title="Tonight").title
+    'Tonight'
     """
-    require_page_names(path, pdf)
-    return write_page(design_page(report, title=title), path, pdf)
-
-
-def design_page(report: DesignReport, *, title: str | None = None) -> Page:
-    """Return the page of a report."""
     source = report.config.source.name
     heading = f"Controllers for {source}" if title is None else title.strip()
     if not heading:
@@ -167,7 +141,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
         *survival_blocks({one.name: one.margins for one in report.assessments if one.margins}),
         summary_table(report),
         *_truth_blocks(report.config, report.truth, ("method", "stable")),
-        _situation_text(report),
+        *report.config._summarise().tables,
         *(
             Notice(text=f"{one.name} was {note}")
             for one in report.assessments
@@ -195,28 +169,6 @@ def _truth_blocks(
     ]
 
 
-def _situation_text(report: DesignReport) -> str:
-    """Return the paragraph about the loop and its disturbances."""
-    hardware, truth = report.config.hardware, report.config.truth
-    lines = [
-        f"a {'sinusoid' if isinstance(line, SinusoidalVibration) else 'resonance'} of "
-        f"{nm_text(line.rms_nm, '.6g', unit='nm rms')} at {line.frequency_hz:.4g} Hz"
-        for line in stationary_vibrations(truth.vibrations)
-    ]
-    noise = truth.noise_per_measurement(hardware.n_measurements)
-    return paragraph(
-        "situation",
-        axes="1 axis" if hardware.modes == 1 else f"{hardware.modes} axes",
-        rate=f"{hardware.frame_rate_hz:.6g}",
-        delay=f"{hardware.delay_frames:.4g}",
-        mirror="that settles at once" if hardware.mirror is None else "with dynamics",
-        turbulence=report.config.settings.true_turbulence.replace("_", " "),
-        lines=listing_text(lines) or "no vibration",
-        noise=listing_text([nm_text(float(value)) for value in np.unique(noise)]),
-        gain=f"{report.real_gain:.4g}",
-    )
-
-
 def _certificate_blocks(report: DesignReport) -> list[Block]:
     blocks: list[Block] = [paragraph("certificates")]
     for one in report.assessments:
@@ -242,32 +194,25 @@ def _transfer_blocks(report: DesignReport) -> list[Block]:
     if loops or any(error is not None for _, error, *_ in curves.values()):
         line = "true vibration" if len(lines_hz) == 1 else "true vibrations"
         figure = draw_sigma(curves, loops, lines_hz, line=line)
-        unit, factor = shown_unit("nm")
-        largest: dict[str, list[str]] = {"peaks": [], "rejection": [], "noise": []}
-        for name, (_, *norms) in curves.items():
-            for what, norm in zip(largest, norms, strict=True):
-                if norm is not None:
-                    scale, of = (factor, f" {unit}") if what == "peaks" else (1.0, "")
-                    largest[what].append(f"{name} {scale * np.max(norm):.3g}{of}")
-        said = {what: listing_text(texts) or "none" for what, texts in largest.items()}
-        blocks.append(chart("sigma", figure, gain=gain, **said))
+        blocks.append(chart("sigma", figure, gain=gain))
     if loops:
-        opened = open_loops(loops)
-        margins = listing_text([f"{name} {margins_text(broken)}" for name, *_, broken in opened])
-        blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
+        blocks.append(chart("bode", draw_bode(loops), gain=gain))
     return blocks
 
 
 def _robustness_charts(report: DesignReport) -> list[Chart]:
     """Strehl ratio and residual over the frequency error, and maps with the sensor gain."""
     if report.errors_hz.size == 1:
-        return [_sensor_gain_chart(report)]
-    charts = [_strehl_chart(report), _residual_chart(report)] if report.stable else []
+        return [_strehl_chart(report)]
+    charts = []
+    if report.stable:
+        figure = draw_limits(report.limits, report.names, FREQUENCY_ERROR)
+        charts = [_strehl_chart(report), chart("limits", figure)]
     ends = strehl_ends([one.map for one in report.assessments])
     for number, batch in _sheets(report.assessments):
         maps = {one.name: one.map for one in batch}
         figure = draw_maps(maps, real_gain=report.real_gain, ends=ends)
-        charts.append(chart(f"map{number}", figure, ranges=_map_texts(batch)))
+        charts.append(chart(f"map{number}", figure))
     return charts
 
 
@@ -279,63 +224,25 @@ def _sheets(items: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
 
 
 def _strehl_chart(report: DesignReport) -> Chart:
-    worst = {one.name: one.curve.strehl[0, 0] for one in report.stable}
-    ends = [
-        f"{name} falls to {100 * np.min(strehl):.1f} % at "
-        f"{report.errors_hz[np.argmin(strehl)]:+.4g} Hz"
-        for name, strehl in worst.items()
-    ]
+    """Strehl ratio over the frequency error, or the sensor gain for a truth without vibrations."""
+    by_gain = report.errors_hz.size == 1
     with drawing([2.5]) as (panel,):
-        values = np.concatenate([100 * strehl for strehl in worst.values()])
-        panel.set_axes(FREQUENCY_ERROR, strehl_axis(values))
-        for one in report.assessments:
-            percents = 100 * one.curve.strehl[0, 0] if one.stable else None
-            draw_design(panel, report.names, one.name, one.curve.errors_hz, percents)
-    gain = f"{report.real_gain:.4g}"
-    return chart("robustness", panel.figure, gain=gain, ends=listing_text(ends))
-
-
-def _residual_chart(report: DesignReport) -> Chart:
-    study = report.limits
-    figure = draw_limits(study, report.names, FREQUENCY_ERROR)
-    limits = [
-        f"{name} {nm_text(limit.rms_nm, '.1f')}"
-        for name, limit in (
-            ("limit, frequency known", study.limit),
-            ("limit, frequency anywhere in this range", study.band),
+        worst = np.concatenate([100 * one.curve.strehl[0, 0] for one in report.stable] or [[0.0]])
+        y_axis = strehl_axis(worst) | ({"low": 0.0} if by_gain else {})
+        panel.set_axes(
+            {"label": "sensor gain", "unit": "-"} if by_gain else FREQUENCY_ERROR, y_axis
         )
-        if limit is not None and limit.rms_nm > 0
-    ]
-    worst = [f"{row.design} {nm_text(row.worst_nm, '.1f')}" for row in study.rows if row.stable]
-    said = f" Limits: {listing_text(limits)}." if limits else ""
-    return chart("limits", figure, worst=listing_text(worst), limits=said)
-
-
-def _map_texts(assessments: Sequence[DesignAssessment]) -> str:
-    """Say of each design how far its Strehl ratio ranges over its map."""
-    texts = []
-    for one in assessments:
-        values = 100 * one.map.strehl[np.isfinite(one.map.strehl)]
-        if not values.size:
-            texts.append(f"{one.name}: unstable everywhere.")
-            continue
-        texts.append(
-            f"{one.name}: {values.min():.1f} to {values.max():.1f} %, stable at "
-            f"{int(one.map.stable.sum())} of {one.map.stable.size} sensor gains."
-        )
-    return " ".join(texts)
-
-
-def _sensor_gain_chart(report: DesignReport) -> Chart:
-    """Strehl ratio over the sensor gain, drawn for a truth without vibrations."""
-    with drawing([2.5]) as (panel,):
-        y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0.0}
-        panel.set_axes({"label": "sensor gain", "unit": "-"}, y_axis)
         for one in report.assessments:
-            percents = 100 * one.map.strehl[0, :, 0]
-            draw_design(panel, report.names, one.name, one.map.sensor_gains, percents)
-        panel.rule("real sensor gain", report.real_gain, dash=3)
-    return chart("sensor-gain", panel.figure, ranges=_map_texts(report.assessments))
+            x, percents = one.curve.errors_hz, 100 * one.curve.strehl[0, 0]
+            if by_gain:
+                x, percents = one.map.sensor_gains, 100 * one.map.strehl[0, :, 0]
+            draw_design(
+                panel, report.names, one.name, x, percents if by_gain or one.stable else None
+            )
+        if by_gain:
+            panel.rule("real sensor gain", report.real_gain, dash=3)
+    key = "sensor-gain" if by_gain else "robustness"
+    return chart(key, panel.figure, gain=f"{report.real_gain:.4g}")
 
 
 def _dynamics_charts(report: DesignReport) -> list[Chart]:
@@ -345,21 +252,15 @@ def _dynamics_charts(report: DesignReport) -> list[Chart]:
         for one in report.assessments
     ]
     reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for pair in poles for values in pair))
-    radii = [f"{one.name} {one.loop.spectral_radius:.6g}" for one in report.assessments]
     charts = [
-        chart(f"poles{number}", _draw_poles(batch, reach), radii=listing_text(radii))
+        chart(f"poles{number}", _draw_poles(batch, reach))
         for number, batch in _sheets(list(zip(report.assessments, poles, strict=True)))
     ]
     if not report.stable:
         return charts
     loops = {one.name: one.loop for one in report.stable}
-    peaks = [
-        f"{name} {100 * np.max(np.abs(step.residual[5:])):.0f} %"
-        for name, steps in design_steps(loops).items()
-        for step in steps
-    ]
     frame = f"{1e3 / report.config.hardware.frame_rate_hz:.4g}"
-    return [*charts, chart("step", draw_steps(loops), frame=frame, peaks=listing_text(peaks))]
+    return [*charts, chart("step", draw_steps(loops), frame=frame)]
 
 
 def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
@@ -389,12 +290,7 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
     if not runs:
         return ["No loop is stable, so none was simulated."]
     rate_hz, frames = runs[0][1].frame_rate_hz, runs[0][1].residual_nm.shape[1]
-    residuals = [
-        f"{one.name} {nm_text(float(np.sqrt(np.mean(run.rms_nm**2))), '.1f', unit='nm rms')}"
-        for one, run in runs
-    ]
     time_s = np.arange(min(frames, _EXCERPT)) / rate_hz
-    facts = {"duration": f"{time_s[-1]:.2f}", "residuals": listing_text(residuals)}
     reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :_EXCERPT, 0]))) for _, run in runs)
     residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
     text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
@@ -407,7 +303,7 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
                 style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
                 y = run.residual_nm[0, :_EXCERPT, 0]
                 panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
-        series.append(chart(f"series{number}", panels[0].figure, **facts))
+        series.append(chart(f"series{number}", panels[0].figure, duration=f"{time_s[-1]:.2f}"))
         columns = count_columns(len(batch))
         with drawing([2.2] * len(batch), columns=columns) as panels:
             for panel, (one, run) in zip(panels, batch, strict=True):
@@ -423,21 +319,18 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again
 
 
-def write_sensors_report(
+def sensors_page(
     config: Config,
     designs: Mapping[str, Design],
-    path: str | os.PathLike[str],
     *,
     gain_files: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
-    pdf: str | os.PathLike[str] | None = None,
     title: str | None = None,
-) -> tuple[tuple[Path, ...], TruthComparison]:
-    """Write the page of designs of several sensors, and as a PDF if that is wanted.
+) -> tuple[Page, TruthComparison]:
+    """Return the page of designs of several sensors, and what they leave in the truth.
 
     The truth of the configuration must be stationary. The page gives the digests of the files that
     designs came from.
     """
-    require_page_names(path, pdf)
     source, content = read_source(config.source, "configuration")
     text = content.decode("utf-8-sig", errors="replace")
     gains = [read_source(file, f"gain file of {name}")[0] for name, file in gain_files.items()]
@@ -462,7 +355,7 @@ def write_sensors_report(
         subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
         sections={**sections, **source_section(files, texts={source[0]: text})},
     )
-    return write_page(page, path, pdf), compared
+    return page, compared
 
 
 def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:
@@ -477,11 +370,6 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
     simulation, rows = run_failures(
         design, config, config.truth, drops, frames=frames, cases=1, seed=seed
     )
-    left = [
-        f"without {segment.text} {nm_text(row.exact_nm, '.1f', unit='nm rms')}"
-        for segment, row in rows
-        if segment.text
-    ]
     exact_nm = [row.exact_nm for _, row in rows]
     return chart(
         key,
@@ -489,5 +377,4 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
         group="sensor-failures",
         name=name,
         away=f"{_AWAY_S:g}",
-        residuals=listing_text(left),
     )

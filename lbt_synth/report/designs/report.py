@@ -258,7 +258,7 @@ def design_report(
     Returns
     -------
     DesignReport
-        The numbers; :func:`write_report` makes pages of them.
+        The numbers; :func:`design_page` makes a page of them.
 
     Raises
     ------

@@ -11,24 +11,28 @@ import os
 import platform
 import tomllib
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias
 
+import numpy as np
+
 import lbt_synth
 from lbt_synth.errors import FileError, ProblemError
 from lbt_synth.loop import LoopMargins
-from lbt_synth.report.draw import Figure
+from lbt_synth.report.draw import Figure, figure_series
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.tables import TONES, Table
 from lbt_synth.validation import choice
 
+_MOST_NAMED = 8  # curves of a panel whose ranges are told
 _DISTRIBUTIONS = ("numpy", "scipy", "matplotlib")
 _WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 Source: TypeAlias = tuple[str, str, str]  # a file's name, what it is, and its SHA-256
@@ -104,14 +108,27 @@ def words() -> dict[str, dict[str, str]]:
 def chart(key: str, figure: Figure, *, group: str = "", **facts: object) -> Chart:
     """Return a chart with the words of its key, or of another group, and facts filled in.
 
-    A key that ends in a number is that of a continuation, with the words of the first one.
+    A key that ends in a number is that of a continuation, with the words of the first one. Its
+    words for those who do not see it say from where to where its curves reach.
     """
     name, _, number = key.rpartition("-")
     own = words().get(group or key) or words()[name]
     texts = {name: text.format(**facts) for name, text in own.items()}
     if not group and number.isdigit():
         texts["title"] += " (continued)"
+    texts["alt"] += "".join(f" {text}." for text in _ranges(figure))
     return Chart(key=key, figure=figure, **texts)
+
+
+def _ranges(figure: Figure) -> Iterator[str]:
+    """Yield from where to where the curves of each panel reach; many are one."""
+    for panel, series in groupby(figure_series(figure), lambda one: one.panel):
+        curves = {one.name: one.y[np.isfinite(one.y)] for one in series}
+        if len(curves) > _MOST_NAMED:
+            curves = {f"all {len(curves)}": np.concatenate(list(curves.values()))}
+        texts = [f"{name} {y.min():.3g} to {y.max():.3g}" for name, y in curves.items() if y.size]
+        if texts:
+            yield f"{panel}: {', '.join(texts)}".removeprefix(": ")
 
 
 def survival_blocks(margins: Mapping[str, LoopMargins]) -> list[Block]:

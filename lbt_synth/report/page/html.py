@@ -144,9 +144,40 @@ def require_page_names(
 
 
 def write_page(
-    page: Page, path: str | os.PathLike[str], pdf: str | os.PathLike[str] | None = None
+    page: Page, path: str | os.PathLike[str], *, pdf: str | os.PathLike[str] | None = None
 ) -> tuple[Path, ...]:
-    """Write a page as HTML, and as PDF if that is named; all files are written, or none."""
+    """Write a page as one HTML file that opens offline, and as a PDF if that is wanted.
+
+    Parameters
+    ----------
+    page : Page
+        Of designs (:func:`design_page`), or of a study (:func:`study_page`).
+    path : path-like
+        File to write, that ends in .html.
+    pdf : path-like, optional
+        File to write, that ends in .pdf.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The files; all of them are written, or none.
+
+    Raises
+    ------
+    OutputError
+        If a name ends in something else, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> page = lbt.report.design_page(lbt.report.design_report(config, {"integrator": slow}))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [file.name for file in lbt.report.write_page(page, pathlib.Path(folder) / "a.html")]
+    ['a.html']
+    """
+    require_page_names(path, pdf)
     contents: dict[str | os.PathLike[str], bytes] = {path: page_html(page)}
     if pdf is not None:
         contents[pdf] = print_html(contents[path])
