@@ -15,10 +15,8 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import design_page, design_report, write_page
 from lbt_synth.report.designs.page import sensors_page
-from lbt_synth.report.designs.report import DesignAssessment
-from lbt_synth.report.designs.tables import design_facts, good_range, verdict
-from lbt_synth.report.page.blocks import require_letters, time_text
-from lbt_synth.report.page.html import require_page_names
+from lbt_synth.report.designs.report import DesignAssessment, design_facts, good_range, verdict
+from lbt_synth.report.page.html import require_letters, require_page_names, time_text
 from lbt_synth.storage.rows import json_record, json_units, row_table
 
 _IN_MARGINS = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz")

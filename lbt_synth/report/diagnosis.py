@@ -16,7 +16,7 @@ from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.page.blocks import (
+from lbt_synth.report.page.html import (
     Block,
     Chart,
     Notice,

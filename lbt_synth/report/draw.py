@@ -333,12 +333,10 @@ class Panel:
         high: ArrayLike,
         *,
         look: int | None = 0,
-        solid: bool = False,
     ) -> None:
-        """Shade the area between two curves, (n,) each; a solid one hides what is below it."""
+        """Shade the area between two curves, (n,) each."""
         along, least, most = self._shown("x", x), self._shown("y", low), self._shown("y", high)
-        style = _fill_style(look, solid=solid)
-        self.axes.fill_between(along, least, most, label=_label(name), **style)
+        self.axes.fill_between(along, least, most, label=_label(name), **_fill_style(look))
         self._stands = True
         if name:
             self._note(f"{name}, from", along, least)
@@ -567,8 +565,8 @@ def line_style(
     return style
 
 
-def _fill_style(look: int | None, *, solid: bool = False) -> dict[str, Any]:
-    return {"color": colour(look), "alpha": 1.0 if solid else _SHADE, "linewidth": 0}
+def _fill_style(look: int | None) -> dict[str, Any]:
+    return {"color": colour(look), "alpha": _SHADE, "linewidth": 0}
 
 
 def count_columns(panels: int) -> int:

@@ -17,7 +17,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import PANEL_IN, Panel, drawing
-from lbt_synth.report.page.blocks import (
+from lbt_synth.report.page.html import (
     Block,
     Chart,
     Notice,
@@ -247,7 +247,7 @@ def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names
             names[name],
             name,
             distributions.get(name, ""),
-            *_rounded_texts(np.percentile(column, (0, 50, 100))),
+            *(f"{value:.4g}" for value in np.percentile(column, (0, 50, 100))),
         )
         for name, column in values.items()
         if column.size
@@ -264,13 +264,6 @@ def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names
         f"{_EVALUATION[settings.evaluation]}."
     )
     return [opening, table, *(_histogram_chart(values, names) if rows else ())]
-
-
-def _rounded_texts(values: FloatArray) -> list[str]:
-    """Return numbers with four digits of their range, or of their size if all are equal."""
-    span = float(np.ptp(values)) or float(np.max(np.abs(values))) or 1.0
-    digits = 3 - int(np.floor(np.log10(span)))
-    return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
 
 
 def _controllers_blocks(

@@ -10,8 +10,7 @@ from support.study_pages import CONTROLLERS, PARAMETERS, night, page_of, results
 
 import lbt_synth as lbt
 from lbt_synth.report.draw import figure_series
-from lbt_synth.report.page.blocks import Chart, Notice
-from lbt_synth.report.page.html import page_html
+from lbt_synth.report.page.html import Chart, Notice, page_html
 from lbt_synth.report.study import (
     binned_map,
     cumulative_points,

@@ -7,7 +7,7 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.report.designs.page import design_page
-from lbt_synth.report.page.blocks import Notice
+from lbt_synth.report.page.html import Notice
 from lbt_synth.storage.tables import Table
 
 SMALL = re.sub(

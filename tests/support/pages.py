@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from lbt_synth.report.draw import PANEL_IN, drawing, square_in
-from lbt_synth.report.page.blocks import Chart, Notice, Page
+from lbt_synth.report.page.html import Chart, Notice, Page
 from lbt_synth.storage.tables import Cell, Table
 
 HOSTILE = "</script><script>alert(1)</script><b>&\"'$x$ $$y$$ _z"
@@ -56,7 +56,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
         above.set_axes(frequency, {"label": "size", "unit": "-", "log": True})
         above.span("band", 10, 20)
         above.area("spread", f, 0.5 / f, 2 / f, look=2)
-        above.area("", f[:9], 1e-4 / f[:9], 2e-4 / f[:9], look=2, solid=True)
+        above.area("", f[:9], 1e-4 / f[:9], 2e-4 / f[:9], look=2)
         above.rule("line at 20 Hz", 20.0, dash=3)
         above.curve(name, f, 1 / f)
         above.curve("second", f, np.where(f < 5, np.nan, 1 / f**2), look=1)

@@ -14,9 +14,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop.simulation.run import Drop
 from lbt_synth.models.sensor_suite import OWN_SENSOR
-from lbt_synth.report.designs.report import DesignReport
-from lbt_synth.report.designs.simulation import run_spectra
-from lbt_synth.report.designs.tables import summary_table, verdict
+from lbt_synth.report.designs.report import DesignReport, summary_table, verdict
 from lbt_synth.report.draw import (
     Figure,
     count_columns,
@@ -31,15 +29,15 @@ from lbt_synth.report.figures.loops import (
     draw_steps,
     sigma_curves,
 )
-from lbt_synth.report.figures.records import SPECTRUM, TIME, sensor_failure_figure
+from lbt_synth.report.figures.records import SPECTRUM, TIME, run_spectra, sensor_failure_figure
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
-    draw_limits,
-    draw_maps,
+    limits_figure,
+    robustness_map_figure,
     strehl_axis,
     strehl_ends,
 )
-from lbt_synth.report.page.blocks import (
+from lbt_synth.report.page.html import (
     Block,
     Chart,
     Notice,
@@ -206,12 +204,12 @@ def _robustness_charts(report: DesignReport) -> list[Chart]:
         return [_strehl_chart(report)]
     charts = []
     if report.stable:
-        figure = draw_limits(report.limits, report.names, FREQUENCY_ERROR)
+        figure = limits_figure(report.limits, over_errors=True)
         charts = [_strehl_chart(report), chart("limits", figure)]
     ends = strehl_ends([one.map for one in report.assessments])
     for number, batch in _sheets(report.assessments):
         maps = {one.name: one.map for one in batch}
-        figure = draw_maps(maps, real_gain=report.real_gain, ends=ends)
+        figure = robustness_map_figure(maps, real_gain=report.real_gain, ends=ends)
         charts.append(chart(f"map{number}", figure))
     return charts
 

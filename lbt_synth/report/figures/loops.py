@@ -223,46 +223,32 @@ def draw_sigma(
 
     The unit is that of the errors, the title that of the loops.
     """
-    unstable = [name for name in curves if name in loops and not loops[name].is_stable]
     parts = [
         ("disturbances to error", unit),
         ("phase to residual", "-"),
         ("noise to residual", "-"),
     ]
     drawn = [
-        (label, of, number, {name: (f, y[number]) for name, (f, *y) in curves.items()})
+        (number, label, of, {name: (f, y[number]) for name, (f, *y) in curves.items()})
         for number, (label, of) in enumerate(parts)
         if (number and loops) or any(y[number] is not None for _, *y in curves.values())
     ]
     with drawing([PANEL_IN] * len(drawn), axes=axes) as panels:
-        for panel, (label, of, number, norms) in zip(panels, drawn, strict=True):
-            words = title if number == 1 else ""
-            draw_transfer(panel, label, of, norms, unstable if number else (), title=words)
+        for panel, (number, label, of, norms) in zip(panels, drawn, strict=True):
+            values = np.concatenate([np.zeros(1), *(y for _, y in norms.values() if y is not None)])
+            floor = float(np.max(values)) / _DEEPEST
+            low = floor if np.any(values[1:] < floor) and floor > 0 else None
+            y_axis = {"label": f"\u03c3\u0304, {label}", "unit": of, "log": True, "low": low}
+            panel.set_axes(FREQUENCY, y_axis, title=title if number == 1 else "")
+            for name, (f, norm) in norms.items():
+                is_unstable = number > 0 and name in loops and not loops[name].is_stable
+                if norm is not None or is_unstable:
+                    draw_design(panel, list(norms), name, f, norm)
             for line_hz in lines_hz:
                 panel.rule(line, line_hz, dash=3)
             if number == 1:
                 panel.rule("", 1.0, "y")
     return panels[0].figure
-
-
-def draw_transfer(
-    panel: Panel,
-    label: str,
-    unit: str,
-    norms: Mapping[str, tuple[FloatArray, FloatArray | None]],
-    unstable: Sequence[str] = (),
-    *,
-    title: str = "",
-) -> None:
-    """Draw transfer functions over frequency; unstable loops are named."""
-    values = np.concatenate([np.zeros(1), *(y for _, y in norms.values() if y is not None)])
-    floor = float(np.max(values)) / _DEEPEST
-    low = floor if np.any(values[1:] < floor) and floor > 0 else None
-    y_axis = {"label": f"\u03c3\u0304, {label}", "unit": unit, "log": True, "low": low}
-    panel.set_axes(FREQUENCY, y_axis, title=title)
-    for name, (frequency_hz, norm) in norms.items():
-        if norm is not None or name in unstable:
-            draw_design(panel, list(norms), name, frequency_hz, norm)
 
 
 def axes_name(design: str, measurements: Sequence[int], *, alone: bool) -> str:

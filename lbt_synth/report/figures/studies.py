@@ -106,13 +106,23 @@ def strehl_axis(percents: ArrayLike) -> dict[str, Any]:
     return {"label": "Strehl ratio", "unit": "%", "low": low}
 
 
-def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = None) -> Figure:
+def robustness_map_figure(
+    maps: Mapping[str, RobustnessMap],
+    *,
+    real_gain: float | None = None,
+    ends: tuple[float, float] | None = None,
+    axes: OwnAxes = None,
+) -> Figure:
     """Draw the Strehl ratio of designs over frequency error and sensor gain.
 
     Parameters
     ----------
     maps : mapping of str to RobustnessMap
         Maps of :func:`robustness_map` by the names of their designs.
+    real_gain : float, optional
+        Sensor gain that is marked.
+    ends : (float, float), optional
+        Ends of the one scale of colours [%]; by default those of the maps.
     axes : Axes or sequence of Axes, optional
         Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
@@ -153,22 +163,7 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = 
                 f"the maps must have the same delay errors {delays.tolist()}; got "
                 f"{grid.delay_errors_frames.tolist()} for {name}."
             )
-    return draw_maps(maps, axes=axes)
-
-
-def draw_maps(
-    maps: Mapping[str, RobustnessMap],
-    *,
-    real_gain: float | None = None,
-    ends: tuple[float, float] | None = None,
-    axes: OwnAxes = None,
-) -> Figure:
-    """Draw a map per delay error and design, the real sensor gain marked.
-
-    ``ends`` are those of the one scale of colours [%], by default those of the maps.
-    """
     ends = ends or strehl_ends(maps.values())
-    delays = next(iter(maps.values())).delay_errors_frames
     columns = min(len(maps), 3) if len(delays) > 1 else count_columns(len(maps))
     # the long name of the axis does not fit three columns
     x_axis = FREQUENCY_ERROR if columns < 3 else SHORT_FREQUENCY_ERROR
@@ -215,8 +210,8 @@ def strehl_ends(maps: Sequence[RobustnessMap] | Any) -> tuple[float, float]:
     return (low, high) if high - low > 1 else (low - 0.5, high + 0.5)
 
 
-def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
-    """Draw the residual of each design over the vibration's frequency, and the limits.
+def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes = None) -> Figure:
+    """Draw the residual of each design over the vibration's frequency or its error, and the limits.
 
     Unstable designs are named and not drawn. A study in which no vibration moves raises a
     ProblemError.
@@ -226,22 +221,12 @@ def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
             "a figure of limits needs a vibration that moves; got a truth without vibrations, or "
             "a single error. Give truth.vibrations and robustness.errors_hz."
         )
-    single = study.frequency_hz is not None
-    shift = "shift of the vibration that moves most, the others in proportion"
-    x_axis = {"label": "frequency of the true vibration" if single else shift, "unit": "Hz"}
-    names = [design_label(row.design) for row in study.rows]
-    return draw_limits(study, names, x_axis, study.frequency_hz or 0.0, axes=axes)
-
-
-def draw_limits(
-    study: LimitStudy,
-    names: Sequence[str],
-    x_axis: Mapping[str, Any],
-    start_hz: float = 0.0,
-    *,
-    axes: OwnAxes = None,
-) -> Figure:
-    """Draw the residual of designs, and the limits, over an axis that begins at start_hz."""
+    start_hz, x_axis, names = 0.0, FREQUENCY_ERROR, [row.design for row in study.rows]
+    if not over_errors:
+        shift = "shift of the vibration that moves most, the others in proportion"
+        label = shift if study.frequency_hz is None else "frequency of the true vibration"
+        start_hz, x_axis = study.frequency_hz or 0.0, {"label": label, "unit": "Hz"}
+        names = [design_label(name) for name in names]
     order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
     with drawing([2.5], axes=axes) as (panel,):
         panel.set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})

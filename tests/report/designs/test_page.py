@@ -12,7 +12,7 @@ from support.several_sensors import write_config
 
 import lbt_synth as lbt
 from lbt_synth.report.designs.page import design_page, sensors_page
-from lbt_synth.report.designs.tables import verdict
+from lbt_synth.report.designs.report import verdict
 from lbt_synth.report.page.html import page_html
 from lbt_synth.storage.tables import Table
 

@@ -4,17 +4,22 @@ import base64
 import re
 import sys
 import time
+from datetime import UTC, datetime
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from support.browser import DESK, PHONE, chain, opened
 from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
 from lbt_synth.report.draw import drawing
 from lbt_synth.report.page.html import (
+    Chart,
+    Page,
     chart_svg,
+    creation_time,
     number_tables,
     page_html,
     print_html,
@@ -22,6 +27,7 @@ from lbt_synth.report.page.html import (
     unbroken_text,
     write_page,
 )
+from lbt_synth.storage.tables import Cell, Table
 
 
 @pytest.fixture(scope="module")
@@ -319,3 +325,39 @@ def test_a_pdf_has_sheets_of_a4_and_no_date(tmp_path, monkeypatch):
         assert [float(x) for x in box.split()] == pytest.approx([0, 0, 595.28, 841.89], abs=0.1)
     assert print_html(files[0].read_bytes()) == pdf
     assert print_html(page_html(whole_page(HOSTILE))).startswith(b"%PDF")
+
+
+WORDS = {"title": "t", "caption": "c", "alt": "a", "figure": Figure()}
+CHART = Chart(key="a", **WORDS)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Table(caption="t", headings=("a", "b", "c"), rows=(("1", "2"),)), "1 or 3 cells"),
+        (lambda: Cell(text="a", tone="loud"), "tone must be one of"),
+        (
+            lambda: Page(title="t", subtitle="s", sections={"a": ("a", [CHART])}),
+            "keys of a page must be unique; got a twice",
+        ),
+    ],
+)
+def test_mistakes_are_refused(make, text):
+    with pytest.raises(lbt.errors.ProblemError, match=re.escape(text)):
+        make()
+
+
+def test_a_section_without_blocks_is_left_out():
+    sections = {"a": ("a", ()), "b": ("b", ("words",))}
+    assert list(Page(title="t", subtitle="s", sections=sections).sections) == ["b"]
+
+
+def test_the_creation_time(monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert creation_time() == datetime(1970, 1, 2, tzinfo=UTC)
+    for wrong in ("tomorrow", "1e400", str(10**30)):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", wrong)
+        with pytest.raises(lbt.errors.ProblemError, match="SOURCE_DATE_EPOCH must be a number"):
+            creation_time()
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    assert abs((datetime.now(UTC) - creation_time()).total_seconds()) < 60
