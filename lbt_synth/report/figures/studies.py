@@ -19,7 +19,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import EndToEndEntry, RobustnessMap, RobustnessRow, TradeoffPoint
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES
-from lbt_synth.validation import FloatArray, real_array, require_instance
+from lbt_synth.validation import real_array, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
 SHORT_FREQUENCY_ERROR = {"label": "frequency error", "unit": "Hz"}  # of narrow panels
@@ -329,16 +329,18 @@ def modal_figure(
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
     others = {"turbulence_nm": turbulence_nm, "gains": gains}
     curves = {
-        name: _require_modes(values, name)
+        name: real_array(values, name)
         for name, values in (*residuals_nm.items(), *others.items())
         if values is not None
     }
     count = curves[next(iter(residuals_nm))].size
-    for name, values in curves.items():
-        if values.size != count:
+    for name, curve in curves.items():
+        if curve.shape != (count,) or not count:
             raise DimensionError(
-                f"{name} must have {count} modes like the others; got {values.size}."
+                f"{name} must have {count} modes, one number per mode; got shape {curve.shape}."
             )
+        if np.any(curve <= 0):
+            raise ProblemError(f"{name} must be above 0; got {curve.min():.6g}.")
     modes = np.arange(1.0, count + 1)
     label = "mode, in Noll's order from tip on"
     x_axis = {"label": label, "log": True, "low": 1, "high": max(count, 2)}
@@ -356,18 +358,6 @@ def modal_figure(
         for name in residuals_nm:
             draw_design(panels[-1], list(residuals_nm), name, modes, curves[name], step=step)
     return panels[0].figure
-
-
-def _require_modes(values: ArrayLike, name: str) -> FloatArray:
-    """Return a positive number per mode, (n,)."""
-    curve = real_array(values, name)
-    if curve.ndim != 1 or curve.size == 0:
-        raise DimensionError(
-            f"{name} must be a list, one number per mode; got shape {curve.shape}."
-        )
-    if np.any(curve <= 0):
-        raise ProblemError(f"{name} must be above 0; got {curve.min():.6g}.")
-    return curve
 
 
 _MOST_POINTS = 4000
