@@ -203,7 +203,7 @@ def _summary_blocks(
 def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
     """Return the margins of the designs of a study in the loops that they were made for.
 
-    A controller that is designed anew for each sample has none, nor has one of several sensors.
+    A controller that is designed for each sample has none, nor has one of several sensors.
     """
     loops = {
         name: close_loop(design.hardware, design)
