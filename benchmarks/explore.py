@@ -20,7 +20,6 @@ from statistics import median, quantiles
 
 import lbt_synth as lbt
 from lbt_synth.report.explore.exploration import (
-    Wish,
     explore,
     fulfil,
     judge,
@@ -41,11 +40,11 @@ STEPS = 12
 def processor(path: Path, method: str) -> None:
     """Print the processor time of the steps of one move."""
     exploration = explore(lbt.load_config(path), {})
-    wish = Wish(method=method, values={"gain": 0.9, "noise": 20.0})
-    view = quick_view(exploration, wish)
+    wish = method, {"gain": 0.9, "noise": 20.0}
+    view = quick_view(exploration, *wish)
     whole = whole_view(exploration, view)
     steps = {
-        "configuration": lambda: fulfil(wish, exploration.knobs, exploration.config),
+        "configuration": lambda: fulfil(*wish, exploration.knobs, exploration.config),
         "certified design": lambda: view.config.design(view.request),
         "curves": lambda: loop_curves(view.design, view.config),
         "Strehl curve, residual": lambda: whole_view(exploration, view),

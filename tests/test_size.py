@@ -24,7 +24,7 @@ LINES = {
     "loop": 5475,
     "methods": 1109,
     "models": 4550,
-    "report": 5797,
+    "report": 4993,
     "storage": 1263,
     "studies": 3951,
     "errors, validation": 642,

@@ -21,7 +21,7 @@ designs = {
     "Kalman": lbt.kalman(plant),
     "H-infinity": lbt.hinf(plant, gamma_ratio=1.1),
 }
-figure = lbt.report.figures.sigma_figure(designs)
+figure = lbt.report.figures.loop_figure(designs, "sigma")
 
 # %%
 # The numbers behind the picture are those of any linear system. Here the rejection of the Kalman

@@ -17,8 +17,8 @@ from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.diagnosis.diagnosis import diagnosis_verdict
 from lbt_synth.identification.diagnosis.running_loop import command_row, live_axes
-from lbt_synth.report.diagnosis import diagnosis_tables, write_diagnosis
-from lbt_synth.report.page.html import require_page_names
+from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
+from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.rows import json_record
 
 _STEPS = 4
@@ -54,7 +54,8 @@ def run(arguments: Namespace) -> Report:
     )
     if arguments.output is not None:
         files = (arguments.file, *([arguments.gain] if arguments.gain else []))
-        report.note_files(write_diagnosis(found, arguments.output, pdf=arguments.pdf, files=files))
+        page = diagnosis_page(found, files)
+        report.note_files(write_page(page, arguments.output, pdf=arguments.pdf))
     return report
 
 

@@ -11,7 +11,7 @@ from lbt_synth.cli.display import load_shown
 from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.explore.exploration import Wish, explore, quick_view, whole_view
+from lbt_synth.report.explore.exploration import explore, quick_view, whole_view
 from lbt_synth.storage.atomic_files import require_writable
 
 _MOST_PORTS = 65535
@@ -31,7 +31,7 @@ def run(arguments: Namespace) -> Report:
     require_writable(folder / "explored-1.yaml")
     config = load_shown(arguments)
     exploration = explore(config, load_designs(arguments.gains))
-    first = whole_view(exploration, quick_view(exploration, Wish()))
+    first = whole_view(exploration, quick_view(exploration))
 
     from lbt_synth.report.explore.server import serve  # bokeh's server, slow to import
 

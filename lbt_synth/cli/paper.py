@@ -13,7 +13,7 @@ from lbt_synth.design import FilterDesign
 from lbt_synth.files import save_gain
 from lbt_synth.methods.registry import design_label, design_title
 from lbt_synth.report.draw import save_figure
-from lbt_synth.report.figures import robustness_figure, sigma_figure
+from lbt_synth.report.figures import loop_figure, robustness_figure
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import csv_rows, json_record
@@ -120,7 +120,7 @@ def write_paper(folder: Path, rows: list[RobustnessRow]) -> PaperResult:
     filters = {design_label(design.method): design for design in (kalman_design, hinf_design)}
     for name, figure in (
         ("robustness", robustness_figure(rows, published)),
-        ("sigma", sigma_figure(filters, unit_weights=True)),
+        ("sigma", loop_figure(filters, "sigma", unit_weights=True)),
     ):
         files += [save_figure(figure, folder / f"{name}{ending}") for ending in (".png", ".pdf")]
     files += [

@@ -17,14 +17,15 @@ from lbt_synth.design import Design
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
-from lbt_synth.report.figures import (
-    bode_figure,
-    nichols_figure,
-    nyquist_figure,
-    sigma_figure,
-    step_figure,
+from lbt_synth.report.figures import loop_figure
+from lbt_synth.report.figures.loops import (
+    axes_name,
+    closed_loops,
+    design_steps,
+    loop_points,
+    open_loops,
+    sigma_curves,
 )
-from lbt_synth.report.figures.loops import axes_name, design_steps, open_loops, sigma_curves
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import column, columns, fact, facts, json_record, json_units, table_row
 from lbt_synth.validation import FloatArray
@@ -67,7 +68,8 @@ class StepPoint:
 
 def run(arguments: Namespace) -> Report:
     """Print the margins of designs, and write their figure and their points."""
-    figure, points, kind = _VIEWS[arguments.kind]
+    view = arguments.kind
+    points, kind = _VIEWS.get(view, (_loop_points, LoopPoint))
     require_outputs(arguments.output, inputs=arguments.gains)
     designs, gain = load_designs(arguments.gains), arguments.gain_factor
     choose_design_unit(arguments, *designs.values())
@@ -83,9 +85,12 @@ def run(arguments: Namespace) -> Report:
         report.data["curves"] = _curves(drawn)
         report.data["units"] |= json_units(kind)
         write_outputs(
-            report, arguments.output, drawn, figure=lambda: figure(designs, sensor_gain=gain)
+            report,
+            arguments.output,
+            drawn,
+            figure=lambda: loop_figure(designs, view, sensor_gain=gain),
         )
-    if arguments.kind == "step":
+    if view == "step":
         _add_step_facts(report, designs, gain)
     return report
 
@@ -151,17 +156,19 @@ def _loop_points(designs: Mapping[str, Design], gain_factor: float) -> list[Loop
     """Return the points of the loops of designs."""
     return [
         point
-        for loop in open_loops(designs, sensor_gain=gain_factor)
-        for *curves, response in [loop.points]
-        for point in _points(LoopPoint, loop.name, *curves, response.real, response.imag)
+        for name, _, _, broken in open_loops(closed_loops(designs, gain_factor))
+        if broken is not None
+        for *curves, response in [loop_points(broken)]
+        for point in _points(LoopPoint, name, *curves, response.real, response.imag)
     ]
 
 
 def _sigma_points(designs: Mapping[str, Design], gain_factor: float) -> list[SigmaPoint]:
     """Return the points of the curves of designs."""
+    loops = closed_loops(designs, gain_factor, needed=False)
     return [
         point
-        for name, (_, f, *parts) in sigma_curves(designs, sensor_gain=gain_factor).items()
+        for name, (f, *parts) in sigma_curves(designs, loops).items()
         for point in _points(
             SigmaPoint, name, f, *(np.full(f.size, np.nan) if p is None else p for p in parts)
         )
@@ -174,7 +181,7 @@ def _named_steps(
     """Return the step responses of designs, named with their axes where these differ."""
     return [
         (axes_name(name, [step.axis], alone=len(steps) == 1), step)
-        for name, steps in design_steps(designs, sensor_gain=gain_factor, frames=frames).items()
+        for name, steps in design_steps(closed_loops(designs, gain_factor), frames=frames).items()
         for step in steps
     ]
 
@@ -203,13 +210,8 @@ def _step_points(designs: Mapping[str, Design], gain_factor: float) -> list[Step
     ]
 
 
-_View: TypeAlias = tuple[
-    Callable[..., Any], Callable[[Mapping[str, Design], float], Sequence[Any]], type[Any]
-]
-_VIEWS: Mapping[str, _View] = {  # the figure, the points of its curves, and their type
-    "sigma": (sigma_figure, _sigma_points, SigmaPoint),
-    "bode": (bode_figure, _loop_points, LoopPoint),
-    "nyquist": (nyquist_figure, _loop_points, LoopPoint),
-    "nichols": (nichols_figure, _loop_points, LoopPoint),
-    "step": (step_figure, _step_points, StepPoint),
+_Points: TypeAlias = Callable[[Mapping[str, Design], float], Sequence[Any]]
+_VIEWS: Mapping[str, tuple[_Points, type[Any]]] = {  # the points of curves, but for broken loops
+    "sigma": (_sigma_points, SigmaPoint),
+    "step": (_step_points, StepPoint),
 }

@@ -13,12 +13,10 @@ from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.report import design_report, write_report
-from lbt_synth.report.designs.page import write_sensors_report
-from lbt_synth.report.designs.report import DesignAssessment
-from lbt_synth.report.designs.tables import AssessmentRow, assessment_row, good_range, verdict
-from lbt_synth.report.page.blocks import require_letters, time_text
-from lbt_synth.report.page.html import require_page_names
+from lbt_synth.report import design_page, design_report, write_page
+from lbt_synth.report.designs.page import sensors_page
+from lbt_synth.report.designs.report import DesignAssessment, design_facts, good_range, verdict
+from lbt_synth.report.page.html import require_letters, require_page_names, time_text
 from lbt_synth.storage.rows import json_record, json_units, row_table
 
 _IN_MARGINS = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz")
@@ -39,19 +37,20 @@ def run(arguments: Namespace) -> Report:
         return _report_sensors(arguments, config, designs, several, files)
     with show_spinner("report", quiet=arguments.json):
         found = design_report(config, designs, gain_files=files)
-        written = write_report(found, arguments.output, pdf=arguments.pdf, title=arguments.title)
-    rows = [assessment_row(found, one, limits) for one, limits in found.rows]
+        page = design_page(found, title=arguments.title)
+        written = write_page(page, arguments.output, pdf=arguments.pdf)
+    rows = [design_facts(one) for one in found.assessments]
     report = Report(
         data={
             "designs": {
                 row.design: json_record(row, without=_IN_MARGINS) | _design_record(one)
                 for row, one in zip(rows, found.assessments, strict=True)
             },
-            "units": json_units(AssessmentRow),
+            "units": json_units(rows[0]),
             "verdict": verdict(found),
             "limit_nm": None if found.limits.limit is None else found.limits.limit.rms_nm,
             "sensor_gain": found.real_gain,
-            "sha256": {file.name: file.sha256 for file in found.files},
+            "sha256": {name: sha256 for name, _, sha256 in found.files},
             "made": time_text(found.made),
         },
         tables=[row_table(f"Designs in the loop of {config.source.name}", rows)],
@@ -80,14 +79,8 @@ def _report_sensors(
             "takes both."
         )
     with show_spinner("report", quiet=arguments.json):
-        written, found = write_sensors_report(
-            config,
-            designs,
-            arguments.output,
-            gain_files=files,
-            pdf=arguments.pdf,
-            title=arguments.title,
-        )
+        page, found = sensors_page(config, designs, gain_files=files, title=arguments.title)
+        written = write_page(page, arguments.output, pdf=arguments.pdf)
     report = Report()
     caption = f"Designs in the loop of {config.source.name}; {config.imaging.label}"
     report.add_rows("rows", caption, found.rows, hidden=("worst_nm", "above_band_limit_percent"))

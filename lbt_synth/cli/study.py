@@ -12,7 +12,7 @@ from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
-from lbt_synth.report import write_study_page
+from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import Facts, fact, facts
@@ -53,15 +53,15 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
     draws = run.computed > 0 or not all(path.exists() for path in pages)
     if draws:
-        write_study_page(
+        page = study_page(
             loaded,
             columns,
-            pages[0],
+            folder=folder,
             statistics=statistics,
             failures=run.failures,
             computing_s=run.computing_s,
-            pdf=pages[1] if arguments.pdf else None,
         )
+        write_page(page, pages[0], pdf=pages[1] if arguments.pdf else None)
     files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
     varying = [name for name, p in loaded.settings.parameters.items() if p.varies]
     worst = [worst_table(each, columns, varying) for each in statistics.controllers]

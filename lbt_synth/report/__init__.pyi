@@ -1,4 +1,5 @@
 from . import figures as figures
-from .designs.page import write_report as write_report
+from .designs.page import design_page as design_page
 from .designs.report import design_report as design_report
-from .study import write_study_page as write_study_page
+from .page.html import write_page as write_page
+from .study import study_page as study_page

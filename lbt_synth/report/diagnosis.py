@@ -16,13 +16,11 @@ from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.number_text import number_text
-from lbt_synth.report.page.blocks import (
+from lbt_synth.report.page.html import (
     Block,
     Chart,
     Notice,
     Page,
-    Section,
     chart,
     creation_time,
     paragraph,
@@ -30,11 +28,9 @@ from lbt_synth.report.page.blocks import (
     source_section,
     time_text,
 )
-from lbt_synth.report.page.html import require_page_names, write_page
-from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import cell_text, fact_table, row_table
 from lbt_synth.storage.tables import Table
-from lbt_synth.storage.words import count_text, listing_text
+from lbt_synth.storage.words import count_text
 
 _ROW_IN = 0.42  # height of a category
 _SIGMAS = 2.0
@@ -50,23 +46,16 @@ def _residual_charts(found: Diagnosis) -> list[Chart]:
         names = [row.name for row in rows]
         intervals = {"data": (values - errors, values + errors)}
         figure = _draw_bars(names, {"data": values, "model": promised}, intervals)
-        shown = np.where(np.isfinite(values), values, promised)
-        pairs = zip(names, shown.tolist(), strict=True)  # the limit has no data
-        said = [f"{name} {nm_text(value_nm, '.1f')}" for name, value_nm in pairs]
-        charts.append(chart("residuals", figure, values=listing_text(said)))
+        charts.append(chart("residuals", figure))
     if costs := found.costs:
         columns = {"loop that ran": "running_nm", "best design": "best_nm"}
         bars = {
             name: np.array([getattr(row, field) for row in costs])
             for name, field in columns.items()
         }
-        said = [
-            f"{row.part} {nm_text(row.running_nm, '.1f')} and {nm_text(row.best_nm, '.1f')}"
-            for row in costs
-        ]
         figure = _draw_bars([row.part for row in costs], bars, {})
         best = found.best or "none"
-        charts.append(chart("costs", figure, values=listing_text(said), best=best))
+        charts.append(chart("costs", figure, best=best))
     return charts
 
 
@@ -86,9 +75,8 @@ def _spectrum_charts(found: Diagnosis) -> list[Chart]:
     if found.model is None:
         return []
     designs = {} if found.best_design is None else {found.best: found.best_design}
-    lines = [f"{number_text(line.row.frequency_hz)} Hz" for line in found.lines]
     figure = identification_figure(found.model, designs=designs)
-    return [chart("identification", figure, lines=listing_text(lines) or "none")]
+    return [chart("identification", figure)]
 
 
 def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
@@ -128,41 +116,23 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
     }
 
 
-def write_diagnosis(
-    found: Diagnosis,
-    path: str | os.PathLike[str],
-    *,
-    pdf: str | os.PathLike[str] | None = None,
-    files: Sequence[str | os.PathLike[str]] = (),
-) -> tuple[Path, ...]:
-    """Write a diagnosis as one HTML file that opens offline, and as a PDF if that is wanted.
-
-    ``files`` are those of the record and of the given design, whose digests the page gives. All
-    files are written, or none; a wrong ending or a file that cannot be written raises an
-    OutputError.
-    """
-    require_page_names(path, pdf, inputs=tuple(files))
-    return write_page(diagnosis_page(found, files), path, pdf)
-
-
 def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = ()) -> Page:
-    """Return the page of a diagnosis."""
+    """Return the page of a diagnosis.
+
+    ``files`` are those of the record and of the given design, whose digests the page gives.
+    """
     roles = ("record", "gain file")
     read = [read_source(Path(file), role)[0] for file, role in zip(files, roles, strict=False)]
-    name = read[0].name if read else found.record.source or "a record"
+    name = read[0][0] if read else found.record.source or "a record"
     record, tables = found.record, diagnosis_tables(found)
     disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(found)]
-    sections = (
-        Section(key="verdict", title="Verdict", blocks=_verdict_blocks(found, tables["verdict"])),
-        Section(key="record", title="Record", blocks=tables["record"]),
-        Section(key="loop", title="Loop that ran", blocks=(paragraph("law"), *tables["loop"])),
-        Section(
-            key="disturbance",
-            title="Disturbance",
-            blocks=disturbance or ["No model was identified."],
-        ),
-        source_section(read),
-    )
+    sections: dict[str, tuple[str, Sequence[Block]]] = {
+        "verdict": ("Verdict", _verdict_blocks(found, tables["verdict"])),
+        "record": ("Record", tables["record"]),
+        "loop": ("Loop that ran", (paragraph("law"), *tables["loop"])),
+        "disturbance": ("Disturbance", disturbance or ["No model was identified."]),
+        **source_section(read),
+    }
     return Page(
         title=f"Diagnosis of {name}",
         subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "

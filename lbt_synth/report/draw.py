@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.report import scales
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.warning_filters import ignore_warnings
@@ -62,7 +61,12 @@ _LETTER_IN = 0.068  # width of a letter at 8 points, generously
 _AROUND_IN = 0.55  # below and above the axes of a panel
 _FLAG_IN = 0.15  # width of an upright text
 _LONGEST = {"name": 60, "category": 36}  # letters in a legend, and beside bars
-_MOST_OF_A_PANEL = 1 / 3  # that a legend in it may cover
+_ROOM = 0.04  # around what is drawn, as a part of its extent
+_MOST_RATIO = 1e8  # of the ends of a logarithmic scale: a zero must not stretch it
+_FEW_DECADES = 150  # ratio of the ends below which a logarithmic scale has ticks at 2 and 5, too
+_STEPS = (1, 2, 5, 10)  # of ticks within a decade
+_CONTOURS = 6  # of a map, about, at round values
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def colour(look: int | None) -> str:
@@ -160,7 +164,9 @@ def drawing(
                 figure.set_layout_engine("none")
         else:
             for panel in panels:
-                _draw_own_legend(panel)
+                marks, names = _legend_entries([panel])
+                if names:
+                    panel.axes.legend(marks, names, handlelength=3.2)
         for panel in panels:
             if panel.is_equal:
                 panel.axes.set_aspect("equal")
@@ -196,7 +202,7 @@ def _legend_entries(panels: Sequence[Panel]) -> tuple[list[Any], list[str]]:
     for panel in panels:
         for mark, name in zip(*panel.axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(name, mark)
-    return list(entries.values()), [scales.shorten(name, _LONGEST["name"]) for name in entries]
+    return list(entries.values()), [shorten(name, _LONGEST["name"]) for name in entries]
 
 
 def _draw_legend(figure: Figure, panels: Sequence[Panel], height: float) -> None:
@@ -211,31 +217,19 @@ def _draw_legend(figure: Figure, panels: Sequence[Panel], height: float) -> None
     figure.set_size_inches(_WIDTH_IN, height)
 
 
-def _draw_own_legend(panel: Panel) -> None:
-    """Draw the legend of the user's axes: in them, or beside them if it would cover too much."""
-    marks, names = _legend_entries([panel])
-    if not names:
-        return
-    legend = panel.axes.legend(marks, names, handlelength=3.2)
-    covered, whole = legend.get_window_extent(), panel.axes.get_window_extent()
-    if covered.width * covered.height > _MOST_OF_A_PANEL * whole.width * whole.height:
-        legend.set_loc("upper left")
-        legend.set_bbox_to_anchor((1.02, 1.0), transform=panel.axes.transAxes)
-
-
 def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:
     """Draw one colour bar for all maps, and return whether there are any."""
     from matplotlib.colors import LogNorm
+    from matplotlib.ticker import FuncFormatter
 
     mapped = [panel for panel in panels if panel.image is not None]
     if not mapped:
         return False
     image, places = mapped[0].image, [panel.axes for panel in mapped]
-    style = {"location": "bottom", "shrink": 0.6, "aspect": 40} if below else {}
-    bar = mapped[0].figure.colorbar(image, ax=places, **style)
+    style: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40} if below else {}
     if isinstance(image.norm, LogNorm):
-        ticks = scales.log_ticks(image.norm.vmin, image.norm.vmax)
-        bar.set_ticks(ticks, labels=scales.log_tick_texts(ticks))
+        style["format"] = FuncFormatter(tick_text)
+    bar = mapped[0].figure.colorbar(image, ax=places, **style)
     bar.set_label(mapped[0].image_text)
     bar.outline.set_visible(False)
     return True
@@ -244,8 +238,8 @@ def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:
 class Panel:
     """Axes that a part of a figure is drawn on.
 
-    A mark with a name is in the legend, once for each name, if it reaches into the scales. A look
-    is the number of a colour with its dashes and marker; None is dark grey.
+    A mark with a name is in the legend, once for each name. A look is the number of a colour with
+    its dashes and marker; None is dark grey.
     """
 
     def __init__(self, axes: Axes) -> None:
@@ -256,13 +250,10 @@ class Panel:
         self.title_lines = 0
         self._title = ""
         self._axis: dict[str, dict[str, Any]] = {}
-        self._values: dict[str, list[FloatArray]] = {"x": [], "y": []}
-        # of curves: x, y, and whether they have markers
-        self._curves: list[tuple[FloatArray, FloatArray, bool]] = []
-        self._named: list[tuple[Any, FloatArray | None, FloatArray | None]] = []
-        self._cut: list[Any] = []  # areas and error bars, which end at the edges
+        self._heights: list[FloatArray] = []  # of curves
         self._flags: tuple[FloatArray, FloatArray, Sequence[str]] | None = None
-        self.is_equal = self._stands = self._tight = self._rows = False
+        self.is_equal = self._stands = False
+        axes.margins(x=0, y=_ROOM)
         self.set_axes({}, {})
 
     @property
@@ -277,7 +268,7 @@ class Panel:
 
         Each has a label, and may have a unit ("-" of a pure number), ends (low, high), and a
         logarithmic scale (log), on which nothing is drawn that is not positive. What is beyond an
-        end is not drawn; an end moves out where it would cut a marker.
+        end is not drawn; a low or high end of y moves out where a curve runs along it.
         """
         for name, axis in (("x", x), ("y", y)):
             unit, factor = shown_unit(axis.get("unit", ""))
@@ -289,6 +280,7 @@ class Panel:
                 "log": axis.get("log", False),
                 "ends": [None if end is None else factor * end for end in ends],
             }
+            getattr(self.axes, f"set_{name}scale")("log" if axis.get("log") else "linear")
         self._title = title
         self.is_equal = self._stands = equal
 
@@ -318,16 +310,12 @@ class Panel:
         style = line_style(**look)
         label = f"_{name}" if quiet else _label(name)
         (line,) = self.axes.plot(along, up, drawstyle=step, label=label, **style)
-        self._values["x"].append(along)
-        self._values["y"].append(up)
-        self._curves.append((along, up, "marker" in style))
-        if along.size:
-            self._named.append((line, along, up))
+        self._heights.append(up)
+        if "marker" in style:
+            self.axes.margins(x=_ROOM)
         if error is not None:
             half = self._shown("y", error)
-            ends = up - half, up + half
-            self._values["y"] += ends
-            self._cut.append(self.axes.vlines(along, *ends, color=line.get_color(), linewidth=1.0))
+            self.axes.vlines(along, up - half, up + half, color=line.get_color(), linewidth=1.0)
         if name and numbers and along.size:
             self._note(name, along, up)
 
@@ -345,14 +333,10 @@ class Panel:
         high: ArrayLike,
         *,
         look: int | None = 0,
-        solid: bool = False,
     ) -> None:
-        """Shade the area between two curves, (n,) each; a solid one hides what is below it."""
+        """Shade the area between two curves, (n,) each."""
         along, least, most = self._shown("x", x), self._shown("y", low), self._shown("y", high)
-        style = _fill_style(look, solid=solid)
-        self._cut.append(self.axes.fill_between(along, least, most, label=_label(name), **style))
-        self._values["x"].append(along)
-        self._values["y"] += [least, most]
+        self.axes.fill_between(along, least, most, label=_label(name), **_fill_style(look))
         self._stands = True
         if name:
             self._note(f"{name}, from", along, least)
@@ -364,10 +348,7 @@ class Panel:
         draw = self.axes.axvline if axis == "x" else self.axes.axhline
         strokes = _DASHES[dash]
         style = {"color": _GREY, "linewidth": 1.0, "linestyle": (0, strokes) if strokes else "-"}
-        line = draw(place[0], zorder=1.6, label=_label(name), **style)
-        self._named.append((line, *((place, None) if axis == "x" else (None, place))))
-        if axis == "y":
-            self._values["y"].append(place)
+        draw(place[0], zorder=1.6, label=_label(name), **style)
 
     def span(
         self, name: str, low: float, high: float, axis: str = "x", *, look: int | None = None
@@ -375,8 +356,7 @@ class Panel:
         """Shade a range of an axis, from end to end of the other."""
         ends = self._shown(axis, [low, high])
         shade = self.axes.axvspan if axis == "x" else self.axes.axhspan
-        patch = shade(ends[0], ends[1], label=_label(name), **_fill_style(look))
-        self._named.append((patch, *((ends, None) if axis == "x" else (None, ends))))
+        shade(ends[0], ends[1], label=_label(name), **_fill_style(look))
 
     def bars(
         self,
@@ -394,17 +374,17 @@ class Panel:
             drawn, shade = np.isfinite(values), colour(look)
             size = 0.9 * height
             self.axes.barh(up[drawn], values[drawn], height=size, color=shade, label=_label(name))
-            self._values["x"] += [np.zeros(1), values]
             if name in intervals:
                 ends = [self._shown("x", end) for end in intervals[name]]
                 self.axes.hlines(up, *ends, color="black", linewidth=1.0)
-                self._values["x"] += ends
             self._note(f"{name} {self._axis['x']['text']}", tuple(categories), values)
-        names = [scales.shorten(name, _LONGEST["category"]) for name in categories]
+        names = [shorten(name, _LONGEST["category"]) for name in categories]
         self.axes.set_yticks(places, names)
+        self.axes.set_ylim(len(names) - 0.4, -0.6)
+        self.axes.margins(x=_ROOM)
         self.axes.tick_params(axis="y", length=0)
         self.axes.grid(visible=False, axis="y")
-        self._stands = self._rows = True
+        self._stands = True
 
     def flags(self, x: ArrayLike, y: ArrayLike, texts: Sequence[str]) -> None:
         """Write upright texts along the upper edge, each with a line down to its point; x rises."""
@@ -420,84 +400,70 @@ class Panel:
         *,
         ends: tuple[float, float],
         log: bool = False,
-        levels: Sequence[float] = (),
+        contours: bool = False,
         blank: str = "no value",
     ) -> None:
         """Draw values (ny, nx) over a grid of increasing centres, nan hatched as ``blank``.
 
-        ``ends`` are those of the colours; lines of equal value are drawn at ``levels``.
+        ``ends`` are those of the colours; contours are lines of equal, round values.
         """
-        from matplotlib.colors import LogNorm, Normalize
+        from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
         along, up = self._shown("x", x), self._shown("y", y)
-        edges, shown = (
-            (scales.cell_edges(along), scales.cell_edges(up)),
-            np.ma.masked_invalid(values),
-        )
+        edges, shown = (_cell_edges(along), _cell_edges(up)), np.ma.masked_invalid(values)
         self.axes.grid(visible=False)
+        self.axes.margins(0)
         norm = (LogNorm if log else Normalize)(*ends)
         self.image = self.axes.pcolormesh(*edges, shown, cmap="viridis", norm=norm, rasterized=True)
         self.image_text = f"{label} [{unit}]" if unit else label
-        inner = scales.levels_within(values, levels)
-        if inner:
-            shades = ["white" if level < sum(ends) / 2 else "black" for level in inner]
-            lines = self.axes.contour(along, up, shown, levels=inner, linewidths=0.8, colors=shades)
-            texts = self.axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
-            boxes = [text.get_window_extent().extents for text in texts]
-            for text, stays in zip(texts, scales.keep_apart(boxes), strict=True):
-                text.set_visible(stays)
-        labels = {"label": _label(blank)}
-        for left, right, low, high in scales.blank_cells(np.isnan(values), *edges):
-            self.axes.fill_between([left, right], low, high, **_BLANK, **labels)
-            labels = {}
-        self._values["x"].append(edges[0])
-        self._values["y"].append(edges[1])
-        self._stands = self._tight = True
+        if contours and min(values.shape) > 1 and np.ptp(shown.compressed()) > 0:
+            shades = {"cmap": ListedColormap(["white", "black"]), "norm": Normalize(*ends)}
+            lines = self.axes.contour(along, up, shown, _CONTOURS, linewidths=0.8, **shades)
+            self.axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+        if np.any(np.isnan(values)):  # what no cell covers
+            self.axes.patch.set(**_BLANK)
+            corner = [edges[0][0]] * 2, edges[1][0], edges[1][0]
+            self.axes.fill_between(*corner, label=_label(blank), **_BLANK)
+        self._stands = True
         for place, row in zip(up, values, strict=True):
             self._note(f"{label} at {self._axis['y']['text']} {place:g}", along, row)
 
-    def ends(self, name: str) -> tuple[float, float]:
-        """Return the ends of the scale of an axis."""
-        if self._rows and name == "y":
-            return len(self.axes.get_yticks()) - 0.4, -0.6
-        axis, room = self._axis[name], scales.ROOM
-        if self._tight or (
-            name == "x" and not self._rows and not any(marked for *_, marked in self._curves)
-        ):
-            room = 0.0  # lines without markers need no room at the ends of x
-        # areas and bars stand on an end, and equal scales stay equal: they move none
-        curves = (
-            []
-            if self._stands
-            else [(x if name == "x" else y, marked) for x, y, marked in self._curves]
-        )
-        return scales.scale_ends(
-            self._values[name], curves, log=axis["log"], ends=axis["ends"], room=room
-        )
+    def _limits(self, name: str) -> tuple[float, float]:
+        """Return the ends of the scale of an axis: those that are given, else those of the data."""
+        log, (first, last) = self._axis[name]["log"], self._axis[name]["ends"]
+        low, high = getattr(self.axes, f"get_{name}lim")()
+        if log:
+            low = max(low, high / _MOST_RATIO)
+        low, high = low if first is None else first, high if last is None else last
+        if first is not None and high <= low:  # all values are below the end that is given
+            high = 2 * low if log else low + 1
+        if log or name == "x" or self._stands:  # areas and bars stand on an end
+            return low, high
+        room = _ROOM * (high - low)
+        heights = np.concatenate([np.zeros(0), *self._heights])
+        low -= room * (first is not None and bool(np.any(np.isclose(heights, low))))
+        high += room * (last is not None and bool(np.any(np.isclose(heights, high))))
+        return low, high
 
     def finish(self) -> None:
-        """Set the scales, leave out of the legend what they do not show, and write the title."""
-        ends = {name: self.ends(name) for name in ("x", "y")}
+        """Set the scales and their ticks, and write the title."""
+        from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
         for name, place in (("x", self.axes.xaxis), ("y", self.axes.yaxis)):
-            axis = self._axis[name]
-            if axis["log"]:
-                getattr(self.axes, f"set_{name}scale")("log")
-                ticks = scales.log_ticks(*ends[name])
-                place.set_ticks(ticks, scales.log_tick_texts(ticks))
-                place.set_ticks([], minor=True)
-            getattr(self.axes, f"set_{name}lim")(*ends[name])
-            place.set_label_text(axis["text"], parse_math=False)
-        for mark, x, y in self._named:
-            if not (scales.overlap(x, ends["x"]) and scales.overlap(y, ends["y"])):
-                mark.set_label("_unseen")
-        for mark in self._cut:  # programs that draw an SVG need not cut them off there
-            for path in mark.get_paths():
-                np.clip(path.vertices[:, 1], *sorted(ends["y"]), out=path.vertices[:, 1])
+            low, high = self._limits(name)
+            getattr(self.axes, f"set_{name}lim")(low, high)
+            if self._axis[name]["log"]:
+                factors = (1, 2, 5) if high < _FEW_DECADES * low else (1,)
+                decades, equal_steps = LogLocator(subs=factors), MaxNLocator(7, steps=_STEPS)
+                place.set_major_locator(equal_steps if high < 10 * low else decades)
+                place.set_major_formatter(FuncFormatter(tick_text))
+                place.set_minor_locator(NullLocator())
+            place.set_label_text(self._axis[name]["text"], parse_math=False)
         width_in = self.axes.get_window_extent().width / self.axes.figure.dpi
         if self._flags is not None:
             self._draw_flags(width_in)
         letters = max(12, int(width_in / _LETTER_IN))
-        lines = textwrap.wrap(scales.shorten(self._title, 3 * letters), letters)
+        lines = textwrap.wrap(shorten(self._title, 3 * letters), letters)
         self.title_lines = len(lines)
         self.axes.set_title("\n".join(lines), loc="left", parse_math=False)
 
@@ -507,7 +473,7 @@ class Panel:
         x, y, texts = self._flags
         points = self.axes.transData.transform(np.column_stack((x, y)))
         across = self.axes.transAxes.inverted().transform(points)[:, 0]
-        places = scales.spread_labels(across, _FLAG_IN / width_in)
+        places = spread_labels(across, _FLAG_IN / width_in)
         line = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "relpos": (0.5, 0.0)}
         for text, point, place in zip(texts, zip(x, y, strict=True), places, strict=True):
             self.axes.annotate(
@@ -522,6 +488,43 @@ class Panel:
                 color="0.15",
                 arrowprops={**line, "shrinkA": 0, "shrinkB": 0},
             )
+
+
+def tick_text(value: float, _: object = None) -> str:
+    """Return the text of a tick of a logarithmic scale: 0.01, 5, 200, 10⁻⁶, 2·10⁵."""
+    if value == 0 or 0.999e-3 <= value <= 1.001e4:
+        return f"{value:g}"
+    power = int(np.floor(np.log10(value) + 1e-9))
+    factor, raised = f"{value / 10.0**power:.6g}", f"10{str(power).translate(_RAISED)}"
+    return raised if factor == "1" else f"{factor}·{raised}"
+
+
+def shorten(text: str, most: int) -> str:
+    """Return a text of at most so many characters, with its middle left out if need be."""
+    if len(text) <= most:
+        return text
+    return f"{text[: most // 2]}…{text[len(text) - (most - 1) // 2 :]}"
+
+
+def spread_labels(places: FloatArray, width: float) -> FloatArray:
+    """Return places in (0, 1) for labels of that width near increasing ones; none overlap."""
+    gap = min(width, 1 / max(places.size, 1))
+    steps = gap * np.arange(places.size)
+    least = gap / 2 + steps
+    # pushed to the right where they are crowded, and back from the end
+    right = np.maximum.accumulate(np.maximum(places, least) - steps) + steps
+    ends = 1 - least[::-1]
+    left = np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps
+    return np.asarray(left)
+
+
+def _cell_edges(centres: FloatArray) -> FloatArray:
+    """Return the ends of the cells of increasing values, halfway between them."""
+    if centres.size == 1:
+        return np.array([centres[0] - 0.05, centres[0] + 0.05])
+    middle = (centres[1:] + centres[:-1]) / 2
+    first, last = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
+    return np.concatenate([[first], middle, [last]])
 
 
 def _label(name: str) -> str:
@@ -562,8 +565,8 @@ def line_style(
     return style
 
 
-def _fill_style(look: int | None, *, solid: bool = False) -> dict[str, Any]:
-    return {"color": colour(look), "alpha": 1.0 if solid else _SHADE, "linewidth": 0}
+def _fill_style(look: int | None) -> dict[str, Any]:
+    return {"color": colour(look), "alpha": _SHADE, "linewidth": 0}
 
 
 def count_columns(panels: int) -> int:

@@ -8,30 +8,29 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import PANEL_IN, Panel, drawing
-from lbt_synth.report.page.blocks import (
+from lbt_synth.report.page.html import (
     Block,
     Chart,
-    Listing,
     Notice,
     Page,
-    Section,
+    Sections,
     chart,
     creation_time,
     paragraph,
     read_source,
     source_section,
+    survival_blocks,
     time_text,
 )
-from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.array_file import digest
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, duration_text, listing_text
@@ -50,7 +49,7 @@ from lbt_synth.studies.study.statistics import (
 from lbt_synth.validation import FloatArray
 
 _UNSTABLE_PANELS = 4
-_POINTS = 200  # of a cumulative distribution
+_POINTS = 400  # of a cumulative distribution
 _BINS = 30  # of a histogram, at most
 _CELLS = 32  # along either axis of a map, at most
 _WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
@@ -69,17 +68,16 @@ _EVALUATION = {
 Names = Mapping[str, str]  # what each parameter is called
 
 
-def write_study_page(
+def study_page(
     study: Study,
     columns: Mapping[str, ArrayLike],
-    path: str | os.PathLike[str],
     *,
+    folder: str | os.PathLike[str] = ".",
     statistics: StudyStatistics | None = None,
     failures: Sequence[Failure] = (),
     computing_s: float | None = None,
-    pdf: str | os.PathLike[str] | None = None,
-) -> tuple[Path, ...]:
-    """Write the page of a study as one HTML file that opens offline, and as a PDF if wanted.
+) -> Page:
+    """Return the page of a study; :func:`write_page` writes it.
 
     Parameters
     ----------
@@ -87,67 +85,37 @@ def write_study_page(
         The study.
     columns : mapping of str to (n,) array_like
         Its results, all or those that there are so far.
-    path : path-like
-        File to write, that ends in .html, in the directory of the results.
+    folder : path-like, optional
+        Directory of the results, which is named in commands that replay them.
     statistics : StudyStatistics, optional
         Those of the columns, if they are known already.
     failures : sequence of (int, str, str), optional
         Row, controller and error of what failed.
     computing_s : float, optional
         Time of all its batches, of all processes together [s].
-    pdf : path-like, optional
-        File to write, that ends in .pdf.
 
     Returns
     -------
-    tuple of pathlib.Path
-        The files; all of them are written, or none.
+    Page
+        The page.
 
     Raises
     ------
     ProblemError
         If the columns are not those of the study.
-    OutputError
-        If a name ends in something else, or a file cannot be written.
 
     Examples
     --------
-    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> import lbt_synth as lbt
     >>> study = lbt.studies.load_study("examples/study.yaml")
     >>> values = study.values(0, 2)
     >>> columns = dict(zip(study.parameter_names, values.T))
     >>> columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     files = lbt.report.write_study_page(
-    ...         study, columns, pathlib.Path(folder) / "summary.html"
-    ...     )
-    >>> files[0].name
-    'summary.html'
+    >>> lbt.report.study_page(study, columns).title
+    'Robustness study study.yaml'
     """
-    require_page_names(path, pdf, inputs=study.inputs)
     if statistics is None:
         statistics = study_statistics(columns, study.parameter_names, list(study.controllers))
-    page = study_page(
-        study,
-        statistics,
-        columns,
-        folder=Path(path).parent,
-        failures=failures,
-        computing_s=computing_s,
-    )
-    return write_page(page, path, pdf)
-
-
-def study_page(
-    study: Study,
-    statistics: StudyStatistics,
-    columns: Mapping[str, ArrayLike],
-    *,
-    folder: Path,
-    failures: Sequence[Failure] = (),
-    computing_s: float | None = None,
-) -> Page:
-    """Return the page of a study's results; columns (n,) have one value per sample."""
     samples = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
     if any(len(each.strehl) != statistics.samples for each in samples):
         raise ProblemError(
@@ -167,16 +135,25 @@ def study_page(
             f"{statistics.samples} samples of {varying} parameters, "
             f"{count_text(len(statistics.controllers), 'controller')}. Made {made}."
         ),
-        sections=(
-            _summary_section(study, statistics, samples),
-            _samples_section(study, values, names),
-            _controllers_section(study, statistics, failures),
-            _comparison_section(statistics, samples),
-            _dependence_section(statistics, samples, values, names),
-            _worst_section(study, statistics, columns, names, folder),
-            Section(key="reading", title="How to read the figures", blocks=reading),
-            _origin_section(study, statistics, computing_s),
-        ),
+        sections={
+            "summary": ("Summary", _summary_blocks(study, statistics, samples)),
+            "samples": ("What was sampled", _samples_blocks(study, values, names)),
+            "controllers": ("Controllers", _controllers_blocks(study, statistics, failures)),
+            "comparison": (
+                "Comparison on the same samples",
+                _comparison_blocks(statistics, samples),
+            ),
+            "dependence": (
+                "What the Strehl ratio depends on",
+                _dependence_blocks(statistics, samples, values, names),
+            ),
+            "worst": (
+                "Worst samples",
+                _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
+            ),
+            "reading": ("How to read the figures", reading),
+            **_origin_section(study, statistics, computing_s),
+        },
     )
 
 
@@ -192,9 +169,9 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     return out
 
 
-def _summary_section(
+def _summary_blocks(
     study: Study, statistics: StudyStatistics, samples: Sequence[ControllerSamples]
-) -> Section:
+) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
     unstable = [each for each in statistics.controllers if each.unstable]
     failed = [each for each in statistics.controllers if each.failed]
@@ -217,9 +194,26 @@ def _summary_section(
         blocks.append(Notice(text=text, tone="good"))
     blocks += [
         _verdict_text(statistics.controllers),
+        *survival_blocks(_design_margins(study, statistics)),
         summary.strehl_table(statistics),
     ]
-    return Section(key="summary", title="Summary", blocks=(*blocks, *_distribution_chart(samples)))
+    return [*blocks, *_distribution_chart(samples)]
+
+
+def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
+    """Return the margins of the designs of a study in the loops that they were made for.
+
+    A controller that is designed for each sample has none, nor has one of several sensors.
+    """
+    loops = {
+        name: close_loop(design.hardware, design)
+        for name in (each.controller for each in statistics.controllers)
+        if name in study.controllers
+        and (design := fixed_design(study.controllers[name])) is not None
+        and design.hardware is not None
+        and not design.other_sensors
+    }
+    return {name: loop_margins(loop) for name, loop in loops.items() if loop.is_stable}
 
 
 def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
@@ -245,7 +239,7 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     return f"{text} {paragraph('regret', name=least.controller, loss=summary.percent(loss))}"
 
 
-def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Names) -> Section:
+def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
     """Show the parameters and their histograms."""
     distributions = {name: section.text for name, section in study.settings.parameters.items()}
     rows = tuple(
@@ -253,7 +247,7 @@ def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Name
             names[name],
             name,
             distributions.get(name, ""),
-            *_rounded_texts(np.percentile(column, (0, 50, 100))),
+            *(f"{value:.4g}" for value in np.percentile(column, (0, 50, 100))),
         )
         for name, column in values.items()
         if column.size
@@ -269,24 +263,12 @@ def _samples_section(study: Study, values: Mapping[str, FloatArray], names: Name
         f"{study.samples} samples, {_SAMPLING[settings.sampling]}, seed {settings.seed}; "
         f"{_EVALUATION[settings.evaluation]}."
     )
-    blocks = (
-        opening,
-        table,
-        *(_histogram_chart(values, names) if rows else ()),
-    )
-    return Section(key="samples", title="What was sampled", blocks=blocks)
+    return [opening, table, *(_histogram_chart(values, names) if rows else ())]
 
 
-def _rounded_texts(values: FloatArray) -> list[str]:
-    """Return numbers with four digits of their range, or of their size if all are equal."""
-    span = float(np.ptp(values)) or float(np.max(np.abs(values))) or 1.0
-    digits = 3 - int(np.floor(np.log10(span)))
-    return [f"{round(float(value), digits) + 0.0:.6g}" for value in values]
-
-
-def _controllers_section(
+def _controllers_blocks(
     study: Study, statistics: StudyStatistics, failures: Sequence[Failure]
-) -> Section:
+) -> list[Block]:
     """List the controllers, with digests of what is the same for all samples, and failures."""
     origins = {name: section.text for name, section in study.settings.controllers.items()}
     digests = {
@@ -319,55 +301,49 @@ def _controllers_section(
                 words=(1, 2),
             )
         )
-    return Section(key="controllers", title="Controllers", blocks=blocks)
+    return blocks
 
 
 def _count_cell(count: int) -> Cell:
     return Cell(text=str(count), tone="bad" if count else "plain")
 
 
-def _comparison_section(
+def _comparison_blocks(
     statistics: StudyStatistics, samples: Sequence[ControllerSamples]
-) -> Section:
+) -> list[Block]:
     """Compare the controllers on the same samples."""
     table = summary.comparison_table(statistics)
-    blocks: tuple[Block, ...] = (
-        *([table] if table.rows else []),
-        *_loss_chart(samples),
-        summary.residual_table(statistics),
-    )
-    return Section(key="comparison", title="Comparison on the same samples", blocks=blocks)
+    compared = [table] if table.rows else []
+    return [*compared, *_loss_chart(samples), summary.residual_table(statistics)]
 
 
-def _dependence_section(
+def _dependence_blocks(
     statistics: StudyStatistics,
     samples: Sequence[ControllerSamples],
     values: Mapping[str, FloatArray],
     names: Names,
-) -> Section:
+) -> list[Block]:
     """Show what the Strehl ratio depends on."""
     if not statistics.ranked:
-        blocks: tuple[Block, ...] = (Notice(text=paragraph("no-index")),)
-        return Section(key="dependence", title="Dependence", blocks=blocks)
-    blocks = (
+        return [Notice(text=paragraph("no-index"))]
+    return [
         *_sensitivity_chart(statistics, names),
         summary.sensitivity_table(statistics, names=names),
         *_conditional_charts(statistics, names),
         *_map_charts(statistics, samples, values, names),
-    )
-    return Section(key="dependence", title="What the Strehl ratio depends on", blocks=blocks)
+    ]
 
 
-def _worst_section(
+def _worst_blocks(
     study: Study,
     statistics: StudyStatistics,
     columns: Mapping[str, ArrayLike],
     names: Names,
-    folder: Path,
-) -> Section:
+    folder: str,
+) -> list[Block]:
     """List the worst samples, and the commands that replay them."""
     blocks: list[Block] = []
-    words = ["lbt-synth", "study", os.fspath(study.source), "-o", os.fspath(folder), "--row"]
+    words = ["lbt-synth", "study", os.fspath(study.source), "-o", folder, "--row"]
     commands = []
     most = 0
     for each in statistics.controllers:
@@ -382,13 +358,13 @@ def _worst_section(
         blocks.insert(0, paragraph("worst", count=_PARAMETERS))
     if commands:
         caption = "Commands that replay the first of each table; any other row likewise"
-        blocks.append(Listing(caption=caption, text="\n".join(dict.fromkeys(commands))))
-    return Section(key="worst", title="Worst samples", blocks=blocks)
+        blocks.append((caption, "\n".join(dict.fromkeys(commands))))
+    return blocks
 
 
 def _origin_section(
     study: Study, statistics: StudyStatistics, computing_s: float | None
-) -> Section:
+) -> Sections:
     """Name the files and programs that the page was made from."""
     rows = [
         ("samples with results", f"{statistics.samples} of {study.samples}"),
@@ -403,29 +379,17 @@ def _origin_section(
         source, content = read_source(path, role)
         sources.append(source)
         if place < len(roles):
-            texts[f"{role.capitalize()} {source.name}"] = content.decode("utf-8-sig", "replace")
+            texts[f"{role.capitalize()} {source[0]}"] = content.decode("utf-8-sig", "replace")
     return source_section(sources, texts=texts, about=about)
 
 
 def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
     """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
-    medians = []
-    steps: list[tuple[str, int, FloatArray, FloatArray]] = []
-    for look, each in enumerate(samples):
-        values = each.strehl[each.evaluated]
-        if not values.size:
-            medians.append(f"{each.controller} has none")
-            continue
-        medians.append(f"{each.controller} has a median of {100 * np.median(values):.1f} %")
-        level, share = cumulative_points(values)
-        # from nothing just below the first value
-        steps.append(
-            (each.controller, look, 100 * np.append(level[:1], level), 100 * np.append(0.0, share))
-        )
-    if not steps:
+    strehls = {each.controller: each.strehl[each.evaluated] for each in samples}
+    if not any(values.size for values in strehls.values()):
         return []
-    top = max(float(x[-1]) for *_, x, _ in steps)
-    least = 100 / max(int(each.evaluated.sum()) for each in samples)
+    top = 100 * max(float(np.max(values, initial=0.0)) for values in strehls.values())
+    least = 100 / max(values.size for values in strehls.values())
     low = min(10.0, 10.0 ** np.floor(np.log10(least)))
     x_axis = {"label": "Strehl ratio", "unit": "%", "low": 0}
     x_axis["high"] = min(100.0, max(1.02 * top, 1.0))
@@ -434,14 +398,19 @@ def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
         plain.set_axes(x_axis, y_axis | {"low": 0}, title="all samples")
         tail.set_axes(x_axis, y_axis | {"low": low, "log": True}, title="lower tail")
         plain.rule("half of the samples", 50, "y")
-        for name, look, x, y in steps:
-            _draw_steps(plain, name, x, y, look)
-            _draw_steps(tail, name, x[1:], y[1:], look)
-    return [chart("distribution", plain.figure, medians="; ".join(medians))]
+        for look, (name, values) in enumerate(strehls.items()):
+            if values.size:
+                level, share = cumulative_points(values)
+                # from nothing just below the first value
+                x, y = np.append(level[:1], level), np.append(0.0, share)
+                _draw_steps(plain, name, x, y, look)
+                _draw_steps(tail, name, level, share, look)
+    return [chart("distribution", plain.figure)]
 
 
 def _draw_steps(panel: Panel, name: str, x: FloatArray, y: FloatArray, look: int) -> None:
-    panel.curve(name, x, y, look=look, step="steps-post", width=1.8)
+    """Draw shares over values, both in percent."""
+    panel.curve(name, 100 * x, 100 * y, look=look, step="steps-post", width=1.8)
 
 
 def _loss_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
@@ -455,7 +424,7 @@ def _loss_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
         for look, (each, loss) in enumerate(zip(samples, losses, strict=True)):
             level, share = cumulative_points(loss)
             x, y = np.append(0.0, level), np.append(1.0, 1 - share)
-            _draw_steps(panel, each.controller, 100 * x, 100 * y, look)
+            _draw_steps(panel, each.controller, x, y, look)
     return [chart("loss", panel.figure)]
 
 
@@ -467,46 +436,32 @@ def _histogram_chart(parameters: Mapping[str, FloatArray], names: Names) -> list
     with drawing([1.7] * len(varying), columns=min(len(varying), 3)) as panels:
         for panel, (name, values) in zip(panels, varying.items(), strict=True):
             panel.set_axes({"label": names[name]}, {"label": "samples", "unit": "%", "low": 0})
-            listed = value_shares(values)
-            if listed is not None:
-                places, share = listed
-                x, y = np.repeat(places, 3), np.zeros(3 * len(places))
-                y[1::3] = 100 * share
-                x[2::3] = np.nan  # the stems are not joined
-                panel.curve("", x, y, dash=0, width=5)
-                panel.curve("samples [%]", places, 100 * share, line=False, marker="o", quiet=True)
-            else:
-                edges, share = histogram(values)
-                x = np.repeat(edges, 2)
-                y = np.concatenate(([0.0], np.repeat(100 * share, 2), [0.0]))
-                panel.area("", x, np.zeros_like(y), y)
-                panel.curve("samples [%]", x, y, dash=0, quiet=True)
+            edges, share = histogram(values)
+            x = np.repeat(edges, 2)
+            y = np.concatenate(([0.0], np.repeat(100 * share, 2), [0.0]))
+            panel.area("", x, np.zeros_like(y), y)
+            panel.curve("samples [%]", x, y, dash=0, quiet=True)
     listed_names = listing_text([names[name] for name in varying])
     return [chart("parameters", panels[0].figure, names=listed_names)]
 
 
 def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
     """First-order indices as bars, one series per controller."""
-    varying = statistics.ranked
-    if not varying:
-        return []
     bars: dict[str, FloatArray] = {}
     intervals: dict[str, tuple[FloatArray, FloatArray]] = {}
-    strongest = []
     for one in statistics.controllers:
-        value = 100 * np.array([one.sensitivity[name]["index"] for name in varying])
-        error = 200 * np.array([one.sensitivity[name]["index_error"] for name in varying])
-        bars[one.controller], low, high = np.maximum((value, value - error, value + error), 0)
+        rows = [one.sensitivity[name] for name in statistics.ranked]
+        value, error = (
+            100 * np.array([row[key] for row in rows]) for key in ("index", "index_error")
+        )
+        low, high = value - 2 * error, value + 2 * error
+        bars[one.controller], low, high = np.maximum((value, low, high), 0)
         intervals[one.controller] = low, high
-        strongest += [
-            f"{one.controller} depends most on {name}, {100 * one.sensitivity[name]['index']:.0f} %"
-            for name in one.ranked[:1]
-        ] or [f"{one.controller} has none"]
-    height_in = min(max(0.8, 0.24 * len(varying) * len(bars) + 0.2), 7.5)  # fits a sheet
+    height_in = min(max(0.8, 0.24 * len(statistics.ranked) * len(bars) + 0.2), 7.5)  # fits a sheet
     with drawing([height_in]) as (panel,):
         panel.set_axes({"label": "variance explained by itself", "unit": "%", "low": 0}, {})
-        panel.bars([names[name] for name in varying], bars, intervals)
-    return [chart("sensitivity", panel.figure, strongest="; ".join(strongest))]
+        panel.bars([names[name] for name in statistics.ranked], bars, intervals)
+    return [chart("sensitivity", panel.figure)]
 
 
 def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart]:
@@ -514,57 +469,49 @@ def _conditional_charts(statistics: StudyStatistics, names: Names) -> list[Chart
 
     The latter are drawn over the parameters that their part changes most with.
     """
-    curves = {
-        name: [
-            (look, one.controller, one.curves[name])
-            for look, one in enumerate(statistics.controllers)
-            if name in one.curves
-        ]
+    groups = {
+        name: [one.curves[name] for one in statistics.controllers if name in one.curves]
         for name in statistics.ranked
     }
-    curves = {name: own for name, own in curves.items() if own}
-    if not curves:
+    groups = {name: curves for name, curves in groups.items() if curves}
+    if not groups:
         return []
-    style: dict[str, Any] = {"marker": "own", "width": 1.8}
-    with drawing([PANEL_IN] * len(curves), columns=min(len(curves), 2)) as panels:
-        for panel, (name, own) in zip(panels, curves.items(), strict=True):
-            least = min(100 * float(np.min(curve["low"])) for *_, curve in own)
-            y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0 if least < _HIGH else None}
-            panel.set_axes({"label": names[name]}, y_axis)
-            for look, controller, curve in own:
-                x, y = curve["parameter"], 100 * curve["mean"]
-                panel.curve(controller, x, y, look=look, **style)
-            for look, controller, curve in own:
-                label, y = f"{controller}, 10th percentile", 100 * curve["low"]
-                panel.curve(label, curve["parameter"], y, look=look, width=0.9, quiet=True)
-            panel.curve("10th percentile (thin)", [], [], look=None, width=0.9)
-    charts = [
-        chart("curves", panels[0].figure, names=listing_text([names[name] for name in curves]))
-    ]
-    unstable = {
-        name: [
-            (look, controller, curve) for look, controller, curve in own if curve["unstable"].any()
-        ]
-        for name, own in curves.items()
-    }
+    charts = [_parameter_chart("curves", statistics, list(groups), names)]
     spans = {
-        name: max(float(np.ptp(curve["unstable"])) for *_, curve in own)
-        for name, own in unstable.items()
-        if own
+        name: max(float(np.ptp(curve["unstable"])) for curve in curves)
+        for name, curves in groups.items()
+        if any(curve["unstable"].any() for curve in curves)
     }
-    if not spans:
-        return charts
     most = sorted(spans, key=lambda name: -spans[name])[:_UNSTABLE_PANELS]
-    with drawing([PANEL_IN] * len(most), columns=min(len(most), 2)) as panels:
-        for panel, name in zip(panels, most, strict=True):
-            panel.set_axes({"label": names[name]}, {"label": "unstable", "unit": "%", "low": 0})
-            for look, controller, curve in unstable[name]:
-                x, y = curve["parameter"], 100 * curve["unstable"]
-                panel.curve(controller, x, y, look=look, **style)
-    return [
-        *charts,
-        chart("unstable", panels[0].figure, names=listing_text([names[name] for name in most])),
-    ]
+    return [*charts, _parameter_chart("unstable", statistics, most, names)] if most else charts
+
+
+def _parameter_chart(
+    key: str, statistics: StudyStatistics, parameters: Sequence[str], names: Names
+) -> Chart:
+    """Draw the Strehl ratios, or the part of unstable loops, over some parameters."""
+    is_strehl, columns = key == "curves", min(len(parameters), 2)
+    label = "Strehl ratio" if is_strehl else "unstable"
+    with drawing([PANEL_IN] * len(parameters), columns=columns) as panels:
+        for panel, name in zip(panels, parameters, strict=True):
+            curves = {
+                (look, one.controller): one.curves[name]
+                for look, one in enumerate(statistics.controllers)
+                if name in one.curves and (is_strehl or one.unstable)
+            }
+            least = min(100 * float(np.min(curve["low"])) for curve in curves.values())
+            low = None if is_strehl and least >= _HIGH else 0
+            panel.set_axes({"label": names[name]}, {"label": label, "unit": "%", "low": low})
+            style: dict[str, Any] = {"marker": "own", "width": 1.8}
+            for (look, controller), curve in curves.items():
+                y = 100 * curve["mean" if is_strehl else "unstable"]
+                panel.curve(controller, curve["parameter"], y, look=look, **style)
+            for (look, controller), curve in curves.items() if is_strehl else ():
+                label_low, y = f"{controller}, 10th percentile", 100 * curve["low"]
+                panel.curve(label_low, curve["parameter"], y, look=look, width=0.9, quiet=True)
+            if is_strehl:
+                panel.curve("10th percentile (thin)", [], [], look=None, width=0.9)
+    return chart(key, panels[0].figure, names=listing_text([names[name] for name in parameters]))
 
 
 def _map_charts(
@@ -589,7 +536,7 @@ def _map_charts(
             label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
             panel.map(x, y, 100 * mean, ends=ends, blank="no sample", **label)
         facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
-        facts |= {"controller": each.controller, "low": f"{low:.1f}", "high": f"{high:.1f}"}
+        facts["controller"] = each.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
     return charts
 
@@ -597,12 +544,9 @@ def _map_charts(
 def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return levels (k,) and the part of the values at or below each, denser in the tails."""
     ordered, n = np.sort(values), len(values)
-    ranks = np.arange(n)
-    if n > 2 * _POINTS:
-        tail = np.geomspace(1, n / 4, _POINTS // 4).astype(np.int64) - 1
-        even = np.linspace(0, n - 1, _POINTS).astype(np.int64)
-        ranks = np.concatenate((tail, n - 1 - tail, even))
-    level = np.unique(ordered[ranks])
+    tail = np.geomspace(1, n, _POINTS // 4)
+    ranks = np.concatenate((tail, n + 1 - tail, np.linspace(1, n, _POINTS // 2)))
+    level = np.unique(ordered[ranks.astype(np.int64) - 1])
     return level, np.searchsorted(ordered, level, side="right") / n
 
 
@@ -613,14 +557,6 @@ def histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return edges, counts / len(values)
 
 
-def value_shares(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Return the distinct values of a list parameter and their parts; None if it is no list."""
-    if not is_list(np.sort(values)):
-        return None
-    distinct, counts = np.unique(values, return_counts=True)
-    return distinct, counts / len(values)
-
-
 def binned_map(
     x: FloatArray, y: FloatArray, result: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -629,32 +565,24 @@ def binned_map(
     It is (ny, nx), nan in a cell without samples, and comes after the centres of the cells, or
     the values of a list, x (nx,) and y (ny,).
     """
-    cells = len(x) / _PER_CELL
-    lists = [value_shares(x), value_shares(y)]
-    for listed in lists:
-        cells /= 1 if listed is None else len(listed[0])
-    width = int(np.clip(cells ** (1 / max(lists.count(None), 1)), 3, _CELLS))
-    (columns, x_edges), (rows, y_edges) = (
-        _cells(values, listed, width) for values, listed in zip((x, y), lists, strict=True)
-    )
-    samples = np.histogram2d(y, x, bins=(y_edges, x_edges))[0]
-    sums = np.histogram2d(y, x, bins=(y_edges, x_edges), weights=result)[0]
-    mean = np.full(samples.shape, np.nan)
-    np.divide(sums, samples, out=mean, where=samples > 0)
-    return columns, rows, mean
+    from scipy.stats import binned_statistic_2d
+
+    cells = int(np.clip(np.sqrt(len(x) / _PER_CELL), 3, _CELLS))
+    (columns, x_edges), (rows, y_edges) = (_cells(values, cells) for values in (x, y))
+    mean = binned_statistic_2d(y, x, result, bins=(y_edges, x_edges)).statistic
+    return columns, rows, np.asarray(mean)
 
 
-def _cells(
-    values: FloatArray, listed: tuple[FloatArray, FloatArray] | None, cells: int
-) -> tuple[FloatArray, FloatArray]:
+def _cells(values: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
     """Return the centres of the cells along one axis, and their edges."""
-    if listed is not None:
-        centres = listed[0]
+    ordered = np.sort(values)
+    if is_list(ordered):
+        centres = np.unique(values)
         inner = (centres[:-1] + centres[1:]) / 2
     else:
-        low, high = np.percentile(values, _WITHIN)
+        low, high = np.percentile(ordered, _WITHIN)
         if not low < high:
-            low, high = float(np.min(values)), float(np.max(values))
+            low, high = ordered[0], ordered[-1]
         edges = np.linspace(low, high, cells + 1)
         centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
-    return centres, np.concatenate(([-np.inf], inner, [np.inf]))
+    return centres, np.concatenate(([ordered[0] - 1], inner, [ordered[-1] + 1]))

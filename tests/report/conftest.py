@@ -19,7 +19,8 @@ def pages(tmp_path_factory):
         "kalman": lbt.kalman(config.plant),
         "integrator with a rather long name of its file": lbt.integrator(config.hardware, gain=0.4),
     }
-    lbt.report.write_report(lbt.report.design_report(config, designs), folder / "report.html")
+    page = lbt.report.design_page(lbt.report.design_report(config, designs))
+    lbt.report.write_page(page, folder / "report.html")
     (folder / "study.html").write_bytes(page_html(page_of(results())))
     (folder / "marks.html").write_bytes(page_html(whole_page()))
     (folder / "hostile.html").write_bytes(page_html(whole_page(HOSTILE)))

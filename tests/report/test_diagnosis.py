@@ -9,9 +9,9 @@ from support.diagnoses import line_diagnosis, short_record
 from support.pages import Reader
 
 import lbt_synth as lbt
-from lbt_synth.report.diagnosis import diagnosis_page, write_diagnosis
+from lbt_synth.report.diagnosis import diagnosis_page
 from lbt_synth.report.draw import figure_series
-from lbt_synth.report.page.html import page_html
+from lbt_synth.report.page.html import page_html, write_page
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def page():
 
 
 def test_sections_and_charts(page):
-    assert [section.key for section in page.sections] == [
+    assert list(page.sections) == [
         "verdict",
         "record",
         "loop",
@@ -48,7 +48,7 @@ def test_words_have_the_signs_of_print(page):
 def test_files(tmp_path):
     source = tmp_path / "night.npz"
     source.write_bytes(b"what was recorded")
-    (path,) = write_diagnosis(line_diagnosis(), tmp_path / "page.html", files=[source])
+    (path,) = write_page(diagnosis_page(line_diagnosis(), [source]), tmp_path / "page.html")
     headings = re.findall(r"<th scope=.col.[^>]*>([^<]*)<", path.read_text())
     assert "± [nm]" in headings
     assert not [heading for heading in headings if "+-" in heading]
@@ -63,17 +63,17 @@ def test_files(tmp_path):
 def test_what_is_wrong_comes_first_and_loudly(tmp_path):
     found = lbt.identification.diagnose(short_record(-1.0))
     page = diagnosis_page(found)
-    first = page.sections[0].blocks[0]
+    first = page.blocks[0]
     assert (first.tone, first.text) == (
         "bad",
         "The commands are not those that the mirror followed: they have the opposite sign.",
     )
     assert page.charts == []
-    assert [section.key for section in page.sections][:3] == ["verdict", "record", "loop"]
+    assert list(page.sections)[:3] == ["verdict", "record", "loop"]
 
 
 def test_names(tmp_path):
     with pytest.raises(lbt.errors.OutputError, match=r"\.html"):
-        write_diagnosis(line_diagnosis(), tmp_path / "page.txt")
+        write_page(diagnosis_page(line_diagnosis()), tmp_path / "page.txt")
     with pytest.raises(lbt.errors.FileError, match="cannot read"):
-        write_diagnosis(line_diagnosis(), tmp_path / "a.html", files=[tmp_path / "nowhere"])
+        diagnosis_page(line_diagnosis(), [tmp_path / "nowhere"])

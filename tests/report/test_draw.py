@@ -4,8 +4,9 @@ import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.figure import Figure
-from support.figures import legend
 from support.pages import every_mark
 
 import lbt_synth as lbt
@@ -16,6 +17,9 @@ from lbt_synth.report.draw import (
     figure_series,
     marker_of,
     save_figure,
+    shorten,
+    spread_labels,
+    tick_text,
 )
 from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
 
@@ -45,36 +49,59 @@ def test_titles_are_whole_and_stay_above_their_panel(columns):
         assert title.y1 <= names.get_window_extent().y0 + 1
 
 
-def test_areas_and_errors_end_at_the_edges_of_their_panel():
-    """Programs that draw an SVG need not cut them off there."""
-    x = np.array([1.0, 2.0, 3.0])
+@pytest.mark.parametrize(
+    ("values", "ends"),
+    [
+        ([1.0, 50.0], (0.0, 50.0 + 0.04 * 49)),
+        ([0.0, 100.0], (-4.0, 104.0)),  # a curve along an end that is given is not cut
+        ([150.0, 170.0], (0.0, 100.0)),
+    ],
+)
+def test_ends_that_are_given_cut_no_curve_that_runs_along_them(values, ends):
+    high = None if values[1] == 50 else 100.0
     with drawing([2.0]) as (panel,):
-        panel.set_axes(X, {"label": "y", "low": 0.1, "high": 2.5})
-        panel.area("", x, x * 1e-9, x)
-        panel.curve("", x, x, error=2 * x)
-    assert panel.axes.get_ylim() == (0.1, 2.5)
-    for drawn in panel.axes.collections:
-        heights = np.concatenate([path.vertices[:, 1] for path in drawn.get_paths()])
-        assert heights.min() == 0.1
-        assert heights.max() == 2.5
+        panel.set_axes(X, {"label": "y", "low": 0.0, "high": high})
+        panel.curve("curve", [0.0, 1.0], values)
+    assert panel.axes.get_ylim() == pytest.approx(ends)
 
 
-def test_a_legend_names_what_is_seen():
-    x = np.array([1.0, 3.0])
-    with drawing([2.0, 2.0]) as panels:
-        for panel, high in zip(panels, (None, 50.0), strict=True):
-            panel.set_axes({"label": "x", "high": high}, {"label": "y", "low": 0.0, "high": 10.0})
-            panel.curve("curve", x, x)
-            panel.curve("far above", x, x + 50)
-            panel.curve("unstable", [], [])
-            panel.rule("line", 2.0)
-            panel.rule("line beyond", 20.0)
-            panel.rule("level", 9.0, "y")
-            panel.span("band at the edge", 2.9, 40.0)
-            panel.span("band beyond", 30.0, 40.0)
-    seen = ["curve", "unstable", "line", "level", "band at the edge"]
-    assert legend(panels[0].axes) == seen
-    assert set(legend(panels[1].axes)) == {*seen, "line beyond", "band beyond"}
+@pytest.mark.parametrize(
+    ("low", "high", "texts"),
+    [
+        (0.1, 400, ["0.1", "1", "10", "100"]),
+        (20, 300, ["20", "50", "100", "200"]),
+        (64, 171, ["80", "100", "120", "140", "160"]),  # not 100 alone
+        (1e-9, 10.0, ["10⁻⁶", "10⁻⁴", "0.01", "1"]),  # a zero is no scale
+    ],
+)
+def test_ticks_of_logarithmic_scales(low, high, texts):
+    with drawing([2.0]) as (panel,):
+        panel.set_axes(X, {"label": "y", "log": True})
+        panel.curve("curve", [0.0, 1.0, 2.0], [0.0, low, high])
+    panel.figure.draw_without_rendering()
+    bottom, top = panel.axes.get_ylim()
+    ticks = panel.axes.yaxis.get_major_ticks()
+    shown = [tick.label1.get_text() for tick in ticks if bottom <= tick.get_loc() <= top]
+    assert shown == texts
+    assert bottom >= 0.999e-8 * top
+
+
+def test_texts_are_short():
+    assert [tick_text(value) for value in (1.2e5, 1.25e-5)] == ["1.2·10⁵", "1.25·10⁻⁵"]
+    assert [tick_text(value) for value in (0.001, 2.0, 10_000)] == ["0.001", "2", "10000"]
+    assert [shorten(text, 5) for text in ("abcdefghij", "abc")] == ["ab…ij", "abc"]
+
+
+@given(st.lists(st.floats(0, 1), max_size=40))
+def test_labels_do_not_overlap(wanted):
+    wanted = sorted(wanted)
+    places = spread_labels(np.array(wanted), 0.045)
+    gap = min(0.045, 1 / max(len(wanted), 1))
+    assert places.size == len(wanted)
+    assert np.all(np.diff(places) > gap - 1e-9)
+    assert np.all((places > 0) & (places < 1))
+    if wanted and np.all(np.diff([-0.03, *wanted, 1.03]) > 0.06):
+        assert places == pytest.approx(wanted)
 
 
 def test_names_that_are_shortened_alike_stay_two():
@@ -82,19 +109,6 @@ def test_names_that_are_shortened_alike_stay_two():
         for middle in "ab":
             panel.curve(50 * "x" + middle + 50 * "x", [0.0, 1.0], [0.0, 1.0])
     assert len(panel.figure.legends[0].get_texts()) == 2
-
-
-@pytest.mark.parametrize("count", [2, 9])
-def test_a_legend_on_own_axes_does_not_cover_them(count):
-    axes = Figure(figsize=(4, 2.5), layout="constrained").subplots()
-    with drawing([2.0], axes=axes) as (panel,):
-        for i in range(count):
-            panel.curve(f"curve with a long name {i}", [0.0, 1.0], [0.0, i], look=i)
-    axes.figure.draw_without_rendering()
-    names, place = axes.get_legend().get_window_extent(), axes.get_window_extent()
-    assert (names.x0 >= place.x1) == (count == 9)
-    if count == 2:
-        assert names.width * names.height < place.width * place.height / 3
 
 
 def draw_two(axes=None):

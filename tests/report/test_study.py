@@ -10,8 +10,7 @@ from support.study_pages import CONTROLLERS, PARAMETERS, night, page_of, results
 
 import lbt_synth as lbt
 from lbt_synth.report.draw import figure_series
-from lbt_synth.report.page.blocks import Chart, Listing, Notice
-from lbt_synth.report.page.html import page_html
+from lbt_synth.report.page.html import Chart, Notice, page_html
 from lbt_synth.report.study import (
     binned_map,
     cumulative_points,
@@ -28,7 +27,7 @@ def page():
 
 
 def blocks(page, kind):
-    return [block for section in page.sections for block in section.blocks if type(block) is kind]
+    return [block for block in page.blocks if type(block) is kind]
 
 
 def table(page, start):
@@ -37,11 +36,11 @@ def table(page, start):
 
 def without_charts(page):
     """The same page without its drawings, which are slow to make."""
-    sections = [
-        replace(each, blocks=tuple(b for b in each.blocks if not isinstance(b, Chart)))
-        for each in page.sections
-    ]
-    return replace(page, sections=tuple(sections))
+    sections = {
+        key: (title, [block for block in blocks if not isinstance(block, Chart)])
+        for key, (title, blocks) in page.sections.items()
+    }
+    return replace(page, sections=sections)
 
 
 def text(cell):
@@ -49,7 +48,7 @@ def text(cell):
 
 
 def test_what_is_wrong_is_said_first(page):
-    first = page.sections[0].blocks
+    first = page.blocks
     assert [type(block) for block in first[:3]] == [Notice, Notice, str]
     unstable = int(np.sum(results()["sharp.stable"] == 0))
     assert f"sharp in {unstable} of 300" in first[0].text
@@ -59,7 +58,7 @@ def test_what_is_wrong_is_said_first(page):
 
 def test_a_study_that_is_not_complete_says_so():
     columns = {name: values[:100] for name, values in results().items()}
-    first = page_of(columns).sections[0].blocks[0]
+    first = page_of(columns).blocks[0]
     assert isinstance(first, Notice)
     assert first.tone == "bad"
     assert "100 of 300 samples" in first.text
@@ -67,13 +66,13 @@ def test_a_study_that_is_not_complete_says_so():
 
 def test_a_study_in_which_all_is_well_says_so():
     columns = {name: values for name, values in results().items() if not name.startswith("frail")}
-    first = page_of(columns, ("steady",)).sections[0].blocks[0]
+    first = page_of(columns, ("steady",)).blocks[0]
     assert (first.tone, "stable in every sample" in first.text) == ("good", True)
 
 
 def test_the_leader_is_named_by_each_measure(page):
     columns = results()
-    words = next(block for block in page.sections[0].blocks if isinstance(block, str))
+    words = next(block for block in page.blocks if isinstance(block, str))
     steady = columns["steady.strehl"]
     assert f"Highest mean Strehl ratio: steady, {100 * steady.mean():.1f} %" in words
     low = 100 * np.percentile(steady, 5)
@@ -93,7 +92,9 @@ def test_failures_are_listed_and_counted(page):
 def test_worst_rows_come_with_the_command_that_replays_them(page):
     rows = table(page, "Worst samples of sharp").rows
     assert all(text(row[1]) == "unstable" for row in rows)
-    commands = next(b.text for b in blocks(page, Listing) if "replay" in b.caption).splitlines()
+    commands = next(
+        text for caption, text in blocks(page, tuple) if "replay" in caption
+    ).splitlines()
     assert commands[1] == f"lbt-synth study night.yaml -o out --row {text(rows[0][0])}"
 
 
@@ -104,7 +105,7 @@ def test_names_are_short_and_explained_once(page):
 
 
 def test_every_section_has_content_and_every_chart_its_words(page):
-    assert [section.key for section in page.sections] == [
+    assert list(page.sections) == [
         "summary",
         "samples",
         "controllers",
@@ -141,7 +142,7 @@ def test_nothing_evaluated_makes_a_page_without_figures():
         if "." in name and name.split(".")[0] in CONTROLLERS:
             columns[name] = np.full(30, np.nan)
     page = page_of(columns)
-    assert page.sections[0].blocks[-2] == "No controller was evaluated on any sample."
+    assert page.sections["summary"][1][-2] == "No controller was evaluated on any sample."
     assert page_html(page)
 
 
@@ -150,7 +151,7 @@ def test_columns_that_make_no_page_are_refused():
         page_of({name: values[:0] for name, values in results().items()})
     statistics = lbt.studies.study_statistics(results(), PARAMETERS, CONTROLLERS)
     with pytest.raises(lbt.errors.ProblemError, match="300 samples of the statistics; got 200"):
-        study_page(night(), statistics, results(200), folder=Path("out"))
+        study_page(night(), results(200), statistics=statistics)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +159,7 @@ def test_columns_that_make_no_page_are_refused():
 )
 def test_names_of_files_cannot_break_the_command(page, name, words):
     found = page_of(results(), study=replace(night(), source=Path(name)))
-    commands = next(b.text for b in blocks(found, Listing) if "replay" in b.caption)
+    commands = next(text for caption, text in blocks(found, tuple) if "replay" in caption)
     assert f"lbt-synth study {words} -o out --row " in commands
 
 
@@ -173,7 +174,8 @@ def test_a_page_from_a_study_file(study, tmp_path):
     columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
     folder = tmp_path / "a folder"
     folder.mkdir()
-    files = lbt.report.write_study_page(study, columns, folder / "summary.html")
+    page = lbt.report.study_page(study, columns, folder=folder)
+    files = lbt.report.write_page(page, folder / "summary.html")
     assert [file.name for file in files] == ["summary.html"]
     html = files[0].read_text(encoding="utf-8")
     for words in (
@@ -186,6 +188,22 @@ def test_a_page_from_a_study_file(study, tmp_path):
         "a folder&#39; --row 0",
     ):
         assert words in html, words
+
+
+def test_each_design_says_which_errors_it_survives(study):
+    fast = lbt.integrator(study.config.hardware, gain=0.9)  # unstable above 1
+    names = (*study.controllers, "fast")
+    columns = {f"{name}.{what}": np.ones(2) for name in names for what in ("strehl", "stable")}
+    columns |= {f"{name}.residual_nm": np.ones(2) for name in names} | {"fixed": np.ones(2)}
+    designs = {**study.controllers, "fast": fast}
+    page = page_of(columns, names, ("fixed",), replace(study, controllers=designs))
+    blocks = page.sections["summary"][1]
+    for name, design in designs.items():
+        margins = lbt.loop_margins(lbt.close_loop(design.hardware, design))
+        assert f"{name} {margins.survival}" in blocks
+        warned = [block.text for block in blocks if getattr(block, "text", "").startswith(name)]
+        assert warned == [f"{name}: {text}" for text in margins.fragilities]
+    assert "fast: a sensor gain that is off by 0.92 dB makes this loop unstable." in warned
 
 
 def test_digests_are_of_the_matrices(study):

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from lbt_synth.report.draw import PANEL_IN, drawing, square_in
-from lbt_synth.report.page.blocks import Chart, Listing, Notice, Page, Section
+from lbt_synth.report.page.html import Chart, Notice, Page
 from lbt_synth.storage.tables import Cell, Table
 
 HOSTILE = "</script><script>alert(1)</script><b>&\"'$x$ $$y$$ _z"
@@ -56,7 +56,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
         above.set_axes(frequency, {"label": "size", "unit": "-", "log": True})
         above.span("band", 10, 20)
         above.area("spread", f, 0.5 / f, 2 / f, look=2)
-        above.area("", f[:9], 1e-4 / f[:9], 2e-4 / f[:9], look=2, solid=True)
+        above.area("", f[:9], 1e-4 / f[:9], 2e-4 / f[:9], look=2)
         above.rule("line at 20 Hz", 20.0, dash=3)
         above.curve(name, f, 1 / f)
         above.curve("second", f, np.where(f < 5, np.nan, 1 / f**2), look=1)
@@ -79,7 +79,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
                 {"label": "error", "unit": "Hz"}, {"label": "gain", "unit": "-"}, title=title
             )
             ends, gains = (float(title == "other"), 30.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4])
-            more = {"log": title == "other", "levels": (10, 20), "blank": "unstable"}
+            more = {"log": title == "other", "contours": True, "blank": "unstable"}
             panel.map(np.arange(6.0), gains, values, "ratio", "%", ends=ends, **more)
     words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
     maps = Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
@@ -111,11 +111,10 @@ def whole_page(name: str = "first") -> Page:
     return Page(
         title=f"Page of {name}",
         subtitle=f"about {name}",
-        sections=(
-            Section(
-                key="summary",
-                title=f"Summary of {name}",
-                blocks=(
+        sections={
+            "summary": (
+                f"Summary of {name}",
+                (
                     f"Words of {name}. " * 20,
                     Notice(text=f"{name} is bad", tone="bad"),
                     Notice(text="note", tone="note"),
@@ -123,11 +122,7 @@ def whole_page(name: str = "first") -> Page:
                     wide,
                 ),
             ),
-            Section(key="charts", title="Charts", blocks=every_mark(name)),
-            Section(
-                key="listing",
-                title="Listing",
-                blocks=(Listing(caption=name, text=f"a: 1\n\tb: {name}\n" + 200 * "x"),),
-            ),
-        ),
+            "charts": ("Charts", every_mark(name)),
+            "listing": ("Listing", ((name, f"a: 1\n\tb: {name}\n" + 200 * "x"),)),
+        },
     )

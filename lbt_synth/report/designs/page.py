@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -13,14 +12,9 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import largest_singular_values
-from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop.simulation.run import Drop
-from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.sensor_suite import OWN_SENSOR
-from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.report.designs.report import DesignAssessment, DesignReport
-from lbt_synth.report.designs.tables import summary_table, truth_table, verdict
+from lbt_synth.report.designs.report import DesignReport, summary_table, verdict
 from lbt_synth.report.draw import (
     Figure,
     count_columns,
@@ -29,38 +23,35 @@ from lbt_synth.report.draw import (
 )
 from lbt_synth.report.figures.loops import (
     FREQUENCY,
-    break_loops,
     draw_bode,
     draw_design,
     draw_sigma,
     draw_steps,
-    frequency_grid,
+    sigma_curves,
 )
-from lbt_synth.report.figures.records import SPECTRUM, TIME, sensor_failure_figure
+from lbt_synth.report.figures.records import SPECTRUM, TIME, run_spectra, sensor_failure_figure
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
-    draw_limits,
-    draw_maps,
+    limits_figure,
+    robustness_map_figure,
     strehl_axis,
     strehl_ends,
 )
-from lbt_synth.report.number_text import fixed_text, number_text, signed_text
-from lbt_synth.report.page.blocks import (
+from lbt_synth.report.page.html import (
     Block,
     Chart,
     Notice,
     Page,
-    Section,
     chart,
     creation_time,
     paragraph,
     read_source,
     require_letters,
     source_section,
+    survival_blocks,
     time_text,
 )
-from lbt_synth.report.page.html import require_page_names, write_page
-from lbt_synth.storage.display_unit import nm_text, shown_unit
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import compare_in_truth
@@ -68,78 +59,59 @@ from lbt_synth.studies.limits import TruthComparison
 from lbt_synth.studies.robustness import run_failures
 
 _PANELS = 6  # of one figure that has a panel per design: they fit a sheet
-_STEP_NM = 100.0
 _EXCERPT = 400  # frames of a simulated series
 
 
-def write_report(
-    report: DesignReport,
-    path: str | os.PathLike[str],
-    *,
-    pdf: str | os.PathLike[str] | None = None,
-    title: str | None = None,
-) -> tuple[Path, ...]:
-    """Write a report as one HTML file that opens offline, and as a PDF if that is wanted.
+def design_page(report: DesignReport, *, title: str | None = None) -> Page:
+    """Return the page of a report; :func:`write_page` writes it.
 
     Parameters
     ----------
     report : DesignReport
         Result of :func:`design_report`.
-    path : path-like
-        File to write, that ends in .html.
-    pdf : path-like, optional
-        File to write, that ends in .pdf.
     title : str, optional
         Heading of the page; by default it names the configuration.
 
     Returns
     -------
-    tuple of pathlib.Path
-        The files; all of them are written, or none.
+    Page
+        The page.
 
     Raises
     ------
-    OutputError
-        If a name ends in something else, or a file cannot be written.
     ProblemError
         If the title is empty, or cannot be shown.
 
     Examples
     --------
-    >>> import lbt_synth as lbt, pathlib, tempfile
+    >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
     >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
     >>> report = lbt.report.design_report(config, {"integrator": slow})
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     [file.name for file in lbt.report.write_report(report, pathlib.Path(folder) / "a.html")]
-    ['a.html']
+    >>> lbt.report.design_page(report, title="Tonight").title
+    'Tonight'
     """
-    require_page_names(path, pdf)
-    return write_page(design_page(report, title=title), path, pdf)
-
-
-def design_page(report: DesignReport, *, title: str | None = None) -> Page:
-    """Return the page of a report."""
     source = report.config.source.name
     heading = f"Controllers for {source}" if title is None else title.strip()
     if not heading:
         raise ProblemError("title must hold at least one letter; got an empty text.")
     require_letters(heading, "title")
-    count = len(report.assessments)
-    names = listing_text([one.name for one in report.assessments])
-    sections = [
-        Section(key="summary", title="Summary", blocks=_summary_blocks(report)),
-        Section(key="transfer", title="Transfer functions", blocks=_transfer_blocks(report)),
-        Section(key="errors", title="Robustness", blocks=_robustness_charts(report)),
-        Section(key="dynamics", title="Dynamics", blocks=_dynamics_charts(report)),
-        Section(key="simulation", title="Simulation", blocks=_simulation_blocks(report)),
-        Section(key="certificates", title="Certificates", blocks=_certificate_blocks(report)),
-        source_section(report.files, versions=report.versions, texts={source: report.config_text}),
-    ]
+    count, names = len(report.assessments), listing_text(report.names)
+    sections: dict[str, tuple[str, Sequence[Block]]] = {
+        "summary": ("Summary", _summary_blocks(report)),
+        "transfer": ("Transfer functions", _transfer_blocks(report)),
+        "errors": ("Robustness", _robustness_charts(report)),
+        "dynamics": ("Dynamics", _dynamics_charts(report)),
+        "simulation": ("Simulation", _simulation_blocks(report)),
+        "certificates": ("Certificates", _certificate_blocks(report)),
+        **source_section(
+            report.files, versions=report.versions, texts={source: report.config_text}
+        ),
+    }
     return Page(
         title=heading,
         subtitle=f"{count_text(count, 'design')}: {names}. Made {time_text(report.made)}.",
-        sections=tuple(sections),
+        sections=sections,
     )
 
 
@@ -150,13 +122,13 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             text = paragraph(
                 "unstable",
                 name=one.name,
-                radius=number_text(one.loop.spectral_radius, 6),
-                gain=number_text(report.real_gain),
+                radius=f"{one.loop.spectral_radius:.6g}",
+                gain=f"{report.real_gain:.4g}",
             )
             blocks.append(Notice(text=text, tone="bad"))
         if not one.certified:
             why = one.certificate_error or "; ".join(
-                f"{check.name} {number_text(check.value, 6)}, limit {number_text(check.limit, 6)}"
+                f"{check.name} {check.value:.6g}, limit {check.limit:.6g}"
                 for check in one.checks
                 if not check.passed
             )
@@ -164,15 +136,10 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
     return [
         *blocks,
         verdict(report),
+        *survival_blocks({one.name: one.margins for one in report.assessments if one.margins}),
         summary_table(report),
-        truth_table(report),
-        *(
-            Notice(text=f"{one.name}: {text}.")
-            for one in report.stable
-            for text in report.truth.warnings[one.name]
-        ),
-        *(Notice(text=note) for note in report.truth.notes),
-        _situation_text(report),
+        *_truth_blocks(report.config, report.truth, ("method", "stable")),
+        *report.config._summarise().tables,
         *(
             Notice(text=f"{one.name} was {note}")
             for one in report.assessments
@@ -181,26 +148,23 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
     ]
 
 
-def _situation_text(report: DesignReport) -> str:
-    """Return the paragraph about the loop and its disturbances."""
-    hardware, truth = report.config.hardware, report.config.truth
-    lines = [
-        f"a {'sinusoid' if isinstance(line, SinusoidalVibration) else 'resonance'} of "
-        f"{nm_text(line.rms_nm, '.6g', unit='nm rms')} at {number_text(line.frequency_hz)} Hz"
-        for line in stationary_vibrations(truth.vibrations)
+def _truth_blocks(
+    config: Config, truth: TruthComparison, without: Sequence[str] = ()
+) -> list[Block]:
+    """Return the designs beside reference designs, and what is wrong with them in the truth."""
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    hidden = ("worst_nm", "above_band_limit_percent", *without)
+    stable = {row.design for row in truth.rows if row.stable}
+    return [
+        row_table(caption, truth.rows, without=hidden),
+        *(
+            Notice(text=f"{name}: {text}.")
+            for name, texts in truth.warnings.items()
+            if name in stable  # an unstable loop is named above
+            for text in texts
+        ),
+        *(Notice(text=note) for note in truth.notes),
     ]
-    noise = truth.noise_per_measurement(hardware.n_measurements)
-    return paragraph(
-        "situation",
-        axes="1 axis" if hardware.modes == 1 else f"{hardware.modes} axes",
-        rate=number_text(hardware.frame_rate_hz),
-        delay=number_text(hardware.delay_frames),
-        mirror="that settles at once" if hardware.mirror is None else "with dynamics",
-        turbulence=report.config.settings.true_turbulence.replace("_", " "),
-        lines=listing_text(lines) or "no vibration",
-        noise=listing_text([nm_text(float(value)) for value in np.unique(noise)]),
-        gain=number_text(report.real_gain),
-    )
 
 
 def _certificate_blocks(report: DesignReport) -> list[Block]:
@@ -217,61 +181,36 @@ def _certificate_blocks(report: DesignReport) -> list[Block]:
 
 def _transfer_blocks(report: DesignReport) -> list[Block]:
     """Return singular values of the estimation error and of the closed loops, and their margins."""
-    names, lines_hz = report.names, report.config.truth.lines_hz
-    f = frequency_grid(report.config.hardware.frame_rate_hz, lines_hz)
-    errors = {
-        one.name: (f, largest_singular_values(one.design.error_system(), f))
-        for one in report.assessments
-        if one.design.is_estimator
-    }
-    rejections, noises = (
-        {
-            one.name: (f, spectral_norms(getattr(one.loop, name)(f)) if one.stable else None)
-            for one in report.assessments
-            if report.stable
-        }
-        for name in ("sensitivity", "noise_transfer")
-    )
-    gain = number_text(report.real_gain)
+    lines_hz, gain = report.config.truth.lines_hz, f"{report.real_gain:.4g}"
+    designs = {one.name: one.design for one in report.assessments}
+    loops = {one.name: one.loop for one in report.assessments}
+    curves = sigma_curves(designs, loops, lines_hz=lines_hz)
     blocks: list[Block] = []
     if not report.stable:
+        loops = {}
         blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
-    if errors or report.stable:
+    if loops or any(error is not None for _, error, *_ in curves.values()):
         line = "true vibration" if len(lines_hz) == 1 else "true vibrations"
-        figure = draw_sigma(errors, rejections, noises, names, lines_hz, line=line)
-        largest = {
-            what: listing_text(
-                [
-                    f"{name} {number_text(factor * float(np.max(norm)), 3)}{unit and f' {unit}'}"
-                    for name, (_, norm) in norms.items()
-                    if norm is not None
-                ]
-            )
-            or "none"
-            for what, norms, (unit, factor) in (
-                ("peaks", errors, shown_unit("nm")),
-                ("rejection", rejections, ("", 1.0)),
-                ("noise", noises, ("", 1.0)),
-            )
-        }
-        blocks.append(chart("sigma", figure, gain=gain, **largest))
-    if report.stable:
-        loops = break_loops({one.name: one.loop for one in report.assessments})
-        margins = listing_text([f"{loop.name} {loop.margins}" for loop in loops])
-        blocks.append(chart("bode", draw_bode(loops), gain=gain, margins=margins))
+        figure = draw_sigma(curves, loops, lines_hz, line=line)
+        blocks.append(chart("sigma", figure, gain=gain))
+    if loops:
+        blocks.append(chart("bode", draw_bode(loops), gain=gain))
     return blocks
 
 
 def _robustness_charts(report: DesignReport) -> list[Chart]:
     """Strehl ratio and residual over the frequency error, and maps with the sensor gain."""
     if report.errors_hz.size == 1:
-        return [_sensor_gain_chart(report)]
-    charts = [_strehl_chart(report), _residual_chart(report)] if report.stable else []
+        return [_strehl_chart(report)]
+    charts = []
+    if report.stable:
+        figure = limits_figure(report.limits, over_errors=True)
+        charts = [_strehl_chart(report), chart("limits", figure)]
     ends = strehl_ends([one.map for one in report.assessments])
     for number, batch in _sheets(report.assessments):
         maps = {one.name: one.map for one in batch}
-        figure = draw_maps(maps, real_gain=report.real_gain, ends=ends)
-        charts.append(chart(f"map{number}", figure, ranges=_map_texts(batch)))
+        figure = robustness_map_figure(maps, real_gain=report.real_gain, ends=ends)
+        charts.append(chart(f"map{number}", figure))
     return charts
 
 
@@ -283,64 +222,25 @@ def _sheets(items: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
 
 
 def _strehl_chart(report: DesignReport) -> Chart:
-    worst = {one.name: one.curve.strehl[0, 0] for one in report.stable}
-    ends = [
-        f"{name} falls to {fixed_text(100 * float(np.min(strehl)), 1)} % at "
-        f"{signed_text(float(report.errors_hz[np.argmin(strehl)]))} Hz"
-        for name, strehl in worst.items()
-    ]
+    """Strehl ratio over the frequency error, or the sensor gain for a truth without vibrations."""
+    by_gain = report.errors_hz.size == 1
     with drawing([2.5]) as (panel,):
-        values = np.concatenate([100 * strehl for strehl in worst.values()])
-        panel.set_axes(FREQUENCY_ERROR, strehl_axis(values))
-        for one in report.assessments:
-            percents = 100 * one.curve.strehl[0, 0] if one.stable else None
-            draw_design(panel, report.names, one.name, one.curve.errors_hz, percents)
-    gain = number_text(report.real_gain)
-    return chart("robustness", panel.figure, gain=gain, ends=listing_text(ends))
-
-
-def _residual_chart(report: DesignReport) -> Chart:
-    study = report.limits
-    figure = draw_limits(study, report.names, FREQUENCY_ERROR)
-    limits = [
-        f"{name} {nm_text(limit.rms_nm, '.1f')}"
-        for name, limit in (
-            ("limit, frequency known", study.limit),
-            ("limit, frequency anywhere in this range", study.band),
+        worst = np.concatenate([100 * one.curve.strehl[0, 0] for one in report.stable] or [[0.0]])
+        y_axis = strehl_axis(worst) | ({"low": 0.0} if by_gain else {})
+        panel.set_axes(
+            {"label": "sensor gain", "unit": "-"} if by_gain else FREQUENCY_ERROR, y_axis
         )
-        if limit is not None and limit.rms_nm > 0
-    ]
-    worst = [f"{row.design} {nm_text(row.worst_nm, '.1f')}" for row in study.rows if row.stable]
-    said = f" Limits: {listing_text(limits)}." if limits else ""
-    return chart("limits", figure, worst=listing_text(worst), limits=said)
-
-
-def _map_texts(assessments: Sequence[DesignAssessment]) -> str:
-    """Say of each design how far its Strehl ratio ranges over its map."""
-    texts = []
-    for one in assessments:
-        values = 100 * one.map.strehl[np.isfinite(one.map.strehl)]
-        if not values.size:
-            texts.append(f"{one.name}: unstable everywhere.")
-            continue
-        texts.append(
-            f"{one.name}: {fixed_text(float(values.min()), 1)} to "
-            f"{fixed_text(float(values.max()), 1)} %, stable at {int(one.map.stable.sum())} of "
-            f"{one.map.stable.size} sensor gains."
-        )
-    return " ".join(texts)
-
-
-def _sensor_gain_chart(report: DesignReport) -> Chart:
-    """Strehl ratio over the sensor gain, drawn for a truth without vibrations."""
-    with drawing([2.5]) as (panel,):
-        y_axis = {"label": "Strehl ratio", "unit": "%", "low": 0.0}
-        panel.set_axes({"label": "sensor gain", "unit": "-"}, y_axis)
         for one in report.assessments:
-            percents = 100 * one.map.strehl[0, :, 0]
-            draw_design(panel, report.names, one.name, one.map.sensor_gains, percents)
-        panel.rule("real sensor gain", report.real_gain, dash=3)
-    return chart("sensor-gain", panel.figure, ranges=_map_texts(report.assessments))
+            x, percents = one.curve.errors_hz, 100 * one.curve.strehl[0, 0]
+            if by_gain:
+                x, percents = one.map.sensor_gains, 100 * one.map.strehl[0, :, 0]
+            draw_design(
+                panel, report.names, one.name, x, percents if by_gain or one.stable else None
+            )
+        if by_gain:
+            panel.rule("real sensor gain", report.real_gain, dash=3)
+    key = "sensor-gain" if by_gain else "robustness"
+    return chart(key, panel.figure, gain=f"{report.real_gain:.4g}")
 
 
 def _dynamics_charts(report: DesignReport) -> list[Chart]:
@@ -350,24 +250,15 @@ def _dynamics_charts(report: DesignReport) -> list[Chart]:
         for one in report.assessments
     ]
     reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for pair in poles for values in pair))
-    radii = [f"{one.name} {number_text(one.loop.spectral_radius, 6)}" for one in report.assessments]
     charts = [
-        chart(f"poles{number}", _draw_poles(batch, reach), radii=listing_text(radii))
+        chart(f"poles{number}", _draw_poles(batch, reach))
         for number, batch in _sheets(list(zip(report.assessments, poles, strict=True)))
     ]
     if not report.stable:
         return charts
-    steps = {one.name: (report.simulations[one.name].step,) for one in report.stable}
-    peaks = [
-        f"{name} {nm_text(_STEP_NM * float(np.max(np.abs(step.residual[5:]))), '.0f')}"
-        for name, (step,) in steps.items()
-    ]
-    facts = {
-        "step": nm_text(_STEP_NM, ".4g"),
-        "frame": number_text(1e3 / report.config.hardware.frame_rate_hz),
-        "peaks": listing_text(peaks),
-    }
-    return [*charts, chart("step", draw_steps(steps, height_nm=_STEP_NM), **facts)]
+    loops = {one.name: one.loop for one in report.stable}
+    frame = f"{1e3 / report.config.hardware.frame_rate_hz:.4g}"
+    return [*charts, chart("step", draw_steps(loops), frame=frame)]
 
 
 def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
@@ -393,62 +284,61 @@ def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
 def _simulation_blocks(report: DesignReport) -> list[Block]:
     """Return series and spectra of the simulated loops."""
     settings = report.config.settings.simulation
-    runs = [(name, report.simulations[name]) for name in report.simulations]
+    runs = [(one, one.run) for one in report.assessments if one.run is not None]
     if not runs:
         return ["No loop is stable, so none was simulated."]
-    _, frames, _ = runs[0][1].run.residual_nm.shape
-    residuals = [f"{name} {nm_text(one.residual_nm, '.1f', unit='nm rms')}" for name, one in runs]
-    series = {name: one.run.residual_nm[0, :_EXCERPT, 0] for name, one in runs}
-    time_s = np.arange(min(frames, _EXCERPT)) / report.config.hardware.frame_rate_hz
-    facts = {"duration": fixed_text(float(time_s[-1]), 2), "residuals": listing_text(residuals)}
-    reach = 1.05 * max(float(np.max(np.abs(y))) for y in series.values())
+    rate_hz, frames = runs[0][1].frame_rate_hz, runs[0][1].residual_nm.shape[1]
+    time_s = np.arange(min(frames, _EXCERPT)) / rate_hz
+    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :_EXCERPT, 0]))) for _, run in runs)
     residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
     text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
-    blocks: list[Block] = [text]
+    series: list[Block] = []
+    spectra: list[Block] = []
     for number, batch in _sheets(runs):
         with drawing([0.95] * len(batch)) as panels:
-            for panel, (name, _) in zip(panels, batch, strict=True):
-                panel.set_axes(TIME, residual, title=name)
-                own: dict[str, Any] = {"look": report.names.index(name), "width": 0.9, "dash": 0}
-                panel.curve("residual", time_s, series[name], quiet=True, **own)
-        blocks.append(chart(f"series{number}", panels[0].figure, **facts))
-    for number, batch in _sheets(runs):
+            for panel, (one, run) in zip(panels, batch, strict=True):
+                panel.set_axes(TIME, residual, title=one.name)
+                style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
+                y = run.residual_nm[0, :_EXCERPT, 0]
+                panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
+        series.append(chart(f"series{number}", panels[0].figure, duration=f"{time_s[-1]:.2f}"))
         columns = count_columns(len(batch))
         with drawing([2.2] * len(batch), columns=columns) as panels:
-            for panel, (name, one) in zip(panels, batch, strict=True):
-                panel.set_axes(FREQUENCY, SPECTRUM, title=name)
-                f = one.frequency_hz
-                panel.curve("before the correction", f, one.open_nm2_hz, look=None, width=0.8)
-                panel.curve("residual, simulated", f, one.residual_nm2_hz, look=5, dash=0)
-                panel.curve("residual, exact", f, one.exact_nm2_hz, look=1, width=1.4)
-        blocks.append(chart(f"spectra{number}", panels[0].figure))
-    return blocks
+            for panel, (one, run) in zip(panels, batch, strict=True):
+                panel.set_axes(FREQUENCY, SPECTRUM, title=one.name)
+                f, opened, left, exact = run_spectra(run, one.loop, report.config.truth)
+                panel.curve("before the correction", f, opened, look=None, width=0.8)
+                panel.curve("residual, simulated", f, left, look=5, dash=0)
+                panel.curve("residual, exact", f, exact, look=1, width=1.4)
+        spectra.append(chart(f"spectra{number}", panels[0].figure))
+    return [text, *series, *spectra]
 
 
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again
 
 
-def write_sensors_report(
+def sensors_page(
     config: Config,
     designs: Mapping[str, Design],
-    path: str | os.PathLike[str],
     *,
     gain_files: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
-    pdf: str | os.PathLike[str] | None = None,
     title: str | None = None,
-) -> tuple[tuple[Path, ...], TruthComparison]:
-    """Write the page of designs of several sensors, and as a PDF if that is wanted.
+) -> tuple[Page, TruthComparison]:
+    """Return the page of designs of several sensors, and what they leave in the truth.
 
     The truth of the configuration must be stationary. The page gives the digests of the files that
     designs came from.
     """
-    require_page_names(path, pdf)
     source, content = read_source(config.source, "configuration")
     text = content.decode("utf-8-sig", errors="replace")
     gains = [read_source(file, f"gain file of {name}")[0] for name, file in gain_files.items()]
     files = [source, *gains]
-    found = compare_in_truth(designs, config)
-    sections = [_sensors_section(config, designs, found)]
+    compared = compare_in_truth(designs, config)
+    opening = _truth_blocks(config, compared, ("phase_margin_deg",))
+    if compared.limit is not None:
+        least = nm_text(compared.limit.rms_nm, ".1f", unit="nm rms")
+        opening.insert(0, f"No controller of the loop's own sensor alone leaves less than {least}.")
+    sections: dict[str, tuple[str, Sequence[Block]]] = {"summary": ("Summary", opening)}
     for number, (name, design) in enumerate(designs.items(), start=1):
         failures = design.tables()[0]
         blocks: tuple[Block, ...] = (
@@ -457,35 +347,13 @@ def write_sensors_report(
             _failure_chart(config, name, design, f"failures-{number}"),
             row_table("Certificate, computed again", design.recertify().checks),
         )
-        sections.append(Section(key=f"design-{number}", title=name, blocks=blocks))
-    sections.append(source_section(files, texts={source.name: text}))
+        sections[f"design-{number}"] = (name, blocks)
     page = Page(
         title=title or f"Several sensors for {config.source.name}",
         subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
-        sections=tuple(sections),
+        sections={**sections, **source_section(files, texts={source[0]: text})},
     )
-    return write_page(page, path, pdf), found
-
-
-def _sensors_section(
-    config: Config, designs: Mapping[str, Design], found: TruthComparison
-) -> Section:
-    """Open with what each design leaves in the truth, beside references."""
-    blocks: list[Block] = []
-    for name, design in designs.items():
-        own = next(row for row in found.rows if row.design == name)
-        others = listing_text(list(design.other_sensors))
-        text = f"{name} reads {others} beside the loop's own sensor, and leaves "
-        text += nm_text(own.residual_nm, ".1f", unit="nm rms")
-        if found.limit is not None:
-            least = nm_text(found.limit.rms_nm, ".1f", unit="nm rms")
-            text += f"; no controller of the own sensor alone leaves less than {least}"
-        blocks.append(f"{text}.")
-    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
-    hidden = ("worst_nm", "above_band_limit_percent", "phase_margin_deg")
-    blocks.append(row_table(caption, found.rows, without=hidden))
-    blocks += [Notice(text=note) for note in found.notes]
-    return Section(key="summary", title="Summary", blocks=blocks)
+    return page, compared
 
 
 def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:
@@ -500,11 +368,6 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
     simulation, rows = run_failures(
         design, config, config.truth, drops, frames=frames, cases=1, seed=seed
     )
-    left = [
-        f"without {segment.text} {nm_text(row.exact_nm, '.1f', unit='nm rms')}"
-        for segment, row in rows
-        if segment.text
-    ]
     exact_nm = [row.exact_nm for _, row in rows]
     return chart(
         key,
@@ -512,5 +375,4 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
         group="sensor-failures",
         name=name,
         away=f"{_AWAY_S:g}",
-        residuals=listing_text(left),
     )

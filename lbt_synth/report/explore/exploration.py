@@ -1,9 +1,15 @@
-"""From a wish to what the page shows: pure functions, in the order in which results come."""
+"""What can be moved on the page of sliders, and from there to what it shows: pure functions.
+
+A method of synthesis declares the range of an option's slider beside the option, as ``slider``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from types import MappingProxyType
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -14,58 +20,246 @@ from lbt_synth.design import Design
 from lbt_synth.linear import hinf_norm, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
-from lbt_synth.methods.registry import default_method, design_title, method_named
+from lbt_synth.methods.method import Method, Section
+from lbt_synth.methods.registry import all_methods, default_method, design_title, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
-from lbt_synth.report.designs.report import require_compatible
-from lbt_synth.report.designs.simulation import exact_spectrum
-from lbt_synth.report.explore.knobs import (
-    SHIFT,
-    Knob,
-    list_knobs,
-    section_content,
-    section_of,
-    shift_range_hz,
-)
+from lbt_synth.models import Vibration
+from lbt_synth.models.vibration import stationary_vibrations
+from lbt_synth.report.designs.report import frequency_errors, require_compatible
 from lbt_synth.report.figures.loops import frequency_grid
-from lbt_synth.report.number_text import fixed_text, number_text
-from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.report.figures.records import exact_spectrum
+from lbt_synth.storage.display_unit import nm_text, shown_unit
+from lbt_synth.storage.rows import fact, facts, row_table
+from lbt_synth.storage.tables import Table
 from lbt_synth.studies import compare_in_truth, robustness_map
 from lbt_synth.validation import ComplexArray, FloatArray
+
+Content: TypeAlias = dict[str, Any]  # of a configuration file
+# puts a value into a file, given the factor on what it was
+Edit: TypeAlias = Callable[[Config, Content, float, float], None]
+SHIFT = "shift"  # key of the knob that moves the true lines
+_WIDEST_HZ = 4.0  # half width of a band
+_NEAR = 0.9  # of its frequency, half the widest band around a line
+_MOST_DAMPING = 0.99
+
+
+@dataclass(frozen=True, slots=True)
+class Knob:
+    """One number that can be moved."""
+
+    key: str
+    label: str
+    unit: str  # empty for a pure number
+    low: float
+    high: float
+    value: float  # where it stands before it is moved
+    edit: Edit | None = None  # what puts its value into a configuration, or
+    option: str = ""  # the option of the method that it is
+    log: bool = False  # whether equal steps are equal factors
+    methods: frozenset[str] | None = None  # whose designs alone it changes; None: it is the loop's
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """The unit that people see, and the factor to it."""
+        return shown_unit(self.unit)
+
+
+def list_knobs(config: Config) -> tuple[Knob, ...]:
+    """Return what can be moved in a configuration: the loop and the sky, then the design."""
+    own = (knob for method in all_methods().values() for knob in _method_knobs(method, config))
+    return (*_loop_knobs(config), *_model_knobs(config), *own)
+
+
+def shift_range_hz(config: Config) -> tuple[float, float]:
+    """Return how far the true lines can be moved [Hz]: over the configuration's errors."""
+    errors = frequency_errors(config)
+    return float(errors[0]), float(errors[-1])
+
+
+def _loop_knobs(config: Config) -> Iterator[Knob]:
+    """Yield the knobs of what the real loop meets."""
+    delay, gain = config.settings.loop.delay_frames, config.truth.sensor_gain * config.sensor_gain
+    yield Knob(
+        "delay",
+        "total delay",
+        "frames",
+        1.0,
+        max(6.0, delay),
+        delay,
+        _setter("loop", "delay_frames"),
+    )
+    yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, _scale_sensor_gain)
+    noise_nm = float(np.sqrt(np.mean(np.square(config.noise_nm))))
+    if noise_nm > 0:
+        yield _factor_knob("noise", "measurement noise", "nm", noise_nm, 10.0, _scale_noise)
+    low, high = shift_range_hz(config)
+    if low < high:
+        label = "frequency error, true less assumed"
+        yield Knob(SHIFT, label, "Hz", low, high, 0.0, _set_shift)
+    air = config.settings.atmosphere
+    if air is not None:
+        for key, label, unit, name in (
+            ("seeing", "seeing", "arcsec", "seeing_arcsec"),
+            ("wind", "wind speed", "m/s", "wind_speed_m_s"),
+        ):
+            edit = _setter("atmosphere", name)
+            yield _factor_knob(key, label, unit, getattr(air, name), 4.0, edit)
+
+
+def _factor_knob(key: str, label: str, unit: str, value: float, factor: float, edit: Edit) -> Knob:
+    """Return a knob that reaches from its value by a factor to both sides."""
+    return Knob(key, label, unit, value / factor, value * factor, value, edit, log=True)
+
+
+def _model_knobs(config: Config) -> Iterator[Knob]:
+    """Yield the knobs of the lines that filters assume."""
+    lines = config.settings.model.vibrations
+    if not lines:
+        return
+    filters = [method for method in all_methods().values() if method.estimator]
+    methods = frozenset(method.name for method in filters)
+    damping = float(np.exp(np.mean(np.log([line.damping for line in lines]))))
+    knob = _factor_knob("damping", "assumed damping", "", damping, 10.0, _scale_damping)
+    yield replace(knob, high=min(knob.high, 0.9), methods=methods)
+    reach = min(_WIDEST_HZ, *(_NEAR * line.frequency_hz for line in lines))
+    value = min(reach, *(line.spread_hz or 0.0 for line in lines))
+    methods = frozenset(method.name for method in filters if not method.needs_options)
+    label = "half width of assumed bands"
+    yield Knob("spread", label, "Hz", 0.0, reach, value, _set_spread, methods=methods)
+
+
+def _method_knobs(method: Method, config: Config) -> Iterator[Knob]:
+    """Yield the knobs of what a method declares a slider for: options, and keys of its section."""
+    methods, section = frozenset({method.name}), section_of(method, config)
+    for name, low, high in _declared_sliders(method.options):
+        option = method.options.model_fields[name]
+        value = option.examples[0] if option.is_required() and option.examples else option.default
+        value = float(config.design_defaults.get(name, value))
+        key, label = f"{method.name}-{name}", _label(name)
+        yield Knob(key, *label, low, high, value, option=name, methods=methods)
+    if section is None:
+        return
+    for name, low, high in _declared_sliders(type(section)):
+        value, edit = float(getattr(section, name)), _setter("design", method.name, name)
+        key, label = f"{method.name}-{name}", _label(name)
+        yield Knob(key, *label, low, high, value, edit, methods=methods)
+    if getattr(section, "bands", None):
+        half = float(np.mean([band.high_hz - band.low_hz for band in section.bands])) / 2
+        edit = partial(_scale_bands, method.name)
+        key, words = f"{method.name}-band", "half width of the bands"
+        knob = _factor_knob(key, words, "Hz", half, 10.0, edit)
+        yield replace(knob, high=max(_WIDEST_HZ, half), methods=methods)
+
+
+def _declared_sliders(kind: type[Section]) -> Iterator[tuple[str, float, float]]:
+    """Yield the fields that declare a slider, with its ends."""
+    for name, field in kind.model_fields.items():
+        extra = field.json_schema_extra
+        if isinstance(extra, dict) and isinstance(ends := extra.get("slider"), list):
+            low, high = (float(str(end)) for end in ends)
+            yield name, low, high
+
+
+def _label(name: str) -> tuple[str, str]:
+    """Return the name of an option as words, and its unit."""
+    words, _, unit = name.rpartition("_")
+    return (words.replace("_", " "), "Hz") if unit == "hz" else (name.replace("_", " "), "")
+
+
+def section_of(method: Method, config: Config) -> Any:
+    """Return a method's section of a configuration, else one made for its plant; None if none."""
+    section = config.method_section(method.name)
+    if section is None and method.plant_section is not None and config.plant.vibrations:
+        section = method.plant_section(config.plant, None)
+    return section
+
+
+def _setter(*keys: str) -> Edit:
+    """Return the edit that sets the number at a path of keys."""
+
+    def edit(_: Config, content: Content, value: float, factor: float) -> None:
+        for key in keys[:-1]:
+            content = content[key]
+        content[keys[-1]] = value
+
+    return edit
+
+
+def _scale_sensor_gain(config: Config, content: Content, value: float, factor: float) -> None:
+    """Scale the real sensor gain; gains of several measurements keep their proportions."""
+    truth = content.setdefault("truth", {})
+    gain = truth.get("sensor_gain", 1.0)
+    truth["sensor_gain"] = [factor * g for g in gain] if isinstance(gain, list) else factor * gain
+
+
+def _scale_noise(config: Config, content: Content, value: float, factor: float) -> None:
+    """Scale the noise of all measurements."""
+    sensor = content["sensor"]
+    for name in ("noise_mas", "pyramid"):
+        sensor.pop(name, None)
+    sensor["noise_nm"] = (factor * np.asarray(config.noise_nm)).tolist()
+
+
+def _set_shift(config: Config, content: Content, value: float, factor: float) -> None:
+    """Move the true lines, the one that moves most by a shift; those of the model stay."""
+    for line in _true_lines(config, content):
+        place_hz = line["frequency_hz"]
+        percent = line.pop("frequency_error_percent", None)
+        if percent is not None:
+            line["frequency_error_hz"] = place_hz * percent / 100  # so that it stays as it is
+        line["frequency_hz"] += config.truth.frequency_shift_hz(place_hz, value)
+
+
+def _scale_damping(config: Config, content: Content, value: float, factor: float) -> None:
+    """Scale the damping of the lines of the model; those of the truth stay."""
+    _true_lines(config, content)
+    for line in content["model"]["vibrations"]:
+        line["damping"] = min(line["damping"] * factor, _MOST_DAMPING)
+
+
+def _set_spread(config: Config, content: Content, value: float, factor: float) -> None:
+    """Spread the lines of the model over bands of a half width; those of the truth stay."""
+    _true_lines(config, content)
+    for line in content["model"]["vibrations"]:
+        if value > 0:
+            line["spread_hz"] = value
+        else:
+            line.pop("spread_hz", None)
+            line.pop("lines", None)
+
+
+def _scale_bands(
+    method: str, config: Config, content: Content, value: float, factor: float
+) -> None:
+    """Scale the half widths of the bands of a method's section; their middles stay."""
+    highest = config.hardware.frame_rate_hz / 2
+    for band in content["design"][method]["bands"]:
+        middle = (band["low_hz"] + band["high_hz"]) / 2
+        half = factor * (band["high_hz"] - band["low_hz"]) / 2
+        band |= {"low_hz": max(middle - half, 0.0), "high_hz": min(middle + half, highest)}
+
+
+def _true_lines(config: Config, content: Content) -> list[Content]:
+    """Return the lines of the truth; those that it takes from the model become its own."""
+    truth = content.setdefault("truth", {})
+    if not isinstance(truth.get("vibrations", []), list):
+        lines = stationary_vibrations(config.truth.vibrations)
+        errors = config.truth.frequency_errors_hz or (None,) * len(lines)
+        entries = truth["vibrations"] = []
+        for line, error in zip(lines, errors, strict=True):
+            if not isinstance(line, Vibration):
+                continue
+            names = ("frequency_hz", "damping", "rms_nm")
+            entry = {"kind": "resonance", **{n: float(getattr(line, n)) for n in names}}
+            if len(line.direction) == 2:
+                entry["direction_deg"] = float(np.degrees(np.arctan2(*line.direction[::-1])))
+            entries.append(entry if error is None else {**entry, "frequency_error_hz": error})
+    return truth.setdefault("vibrations", [])  # type: ignore[no-any-return]  # of a file
+
 
 _POINTS, _NEAR_A_LINE = 240, 28  # frequencies of a curve: in all, and on each side of a line
 _SHIFTS = 15
 _SEGMENT = 2048  # frames of a segment of the spectrum
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
-    """A method of synthesis, and the values of the knobs that were moved, by their keys."""
-
-    method: str = field(default_factory=default_method)
-    values: Mapping[str, float] = field(default_factory=dict)
-
-    def move(self, knobs: Sequence[Knob]) -> dict[Knob, float]:
-        """Return the knobs that it moves and that act on its design, with values in reach."""
-        return {
-            knob: min(max(float(self.values[knob.key]), knob.low), knob.high)
-            for knob in knobs
-            if knob.key in self.values and (knob.methods is None or self.method in knob.methods)
-        }
-
-    def shift_hz(self, knobs: Sequence[Knob]) -> float:
-        """Return by how much it moves the true lines [Hz]."""
-        return next((v for knob, v in self.move(knobs).items() if knob.key == SHIFT), 0.0)
-
-
-@table_row
-class ExploredRow:
-    """A design in the loop that the sliders make; what an unstable loop does not have is nan."""
-
-    design: str = column("design")
-    residual_nm: float = nm_column("residual", format=".1f", missing="unstable")
-    strehl: float = percent_column("Strehl ratio")
-    modulus: float = column("modulus margin", format=".3f")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,7 +273,8 @@ class Shown:
     spectrum_nm2_hz: FloatArray  # (f,): of the residual, sum over the axes
     broken: ComplexArray  # (q, f): loop gain of each measurement, the others closed
     poles: ComplexArray  # of the closed loop
-    row: ExploredRow | None = None  # what it leaves where the true lines are now
+    # residual [nm rms], Strehl ratio and modulus margin where the true lines are now
+    left: tuple[float, float, float] | None = None
     shift_hz: FloatArray | None = None  # (s,): by which the true lines are moved from the start
     strehls: FloatArray | None = None  # (s,): Strehl ratio there, in [0, 1]
 
@@ -95,9 +290,9 @@ class Exploration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """What a wish gives; the first of the designs on show is its own."""
+    """What a method and sliders give; the first of the designs on show is its own."""
 
-    wish: Wish
+    values: Mapping[str, float]  # of the knobs that were moved, by their keys
     config: Config
     request: DesignRequest
     shift_hz: float  # of the true lines
@@ -118,44 +313,67 @@ def explore(config: Config, designs: Mapping[str, Design]) -> Exploration:
     return Exploration(config=config, designs=designs, knobs=list_knobs(config))
 
 
-def fulfil(wish: Wish, knobs: Sequence[Knob], config: Config) -> tuple[Config, DesignRequest]:
-    """Return the configuration and the request of a wish; ConfigError where they do not fit."""
-    method, moved = method_named(wish.method), wish.move(knobs)
+def moved_knobs(
+    method: str, values: Mapping[str, float], knobs: Sequence[Knob]
+) -> dict[Knob, float]:
+    """Return the knobs that were moved and act on the designs of a method, with values in reach."""
+    return {
+        knob: min(max(float(values[knob.key]), knob.low), knob.high)
+        for knob in knobs
+        if knob.key in values and (knob.methods is None or method in knob.methods)
+    }
+
+
+def fulfil(
+    name: str, values: Mapping[str, float], knobs: Sequence[Knob], config: Config
+) -> tuple[Config, DesignRequest]:
+    """Return the configuration and the request of a method whose knobs were moved.
+
+    ConfigError where they do not fit.
+    """
+    method, moved = method_named(name), moved_knobs(name, values, knobs)
     content = config.settings.model_dump(exclude_unset=True)
-    if method.section is not None and section_of(method, config) is not None:
-        section_content(method, config, content)
+    section = None if method.section is None else section_of(method, config)
+    if section is not None and content.setdefault("design", {}).get(name) is None:
+        content["design"][name] = section.model_dump(exclude_unset=True)  # made for its plant
     for knob, value in moved.items():
         if knob.edit is not None:
-            knob.edit(config, content, value)
+            knob.edit(config, content, value, value / knob.value if knob.value else 1.0)
     settings = validate_sections(FileSection, content, config.source)
     options = {
         knob.option: moved.get(knob, knob.value)
         for knob in knobs
-        if knob.option and wish.method in (knob.methods or ())
+        if knob.option and name in (knob.methods or ())
     }
-    request = design_request(wish.method, {**method.reference_options, **options})
+    request = design_request(name, {**method.reference_options, **options})
     return build_config(settings, config.source), request
 
 
-def quick_view(exploration: Exploration, wish: Wish, before: View | None = None) -> View:
+def quick_view(
+    exploration: Exploration,
+    method: str | None = None,
+    values: Mapping[str, float] = MappingProxyType({}),
+    before: View | None = None,
+) -> View:
     """Design, and return the view with its curves; the view before lends what is not yet known."""
-    config, request = fulfil(wish, exploration.knobs, exploration.config)
-    design = config.design(request)
-    label = request.method.label
+    name, knobs = method or default_method(), exploration.knobs
+    config, request = fulfil(name, values, knobs, exploration.config)
+    shifts = (v for knob, v in moved_knobs(name, values, knobs).items() if knob.key == SHIFT)
+    design, label = config.design(request), request.method.label
     own = f"{label} by the sliders" if label in exploration.designs else label
     shown = {
         name: loop_curves(one, config) for name, one in {own: design, **exploration.designs}.items()
     }
     if before is not None:
         shown = {
-            name: replace(one, row=last.row, shift_hz=last.shift_hz, strehls=last.strehls)
+            name: replace(one, left=last.left, shift_hz=last.shift_hz, strehls=last.strehls)
             for (name, one), last in zip(shown.items(), before.shown.values(), strict=True)
         }
     return View(
-        wish=wish,
+        values=values,
         config=config,
         request=request,
-        shift_hz=wish.shift_hz(exploration.knobs),
+        shift_hz=next(shifts, 0.0),
         design=design,
         shown=shown,
     )
@@ -188,13 +406,13 @@ def whole_view(exploration: Exploration, view: View) -> View:
     """Return a view with what its designs leave."""
     designs = (view.design, *exploration.designs.values())
     shown = {
-        name: complete(one, name, design, view, exploration.config)
+        name: complete(one, design, view, exploration.config)
         for (name, one), design in zip(view.shown.items(), designs, strict=True)
     }
     return replace(view, shown=shown, is_whole=True)
 
 
-def complete(one: Shown, name: str, design: Design, view: View, start: Config) -> Shown:
+def complete(one: Shown, design: Design, view: View, start: Config) -> Shown:
     """Return a design with what it leaves if the true lines move from where they are at start."""
     hardware, config = view.config.hardware, view.config
     lines = {n: getattr(start.truth, n) for n in ("vibrations", "frequency_errors_hz")}
@@ -210,20 +428,32 @@ def complete(one: Shown, name: str, design: Design, view: View, start: Config) -
     )
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     now = int(np.searchsorted(shifts, view.shift_hz))
-    row = ExploredRow(
-        design=name,
-        residual_nm=float(grid.residual_nm[0, 0, now]),
-        strehl=float(grid.strehl[0, 0, now]),
-        modulus=1 / float(hinf_norm(loop.output_sensitivity())) if loop.is_stable else np.nan,
-    )
-    return replace(one, row=row, shift_hz=shifts, strehls=grid.strehl[0, 0])
+    modulus = 1 / float(hinf_norm(loop.output_sensitivity())) if loop.is_stable else np.nan
+    left = float(grid.residual_nm[0, 0, now]), float(grid.strehl[0, 0, now]), modulus
+    return replace(one, left=left, shift_hz=shifts, strehls=grid.strehl[0, 0])
 
 
-def describe_moves(exploration: Exploration, wish: Wish) -> str:
-    """Return the sliders that a wish moved, as people read them; empty without any."""
+def explored_table(shown: Mapping[str, Shown]) -> Table:
+    """Return what designs leave; an unstable loop has no numbers."""
+    rows = [
+        facts(
+            design=fact(name, "design"),
+            residual_nm=fact(one.left[0], "residual", unit="nm", format=".1f", missing="unstable"),
+            strehl=fact(one.left[1], "Strehl ratio", unit="%", scale=100, format=".2f"),
+            modulus=fact(one.left[2], "modulus margin", format=".3f"),
+        )
+        for name, one in shown.items()
+        if one.left is not None
+    ]
+    return row_table("", rows)
+
+
+def describe_moves(exploration: Exploration, view: View) -> str:
+    """Return the sliders that were moved for a view, as people read them; empty without any."""
+    moved = moved_knobs(view.request.method.name, view.values, exploration.knobs)
     return ", ".join(
-        f"{knob.label} {number_text(value * knob.shown[1])} {knob.shown[0]}".rstrip()
-        for knob, value in wish.move(exploration.knobs).items()
+        f"{knob.label} {value * knob.shown[1]:.4g} {knob.shown[0]}".rstrip()
+        for knob, value in moved.items()
     )
 
 
@@ -237,17 +467,16 @@ def judge(view: View) -> str:
     hardware, gain = view.config.hardware, view.config.truth.sensor_gain
     margins = loop_margins(close_loop(hardware, view.design.controller, sensor_gain=gain))
     residual, strehl = nm_text(own.residual_nm, ".1f", unit="nm rms"), 100 * own.strehl
-    sentences = [f"{view.name} leaves {residual}, Strehl ratio {fixed_text(strehl, 1)} %"]
+    sentences = [f"{view.name} leaves {residual}, Strehl ratio {strehl:.1f} %"]
     if compared.limit is not None:
-        above = fixed_text(own.above_limit_percent, 1)
+        above = f"{own.above_limit_percent:.1f}"
         sentences[0] += f", {above} % above the least of any linear controller"
     best = min(others, key=lambda row: row.residual_nm, default=own)
     if best.residual_nm < own.residual_nm:
         least = nm_text(best.residual_nm, ".1f")
         sentences.append(f"the {design_title(best.method)} leaves {least} here")
     sentences.append(
-        f"Margins: modulus {number_text(margins.modulus, 3)}, phase "
-        f"{number_text(margins.phase_deg, 3)} degrees"
+        f"Margins: modulus {margins.modulus:.3g}, phase {margins.phase_deg:.3g} degrees"
     )
     sentences.append(f"it {margins.survival.removesuffix('.')}")
     sentences += [f"WARNING: {text.removesuffix('.')}" for text in margins.fragilities]

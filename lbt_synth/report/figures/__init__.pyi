@@ -1,8 +1,4 @@
-from .loops import bode_figure as bode_figure
-from .loops import nichols_figure as nichols_figure
-from .loops import nyquist_figure as nyquist_figure
-from .loops import sigma_figure as sigma_figure
-from .loops import step_figure as step_figure
+from .loops import loop_figure as loop_figure
 from .records import identification_figure as identification_figure
 from .studies import modal_figure as modal_figure
 from .studies import robustness_figure as robustness_figure

@@ -1,9 +1,8 @@
-"""Figures of loops: singular values, Bode, Nyquist and Nichols plots, and step responses."""
+"""Views of loops: singular values, Bode, Nyquist and Nichols plots, and step responses."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,9 +15,8 @@ from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop, broken_loops, close_loop, loop_margins, step_response
 from lbt_synth.loop.broken_loops import BrokenLoop
 from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
-from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing, square_in
-from lbt_synth.report.scales import shorten
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing, shorten, square_in
+from lbt_synth.validation import ComplexArray, FloatArray, choice
 
 FREQUENCY = {"label": "frequency", "unit": "Hz", "log": True}
 _DECADES = 3.6  # of frequency that are drawn, below half the frame rate
@@ -29,11 +27,102 @@ _REACH = 2.5  # of a Nyquist plot from its centre
 _FAR = 8.0  # loop gain beyond which a Nyquist plot draws nothing
 _MODULI = (0.3, 0.5, 0.7)  # modulus margins whose contours a Nichols plot has
 _TURN = np.linspace(0, 2 * np.pi, 241)
+_APART = 1e-12  # of a response, that another axis has by rounding
 _THIN: dict[str, Any] = {"look": None, "width": 1.0, "numbers": False}
-# Frequencies [Hz], and the largest singular values of a design, (f,) each; None for what a design
-# does not have, or where its loop is unstable
-Norms: TypeAlias = tuple[FloatArray, FloatArray | None]
-Steps: TypeAlias = Mapping[str, Sequence[LoopStep]]  # of each design; none in an unstable loop
+Loops: TypeAlias = Mapping[str, ClosedLoop]  # by the names of designs
+# Frequencies [Hz] of a curve, (f,), and the largest singular values of error, rejection and noise,
+# (f,) each; None for what there is not
+SigmaCurves: TypeAlias = tuple[FloatArray, FloatArray | None, FloatArray | None, FloatArray | None]
+# Name of a broken loop, its look, its dash (None for the first axis of a design), and the loop
+# itself; None where it is unstable
+OpenLoop: TypeAlias = tuple[str, int, int | None, BrokenLoop | None]
+
+
+def loop_figure(
+    designs: Mapping[str, Design],
+    kind: str,
+    *,
+    sensor_gain: float = 1.0,
+    unit_weights: bool = False,
+    axes: OwnAxes = None,
+) -> Figure:
+    """Draw a view of the loops of designs.
+
+    Parameters
+    ----------
+    designs : mapping of str to Design
+        Designs by the name they get in the legend. Each needs a loop, but for ``"sigma"``.
+    kind : {"sigma", "bode", "nyquist", "nichols", "step"}
+        ``"sigma"``: largest singular values of the estimation error, the rejection and the noise
+        transfer, a panel each, the vibration frequencies marked. Axes that do not mix have a curve
+        each; of others the largest singular value is that of the worst direction.
+        ``"bode"``: gain and phase over frequency, with the margins; the phase has no jumps and
+        includes the delay.
+        ``"nyquist"``: the complex plane, a panel for each design. Around -1 are the circles of
+        the modulus margin and of the disk margin of all axes at once; no loop enters them.
+        ``"nichols"``: gain over phase. A loop that stays outside a contour has its modulus margin.
+        ``"step"``: residual and command after a step of the wavefront, in two panels.
+        Loops are broken at each measurement in turn, the others closed; axes that respond alike
+        are one curve.
+    sensor_gain : float, optional
+        Real sensor gain, relative to the one of each design.
+    unit_weights : bool, optional
+        Draw the estimation error against disturbances of unit size, as the paper
+        does, instead of the weighted ones of each design.
+    axes : Axes or sequence of Axes, optional
+        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A loop that is unstable at this sensor gain is named and not drawn.
+
+    Raises
+    ------
+    ProblemError
+        If there is no design, one has no loop, there is no such view,
+        or ``axes`` are not one per panel.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
+    >>> len(lbt.report.figures.loop_figure({"slow": slow}, "bode").axes)
+    2
+    """
+    choice(kind, "kind", ("sigma", *DRAWN))
+    loops = closed_loops(designs, sensor_gain, needed=kind != "sigma")
+    if kind != "sigma":
+        return DRAWN[kind](loops, axes=axes)
+    curves = sigma_curves(designs, loops, unit_weights=unit_weights)
+    estimators = [design for design in designs.values() if design.is_estimator]
+    physical = all(design.hardware is not None for design in estimators)
+    factor = "" if sensor_gain == 1 else f" at {sensor_gain:g} times the sensor gain"
+    return draw_sigma(
+        curves,
+        loops,
+        _vibrations_hz(designs),
+        unit="nm" if physical and not unit_weights else "-",
+        title=f"closed loops{factor}",
+        axes=axes,
+    )
+
+
+def closed_loops(
+    designs: Mapping[str, Design], sensor_gain: float, *, needed: bool = True
+) -> dict[str, ClosedLoop]:
+    """Close the loop of each design; one without a loop is refused where it is needed."""
+    if not designs:
+        raise ProblemError("a plot of loops needs at least one design; got none.")
+    loops = {}
+    for name, design in designs.items():
+        if design.hardware is not None:
+            loops[name] = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
+        elif needed:
+            raise ProblemError(
+                f"{name} is a filter of a bare estimation problem; expected a design for a loop."
+            )
+    return loops
 
 
 def frequency_grid(
@@ -70,138 +159,21 @@ def draw_design(
         panel.curve(name, x, y, look=number, **look)
 
 
-def draw_transfer(
-    panel: Panel,
-    label: str,
-    unit: str,
-    norms: Mapping[str, Norms],
-    names: Sequence[str],
-    lines_hz: Sequence[float],
-    *,
-    title: str = "",
-    line: str = "vibration",
-) -> None:
-    """Draw transfer functions over frequency, with the vibrations at lines_hz marked."""
-    values = np.concatenate([np.zeros(1), *(y for _, y in norms.values() if y is not None)])
-    floor = float(np.max(values)) / _DEEPEST
-    low = floor if np.any(values[1:] < floor) and floor > 0 else None
-    y_axis = {"label": f"\u03c3\u0304, {label}", "unit": unit, "log": True, "low": low}
-    panel.set_axes(FREQUENCY, y_axis, title=title)
-    for name, (frequency_hz, norm) in norms.items():
-        draw_design(panel, names, name, frequency_hz, norm)
-    for line_hz in lines_hz:
-        panel.rule(line, line_hz, dash=3)
-
-
-def draw_sigma(
-    errors: Mapping[str, Norms],
-    rejections: Mapping[str, Norms],
-    noises: Mapping[str, Norms],
-    names: Sequence[str],
-    lines_hz: Sequence[float],
-    *,
-    unit: str = "nm",
-    title: str = "",
-    line: str = "vibration",
-    axes: OwnAxes = None,
-) -> Figure:
-    """Draw estimation errors, and rejection and noise transfer of loops; a panel for what is there.
-
-    The title is that of the loops.
-    """
-    parts = [
-        ("disturbances to error", unit, errors, ""),
-        ("phase to residual", "-", rejections, title),
-        ("noise to residual", "-", noises, ""),
-    ]
-    parts = [part for part in parts if part[2]]
-    with drawing([PANEL_IN] * len(parts), axes=axes) as panels:
-        for panel, (label, of, norms, words) in zip(panels, parts, strict=True):
-            draw_transfer(panel, label, of, norms, names, lines_hz, title=words, line=line)
-            if norms is rejections:
-                panel.rule("", 1.0, "y")
-    return panels[0].figure
-
-
-def sigma_figure(
-    designs: Mapping[str, Design],
-    *,
-    sensor_gain: float = 1.0,
-    unit_weights: bool = False,
-    axes: OwnAxes = None,
-) -> Figure:
-    """Largest singular values of the estimation error, the rejection and the noise transfer.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by the name they get in the legend. Those without a loop get
-        only the first panel, integrators only the others.
-    sensor_gain : float, optional
-        Real sensor gain of the closed loops.
-    unit_weights : bool, optional
-        Draw the estimation error against disturbances of unit size, as the paper
-        does, instead of the weighted ones of each design.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel per transfer function, the vibration frequencies marked. A loop that is
-        unstable at this sensor gain is named and not drawn. Axes that do not mix have a curve each;
-        of others the largest singular value is that of the worst direction.
-
-    Raises
-    ------
-    ProblemError
-        If there is no design,
-        or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> figure = lbt.report.figures.sigma_figure({"Kalman": lbt.kalman(walk)})
-    >>> len(figure.axes)
-    1
-    """
-    if not designs:
-        raise ProblemError("a sigma plot needs at least one design; got none.")
-    lines_hz = _vibration_frequencies(designs.values())
-    norms = sigma_curves(designs, sensor_gain=sensor_gain, unit_weights=unit_weights)
-    names = list(norms)
-    errors = {name: (f, error) for name, (_, f, error, *_) in norms.items() if error is not None}
-    split = {design for name, (design, *_) in norms.items() if name != design}
-    closed = [
-        name
-        for name, (design, *_) in norms.items()
-        if designs[design].hardware is not None and name not in split
-    ]
-    rejections = {name: (norms[name][1], norms[name][3]) for name in closed}
-    noises = {name: (norms[name][1], norms[name][4]) for name in closed}
-    physical = all(designs[name].hardware is not None for name in errors)
-    unit = "nm" if physical and not unit_weights else "-"
-    factor = "" if sensor_gain == 1 else f" at {sensor_gain:g} times the sensor gain"
-    title = f"closed loops{factor}"
-    more: dict[str, Any] = {"unit": unit, "title": title, "axes": axes}
-    return draw_sigma(errors, rejections, noises, names, lines_hz, **more)
-
-
-_APART = 1e-12  # of a response, that another axis has by rounding
-_Curves: TypeAlias = tuple[str, FloatArray, FloatArray | None, FloatArray | None, FloatArray | None]
-
-
 def sigma_curves(
-    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, unit_weights: bool = False
-) -> dict[str, _Curves]:
-    """Return of each curve its design, frequencies [Hz], and values of error, rejection and noise.
+    designs: Mapping[str, Design],
+    loops: Loops,
+    *,
+    unit_weights: bool = False,
+    lines_hz: Sequence[float] | None = None,
+) -> dict[str, SigmaCurves]:
+    """Return frequencies [Hz] and values of error, rejection and noise by the names of curves.
 
     They are largest singular values. Axes that do not mix have a curve each, unless they are equal:
     the largest of both would be that of the other axis at a line of one. Frequencies are dense
-    around vibrations.
+    around lines, by default the vibrations of the designs.
     """
-    lines_hz, curves = _vibration_frequencies(designs.values()), {}
+    lines_hz = _vibrations_hz(designs) if lines_hz is None else lines_hz
+    curves: dict[str, SigmaCurves] = {}
     for name, design in designs.items():
         grid, error = frequency_grid(1 / design.controller.dt_s, lines_hz), None
         rejection = noise = None
@@ -209,19 +181,17 @@ def sigma_curves(
             problem = design.problem
             system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
             error = largest_singular_values(system, grid)
-        if design.hardware is not None:
-            loop = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
-            if loop.is_stable:
-                S, N = loop.sensitivity(grid), loop.noise_transfer(grid)
-                axes = [np.abs(part.diagonal(axis1=1, axis2=2)).T for part in (S, N)]
-                if _are_apart(S) and _are_apart(N) and not np.allclose(axes[0], axes[0][0]):
-                    for axis, pair in enumerate(zip(*axes, strict=True)):
-                        curves[axes_name(name, [axis], alone=False)] = name, grid, None, *pair
-                    if error is not None:
-                        curves[name] = name, grid, error, None, None
-                    continue
-                rejection, noise = spectral_norms(S), spectral_norms(N)
-        curves[name] = name, grid, error, rejection, noise
+        if name in loops and loops[name].is_stable:
+            S, N = loops[name].sensitivity(grid), loops[name].noise_transfer(grid)
+            diagonals = [np.abs(part.diagonal(axis1=1, axis2=2)).T for part in (S, N)]
+            if _are_apart(S) and _are_apart(N) and not np.allclose(diagonals[0], diagonals[0][0]):
+                for axis, pair in enumerate(zip(*diagonals, strict=True)):
+                    curves[axes_name(name, [axis], alone=False)] = grid, None, *pair
+                if error is not None:
+                    curves[name] = grid, error, None, None
+                continue
+            rejection, noise = spectral_norms(S), spectral_norms(N)
+        curves[name] = grid, error, rejection, noise
     return curves
 
 
@@ -233,65 +203,52 @@ def _are_apart(response: ComplexArray) -> bool:
     return bool(np.max(others, initial=0.0) <= _APART * np.max(np.abs(response)))
 
 
-def _vibration_frequencies(designs: Iterable[Design]) -> list[float]:
-    frequencies_hz = {
-        line.frequency_hz
-        for design in designs
-        if design.is_estimator and design.plant is not None
-        for line in design.plant.vibrations
-    }
-    return sorted(frequencies_hz)
+def _vibrations_hz(designs: Mapping[str, Design]) -> list[float]:
+    """Return the frequencies of the vibrations that designs assume."""
+    plants = [design.plant for design in designs.values() if design.is_estimator]
+    return sorted({v.frequency_hz for plant in plants if plant for v in plant.vibrations})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OpenLoop:
-    """A broken loop of a design, as it is drawn."""
+def draw_sigma(
+    curves: Mapping[str, SigmaCurves],
+    loops: Loops,
+    lines_hz: Sequence[float],
+    *,
+    unit: str = "nm",
+    title: str = "",
+    line: str = "vibration",
+    axes: OwnAxes = None,
+) -> Figure:
+    """Draw estimation errors, and rejection and noise transfer of loops; a panel for what is there.
 
-    design: str
-    name: str  # in the legend: the design, and its axes where they differ
-    look: int  # that of the design
-    dash: int | None  # None for the first of its axes
-    broken: BrokenLoop | None  # None where the loop is unstable
-
-    @property
-    def margins(self) -> str:
-        """Phase and gain margins as text."""
-        if self.broken is None:
-            return "unstable"
-        point = self.broken.phase_margin
-        texts = [] if point is None else [f"{point.phase_deg:.1f}° at {point.frequency_hz:.3g} Hz"]
-        gains = [f"{20 * np.log10(point.gain):+.1f}" for point in self.broken.gain_margins]
-        return ", ".join(texts + ([f"{' / '.join(gains)} dB"] if gains else []))
-
-    @property
-    def points(self) -> tuple[FloatArray, FloatArray, FloatArray, ComplexArray]:
-        """Frequency [Hz], gain [dB], phase [deg] and response where a curve is drawn, (f,) each."""
-        loop = self.broken
-        if loop is None:
-            return np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.complex128)
-        shown = loop.frequency_hz >= loop.frequency_hz[-1] / 10**_DECADES
-        columns = loop.frequency_hz, loop.gain_db, loop.phase_deg
-        f, gain, phase = (column[shown] for column in columns)
-        return f, gain, phase, loop.response[shown]
-
-    def draw(self, panel: Panel, x: ArrayLike, y: ArrayLike) -> None:
-        """Draw a curve in the look of the loop, named with its margins."""
-        name = f"{shorten(self.name, 24)}: {self.margins}"
-        panel.curve(name, x, y, look=self.look, dash=self.dash)
-
-
-def closed_loops(designs: Mapping[str, Design], sensor_gain: float) -> dict[str, ClosedLoop]:
-    """Close the loop of each design; one without a loop is refused."""
-    if not designs:
-        raise ProblemError("a plot of loops needs at least one design; got none.")
-    loops = {}
-    for name, design in designs.items():
-        if design.hardware is None:
-            raise ProblemError(
-                f"{name} is a filter of a bare estimation problem; expected a design for a loop."
-            )
-        loops[name] = close_loop(design.hardware, design.controller, sensor_gain=sensor_gain)
-    return loops
+    The unit is that of the errors, the title that of the loops.
+    """
+    parts = [
+        ("disturbances to error", unit),
+        ("phase to residual", "-"),
+        ("noise to residual", "-"),
+    ]
+    drawn = [
+        (number, label, of, {name: (f, y[number]) for name, (f, *y) in curves.items()})
+        for number, (label, of) in enumerate(parts)
+        if (number and loops) or any(y[number] is not None for _, *y in curves.values())
+    ]
+    with drawing([PANEL_IN] * len(drawn), axes=axes) as panels:
+        for panel, (number, label, of, norms) in zip(panels, drawn, strict=True):
+            values = np.concatenate([np.zeros(1), *(y for _, y in norms.values() if y is not None)])
+            floor = float(np.max(values)) / _DEEPEST
+            low = floor if np.any(values[1:] < floor) and floor > 0 else None
+            y_axis = {"label": f"\u03c3\u0304, {label}", "unit": of, "log": True, "low": low}
+            panel.set_axes(FREQUENCY, y_axis, title=title if number == 1 else "")
+            for name, (f, norm) in norms.items():
+                is_unstable = number > 0 and name in loops and not loops[name].is_stable
+                if norm is not None or is_unstable:
+                    draw_design(panel, list(norms), name, f, norm)
+            for line_hz in lines_hz:
+                panel.rule(line, line_hz, dash=3)
+            if number == 1:
+                panel.rule("", 1.0, "y")
+    return panels[0].figure
 
 
 def axes_name(design: str, measurements: Sequence[int], *, alone: bool) -> str:
@@ -302,65 +259,47 @@ def axes_name(design: str, measurements: Sequence[int], *, alone: bool) -> str:
     return f"{design}, {'axis' if len(measurements) == 1 else 'axes'} {numbers}"
 
 
-def open_loops(designs: Mapping[str, Design], *, sensor_gain: float = 1.0) -> list[OpenLoop]:
-    """Break the loop of each design; equal axes are one."""
-    return break_loops(closed_loops(designs, sensor_gain))
-
-
-def break_loops(loops: Mapping[str, ClosedLoop]) -> list[OpenLoop]:
+def open_loops(loops: Loops) -> list[OpenLoop]:
     """Break the loops of designs at each measurement, the others closed; equal axes are one."""
-    opened = []
+    opened: list[OpenLoop] = []
     for look, (design, loop) in enumerate(loops.items()):
         groups = broken_loops(loop) if loop.is_stable else (None,)
         for number, broken in enumerate(groups):
             measurements = () if broken is None else broken.measurements
             name = axes_name(design, measurements, alone=len(groups) == 1)
-            dash = look + number if number else None
-            opened.append(OpenLoop(design=design, name=name, look=look, dash=dash, broken=broken))
+            opened.append((name, look, look + number if number else None, broken))
     return opened
 
 
-def bode_figure(
-    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, axes: OwnAxes = None
-) -> Figure:
-    """Gain and phase of loops over frequency, with their margins.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by the name they get in the legend; each needs a loop.
-    sensor_gain : float, optional
-        Real sensor gain, relative to the one of each design.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Two panels. Each measurement is broken in turn, the others closed; axes that respond
-        alike are one curve. Margins are marked and in the legend. The phase has no jumps and
-        includes the delay.
-
-    Raises
-    ------
-    ProblemError
-        If there is no design, one has no loop, or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
-    >>> len(lbt.report.figures.bode_figure({"slow": slow}).axes)
-    2
-    """
-    return draw_bode(open_loops(designs, sensor_gain=sensor_gain), axes=axes)
+def loop_points(broken: BrokenLoop) -> tuple[FloatArray, FloatArray, FloatArray, ComplexArray]:
+    """Frequency [Hz], gain [dB], phase [deg] and response where a curve is drawn, (f,) each."""
+    shown = broken.frequency_hz >= broken.frequency_hz[-1] / 10**_DECADES
+    f, gain, phase = broken.frequency_hz, broken.gain_db, broken.phase_deg
+    return f[shown], gain[shown], phase[shown], broken.response[shown]
 
 
-def draw_bode(loops: Sequence[OpenLoop], *, axes: OwnAxes = None) -> Figure:
+def margins_text(broken: BrokenLoop | None) -> str:
+    """Phase and gain margins of a broken loop as text."""
+    if broken is None:
+        return "unstable"
+    point = broken.phase_margin
+    texts = [] if point is None else [f"{point.phase_deg:.1f}° at {point.frequency_hz:.3g} Hz"]
+    gains = [f"{20 * np.log10(point.gain):+.1f}" for point in broken.gain_margins]
+    return ", ".join(texts + ([f"{' / '.join(gains)} dB"] if gains else []))
+
+
+def _draw_opened(panel: Panel, opened: OpenLoop, x: ArrayLike, y: ArrayLike) -> None:
+    """Draw a curve in the look of a loop, named with its margins."""
+    name, look, dash, broken = opened
+    panel.curve(f"{shorten(name, 24)}: {margins_text(broken)}", x, y, look=look, dash=dash)
+
+
+def draw_bode(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     """Draw gain and phase of broken loops, with their margins."""
-    curves = [each.points for each in loops if each.broken is not None]
-    gains = np.concatenate([np.zeros(1), *(gain for _, gain, *_ in curves)])
-    phases = np.concatenate([[-180.0, -90.0], *(phase for _, _, phase, _ in curves)])
+    opened = open_loops(loops)
+    points = [None if broken is None else loop_points(broken) for *_, broken in opened]
+    gains = np.concatenate([np.zeros(1), *(each[1] for each in points if each)])
+    phases = np.concatenate([[-180.0, -90.0], *(each[2] for each in points if each)])
     y_axis = {
         "label": "loop gain",
         "unit": "dB",
@@ -371,14 +310,16 @@ def draw_bode(loops: Sequence[OpenLoop], *, axes: OwnAxes = None) -> Figure:
         above.set_axes(FREQUENCY, y_axis)
         below.set_axes(FREQUENCY, {"label": "phase", "unit": "deg"})
         above.rule("", 0.0, "y", dash=1)
-        for each in loops:
-            f, gain, phase, _ = each.points
-            each.draw(above, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
-            if each.broken is not None:
-                each.draw(below, f, phase)
+        for each, curves in zip(opened, points, strict=True):
+            if curves is None:
+                _draw_opened(above, each, [], [])
+                continue
+            f, gain, phase, _ = curves
+            _draw_opened(above, each, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
+            _draw_opened(below, each, f, phase)
         for at in _critical_phases(float(np.nanmin(phases)), float(np.nanmax(phases))):
             below.rule("", at, "y", dash=1)
-        for broken in (each.broken for each in loops if each.broken is not None):
+        for broken in (broken for *_, broken in opened if broken is not None):
             for frequency_hz, ends in _gain_marks(broken):
                 _mark(above, "gain margin", [frequency_hz] * 2, ends, "s")
             for frequency_hz, ends in _phase_marks(broken):
@@ -386,47 +327,16 @@ def draw_bode(loops: Sequence[OpenLoop], *, axes: OwnAxes = None) -> Figure:
     return above.figure
 
 
-def nyquist_figure(
-    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, axes: OwnAxes = None
-) -> Figure:
-    """Broken loops in the complex plane, with the disks that they keep out of.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by the name in the title of their panel; each needs a loop.
-    sensor_gain : float, optional
-        Real sensor gain, relative to the one of each design.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel per design, as :func:`bode_figure` breaks its loop. Around -1 are the circles
-        of the modulus margin and of the disk margin of all axes at once; no loop enters them.
-
-    Raises
-    ------
-    ProblemError
-        If there is no design, one has no loop, or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
-    >>> len(lbt.report.figures.nyquist_figure({"slow": slow}).axes)
-    1
-    """
-    loops = closed_loops(designs, sensor_gain)
+def _draw_nyquist(loops: Loops, *, axes: OwnAxes = None) -> Figure:
+    """Draw broken loops in the complex plane, with the disks that they keep out of."""
     columns = min(2, len(loops))
     with drawing([square_in(columns)] * len(loops), columns=columns, axes=axes) as panels:
         for panel, (name, loop) in zip(panels, loops.items(), strict=True):
-            _draw_nyquist(panel, name, loop)
+            _draw_plane(panel, name, loop)
     return panels[0].figure
 
 
-def _draw_nyquist(panel: Panel, name: str, loop: ClosedLoop) -> None:
+def _draw_plane(panel: Panel, name: str, loop: ClosedLoop) -> None:
     """Draw the broken loops of a design in the complex plane."""
     x, y = (
         {"label": f"{part} part", "unit": "-", "low": low, "high": low + 2 * _REACH}
@@ -441,18 +351,17 @@ def _draw_nyquist(panel: Panel, name: str, loop: ClosedLoop) -> None:
     _mark(panel, "critical point", [-1.0], [0.0], "x")
     if margins is None:
         return
-    opened = break_loops({name: loop})
-    for number, each in enumerate(opened):
-        assert each.broken is not None  # that of a stable loop
-        shown = np.where(np.abs(each.broken.response) < _FAR, each.broken.response, np.nan)
-        label = axes_name("loop", each.broken.measurements, alone=len(opened) == 1)
+    groups = broken_loops(loop)
+    for number, broken in enumerate(groups):
+        shown = np.where(np.abs(broken.response) < _FAR, broken.response, np.nan)
+        label = axes_name("loop", broken.measurements, alone=len(groups) == 1)
         panel.curve(label, shown.real, shown.imag, dash=number)
         pale: dict[str, Any] = {"dash": number, "opacity": 0.35, "numbers": False}
         panel.curve("negative frequencies", shown.real, -shown.imag, **pale)
-        if (point := each.broken.phase_margin) is not None:
+        if (point := broken.phase_margin) is not None:
             ends = [0.0, point.response.real], [0.0, point.response.imag]
             _mark(panel, "phase margin", *ends, "o")
-        for point in each.broken.gain_margins:
+        for point in broken.gain_margins:
             _mark(panel, "gain margin", [point.response.real], [0.0], "s")
     low, high = margins.disk_gain_low, min(margins.disk_gain_high, 1e3)
     for label, centre, radius, look in (
@@ -463,51 +372,22 @@ def _draw_nyquist(panel: Panel, name: str, loop: ClosedLoop) -> None:
         panel.curve(label, *places, look=look, width=1.2, numbers=False)
 
 
-def nichols_figure(
-    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, axes: OwnAxes = None
-) -> Figure:
-    """Gain over phase of loops, with their margins and contours of the modulus margin.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by the name they get in the legend; each needs a loop.
-    sensor_gain : float, optional
-        Real sensor gain, relative to the one of each design.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel, of the loops of :func:`bode_figure`. A loop that stays outside a contour has
-        its modulus margin.
-
-    Raises
-    ------
-    ProblemError
-        If there is no design, one has no loop, or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
-    >>> len(lbt.report.figures.nichols_figure({"slow": slow}).axes)
-    1
-    """
-    opened = open_loops(designs, sensor_gain=sensor_gain)
-    loops = [each.broken for each in opened if each.broken is not None]
-    phases = [_within(phase, gain) for _, gain, phase, _ in (each.points for each in opened)]
-    reach = np.concatenate([[-360.0, 0.0], *phases])
+def _draw_nichols(loops: Loops, *, axes: OwnAxes = None) -> Figure:
+    """Draw gain over phase of loops, with their margins and contours of the modulus margin."""
+    opened = open_loops(loops)
+    curves = []
+    for *_, broken in opened:
+        gain, phase = (np.zeros(0),) * 2 if broken is None else loop_points(broken)[1:3]
+        seen = (gain > _LOWEST_DB) & (gain < _HIGHEST_DB)
+        curves.append((np.where(seen, phase, np.nan), np.where(seen, gain, np.nan)))
+    reach = np.concatenate([[-360.0, 0.0], *(phase for phase, _ in curves)])
     lowest, highest = float(np.nanmin(reach)), float(np.nanmax(reach))
     x_axis = {"label": "phase", "unit": "deg", "low": lowest, "high": highest}
     with drawing([2 * PANEL_IN], axes=axes) as (panel,):
         panel.set_axes(x_axis, {"label": "loop gain", "unit": "dB", "high": 40.0})
-        for each in opened:
-            _, gain, phase, _ = each.points
-            gain, phase = _within(gain, gain), _within(phase, gain)
-            each.draw(panel, phase, gain)
-        for broken in loops:
+        for each, curve in zip(opened, curves, strict=True):
+            _draw_opened(panel, each, *curve)
+        for broken in (broken for *_, broken in opened if broken is not None):
             for _, ends in _phase_marks(broken):
                 _mark(panel, "phase margin", ends, [0.0, 0.0], "o")
             for frequency_hz, ends in _gain_marks(broken):
@@ -520,11 +400,6 @@ def nichols_figure(
                 panel.curve(f"modulus {modulus:g}", degrees, decibels, dash=dash, **_THIN)
             _mark(panel, "critical point", [at], [0.0], "x")
     return panel.figure
-
-
-def _within(values: FloatArray, gain_db: FloatArray) -> FloatArray:
-    """Return values where the gain is one that is drawn, nan elsewhere."""
-    return np.where((gain_db > _LOWEST_DB) & (gain_db < _HIGHEST_DB), values, np.nan)
 
 
 def _mark(panel: Panel, name: str, x: Sequence[float], y: Sequence[float], marker: str) -> None:
@@ -557,12 +432,10 @@ def _critical_phases(lowest: float, highest: float) -> list[float]:
     return [float(360 * k - 180) for k in np.arange(first, last + 1)]
 
 
-def design_steps(
-    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, frames: int = SHOWN_FRAMES
-) -> Steps:
+def design_steps(loops: Loops, *, frames: int = SHOWN_FRAMES) -> dict[str, list[LoopStep]]:
     """Return the step responses of designs; axes that respond alike are one."""
     steps: dict[str, list[LoopStep]] = {}
-    for name, loop in closed_loops(designs, sensor_gain).items():
+    for name, loop in loops.items():
         unlike: list[LoopStep] = []
         for axis in range(loop.hardware.modes if loop.is_stable else 0):
             step = step_response(loop, axis=axis, frames=frames)
@@ -572,59 +445,27 @@ def design_steps(
     return steps
 
 
-def step_figure(
-    designs: Mapping[str, Design], *, sensor_gain: float = 1.0, axes: OwnAxes = None
-) -> Figure:
-    """Residual and command of loops after a step of the wavefront.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by the name they get in the legend; each needs a loop.
-    sensor_gain : float, optional
-        Real sensor gain, relative to the one of each design.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Two panels. Axes that respond alike are one curve.
-
-    Raises
-    ------
-    ProblemError
-        If there is no design, one has no loop, or ``axes`` are not one per panel.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.4)
-    >>> len(lbt.report.figures.step_figure({"slow": slow}).axes)
-    2
-    """
-    return draw_steps(design_steps(designs, sensor_gain=sensor_gain), axes=axes)
-
-
-def draw_steps(steps: Steps, *, height_nm: float | None = None, axes: OwnAxes = None) -> Figure:
-    """Draw residual and command after a step; without its height as parts of it."""
-    names, unit = list(steps), "-" if height_nm is None else "nm"
+def draw_steps(loops: Loops, *, axes: OwnAxes = None) -> Figure:
+    """Draw residual and command after a step, as parts of it."""
+    steps = design_steps(loops)
     with drawing([PANEL_IN, PANEL_IN], axes=axes) as panels:
         for panel, label in zip(panels, ("residual", "command"), strict=True):
-            text = f"{label}, part of the step" if height_nm is None else label
-            panel.set_axes(
-                {"label": "time after the step", "unit": "ms"}, {"label": text, "unit": unit}
-            )
+            y_axis = {"label": f"{label}, part of the step", "unit": "-"}
+            panel.set_axes({"label": "time after the step", "unit": "ms"}, y_axis)
             for look, (design, responses) in enumerate(steps.items()):
                 if not responses:
-                    draw_design(panel, names, design, [], None)
+                    draw_design(panel, list(steps), design, [], None)
                 for number, step in enumerate(responses):
-                    panel.curve(
-                        axes_name(design, [step.axis], alone=len(responses) == 1),
-                        1e3 * step.time_s,
-                        (height_nm or 1.0) * getattr(step, label),
-                        look=look,
-                        dash=look + number if number else None,
-                        step="steps-post",
-                    )
+                    name = axes_name(design, [step.axis], alone=len(responses) == 1)
+                    line: dict[str, Any] = {"look": look, "dash": look + number if number else None}
+                    y = getattr(step, label)
+                    panel.curve(name, 1e3 * step.time_s, y, step="steps-post", **line)
     return panels[0].figure
+
+
+DRAWN: Mapping[str, Callable[..., Figure]] = {
+    "bode": draw_bode,
+    "nyquist": _draw_nyquist,
+    "nichols": _draw_nichols,
+    "step": draw_steps,
+}

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.signal import welch
+from scipy.signal import freqz, get_window, welch
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedModel
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
-from lbt_synth.loop import Simulation, close_loop
+from lbt_synth.loop import ClosedLoop, Simulation, close_loop
 from lbt_synth.loop.simulation.run import Segment
+from lbt_synth.models import ARModel, Truth, Vibration
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing
 from lbt_synth.report.figures.loops import FREQUENCY
 from lbt_synth.storage.display_unit import nm_text
@@ -171,13 +173,11 @@ def _predicted_residuals(
             )
         loop = close_loop(model.hardware, controller)
         loop.require_stable()
-        out[name], known = [], np.zeros(0)
+        out[name] = []
         for i, axis in enumerate(model.axes):
             f = axis.frequency_hz
-            if not np.array_equal(f, known):  # the axes of a record share their frequencies
-                known = f
-                reject, let_through = np.abs(loop.sensitivity(f)), np.abs(loop.noise_transfer(f))
-            rejected, passed = reject[:, i] ** 2, let_through[:, i] ** 2
+            rejected = np.abs(loop.sensitivity(f))[:, i] ** 2
+            passed = np.abs(loop.noise_transfer(f))[:, i] ** 2
             density = np.zeros(f.size)
             for j, other in enumerate(model.axes):
                 white = _noise_density(other)
@@ -278,3 +278,60 @@ def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, o
     panel.set_axes(frequency, y_axis, title="innovations, less white noise")
     panel.span("99 % of white noise", -bound, bound, "y")
     panel.curve("excess", test.frequency_hz, excess, width=1.0, quiet=True)
+
+
+_SEGMENT = 2048  # frames of a segment of the spectra, at most
+
+
+def run_spectra(
+    run: Simulation, loop: ClosedLoop, truth: Truth
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return frequencies [Hz], and spectra before the correction and after it, and the exact one.
+
+    They are by Welch's method, means over the runs and sums over the axes [nm^2/Hz], (f,). The
+    exact one is by the transfer functions, with the window's image of each sinusoid.
+    """
+    length = min(run.residual_nm.shape[1], _SEGMENT)
+    spectra = []
+    for series in (run.total_nm, run.residual_nm):
+        f, density = welch(series, run.frame_rate_hz, nperseg=length, detrend=False, axis=1)
+        spectra.append(density.mean(axis=0).sum(axis=-1)[1:])
+    return f[1:], *spectra, exact_spectrum(loop, truth, f, length)[1:]
+
+
+def exact_spectrum(
+    loop: ClosedLoop, truth: Truth, frequency_hz: FloatArray, length: int
+) -> FloatArray:
+    """One-sided spectrum of the residual, summed over the axes [nm^2/Hz], (f,).
+
+    It is that of means over frames; a spectrum S of the phase counts as ``S sinc^2(f / f_s)``.
+    Random disturbances add ``|transfer|^2`` times that. A sinusoid of amplitude a at f0 adds what
+    Welch's method makes of it with a Hann window w of that length:
+    ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the window's Fourier transform.
+    """
+    n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
+    inside = np.clip(frequency_hz, frequency_hz[1] / 2, None)  # spectra may be infinite at 0
+    response = loop.system.frequency_response(inside)[:, :n]
+    rejection, noise_transfer = response[:, :, :n], response[:, :, n:]
+    total = np.zeros(frequency_hz.size)
+    for spectrum, modes in truth.turbulence_groups(n):
+        gain = np.sum(np.abs(rejection[:, :, list(modes)]) ** 2, axis=(1, 2))
+        share = 1.0 if isinstance(spectrum, ARModel) else np.sinc(inside / rate) ** 2
+        total += share * gain * spectrum.psd(inside)
+    noise = noise_transfer * truth.noise_per_measurement(loop.hardware.n_measurements)
+    total += np.sum(np.abs(noise) ** 2, axis=(1, 2)) * 2 / rate
+    for line in stationary_vibrations(truth.vibrations):
+        direction = checked_direction(line, loop.hardware)
+        if isinstance(line, Vibration):
+            gain = np.sum(np.abs(rejection @ direction) ** 2, axis=1)
+            share = np.sinc(line.frequency_hz / rate) ** 2
+            total += share * gain * line.ar_model(rate).psd(inside)
+            continue
+        seen_nm = np.sinc(line.frequency_hz / rate) * line.amplitude_nm
+        left = seen_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
+        power = float(np.sum(np.abs(left) ** 2)) / 2
+        offset = 2 * np.pi * (frequency_hz - line.frequency_hz) / rate
+        _, image = freqz(get_window("hann", length), worN=np.abs(offset))
+        window = np.abs(image)  # whose squares sum up to 3/8 of its length
+        total += power * window**2 / (rate * 0.375 * length)
+    return total

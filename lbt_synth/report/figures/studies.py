@@ -16,15 +16,13 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, count_columns, drawing
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import EndToEndEntry, RobustnessMap, RobustnessRow, TradeoffPoint
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES
-from lbt_synth.validation import FloatArray, real_array, require_instance
+from lbt_synth.validation import real_array, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
 SHORT_FREQUENCY_ERROR = {"label": "frequency error", "unit": "Hz"}  # of narrow panels
-STREHL_LEVELS = (10, 20, 30, 40, 50, 60, 70, 75, 80, 83, 86, 90, 95, 98)  # [%]
 _POINTS: dict[str, Any] = {"marker": "own", "size": 4.0}
 _RINGS: dict[str, Any] = {"line": False, "marker": "own", "filled": False, "size": 9.0}
 
@@ -108,13 +106,23 @@ def strehl_axis(percents: ArrayLike) -> dict[str, Any]:
     return {"label": "Strehl ratio", "unit": "%", "low": low}
 
 
-def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = None) -> Figure:
+def robustness_map_figure(
+    maps: Mapping[str, RobustnessMap],
+    *,
+    real_gain: float | None = None,
+    ends: tuple[float, float] | None = None,
+    axes: OwnAxes = None,
+) -> Figure:
     """Draw the Strehl ratio of designs over frequency error and sensor gain.
 
     Parameters
     ----------
     maps : mapping of str to RobustnessMap
         Maps of :func:`robustness_map` by the names of their designs.
+    real_gain : float, optional
+        Sensor gain that is marked.
+    ends : (float, float), optional
+        Ends of the one scale of colours [%]; by default those of the maps.
     axes : Axes or sequence of Axes, optional
         Your own matplotlib axes to draw on, one per panel; by default a new figure.
 
@@ -155,22 +163,7 @@ def robustness_map_figure(maps: Mapping[str, RobustnessMap], *, axes: OwnAxes = 
                 f"the maps must have the same delay errors {delays.tolist()}; got "
                 f"{grid.delay_errors_frames.tolist()} for {name}."
             )
-    return draw_maps(maps, axes=axes)
-
-
-def draw_maps(
-    maps: Mapping[str, RobustnessMap],
-    *,
-    real_gain: float | None = None,
-    ends: tuple[float, float] | None = None,
-    axes: OwnAxes = None,
-) -> Figure:
-    """Draw a map per delay error and design, the real sensor gain marked.
-
-    ``ends`` are those of the one scale of colours [%], by default those of the maps.
-    """
     ends = ends or strehl_ends(maps.values())
-    delays = next(iter(maps.values())).delay_errors_frames
     columns = min(len(maps), 3) if len(delays) > 1 else count_columns(len(maps))
     # the long name of the axis does not fit three columns
     x_axis = FREQUENCY_ERROR if columns < 3 else SHORT_FREQUENCY_ERROR
@@ -198,7 +191,7 @@ def _draw_map(
     across, up = np.argsort(grid.errors_hz), np.argsort(grid.sensor_gains)
     errors_hz, gains = grid.errors_hz[across], grid.sensor_gains[up]
     values = 100 * grid.strehl[row][np.ix_(up, across)]
-    scale: dict[str, Any] = {"ends": ends, "levels": STREHL_LEVELS, "blank": "unstable loop"}
+    scale: dict[str, Any] = {"ends": ends, "contours": True, "blank": "unstable loop"}
     panel.map(errors_hz, gains, values, "Strehl ratio", "%", **scale)
     if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
         panel.rule("real sensor gain", real_gain, "y", dash=1)
@@ -217,8 +210,8 @@ def strehl_ends(maps: Sequence[RobustnessMap] | Any) -> tuple[float, float]:
     return (low, high) if high - low > 1 else (low - 0.5, high + 0.5)
 
 
-def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
-    """Draw the residual of each design over the vibration's frequency, and the limits.
+def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes = None) -> Figure:
+    """Draw the residual of each design over the vibration's frequency or its error, and the limits.
 
     Unstable designs are named and not drawn. A study in which no vibration moves raises a
     ProblemError.
@@ -228,48 +221,17 @@ def limits_figure(study: LimitStudy, *, axes: OwnAxes = None) -> Figure:
             "a figure of limits needs a vibration that moves; got a truth without vibrations, or "
             "a single error. Give truth.vibrations and robustness.errors_hz."
         )
-    single = study.frequency_hz is not None
-    shift = "shift of the vibration that moves most, the others in proportion"
-    x_axis = {"label": "frequency of the true vibration" if single else shift, "unit": "Hz"}
-    names = [design_label(row.design) for row in study.rows]
-    return draw_limits(study, names, x_axis, study.frequency_hz or 0.0, axes=axes)
-
-
-def draw_limits(
-    study: LimitStudy,
-    names: Sequence[str],
-    x_axis: Mapping[str, Any],
-    start_hz: float = 0.0,
-    *,
-    axes: OwnAxes = None,
-) -> Figure:
-    """Draw the residual of designs, and the limits, over an axis that begins at start_hz.
-
-    Designs of the same residual are one curve with all their names.
-    """
+    start_hz, x_axis, names = 0.0, FREQUENCY_ERROR, [row.design for row in study.rows]
+    if not over_errors:
+        shift = "shift of the vibration that moves most, the others in proportion"
+        label = shift if study.frequency_hz is None else "frequency of the true vibration"
+        start_hz, x_axis = study.frequency_hz or 0.0, {"label": label, "unit": "Hz"}
+        names = [design_label(name) for name in names]
     order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
     with drawing([2.5], axes=axes) as (panel,):
         panel.set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})
-        groups: list[tuple[int, FloatArray | None, list[str]]] = []
-        for look, (name, row) in enumerate(zip(names, study.rows, strict=True)):
-            curve = study.residual_nm[look][order] if row.stable else None
-            equal = [
-                group
-                for _, residual, group in groups
-                if curve is not None
-                and residual is not None
-                and np.allclose(curve, residual, rtol=1e-6, atol=0)
-            ]
-            if equal:
-                equal[0].append(name)
-            else:
-                groups.append((look, curve, [name]))
-        for look, curve, group in groups:
-            name = listing_text(list(dict.fromkeys(group)))
-            if curve is None:
-                panel.curve(f"{name}: unstable", [], [], look=look)
-            else:
-                panel.curve(name, places, curve, look=look)
+        for name, row, residual_nm in zip(names, study.rows, study.residual_nm, strict=True):
+            draw_design(panel, names, name, places, residual_nm[order] if row.stable else None)
         if study.limit is not None and study.limit.rms_nm > 0:
             panel.rule("limit, frequency known", study.limit.rms_nm, "y", dash=3)
         if study.band is not None:
@@ -367,16 +329,18 @@ def modal_figure(
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
     others = {"turbulence_nm": turbulence_nm, "gains": gains}
     curves = {
-        name: _require_modes(values, name)
+        name: real_array(values, name)
         for name, values in (*residuals_nm.items(), *others.items())
         if values is not None
     }
     count = curves[next(iter(residuals_nm))].size
-    for name, values in curves.items():
-        if values.size != count:
+    for name, curve in curves.items():
+        if curve.shape != (count,) or not count:
             raise DimensionError(
-                f"{name} must have {count} modes like the others; got {values.size}."
+                f"{name} must have {count} modes, one number per mode; got shape {curve.shape}."
             )
+        if np.any(curve <= 0):
+            raise ProblemError(f"{name} must be above 0; got {curve.min():.6g}.")
     modes = np.arange(1.0, count + 1)
     label = "mode, in Noll's order from tip on"
     x_axis = {"label": label, "log": True, "low": 1, "high": max(count, 2)}
@@ -394,18 +358,6 @@ def modal_figure(
         for name in residuals_nm:
             draw_design(panels[-1], list(residuals_nm), name, modes, curves[name], step=step)
     return panels[0].figure
-
-
-def _require_modes(values: ArrayLike, name: str) -> FloatArray:
-    """Return a positive number per mode, (n,)."""
-    curve = real_array(values, name)
-    if curve.ndim != 1 or curve.size == 0:
-        raise DimensionError(
-            f"{name} must be a list, one number per mode; got shape {curve.shape}."
-        )
-    if np.any(curve <= 0):
-        raise ProblemError(f"{name} must be above 0; got {curve.min():.6g}.")
-    return curve
 
 
 _MOST_POINTS = 4000
@@ -451,19 +403,11 @@ def mirror_figure(
         response.rule(settled, settling_ms, dash=1)
         x_axis = {"label": "frames after the command", "low": -0.6, "high": count - 0.4}
         weights.set_axes(x_axis, {"label": "weight in the exposure"})
-        _draw_columns(weights, "this mirror", taps[:count], 0.0, look=0)
-        _draw_columns(weights, "settled at once", ideal[:count], -0.4, look=None)
+        for name, values, look in (("settled at once", ideal, None), ("this mirror", taps, 0)):
+            heights = np.zeros(count)
+            heights[: values.size] = values[:count]
+            weights.curve(name, np.arange(count), heights, look=look, step="steps-mid")
     return response.figure
-
-
-def _draw_columns(
-    panel: Panel, name: str, heights: FloatArray, offset: float, *, look: int | None
-) -> None:
-    """Draw upright bars of width 0.4 that begin at an offset from 0, 1 and so on."""
-    left = np.arange(heights.size) + offset
-    x = np.column_stack((left, left, left + 0.4, left + 0.4)).ravel()
-    high = np.column_stack((0 * heights, heights, heights, 0 * heights)).ravel()
-    panel.area(name, x, np.zeros(x.size), high, look=look, solid=look is not None)
 
 
 _SHOWN_MAS = 700.0  # from the centre of the image to its edges
@@ -507,16 +451,16 @@ def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
     with drawing([2.3] * len(methods), columns=len(methods)) as panels:
         for panel, method in zip(panels, methods, strict=True):
             panel.set_axes(x_axis, y_axis, title=design_label(method))
-            _draw_method(panel, [e for e in rows if e.method == method])
+            error, paper, modal, strehl, scatter = np.array(
+                [
+                    (e.error_hz, e.paper, e.modal, e.strehl, e.scatter)
+                    for e in rows
+                    if e.method == method
+                ],
+                dtype=float,
+            ).T
+            if not np.isnan(paper[0]):  # it published none of its own integrator
+                panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
+            panel.curve("modal, measured optical gain", error, modal, look=1)
+            panel.curve("end to end", error, strehl, error=scatter, look=0, **_POINTS)
     return panels[0].figure
-
-
-def _draw_method(panel: Panel, entries: Sequence[EndToEndEntry]) -> None:
-    """Draw the curves of one method; the paper's is left out where it published none."""
-    error, paper, modal, strehl, scatter = np.array(
-        [(e.error_hz, e.paper, e.modal, e.strehl, e.scatter) for e in entries], dtype=float
-    ).T
-    if not np.isnan(paper[0]):
-        panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
-    panel.curve("modal, measured optical gain", error, modal, look=1)
-    panel.curve("end to end", error, strehl, error=scatter, look=0, **_POINTS)

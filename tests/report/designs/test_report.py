@@ -1,5 +1,6 @@
 """The numbers of a report are those of the library."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,15 @@ import pytest
 import lbt_synth as lbt
 from lbt_synth.design import Certificate, Check
 from lbt_synth.report.designs.page import design_page
-from lbt_synth.report.designs.report import frequency_errors
-from lbt_synth.report.designs.tables import assessment_row
+from lbt_synth.report.designs.report import (
+    design_facts,
+    frequency_errors,
+    good_range,
+    summary_table,
+    verdict,
+)
 from lbt_synth.report.draw import figure_series
+from lbt_synth.report.figures.records import run_spectra
 
 
 def test_the_numbers_are_those_of_the_library(report, config, designs):
@@ -22,7 +29,8 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         errors_hz=config.settings.robustness.errors_hz,
     )
     (rejections,) = (c.figure for c in design_page(report).charts if c.key == "sigma")
-    for (one, row), limits in zip(report.rows, study.rows, strict=True):
+    for one, limits in zip(report.assessments, study.rows, strict=True):
+        row = one.limits
         assert row.residual_nm == pytest.approx(limits.residual_nm, rel=1e-9, nan_ok=True)
         assert row.above_limit_percent == pytest.approx(limits.above_limit_percent, nan_ok=True)
         if not one.stable:
@@ -47,7 +55,7 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         peak = np.linalg.norm(loop.sensitivity(series.x), 2, axis=(1, 2))
         assert series.y == pytest.approx(peak, rel=1e-9)
     kalman = report.assessments[0]
-    row = assessment_row(report, *report.rows[0])
+    row = design_facts(kalman)
     assert (row.gamma, row.estimation_rms) == (kalman.design.gamma, kalman.design.rms)
     assert kalman.checks == designs["kalman"].recertify().checks
 
@@ -76,3 +84,49 @@ def test_a_design_that_was_tampered_with_fails(config, designs):
     one = lbt.report.design_report(config, {"wrong": wrong}).assessments[0]
     assert not one.certified
     assert "believe me" not in [check.name for check in one.checks]
+
+
+def test_the_verdict_is_made_of_the_numbers(report):
+    words = verdict(report).replace("\u00a0", " ")
+    kalman, slow, _ = report.assessments
+    assert f"Least residual: kalman, {kalman.residual_nm:.1f} nm rms" in words
+    assert f"Strehl ratio {100 * kalman.strehl:.1f} %" in words
+    worst = {one.name: 100 * np.min(one.curve.strehl) for one in (kalman, slow)}
+    best = max(worst, key=worst.get)
+    assert f"are wrong by -3.5 to +3.5 Hz: {best}, {worst[best]:.1f} %." in words
+    assert len(re.split(r"(?<=[a-z%]\.) |(?<=them\.) ", words)) <= 3
+    table = {row[0]: row[1:] for row in summary_table(report).rows if len(row) > 1}
+    assert table["worst Strehl ratio [%]"] == (*(f"{v:.2f}" for v in worst.values()), "-")
+    low_hz, high_hz = good_range(kalman)
+    strehls, errors = kalman.curve.strehl[0, 0], kalman.curve.errors_hz
+    inside = (errors >= low_hz) & (errors <= high_hz)
+    assert np.all(strehls[inside] >= 0.9 * strehls.max())
+    outside = np.flatnonzero(np.diff(inside.astype(int)))
+    for edge in outside:
+        assert min(strehls[edge], strehls[edge + 1]) < 0.9 * strehls.max()
+    inside = table["within 10 % of its best Strehl ratio [Hz]"]
+    assert inside[0] == f"{low_hz:+.4g} to {high_hz:+.4g}"
+    assert good_range(report.assessments[2]) is None
+    assert "ertificates that do NOT hold: wild." in words
+
+
+def test_equal_designs_share_the_lead(few, designs):
+    kalman = designs["kalman"]
+    pair = {"one": kalman, "two": kalman}
+    words = verdict(lbt.report.design_report(few, pair)).replace("\u00a0", " ")
+    assert "Least residual: one and two, " in words
+    assert "Hz: one and two, " in words
+    three = verdict(lbt.report.design_report(few, {"slow": designs["slow"], **pair}))
+    assert "Least residual: one and two, " in three
+    assert "Hz: one and two, " in three or "Hz: slow, " in three
+
+
+def test_simulations_agree_with_the_exact_answer(report):
+    for one in report.stable:
+        exact = lbt.residual_budget(one.loop, report.config.truth)
+        residual_nm = np.sqrt(np.mean(one.run.rms_nm**2))
+        assert residual_nm == pytest.approx(exact.rms_nm, rel=0.15)
+        f, _, simulated, expected = run_spectra(one.run, one.loop, report.config.truth)
+        ratio = (simulated / expected)[f > 5]
+        assert np.mean(ratio) == pytest.approx(1, abs=0.06)
+        assert np.ptp(one.run_strehls) > 0

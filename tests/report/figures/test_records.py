@@ -6,7 +6,11 @@ from support.eris import eris_model
 
 import lbt_synth as lbt
 from lbt_synth.loop.simulation.run import Drop, run_segments
-from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
+from lbt_synth.report.figures.records import (
+    exact_spectrum,
+    sensor_failure_figure,
+    simulation_figure,
+)
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +90,20 @@ def test_spans_and_levels(sensors_design, sensors_config):
     assert len(series.patches) == len(size.patches) == 2
     drawn = [line for line in size.lines if len(line.get_xdata()) == 2]
     assert [float(line.get_ydata()[0]) for line in drawn] == [20.0, 60.0, 20.0]
+
+
+def test_the_exact_spectrum_has_the_exact_power():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    design = lbt.integrator(path, gain=0.4)
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=10.0, frame_rate_hz=800)
+    shake = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=40, direction=(1,))
+    line = lbt.models.SinusoidalVibration(frequency_hz=31.7, rms_nm=30.0, direction=(1,))
+    truth = lbt.Truth(turbulence=slow, vibrations=(shake, line), noise_nm=5.0)
+    loop = lbt.close_loop(path, design.controller)
+    length = 2048
+    grid = np.arange(length // 2 + 1) * 800 / length
+    density = exact_spectrum(loop, truth, grid, length)
+    power = np.sum(density[1:-1]) * 800 / length  # the ends hold half a bin
+    exact = lbt.residual_budget(loop, truth)
+    means_nm = np.sqrt(exact.rms_nm**2 - exact.within_nm**2)
+    assert np.sqrt(power) == pytest.approx(means_nm, rel=2e-3)

@@ -4,24 +4,30 @@ import base64
 import re
 import sys
 import time
+from datetime import UTC, datetime
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from support.browser import DESK, PHONE, chain, opened
 from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
 from lbt_synth.report.draw import drawing
-from lbt_synth.report.number_text import DASH
 from lbt_synth.report.page.html import (
+    Chart,
+    Page,
     chart_svg,
+    creation_time,
     number_tables,
     page_html,
     print_html,
     require_page_names,
+    unbroken_text,
     write_page,
 )
+from lbt_synth.storage.tables import Cell, Table
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +80,7 @@ def test_figures_have_words_and_numbers(plain):
         for table in number_tables(chart.figure):
             for part in table.by_columns(6):
                 assert f">{part.caption or 'Numbers'}</caption>" in tables
-    assert reader.texts["summary"] == ["Numbers: 110 rows", "Numbers: 12 rows", "Numbers: 3 rows"]
+    assert reader.texts["summary"] == ["Numbers"] * len(charts)
 
 
 def test_numbers_of_long_curves_keep_their_peaks():
@@ -88,9 +94,16 @@ def test_numbers_of_long_curves_keep_their_peaks():
     assert table.headings == ("x", "peak", "hole")
     assert 60 < len(table.rows) <= 120
     assert table.rows[0][0] == "0"
-    assert table.rows[-1] == ("1", table.rows[-1][1], DASH)
+    assert table.rows[-1] == ("1", table.rows[-1][1], "-")
     shown = [float(row[1]) for row in table.rows]
     assert max(shown) == pytest.approx(peak.max(), rel=1e-4)
+
+
+def test_a_number_and_its_error_stay_in_one_line():
+    assert unbroken_text("1 ± 2 (3 to 4)") == "1\u00a0±\u00a02 (3\u00a0to\u00a04)"
+    assert unbroken_text("-1 +- 2") == "\u22121\u00a0±\u00a02"
+    assert unbroken_text("-3.1e-08, 1e-6, a-b") == "\u22123.1e\u221208, 1e\u22126, a-b"
+    assert unbroken_text("-inf, tomorrow is not together") == "\u2212∞, tomorrow is not together"
 
 
 def test_drawings_keep_their_text():
@@ -312,3 +325,39 @@ def test_a_pdf_has_sheets_of_a4_and_no_date(tmp_path, monkeypatch):
         assert [float(x) for x in box.split()] == pytest.approx([0, 0, 595.28, 841.89], abs=0.1)
     assert print_html(files[0].read_bytes()) == pdf
     assert print_html(page_html(whole_page(HOSTILE))).startswith(b"%PDF")
+
+
+WORDS = {"title": "t", "caption": "c", "alt": "a", "figure": Figure()}
+CHART = Chart(key="a", **WORDS)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Table(caption="t", headings=("a", "b", "c"), rows=(("1", "2"),)), "1 or 3 cells"),
+        (lambda: Cell(text="a", tone="loud"), "tone must be one of"),
+        (
+            lambda: Page(title="t", subtitle="s", sections={"a": ("a", [CHART])}),
+            "keys of a page must be unique; got a twice",
+        ),
+    ],
+)
+def test_mistakes_are_refused(make, text):
+    with pytest.raises(lbt.errors.ProblemError, match=re.escape(text)):
+        make()
+
+
+def test_a_section_without_blocks_is_left_out():
+    sections = {"a": ("a", ()), "b": ("b", ("words",))}
+    assert list(Page(title="t", subtitle="s", sections=sections).sections) == ["b"]
+
+
+def test_the_creation_time(monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert creation_time() == datetime(1970, 1, 2, tzinfo=UTC)
+    for wrong in ("tomorrow", "1e400", str(10**30)):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", wrong)
+        with pytest.raises(lbt.errors.ProblemError, match="SOURCE_DATE_EPOCH must be a number"):
+            creation_time()
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    assert abs((datetime.now(UTC) - creation_time()).total_seconds()) < 60
