@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.output import Report
@@ -50,7 +48,6 @@ def run(arguments: Namespace) -> Report:
         measurements=fact(measurements, "measurements"),
         commands=fact(commands, "commands"),
         error=fact(written.error, "difference from the controller", **largest),
-        **_in_single(written.error_single, largest),
     )
     report.data |= {"frame_cost": json_record(cost), **json_record(what)}
     report.tables.append(fact_table("Export", what, *([cost] if written.cost else [])))
@@ -59,13 +56,3 @@ def run(arguments: Namespace) -> Report:
     report.notes += [f"note: {note}." for note in written.notes]
     report.note_files(written.files)
     return report
-
-
-def _in_single(error: float | None, unit: dict[str, str]) -> dict[str, Any]:
-    """Return the facts on single precision, where the target may have it."""
-    if error is None:
-        return {}
-    return {
-        "error_single": fact(error, "  in single precision", **unit),
-        "stable_single": fact(math.isfinite(error), "  stable in single precision"),
-    }

@@ -96,8 +96,6 @@ class Target:
     start : callable
         ``start(numbers, limit)`` returns a twin of the program, stepped in its arithmetic. One that
         knows the limit of a command clips its commands itself.
-    single : callable, optional
-        The same numbers in single precision, which the target has or may have.
     join, split : callable
         ``join(numbers, parts, count)`` returns the numbers of a file of so many modes, and
         ``split(whole, parts, numbers)`` those of each copy of each design.
@@ -127,7 +125,6 @@ class Target:
     computed: Callable[[Design, Any], Written]
     start: Callable[[Any, float], SteppedController]
     options: Mapping[str, Any] = field(default_factory=dict)
-    single: Callable[[Any], Any] | None = None
     join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = _join_one
     split: Callable[[Any, Sequence[ModeDesign], Sequence[Any]], list[list[Any]]] = _split_one
     cost: Callable[[Any], FrameCost] | None = None
@@ -207,9 +204,6 @@ class Exported:
         Largest difference of the commands from those of the controller, over the largest command,
         in the arithmetic of the file: in the closed loop where the design is of one, on white noise
         elsewhere.
-    error_single : float or None
-        The same in single precision, inf where the loop is then unstable; None where the target
-        has no such arithmetic.
     start : callable
         ``start(limit)`` returns what was written, stepped in the arithmetic of the target.
     checks : tuple of Check
@@ -222,7 +216,6 @@ class Exported:
 
     files: tuple[Path, ...]
     error: float
-    error_single: float | None
     start: Callable[[float], SteppedController]
     checks: tuple[Check, ...]
     cost: FrameCost | None
@@ -359,7 +352,6 @@ def export(
     return Exported(
         files=write_together(dict((*files.items(), *certificate.items()))),
         error=error,
-        error_single=_error_in_single(own, pairs, error),
         start=lambda limit: own.start(again, limit),
         checks=checks,
         cost=own.cost(again) if own.cost else None,
@@ -376,24 +368,6 @@ def _require_finite(error: float, precision: str, hint: str) -> None:
             status="arithmetic",
             residual=error,
         )
-
-
-def _error_in_single(
-    own: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
-) -> float | None:
-    """Return the largest error in single precision, inf where a number does not fit."""
-    if own.single is None:
-        return None
-    try:
-        singles = [own.single(held) for _, held in pairs]
-    except ProblemError:
-        return float("inf")
-    if all(single is held for single, (_, held) in zip(singles, pairs, strict=True)):
-        return error
-    return max(
-        rehearsal_error(part.design, own.start(single, np.inf))
-        for single, (part, _) in zip(singles, pairs, strict=True)
-    )
 
 
 def _proved(

@@ -1,8 +1,8 @@
 """Run many independent cases, one file each, and resume where a killed run stopped.
 
-A case is a name and arguments that JSON can hold. Its result is written as soon as it is
-known, whole or not at all, with a digest of the case. Only the process that started the run
-writes.
+A case is a name and arguments: what JSON can hold, arrays and dataclasses. Its result is written as
+soon as it is known, whole or not at all, with a digest of the case. Only the process that started
+the run writes.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,8 @@ def run_cases(
     ----------
     function : callable
         Maps a case to its result, a mapping that JSON can hold; importable by name if
-        other processes run it. Its result must depend on the case only.
+        other processes run it, as what is in the case must be. Its result must depend on the
+        case only.
     cases : mapping of str to mapping
         Arguments of each case, by its name, which is also that of its file.
     directory : path-like
@@ -151,13 +153,20 @@ def _case_digest(name: str, case: Case) -> str:
         )
     try:
         return _digest(case)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise ProblemError(f"the case {name} must fit into JSON: {error}.") from error
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    text = json.dumps(dict(content), sort_keys=True, allow_nan=False)
+    text = json.dumps(dict(content), sort_keys=True, allow_nan=False, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Return an array or a dataclass as what JSON can hold."""
+    if is_dataclass(value):
+        return {each.name: getattr(value, each.name) for each in fields(value)}
+    return value.tolist()
 
 
 def _read(path: Path, expected: str) -> dict[str, Any] | None:
@@ -186,8 +195,8 @@ def _write(
 ) -> dict[str, Any]:
     try:
         written = {"asked": asked, "digest": _digest(result), "case": case, "result": dict(result)}
-        text = json.dumps(written, indent=1, allow_nan=False)
-    except (TypeError, ValueError) as error:
+        text = json.dumps(written, indent=1, allow_nan=False, default=_plain)
+    except (TypeError, ValueError, AttributeError) as error:
         raise ProblemError(f"the result of {name} must fit into JSON: {error}.") from error
     write_atomically(folder / f"{name}.json", text.encode())
     return dict(json.loads(text)["result"])

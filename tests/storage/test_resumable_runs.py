@@ -7,7 +7,9 @@ import subprocess
 import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -135,6 +137,27 @@ def test_cases_and_results_have_to_fit_into_json(tmp_path):
     with pytest.raises(ProblemError, match="result of a must fit"):
         run_cases(lambda _: {"x": float("inf")}, {"a": {"x": 1}}, tmp_path)
     assert not list(tmp_path.glob("*.json"))
+
+
+@dataclass(frozen=True)
+class Loop:
+    gains: np.ndarray
+
+
+def test_a_case_may_hold_arrays_and_dataclasses(tmp_path):
+    def case(*gains):
+        return {"a": {"loop": Loop(gains=np.array(gains))}}
+
+    def total(one):
+        return {"total": float(one["loop"].gains.sum())}
+
+    assert run_cases(total, case(1.0, 2.0), tmp_path) == {"a": {"total": 3.0}}
+    kept = json.loads((tmp_path / "a.json").read_text())["case"]
+    assert kept == {"loop": {"gains": [1.0, 2.0]}}
+    with pytest.raises(OutputError, match="result of other settings"):
+        run_cases(total, case(1.0, 2.5), tmp_path)
+    with pytest.raises(ProblemError, match="case b must fit into JSON"):
+        run_cases(total, {"b": {"loop": object()}}, tmp_path)
 
 
 def test_no_directory(tmp_path):

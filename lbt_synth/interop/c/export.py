@@ -320,7 +320,6 @@ TARGET = Target(
     read=_read,
     computed=as_computed,
     start=lambda terms, _: RunningSource(terms),
-    single=lambda terms: terms if terms.single else terms.rounded(),
     cost=frame_cost,
     join=join,
     split=split,

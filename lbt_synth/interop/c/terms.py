@@ -25,7 +25,7 @@ from lbt_synth.linear import Controller, StateSpace, estimator_form
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import BoolArray, FloatArray, set_fields
+from lbt_synth.validation import BoolArray, FloatArray
 
 _SMALL = 256  # up to so many entries of all matrices, every term is written out
 _LONGEST = 4096  # terms that are written out at most
@@ -414,7 +414,7 @@ def _read_gains(
 
 @table_row
 class FrameCost:
-    """Arithmetic and memory of one frame of a controller, as exported and with whole matrices."""
+    """Arithmetic and memory of one frame of a controller, as exported to C."""
 
     form: str = column(
         "form of the exported source",
@@ -425,30 +425,11 @@ class FrameCost:
         "multiplications per frame",
         help="Of the exported source; factors of 1 and -1 are no multiplications",
     )
-    dense_multiplications: int = column("  with whole matrices", help="The same of A, B, C, D")
     additions: int = column("additions per frame", help="Of the exported source")
-    dense_additions: int = column("  with whole matrices", help="The same of A, B, C, D")
-    coefficients: int = column(help="Numbers that the exported source stores")
-    states: int = column(help="Numbers that it keeps between frames: states and last commands")
-    coefficient_bytes_double: int = column("coefficients, double", unit="bytes", init=False)
-    coefficient_bytes_single: int = column("coefficients, single", unit="bytes", init=False)
-    dense_coefficients: int = column(
-        "  with whole matrices, double",
-        unit="bytes",
-        scale=8,
-        help="Numbers of the whole matrices",
+    coefficients: int = column("coefficients", help="Numbers that the exported source stores")
+    states: int = column(
+        "numbers kept between frames", help="Numbers that it keeps: states and last commands"
     )
-    state_bytes_double: int = column("state, double", unit="bytes", init=False)
-    state_bytes_single: int = column("state, single", unit="bytes", init=False)
-
-    def __post_init__(self) -> None:
-        set_fields(
-            self,
-            coefficient_bytes_double=8 * self.coefficients,
-            coefficient_bytes_single=4 * self.coefficients,
-            state_bytes_double=8 * self.states,
-            state_bytes_single=4 * self.states,
-        )
 
 
 def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
@@ -462,7 +443,7 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
     Returns
     -------
     FrameCost
-        Counts for the C source that :func:`export` writes, and for dense matrices.
+        Counts for the C source that :func:`export` writes.
 
     Raises
     ------
@@ -474,8 +455,8 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
     >>> import lbt_synth as lbt
     >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
     >>> cost = lbt.interop.frame_cost(lag)
-    >>> cost.multiplications, cost.additions, cost.dense_multiplications
-    (1, 1, 4)
+    >>> cost.multiplications, cost.additions
+    (1, 1)
     """
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
     (s, _, m), size = terms.sizes, _matrix_size(terms)
@@ -499,9 +480,6 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
         additions=size if terms.dense else written + table,
         coefficients=size if terms.dense else stored + count_gains(terms),
         states=s + m,
-        dense_multiplications=size,
-        dense_additions=size - s - m,
-        dense_coefficients=period * size,
     )
 
 

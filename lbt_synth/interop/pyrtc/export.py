@@ -265,7 +265,6 @@ TARGET = Target(
     read=_read,
     computed=lambda _, filters: filters[0].as_computed(),
     start=lambda filters, limit: InnerLoop(filters[0], limit),
-    single=lambda filters: filters,
     join=lambda numbers, parts, count: tuple(filters[0] for filters in numbers),
     split=lambda whole, parts, numbers: [[(one,)] for one in whole],
     facts=lambda whole, **_: {"delay_frames": whole[0].delay_frames},

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+import lbt_synth
 from lbt_synth.design import Design, integrator
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop import EndToEndSetup, calibrate
-from lbt_synth.interop.specula.simulation import run_case
+from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.request import reference_design
@@ -169,9 +170,10 @@ def _plan_line(
             controller=design.controller,
             truth=replace(given.PAPER_TRUTH, vibrations=shakes),
             cases={
-                f"{name}-vibration-{vibration}-seed-{seed}": setup.case(
-                    design.controller, vibrations=shakes, seed=seed
-                )
+                f"{name}-vibration-{vibration}-seed-{seed}": {
+                    "setup": replace(setup, vibrations=shakes, motions=(), seed=seed),
+                    "controller": design.controller,
+                }
                 for seed in seeds
             },
         )
@@ -257,15 +259,22 @@ def run_tables(
 ) -> list[EndToEndEntry]:
     """Run what is missing of tables of :func:`plan_tables`; see :func:`end_to_end_tables`."""
     calibrate(setup.system, cache=cache)  # once for all processes
+    versions = {"lbt-synth": lbt_synth.__version__, "specula": specula_version()}
     results = run_cases(
-        functools.partial(run_case, cache=cache),
-        all_cases(rows),
+        functools.partial(_run_case, cache=cache),
+        {name: {"versions": versions, **case} for name, case in all_cases(rows).items()},
         directory,
         jobs=jobs,
         executor=executor,
         progress=progress,
     )
     return make_entries(rows, results, setup)
+
+
+def _run_case(case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None) -> dict[str, Any]:
+    """Return the main numbers of a run."""
+    setup: EndToEndSetup = case["setup"]
+    return setup.run(case["controller"], cache=cache).summary()
 
 
 def all_cases(rows: Iterable[PlannedRow]) -> dict[str, dict[str, Any]]:

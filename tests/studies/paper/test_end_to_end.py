@@ -41,13 +41,13 @@ def test_the_tables_as_planned(rows):
     # the 20 Hz row of Table III is the row with vibration of Table II
     assert len(cases) == 8 * 2 + 3 * 14
     moved = [
-        c["vibrations"][0]["frequency_hz"]
+        c["setup"].vibrations[0].frequency_hz
         for n, c in cases.items()
         if n.startswith("slow-v") and "none" not in n
     ]
     assert sorted(set(moved)) == sorted(40 - row.model_hz for row in TABLE_III)
     still = {
-        c["vibrations"][0]["frequency_hz"]
+        c["setup"].vibrations[0].frequency_hz
         for n, c in cases.items()
         if n.startswith("kal") and "none" not in n
     }
@@ -56,7 +56,7 @@ def test_the_tables_as_planned(rows):
 
 def test_seeds_are_shared_by_the_controllers(rows):
     for row in rows:
-        seeds = [case["setup"]["seed"] for case in row.cases.values()]
+        seeds = [case["setup"].seed for case in row.cases.values()]
         expected = [0, 1] if row.table == "II" or row.error_hz == 0 else [0]
         assert seeds == expected
 
