@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import FileError, OutputError, TelemetryError
-from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
+from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.files.telemetry.time_filters import integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import check_fits, error_reason, read_cards
@@ -264,8 +264,7 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
     fields = _loop_fields(loops[0]) | _system_fields(system)
     if len(loops) > 1:
         fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
-    taps = fields.pop("mirror_taps", None)
-    return check_taps(Telemetry(**fields), taps)
+    return Telemetry(**fields)
 
 
 def _system_fields(system: Any) -> dict[str, Any]:
@@ -278,7 +277,6 @@ def _system_fields(system: Any) -> dict[str, Any]:
             facts |= {name: own[name] for name in _OWN_FIELDS}
             if "mirror" in own:
                 facts["mirror"] = PositionLoop(**own["mirror"])
-                facts["mirror_taps"] = own["mirror_taps"]
     telescope = system.main_telescope
     if telescope is not None:
         facts["diameter_m"] = telescope.enclosing_diameter or telescope.inscribed_diameter

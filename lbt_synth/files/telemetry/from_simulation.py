@@ -8,8 +8,7 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.files.telemetry.fields import Scalar
-from lbt_synth.files.telemetry.telemetry import Telemetry
+from lbt_synth.files.telemetry.telemetry import Scalar, Telemetry
 from lbt_synth.loop import Imaging, Simulation
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import integer, require_instance

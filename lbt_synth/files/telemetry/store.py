@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +13,12 @@ import numpy.typing as npt
 
 import lbt_synth
 from lbt_synth.errors import OutputError, ProblemError, TelemetryError
-from lbt_synth.files.file_checks import FileKind
+from lbt_synth.files.file_checks import READERS, FileKind
 from lbt_synth.files.telemetry import aot
-from lbt_synth.files.telemetry.fields import FACTS, LAYERS, REQUIRED
-from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
+from lbt_synth.files.telemetry.telemetry import FACTS, LAYERS, REQUIRED, Telemetry
 from lbt_synth.linear import Controller
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.array_file import (
-    Cards,
-    digest,
-    fits_bytes,
-    npz_bytes,
-    read_fits,
-    read_npz,
-)
+from lbt_synth.storage.array_file import Cards
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray, choice
@@ -125,12 +117,8 @@ def save_telemetry(
     arrays, meta = pack(telemetry, precision)
     if kind == "aot":
         return write_atomically(target, aot.to_bytes(telemetry, precision, target))
-    meta["digest"] = digest(arrays, meta)
-    text = json.dumps(meta, allow_nan=False)
-    if kind == "npz":
-        return write_atomically(target, npz_bytes(arrays, text))
-    cards, headers = primary_cards(telemetry, meta), layer_cards(telemetry)
-    return write_atomically(target, fits_bytes(cards, arrays, text, headers=headers))
+    cards = partial(primary_cards, telemetry)
+    return _KIND.write(target, arrays, meta, cards, layer_cards(telemetry))
 
 
 def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
@@ -162,13 +150,13 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     lbt_synth.errors.TelemetryError: cannot read nowhere.fits: No such file or directory.
     """
     source = Path(path)
-    if source.suffix.lower() not in (".fits", ".npz"):
+    if source.suffix.lower() not in READERS:
         raise TelemetryError(f"telemetry must end in {_ENDINGS}; got {source.name!r}.", path=source)
     content, is_fits = read_bytes(source, TelemetryError), source.suffix.lower() == ".fits"
     with _KIND.rebuilding(source):
         if is_fits and aot.is_aot(content):
             return aot.from_bytes(content, source)
-        return unpack(*_KIND.decode(content, read_fits if is_fits else read_npz, source))
+        return unpack(*_KIND.decode(content, source))
 
 
 def pack(telemetry: Telemetry, precision: str) -> tuple[dict[str, npt.NDArray[Any]], Meta]:
@@ -215,11 +203,11 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
         )
     if left:
         raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(left))}")
-    taps = fields.pop("mirror_taps", None)
+    fields.pop("mirror_taps", None)  # they follow from the mirror
     if "mirror" in meta:  # a mirror that settles at once is not in the file
         fields["mirror"] = PositionLoop(**meta["mirror"])
     fields |= {name: meta[name] for name in FACTS}
-    return check_taps(Telemetry(**fields, metadata=dict(meta["metadata"])), taps)
+    return Telemetry(**fields, metadata=dict(meta["metadata"]))
 
 
 def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]]:
@@ -228,11 +216,11 @@ def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]
         "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
         "LBTTELEM": (_KIND.version, "version of the lbt_synth telemetry layout"),
     }
-    for name, fact in FACTS.items():
+    for name, (card, comment) in FACTS.items():
         value = getattr(telemetry, name)
         too_large = isinstance(value, int) and value > _LARGEST_CARD
-        if fact.card and value is not None and not too_large:
-            cards[fact.card] = (value, fact.comment)
+        if card and value is not None and not too_large:
+            cards[card] = (value, comment)
     cards["TIMING"] = (telemetry.convention, "")
     cards["SHA256"] = (meta["digest"], "")
     return cards

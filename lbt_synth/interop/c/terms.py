@@ -27,8 +27,6 @@ from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import BoolArray, FloatArray
 
-_SMALL = 256  # up to so many entries of all matrices, every term is written out
-_LONGEST = 4096  # terms that are written out at most
 _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 NONE = frozenset[str]()  # no sensor is missing
 
@@ -70,14 +68,6 @@ class SourceTerms:
         (s, _, m), gains = self.sizes, self.gains[NONE][0]
         states, through = np.hsplit(self.command, [s])
         return np.block([[self.transition[0], gains], [states, np.zeros((m, m)), through]])
-
-    @property
-    def dense(self) -> bool:
-        """Whether matrices are multiplied in loops: there are many terms, and few are zero."""
-        if self.masked:
-            return False
-        count, size = int(np.count_nonzero(self.whole)), _matrix_size(self)
-        return size > _SMALL and (2 * count > size or count > _LONGEST)
 
     def rounded(self) -> SourceTerms:
         """Return the terms in single precision; refuse numbers that do not fit."""
@@ -350,13 +340,6 @@ def read_source(text: str, like: SourceTerms) -> SourceTerms:
     code = re.sub(r"\by\[(\d+)\]", r"y\1", code)
     tables = {name: _numbers(body) for name, body in _TABLE.findall(code)}
     (s, q, m), period = like.sizes, len(like.read)
-    if "transition" in tables:  # whole matrices, by columns
-        columns = tables["transition"].reshape(-1, s).T
-        transition = np.zeros((1, s, s + m))
-        transition[0, :, : columns.shape[1]] = columns
-        gains = {NONE: tables["gains"].reshape(q, s).T[None]}
-        command = tables["output"].reshape(-1, m).T
-        return replace(like, transition=transition, gains=gains, command=command)
     factors = {"c": tables.get("c", np.zeros(0)), "v": np.zeros((period, 0))}
     if "varying" in tables:
         factors["v"] = tables["varying"].reshape(period, -1)
@@ -416,11 +399,6 @@ def _read_gains(
 class FrameCost:
     """Arithmetic and memory of one frame of a controller, as exported to C."""
 
-    form: str = column(
-        "form of the exported source",
-        help='"straight line" where each non-zero term is written out, "loops" where the source '
-        "multiplies by whole matrices",
-    )
     multiplications: int = column(
         "multiplications per frame",
         help="Of the exported source; factors of 1 and -1 are no multiplications",
@@ -459,7 +437,7 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
     (1, 1)
     """
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
-    (s, _, m), size = terms.sizes, _matrix_size(terms)
+    s, _, m = terms.sizes
     sums = [terms.transition, terms.innovation, terms.command[None]]
     table, period = 0, len(terms.read)  # gains in a table, of a frame in which all is read
     if terms.masked:
@@ -475,18 +453,11 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
         stored += int(np.count_nonzero(factors & same))
         stored += period * int(np.count_nonzero(factors & ~same))
     return FrameCost(
-        form="loops" if terms.dense else "straight line",
-        multiplications=size if terms.dense else multiplied + table,
-        additions=size if terms.dense else written + table,
-        coefficients=size if terms.dense else stored + count_gains(terms),
+        multiplications=multiplied + table,
+        additions=written + table,
+        coefficients=stored + count_gains(terms),
         states=s + m,
     )
-
-
-def _matrix_size(terms: SourceTerms) -> int:
-    """Return the entries of all matrices of a frame."""
-    s, q, m = terms.sizes
-    return (s + m) * (s + q + m * terms.applied)
 
 
 def used_readings(terms: SourceTerms, missing: frozenset[str]) -> BoolArray:

@@ -236,6 +236,7 @@ TARGET = Target(
     ],
     facts=lambda _, **options: {"sign": _SIGN},
     remark=_remark,
-    hint="Design with fewer states or less accurate models, or use a target in double precision.",
+    hint="Give an even order, design with fewer states or less accurate models, or use a target in "
+    "double precision.",
     endings=(".npy", ".fits"),
 )

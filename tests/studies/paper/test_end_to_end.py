@@ -1,13 +1,15 @@
 """The tables of the paper, end to end: plans and entries."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from support.end_to_end import fake_results, load_setup, make_table, plan_rows
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.studies.paper import end_to_end
 from lbt_synth.studies.paper.end_to_end import (
     all_cases,
     make_entries,
@@ -101,3 +103,39 @@ def test_a_design_cannot_take_the_name_of_the_papers(setup):
     design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
     with pytest.raises(ProblemError, match="the name kalman is taken"):
         plan_tables(setup, {"kalman": design})
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Set-ups that were run, by what stands in for SPECULA."""
+    seen = []
+
+    def run(setup, controller, cache):
+        seen.append(setup)
+        numbers = dict.fromkeys(("tip_tilt_gain", "other_modes_strehl"), 0.6)
+        numbers |= {"strehl": 0.7 + 0.01 * setup.seed, "tip_rms_nm": 3.0, "tilt_rms_nm": 4.0}
+        return SimpleNamespace(summary=lambda: numbers)
+
+    monkeypatch.setattr(end_to_end, "calibrate", lambda *_, **__: None)
+    monkeypatch.setattr(end_to_end, "specula_version", lambda: "1.1")
+    monkeypatch.setattr(lbt.interop.EndToEndSetup, "run", run)
+    return seen
+
+
+def test_only_what_is_missing_runs_again(tmp_path, setup, runs):
+    counted = []
+    options = {"seeds": [0, 1], "tables": ["II"], "progress": counted.append}
+    first = lbt.studies.end_to_end_tables(setup, tmp_path, **options)
+    assert len(runs) == len(list(tmp_path.glob("*.npz"))) == sum(counted) == 12
+    assert first[0].strehls == pytest.approx((70.0, 71.0))
+    for path in sorted(tmp_path.glob("*.npz"))[3:5]:
+        path.unlink()
+    again = lbt.studies.end_to_end_tables(setup, tmp_path, **options)
+    assert (len(runs), sum(counted)) == (14, 24)
+    assert [entry.strehls for entry in again] == [entry.strehls for entry in first]
+
+
+def test_runs_of_other_settings_are_not_mixed_in(tmp_path, setup, runs):
+    lbt.studies.end_to_end_tables(setup, tmp_path, seeds=[0], tables=["II"])
+    with pytest.raises(OutputError, match="is of another study"):
+        lbt.studies.end_to_end_tables(replace(setup, gain=0.4), tmp_path, seeds=[0], tables=["II"])
