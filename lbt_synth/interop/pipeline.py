@@ -1,19 +1,18 @@
 """The one export: a design in the form that another program loads, proved in its arithmetic.
 
 A target says how it rounds the numbers of a design, writes them, and reads them back. Everything
-else stands here: what is refused, the rehearsal beside the controller, the proof of what was read
-from the file, its certificate. A folder of this room whose ``export`` module has a ``TARGET`` is a
-target; nothing else lists them.
+else stands here: what is refused, the rehearsal beside the controller, the proof of the numbers,
+which must be those that are read from the file, its certificate. A folder of this room whose
+``export`` module has a ``TARGET`` is a target; nothing else lists them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import pickle
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from importlib import import_module
 from os import PathLike
@@ -66,11 +65,6 @@ def _join_one(numbers: Sequence[Any], parts: Sequence[ModeDesign], count: int) -
     return numbers[0]
 
 
-def _split_one(whole: Any, parts: Sequence[ModeDesign], numbers: Sequence[Any]) -> list[list[Any]]:
-    """Return the numbers of a file that holds one design."""
-    return [[whole]]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
     """A program that runs our controllers.
@@ -96,9 +90,8 @@ class Target:
     start : callable
         ``start(numbers, limit)`` returns a twin of the program, stepped in its arithmetic. One that
         knows the limit of a command clips its commands itself.
-    join, split : callable
-        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes, and
-        ``split(whole, parts, numbers)`` those of each copy of each design.
+    join : callable
+        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes.
     cost : callable, optional
         ``cost(whole)`` counts the arithmetic of a frame.
     facts : callable
@@ -126,7 +119,6 @@ class Target:
     start: Callable[[Any, float], SteppedController]
     options: Mapping[str, Any] = field(default_factory=dict)
     join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = _join_one
-    split: Callable[[Any, Sequence[ModeDesign], Sequence[Any]], list[list[Any]]] = _split_one
     cost: Callable[[Any], FrameCost] | None = None
     facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
     remark: Callable[[Design, Any], str] = lambda *_: ""
@@ -334,7 +326,8 @@ def export(
         origin.append(("precision", f"single: commands within {error:.1e} of the largest one"))
     files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
     again = own.read(files, whole)
-    checks = _proved(own, parts, numbers, again, error)
+    _require_same(again, whole)
+    checks = _proved(own, pairs, error)
     require_proved(checks, f"the arithmetic of {target} ({precision} precision)", own.hint)
     _require_finite(error, precision, own.hint)
     notes = [own.remark(part.design, held) for part, held in pairs]
@@ -370,28 +363,45 @@ def _require_finite(error: float, precision: str, hint: str) -> None:
         )
 
 
+def _require_same(read: Any, written: Any) -> None:
+    """Refuse a file that holds other numbers than those that are proved."""
+    if not _is_same(read, written):
+        raise NumericalError(
+            "the file must hold the numbers that are proved; what is read from it is another.",
+            status="arithmetic",
+        )
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Return whether the numbers of a target are the same, in whatever holds them."""
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_is_same, one, other))
+    if isinstance(one, Mapping):
+        return one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)
+    if is_dataclass(one):
+        names = (each.name for each in fields(one))
+        return all(_is_same(getattr(one, name), getattr(other, name)) for name in names)
+    return bool(one == other)
+
+
 def _proved(
-    own: Target, parts: Sequence[ModeDesign], numbers: Sequence[Any], whole: Any, error: float
+    own: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
 ) -> tuple[Check, ...]:
-    """Check the loop of each design with the numbers of a file; equal copies once."""
+    """Check the loop of each design with its numbers in the file."""
     checks: list[Check] = []
-    controlled = sum(len(part.modes) for part in parts)
-    for part, copies in zip(parts, own.split(whole, parts, numbers), strict=True):
-        seen: set[bytes] = set()
-        for held in copies:
-            key = pickle.dumps(held)
-            if key in seen:
-                continue
-            seen.add(key)
-            proof = list(prove_written(part.design, own.computed(part.design, held)))
-            if part.design.other_sensors:
-                how = "a run in which each sensor is missing for a while"
-                name = "commands in a rehearsal, difference"
-                proof.append(Check(name, error, _LARGEST_ERROR, how))
-            if len(part.modes) < controlled:
-                modes = name_modes(np.array(part.modes))
-                proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
-            checks += proof
+    controlled = sum(len(part.modes) for part, _ in pairs)
+    for part, numbers in pairs:
+        proof = list(prove_written(part.design, own.computed(part.design, numbers)))
+        if part.design.other_sensors:
+            how = "a run in which each sensor is missing for a while"
+            name = "commands in a rehearsal, difference"
+            proof.append(Check(name, error, _LARGEST_ERROR, how))
+        if len(part.modes) < controlled:
+            modes = name_modes(np.array(part.modes))
+            proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
+        checks += proof
     return tuple(checks)
 
 

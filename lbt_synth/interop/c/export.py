@@ -26,7 +26,6 @@ from lbt_synth.interop.c.terms import (
     join,
     read_source,
     source_terms,
-    split,
     used_readings,
 )
 from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
@@ -316,7 +315,6 @@ TARGET = Target(
     start=lambda terms, _: RunningSource(terms),
     cost=frame_cost,
     join=join,
-    split=split,
     facts=_facts,
     hint="Try double precision.",
     endings=(".c",),

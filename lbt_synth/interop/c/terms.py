@@ -226,35 +226,21 @@ def _added(terms: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(np.add.accumulate(terms, axis=1)[:, -1])
 
 
-_Places = list[list[tuple[NDArray[np.intp], NDArray[np.intp]]]]  # states and modes of each copy
-
-
-def _places(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign]) -> _Places:
-    """Return where each copy of each design has its states, and its modes."""
-    out, count = [], 0
-    for terms, part in zip(numbers, parts, strict=True):
-        copies = []
-        for modes in part.copies:
-            copies.append((np.arange(count, count + terms.sizes[0]), np.array(modes)))
-            count += terms.sizes[0]
-        out.append(copies)
-    return out
-
-
 def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int) -> SourceTerms:
     """Put controllers side by side, each as often as it has modes."""
-    first, places = numbers[0], _places(numbers, parts)
+    first, pairs = numbers[0], list(zip(numbers, parts, strict=True))
     if parts[0].copies == [tuple(range(count))]:
         return first
-    s = places[-1][-1][0][-1] + 1
+    s = sum(terms.sizes[0] * len(part.copies) for terms, part in pairs)
     transition, gains = np.zeros((1, s, s + count)), np.zeros((1, s, count))
-    command = np.zeros((count, s + count))
-    for terms, copies in zip(numbers, places, strict=True):
-        for states, modes in copies:
-            signals = np.concatenate([states, s + modes])
-            transition[0][np.ix_(states, signals)] = terms.transition[0]
-            gains[0][np.ix_(states, modes)] = terms.gains[NONE][0]
-            command[np.ix_(modes, signals)] = terms.command
+    command, start = np.zeros((count, s + count)), 0
+    for terms, modes in ((terms, list(copy)) for terms, part in pairs for copy in part.copies):
+        states = list(range(start, start + terms.sizes[0]))
+        start += terms.sizes[0]
+        signals = [*states, *(s + mode for mode in modes)]
+        transition[0][np.ix_(states, signals)] = terms.transition[0]
+        gains[0][np.ix_(states, modes)] = terms.gains[NONE][0]
+        command[np.ix_(modes, signals)] = terms.command
     return replace(
         first,
         transition=transition,
@@ -264,29 +250,6 @@ def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int
         read=np.ones((1, count), dtype=np.bool_),
         rows={"measurements": slice(0, count)},
     )
-
-
-def split(
-    whole: SourceTerms, parts: Sequence[ModeDesign], numbers: Sequence[SourceTerms]
-) -> list[list[SourceTerms]]:
-    """Return the terms of each copy of each design."""
-    if len(parts) == 1 and numbers[0].sizes == whole.sizes:
-        return [[whole]]
-    s, out = whole.sizes[0], []
-    for terms, copies in zip(numbers, _places(numbers, parts), strict=True):
-        held = []
-        for states, modes in copies:
-            signals = np.concatenate([states, s + modes])
-            held.append(
-                replace(
-                    terms,
-                    transition=whole.transition[0][np.ix_(states, signals)][None],
-                    gains={NONE: whole.gains[NONE][0][np.ix_(states, modes)][None]},
-                    command=whole.command[np.ix_(modes, signals)],
-                )
-            )
-        out.append(held)
-    return out
 
 
 def as_computed(design: Design, terms: SourceTerms) -> Written:

@@ -339,13 +339,6 @@ def _join(numbers: Sequence[_Numbers], parts: Sequence[ModeDesign], count: int) 
     return whole, delay
 
 
-def _split(whole: _Numbers, parts: Sequence[ModeDesign], _: object) -> list[list[_Numbers]]:
-    """Return the matrix of each copy of each design."""
-    cube, delay = whole
-    steps = range(cube.shape[1])
-    return [[(cube[np.ix_(m, steps, m)], delay) for m in part.copies] for part in parts]
-
-
 def _write(
     place: Path, whole: _Numbers, design: Design, origin: Sequence[tuple[str, str]], **_: Any
 ) -> dict[Path, bytes]:
@@ -393,7 +386,6 @@ TARGET = Target(
     computed=_as_computed,
     start=lambda numbers, limit: AppliedFilter(_flat(numbers), numbers[1], limit),
     join=_join,
-    split=_split,
     facts=lambda whole, **_: {
         "steps": whole[0].shape[1],
         "latency_frames": whole[1] + 1,

@@ -231,9 +231,6 @@ TARGET = Target(
     computed=_as_computed,
     start=InnerLoop,
     join=_join,
-    split=lambda matrix, parts, _: [
-        [matrix[:, list(copy)] for copy in part.copies] for part in parts
-    ],
     facts=lambda _, **options: {"sign": _SIGN},
     remark=_remark,
     hint="Give an even order, design with fewer states or less accurate models, or use a target in "
