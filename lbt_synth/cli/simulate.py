@@ -14,7 +14,7 @@ from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.errors import GainFileError, ProblemError
+from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
@@ -141,7 +141,11 @@ def run(arguments: Namespace) -> Report:
         )
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
-    loop.require_stable()
+    try:
+        loop.require_stable()
+    except UnstableLoopError as error:
+        why = " ".join([str(error), *loop_difference_notes(config, design)])
+        raise UnstableLoopError(why, spectral_radius=loop.spectral_radius) from error
     settings = config.settings.simulation
     sizes = {"frames": settings.frames, "cases": settings.cases, "seed": settings.seed}
     # the same settling for all controllers, so that one seed is one weather

@@ -197,7 +197,9 @@ def test_what_the_command_line_says_of_mixed_filters(tmp_path, capsys, monkeypat
     assert "no better choice than the Kalman filter" in capsys.readouterr().out
     assert main(["design", config, "--method", "kalman", "--horizon", "2", "-o", target]) == 0
     assert main(["simulate", config, target]) == 1
-    assert "the closed loop must be stable; got an unstable one" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the closed loop must be stable; got an unstable one" in said
+    assert "note: designed for a delay of 3 frames" in said
     assert main(["tradeoff", config, "--points", "201"]) == 2
     assert "points must be at most 200" in capsys.readouterr().err
 
@@ -245,7 +247,7 @@ def test_wrong_commands_of_mirror(tmp_path, capsys):
     assert run_mirror(capsys, "design", settled, "--method", "kalman", "-o", gain)[0] == 0
     status, _, err = run_mirror(capsys, "simulate", SLOW_YAML, gain)
     assert status == 1
-    assert "another mirror" in err
+    assert "designed for a mirror that settles at once, run with a mirror with dynamics" in err
     status, _, err = run_mirror(capsys, "mirror", settled)
     assert status == 2
     assert "mirror.local_loop is missing" in err
