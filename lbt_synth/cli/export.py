@@ -32,7 +32,7 @@ from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import simulation_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import Facts, fact, fact_table, facts, json_record
+from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.validation import FloatArray, integer, number
 
 _OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
@@ -55,7 +55,6 @@ def run(arguments: Namespace) -> Report:
     digest = file_sha256(arguments.gain, GainFileError)
     with show_spinner("exporting", quiet=arguments.json):
         written = export(output, design, arguments.target, gain_digest=digest, **options)
-    cost = written.cost or frame_cost(design)
     report = Report(
         data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
     )
@@ -68,8 +67,9 @@ def run(arguments: Namespace) -> Report:
         commands=fact(commands, "commands"),
         error=fact(written.error, "difference from the controller", **largest),
     )
-    report.data |= {"frame_cost": json_record(cost), **json_record(what)}
-    report.tables.append(fact_table("Export", what, *([cost] if written.cost else [])))
+    report.add_facts("Export", what)
+    if arguments.target == "c" and not design.other_sensors:
+        report.add_facts("Cost per frame", frame_cost(design), key="frame_cost")
     if written.checks:
         report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
     report.notes += [f"note: {note}." for note in written.notes]

@@ -17,7 +17,7 @@ from functools import lru_cache
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import column, json_record, table_row
 from lbt_synth.validation import FloatArray, choice
-
-if TYPE_CHECKING:
-    from lbt_synth.interop.c.terms import FrameCost
 
 CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
 FRAMES = 2000
@@ -92,8 +89,6 @@ class Target:
         knows the limit of a command clips its commands itself.
     join : callable
         ``join(numbers, parts, count)`` returns the numbers of a file of so many modes.
-    cost : callable, optional
-        ``cost(whole)`` counts the arithmetic of a frame.
     facts : callable
         ``facts(whole, **options)`` returns what else the certificate names.
     remark : callable
@@ -119,7 +114,6 @@ class Target:
     start: Callable[[Any, float], SteppedController]
     options: Mapping[str, Any] = field(default_factory=dict)
     join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = _join_one
-    cost: Callable[[Any], FrameCost] | None = None
     facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
     remark: Callable[[Design, Any], str] = lambda *_: ""
     hint: str
@@ -200,8 +194,6 @@ class Exported:
         ``start(limit)`` returns what was written, stepped in the arithmetic of the target.
     checks : tuple of Check
         The proof in the loop, with the numbers of the file.
-    cost : FrameCost or None
-        Arithmetic of a frame, if the target counts it.
     notes : tuple of str
         What a user should know of the export.
     """
@@ -210,7 +202,6 @@ class Exported:
     error: float
     start: Callable[[float], SteppedController]
     checks: tuple[Check, ...]
-    cost: FrameCost | None
     notes: tuple[str, ...]
 
 
@@ -347,7 +338,6 @@ def export(
         error=error,
         start=lambda limit: own.start(again, limit),
         checks=checks,
-        cost=own.cost(again) if own.cost else None,
         notes=tuple(notes),
     )
 

@@ -1,4 +1,4 @@
-"""What an object says of itself: a line in a debugger, some when printed, a table in a notebook."""
+"""What an object says of itself: a line in a debugger, some when it is printed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Summary:
 class Summarised:
     """An object whose ``repr`` is one line, and which shows its facts when it is printed.
 
-    Notebooks show the same as a table.
+    Notebooks show the same.
     """
 
     __slots__ = ()
@@ -62,12 +62,8 @@ class Summarised:
         return "\n".join([*lines, *(f"  {note}" for note in found.notes)])
 
     def _repr_html_(self) -> str:
-        """Return the summary as HTML, for notebooks."""
-        found = self._summarise()
-        parts = [f"<p><b>{type(self).__name__}</b>: {escape(self._brief())}</p>"]
-        parts += [_html_table(table, titled=len(found.tables) > 1) for table in found.tables]
-        parts += [f"<p>{escape(note)}</p>" for note in found.notes]
-        return f"<div>{''.join(parts)}</div>"
+        """Return the summary for notebooks, which would show one line."""
+        return f"<pre>{escape(self.summary())}</pre>"
 
 
 def _short_text(value: Any) -> str:
@@ -83,23 +79,7 @@ def _text_lines(table: Table, *, titled: bool) -> list[str]:
     """Return a table as aligned lines: the rows alone, or with the caption and headings."""
     rows = [tuple(cell.text for cell in row) for row in table.cells()]
     caption = [f"  {table.caption}"] if titled else []
-    shown = [table.headings, *rows] if _has_headings(table) else rows
+    is_fact = table.headings == ("quantity", "value", "unit")  # which says no more
+    shown = rows if is_fact else [table.headings, *rows]
     widths = [max(map(len, cells)) for cells in zip(*shown, strict=True)]
     return caption + [f"  {'  '.join(row)}".rstrip() for row in aligned(shown, widths, table)]
-
-
-def _has_headings(table: Table) -> bool:
-    """Return whether the headings say more than that a line is a fact."""
-    return table.headings != ("quantity", "value", "unit")
-
-
-def _html_table(table: Table, *, titled: bool) -> str:
-    caption = f"<caption>{escape(table.caption)}</caption>" if titled else ""
-    head = "".join(f'<th scope="col">{escape(text)}</th>' for text in table.headings)
-    head = f"<thead><tr>{head}</tr></thead>" if _has_headings(table) else ""
-    body = "".join(
-        f'<tr><th scope="row">{escape(first.text)}</th>'
-        f"{''.join(f'<td>{escape(cell.text)}</td>' for cell in rest)}</tr>"
-        for first, *rest in table.cells()
-    )
-    return f"<table>{caption}{head}<tbody>{body}</tbody></table>"

@@ -76,11 +76,8 @@ def test_a_table_of_rows_keeps_its_headings():
             return Summary(tables=[Table(caption="L", headings=("line", "f"), rows=(("a", "20"),))])
 
     assert str(Listed()).splitlines()[1:] == ["  line   f", "  a     20"]
-    assert [cell.text for cell in html(Listed()).iter("th")] == ["line", "f", "a"]
 
 
-def test_the_page_is_well_formed_and_says_the_same():
-    page = html(Shown(values=np.eye(2)))
-    assert [cell.text for cell in page.iter("td")] == ["12.5", "nm", "3", None]
-    assert [cell.text for cell in page.iter("th")] == ["residual <all>", "states"]
-    assert "x < y" in [paragraph.text for paragraph in page.iter("p")]
+def test_a_notebook_shows_the_same():
+    shown = Shown(values=np.eye(2))
+    assert html(shown).text == str(shown)

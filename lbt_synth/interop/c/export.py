@@ -313,7 +313,6 @@ TARGET = Target(
     read=_read,
     computed=as_computed,
     start=lambda terms, _: RunningSource(terms),
-    cost=frame_cost,
     join=join,
     facts=_facts,
     hint="Try double precision.",

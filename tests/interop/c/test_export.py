@@ -568,9 +568,10 @@ def test_the_certificate_beside_the_source(sensor_files):
     assert sensor_files["double"].error < 1e-11 < sensor_files["single"].error < 1e-3
 
 
-def test_the_cost_is_that_of_the_source(sensor_files):
+def test_the_cost_is_that_of_the_source(sensor_files, sensors_design):
     """Products of a frame in which all is read, and numbers, counted in the text."""
-    text, cost = sensor_files["double"].files[0].read_text(), sensor_files["double"].cost
+    text = sensor_files["double"].files[0].read_text()
+    cost = lbt.interop.frame_cost(source_terms(sensors_design))
     sizes = header_numbers(sensor_files["double"].files[0], "double")
     constants, gains = (int(re.search(rf"real {a}\[(\d+)\]", text)[1]) for a in ("c", "gains"))
     varying = int(re.search(r"real varying\[DOUBLE_PERIOD\]\[(\d+)\]", text)[1])
