@@ -88,7 +88,9 @@ class Report:
             print(json.dumps(json_value(self.data), allow_nan=False))
             return
         room = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
-        lines = [line for table in self.tables for line in text_lines(table, room)]
+        lacks_line = "─".encode(sys.stdout.encoding or "utf-8", "replace") == b"?"
+        rule = "-" if lacks_line else "─"
+        lines = [line for table in self.tables for line in text_lines(table, room, rule=rule)]
         for line in (*self.opening, *lines, *self.notes):
             print(printable(line))
 

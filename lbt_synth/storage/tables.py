@@ -81,14 +81,14 @@ def aligned(rows: Iterable[Sequence[str]], widths: Sequence[int], table: Table) 
     ]
 
 
-def text_lines(table: Table, room: int) -> list[str]:
+def text_lines(table: Table, room: int, *, rule: str = "─") -> list[str]:
     """Set a table in as many parts as its numbers need, each with all rows and some columns."""
     parts = [table]
     for most in range(max(len(table.headings) - 1, 1), 0, -1):
         parts = list(table.by_columns(most))
         if all(sum(_widths(part)[1]) + _frame(part) <= room for part in parts):
             break
-    return [line for part in parts for line in _part_lines(part, room)]
+    return [line for part in parts for line in _part_lines(part, room, rule)]
 
 
 def _frame(table: Table) -> int:
@@ -106,7 +106,7 @@ def _widths(table: Table) -> tuple[list[int], list[int]]:
     return [max(map(len, c)) for c in columns], [min(word, _LONGEST_NUMBER) for word in words]
 
 
-def _part_lines(table: Table, room: int) -> list[str]:
+def _part_lines(table: Table, room: int, rule: str) -> list[str]:
     """Set a table; the widest words are broken before any number is."""
     widths, least = _widths(table)
     while sum(widths) > room - _frame(table) and max(widths) > 1:
@@ -119,7 +119,7 @@ def _part_lines(table: Table, room: int) -> list[str]:
         pieces = aligned(zip_longest(*cells, fillvalue=""), widths, table)
         lines += [f"  {'   '.join(piece)}".rstrip() for piece in pieces]
         if len(lines) == len(pieces):
-            lines.append(f" {'─' * (sum(widths) + _frame(table) - 2)}")
+            lines.append(f" {rule * (sum(widths) + _frame(table) - 2)}")
     return [*wrap(table.caption, room), "", *lines, ""]
 
 
