@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4615,
+    "cli": 4630,
     "config": 2331,
     "design": 8382,
     "files": 1608,
@@ -30,7 +30,7 @@ LINES = {
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 313,
+    "files of the package": 314,
     "public names": 259,
     "tuned constants": 857,
     "lines of tests": 42920,

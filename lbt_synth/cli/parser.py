@@ -39,7 +39,6 @@ COMMANDS = {
 _SHARED_MODULES = {
     "completion": "parser",
     "end-to-end-table": "end_to_end",
-    "rehearse": "export",
     "verify": "show",
     **dict.fromkeys(("limits", "mirror", "tradeoff"), "comparisons"),
 }

@@ -1,0 +1,196 @@
+"""The command rehearse: a gain file in the arithmetic of a target, in the loop, on data."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
+from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.output_files import require_figure
+from lbt_synth.cli.parser import command_options
+from lbt_synth.cli.progress import show_spinner
+from lbt_synth.config.load import config_from_text
+from lbt_synth.design import Design
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import require_length
+from lbt_synth.interop import Rehearsal, rehearse
+from lbt_synth.loop import Imaging, series_strehl
+from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.report.draw import save_figure
+from lbt_synth.report.figures.records import simulation_figure
+from lbt_synth.storage.rows import Facts, fact, facts
+from lbt_synth.validation import FloatArray, integer, number
+
+_FRAMES = 8000  # of a drawn disturbance
+_DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
+_ALWAYS = ("target", "file", "stroke", "wavelength_um", "output", "json", "unit", "show_unit")
+_FEWEST, _MOST = 256, 10_000_000  # of a record, and of a drawn disturbance
+
+
+# the source in words, what the loops run_rehearse on, and residual and commands of a record
+_Series: TypeAlias = tuple[
+    str, Disturbance, LoopHardware, Imaging, tuple[FloatArray, FloatArray] | None
+]
+
+
+def run(arguments: Namespace) -> Report:
+    """Run the loop in the arithmetic of a target, beside the design and what ran."""
+    given = [path for path in (arguments.gain, arguments.file) if path is not None]
+    if arguments.output is not None:
+        require_figure(arguments.output, inputs=given)
+    _refuse_idle_options(arguments)
+    design = load_design(arguments.gain)
+    with show_spinner("rehearsing", quiet=arguments.json):
+        recorded = arguments.file is not None
+        series = (_recorded if recorded else _drawn)(arguments, design)
+        source, disturbance, hardware, imaging, ran = series
+        found = rehearse(
+            design,
+            arguments.target,
+            disturbance,
+            hardware=hardware,
+            stroke=arguments.stroke,
+        )
+    loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
+    rows = [
+        _describe(
+            name, one.image_nm2[0], one.commands[0], one.strehl, imaging, found.clipped_frames(one)
+        )
+        for name, one in loops.items()
+    ]
+    if ran is not None:
+        residual, commands = (part[found.settle_frames :] for part in ran)
+
+        def ratio(camera: Imaging) -> FloatArray:
+            return np.array([series_strehl(residual, camera)])
+
+        rows.append(_describe("what ran", residual**2, commands, ratio, imaging, None))
+    report = Report(data={"gain": arguments.gain, "target": arguments.target})
+    what = f"Rehearsal for {arguments.target} on {source}; {imaging.label}"
+    report.add_rows("loops", what, rows)
+    report.add_facts("The target beside the design", _difference_facts(found))
+    report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
+    if arguments.file is not None:
+        report.notes += [
+            "note: residuals are of means over frames, and hold the noise of the measurements.",
+            "note: Strehl ratios are of tip and tilt alone; the record knows no other modes.",
+        ]
+    if design.hardware is not None:
+        report.notes += [f"note: {text}" for text in loop_differences(design.hardware, hardware)]
+    if arguments.output is not None:
+        figure = simulation_figure(found.target, title=f"{design.method} in {arguments.target}")
+        report.note_written(save_figure(figure, arguments.output))
+    return report
+
+
+def _describe(
+    name: str,
+    squares_nm2: FloatArray,
+    commands: FloatArray,
+    strehl: Callable[[Imaging], FloatArray],
+    imaging: Imaging,
+    clipped: int | None,
+) -> Facts:
+    """Return the row of one loop on the series, from the squares of its residual."""
+    axes = np.sqrt(np.mean(squares_nm2, axis=0)).tolist()
+    second = axes[1] if len(axes) == 2 else None
+    ratio = float(strehl(imaging)[0]) if len(axes) <= 2 else None
+    rms = {"unit": "nm rms", "format": ".1f"}
+    largest_nm = float(np.max(np.abs(commands)))
+    return facts(
+        name=fact(name, "loop"),
+        first_nm=fact(axes[0], "first axis", **rms),
+        second_nm=fact(second, "second axis", **rms),
+        residual_nm=fact(float(np.linalg.norm(axes)), "residual", **rms),
+        strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
+        largest_command_nm=fact(largest_nm, "largest command", unit="nm", format=".1f"),
+        clipped_frames=fact(clipped, "clipped frames"),
+    )
+
+
+def _difference_facts(found: Rehearsal) -> Facts:
+    """Return how far the target is from the design."""
+    apart_nm = found.differences
+    rms_nm = float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1))))
+    settled = "frames before, in which the loops settle"
+    return facts(
+        difference_rms_nm=fact(rms_nm, "difference of the commands", unit="nm rms"),
+        difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
+        frames=fact(len(apart_nm), "frames compared"),
+        settle_frames=fact(found.settle_frames, settled),
+    )
+
+
+def _refuse_idle_options(arguments: Namespace) -> None:
+    """Refuse options of a record where none is given, and of a drawn disturbance where one is."""
+    drawn = arguments.file is None
+    for name, (option, usual) in command_options("rehearse").items():
+        idle = name not in (*_DRAWN, *_ALWAYS) if drawn else name in _DRAWN
+        if idle and getattr(arguments, name) != usual:
+            raise ProblemError(f"{option} goes {'with' if drawn else 'without'} --record.")
+
+
+def _recorded(arguments: Namespace, design: Design) -> _Series:
+    """Return the pseudo-open-loop series of a record, in its longest stretch of usable frames.
+
+    Its sensor gain is the one that the design assumes, unless another is given.
+    """
+    record = require_series(load_series(arguments), "a rehearsal runs on").bridged()
+    require_length(record, frames=_FEWEST, seconds=0)
+    choose_unit(arguments, record.diameter_m)
+    gains = _assumed_gains(design, record.axes)
+    if arguments.sensor_gain is not None:
+        gains = np.full(record.axes, number(arguments.sensor_gain, "--sensor-gain", above=0))
+    start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
+    commands = record.commands
+    ran = None
+    if commands is not None:
+        ran = (record.measurements[start:stop] / gains, commands[start:stop])
+    phase_nm = record.pseudo_open_loop(gains)[start:stop]
+    return (
+        f"{stop - start} frames of {Path(arguments.file).name}",
+        Disturbance(phase_nm=phase_nm, frame_means=True),
+        replace(record.hardware, sensor_matrix=np.diag(gains)),
+        record_imaging(arguments, record),
+        ran,
+    )
+
+
+def _assumed_gains(design: Design, axes: int) -> FloatArray:
+    """Return what the measurements of each axis show of a unit of phase, as a design assumes."""
+    sensor = np.eye(axes) if design.hardware is None else design.hardware.sensor
+    gains = np.diag(sensor)
+    if sensor.shape != (axes, axes) or not np.array_equal(sensor, np.diag(gains)):
+        raise ProblemError(
+            f"a rehearsal on a record takes a measurement for each of its {axes} axes; the gain "
+            f"file assumes a sensor matrix {sensor.tolist()}. Design for the axes of the record."
+        )
+    return gains
+
+
+def _drawn(arguments: Namespace, design: Design) -> _Series:
+    """Return a disturbance drawn from the truth that the gain file was made with."""
+    if not design.configuration:
+        raise ProblemError(
+            "the gain file holds no configuration to draw a disturbance from. Give --record."
+        )
+    config = config_from_text(design.configuration, Path(arguments.gain))
+    load_shown(arguments, config)
+    imaging = config.imaging
+    if arguments.wavelength_um is not None:
+        imaging = replace(imaging, wavelength_um=arguments.wavelength_um)
+    frames, alone = _FRAMES, config.hardware.own_sensor_alone()
+    seed = integer(arguments.seed, "--seed", at_least=0)
+    if arguments.frames is not None:
+        frames = integer(arguments.frames, "--frames", at_least=1, at_most=_MOST)
+    drawn = draw_disturbance(config.truth, alone, frames=frames, seed=seed)
+    return f"{frames} frames of its own truth", drawn, config.hardware, imaging, None
