@@ -22,7 +22,7 @@ STILL = replace(SETUP, vibrations=())
 def mean(runs: list[lbt.interop.EndToEndRun]) -> str:
     strehls = [100 * run.strehl for run in runs]
     gains = [run.tip_tilt_gain for run in runs]
-    noise = [run.tip_tilt_noise_nm for run in runs]
+    noise = [run.summary()["tip_tilt_noise_nm"] for run in runs]
     return (
         f"Strehl ratio {np.mean(strehls):.1f} % ({', '.join(f'{s:.1f}' for s in strehls)}), "
         f"optical gain {np.mean(gains):.3f}, left of tip and tilt {np.mean(noise):.1f} nm"
@@ -54,7 +54,7 @@ def optimised() -> None:
     setup = replace(STILL, frames=3200)
     first = replace(setup, seed=1).run(None, cache=CACHE)
     path = setup.system.hardware
-    gains = np.maximum(first.optical_gain, 0.1)
+    gains = np.maximum(first.optical_gain()[0], 0.1)
     found = lbt.design.modal.modal_gains_from_telemetry(
         first.measurements,
         first.commands,
@@ -106,7 +106,7 @@ def sensor_row(config: lbt.config.Config, design: lbt.Design, seed: int) -> list
     run = setup.run(design, cache=CACHE)
     # gains are relative to what the design assumes
     gain = run.tip_tilt_gain / config.sensor_gain
-    truth = replace(config.truth, noise_nm=run.tip_tilt_noise_nm, sensor_gain=gain)
+    truth = replace(config.truth, noise_nm=run.summary()["tip_tilt_noise_nm"], sensor_gain=gain)
     missing = ("truth",) if design.other_sensors else ()
     own = design.controllers[frozenset(missing)]
     loop = lbt.close_loop(config.hardware, own, sensor_gain=gain, blind=missing)

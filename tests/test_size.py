@@ -14,23 +14,23 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4993,
+    "cli": 4630,
     "config": 2331,
     "design": 8382,
-    "files": 1676,
+    "files": 1608,
     "identification": 14397,
-    "interop": 4940,
+    "interop": 4663,
     "linear": 6078,
     "loop": 5475,
     "methods": 1109,
     "models": 4550,
     "report": 4993,
-    "storage": 1263,
+    "storage": 1049,
     "studies": 3951,
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 321,
+    "files of the package": 314,
     "public names": 259,
     "tuned constants": 857,
     "lines of tests": 42920,

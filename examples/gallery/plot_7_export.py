@@ -34,7 +34,7 @@ print((folder / "tip.h").read_text())
 # What a frame costs:
 
 cost = lbt.interop.frame_cost(design)
-print(f"{cost.multiplications} multiplications, {cost.additions} additions, {cost.form}")
+print(f"{cost.multiplications} multiplications, {cost.additions} additions")
 
 # %%
 # The gain file is what other programs read, and what ``lbt-synth verify`` certifies again.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import Action, ArgumentError, ArgumentParser, Namespace, _ActionsContainer
+from argparse import Action, ArgumentParser, Namespace, _ActionsContainer
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -73,23 +73,11 @@ def add_gains(parser: ArgumentParser, nargs: str = "*", text: str = GAIN_FILE) -
     parser.add_argument("gains", nargs=nargs, metavar="gain", help=text, default=[])
 
 
-class OnlyOutput(Action):
-    """Take the name of the output; refuse a second one, which would not be written."""
-
-    def __call__(self, _: Any, namespace: Namespace, values: Any, option: Any = None) -> None:
-        """Store the name."""
-        if getattr(namespace, self.dest) is not self.default:
-            raise ArgumentError(self, "give it once")
-        setattr(namespace, self.dest, values)
-
-
 def add_output(
     parser: ArgumentParser, text: str, *, required: bool = True, default: str | None = None
 ) -> None:
     """Add one output."""
-    parser.add_argument(
-        "-o", "--output", action=OnlyOutput, required=required, default=default, help=text
-    )
+    parser.add_argument("-o", "--output", required=required, default=default, help=text)
 
 
 class TargetChoice(Action):

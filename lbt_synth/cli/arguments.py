@@ -477,11 +477,6 @@ def paper(parser: ArgumentParser) -> None:
     add_output(parser, "directory to write into")
 
 
-def help(parser: ArgumentParser) -> None:  # noqa: A001
-    """Show what a command does, and its arguments."""
-    parser.add_argument("topic", nargs="?", metavar="command", help="default: all of them")
-
-
 def completion(parser: ArgumentParser) -> None:
     """Print the script with which a shell completes commands, options and files."""
     parser.add_argument("shell", choices=("bash", "zsh", "fish"))

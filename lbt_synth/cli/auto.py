@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli import loop_records
-from lbt_synth.cli.display import choose_unit
+from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.files.gain_file.store import require_gain_name

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.display import load_shown
+from lbt_synth.cli.loop_inputs import add_truth, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain

@@ -6,11 +6,11 @@ import json
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lbt_synth.cli.argument_kinds import given_options, option_name
-from lbt_synth.cli.display import choose_wavefront_unit
-from lbt_synth.cli.engine import keep_finished
-from lbt_synth.cli.loop_inputs import load_design, load_designs
+from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.loop_inputs import choose_wavefront_unit, load_design, load_designs
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
@@ -26,14 +26,13 @@ from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import (
-    column,
     csv_rows,
+    fact,
+    facts,
     fill_row,
     json_record,
     json_units,
-    percent_column,
     row_table,
-    table_row,
 )
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import EndToEndEntry
@@ -47,32 +46,6 @@ from lbt_synth.validation import integer
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
 _FILES = ("run.png", "telemetry.fits", "summary.json")
-
-
-@table_row
-class EndToEndFacts:
-    """The main numbers of a run."""
-
-    gain: str = column()
-    method: str = column()
-    specula: str = column()
-    pixels: int = column()
-    frames: int = column()
-    settle_frames: int = column()
-    seed: int = column()
-    strehl: float = percent_column("Strehl ratio")
-    strehl_error: float | None = column("  standard error", unit="points", scale=100, format=".2f")
-    other_modes_strehl: float = percent_column("  without tip and tilt")
-    tip_rms_nm: float = column("tip", unit="nm rms", format=".1f")
-    tilt_rms_nm: float = column("tilt", unit="nm rms", format=".1f")
-    other_modes_rms_nm: float = column("all other modes", unit="nm rms", format=".1f")
-    tip_tilt_gain: float = column("optical gain of tip and tilt", format=".3f")
-    tip_tilt_gain_error: float = column("  standard error", format=".3f")
-    tip_tilt_noise_nm: float = column(
-        "what it leaves of their measurements", unit="nm rms", format=".1f"
-    )
-    condition_number: float = column("condition of the reconstructor", format=".1f")
-    milliseconds_a_frame: float = column("time per frame", unit="ms", format=".1f")
 
 
 def run(arguments: Namespace) -> Report:
@@ -92,20 +65,36 @@ def run(arguments: Namespace) -> Report:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
     _require_seen(loop_run)
     system = loop_run.system
-    facts = fill_row(
-        EndToEndFacts,
-        *(loop_run, system, calibration.reconstructor),
-        gain=str(arguments.gain),
-        method=design.method,
-        specula=version,
-        milliseconds_a_frame=1e3 * loop_run.seconds / total,
-        **loop_run.summary(),
+    numbers, rms = loop_run.summary(), {"unit": "nm rms", "format": ".1f"}
+    percent = {"unit": "%", "scale": 100, "format": ".2f"}
+    headings: dict[str, tuple[str, dict[str, Any]]] = {
+        "strehl": ("Strehl ratio", percent),
+        "strehl_error": ("  standard error", percent | {"unit": "points"}),
+        "other_modes_strehl": ("  without tip and tilt", percent),
+        "tip_rms_nm": ("tip", rms),
+        "tilt_rms_nm": ("tilt", rms),
+        "other_modes_rms_nm": ("all other modes", rms),
+        "tip_tilt_gain": ("optical gain of tip and tilt", {"format": ".3f"}),
+        "tip_tilt_gain_error": ("  standard error", {"format": ".3f"}),
+        "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
+    }
+    milliseconds = 1e3 * loop_run.seconds / total
+    condition = calibration.reconstructor.condition_number
+    what = facts(
+        gain=fact(str(arguments.gain)),
+        method=fact(design.method),
+        specula=fact(version),
+        **{name: fact(getattr(loop_run, name)) for name in ("frames", "settle_frames", "seed")},
+        pixels=fact(system.pixels),
+        **{name: fact(numbers[name], text, **how) for name, (text, how) in headings.items()},
+        condition_number=fact(condition, "condition of the reconstructor", format=".1f"),
+        milliseconds_a_frame=fact(milliseconds, "time per frame", unit="ms", format=".1f"),
     )
     report = Report()
     report.add_facts(
         f"End to end, Strehl ratio at {system.imaging_wavelength_um:g} um: {system.modes} modes, "
         f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
-        facts,
+        what,
     )
     if unread := unread_sensors(design):
         report.notes.append(
@@ -209,11 +198,18 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
     with (
+        choose_engine(arguments) as (executor, workers),
         count_progress(total=total, what="runs", quiet=arguments.json) as advance,
         keep_finished(case_folder),
     ):
         table = run_tables(
-            setup, rows, case_folder, jobs=arguments.jobs, cache=arguments.cache, progress=advance
+            setup,
+            rows,
+            case_folder,
+            executor=executor,
+            workers=workers or 1,
+            cache=arguments.cache,
+            progress=advance,
         )
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]

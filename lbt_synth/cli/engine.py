@@ -25,9 +25,10 @@ def choose_engine(
     arguments: Namespace,
 ) -> AbstractContextManager[tuple[Executor | None, int | None]]:
     """Provide the executor of ``--dask`` or of ``--jobs`` with its workers; None for one job."""
-    if arguments.dask is not None:
-        return connect_cluster(arguments.dask, tls=arguments.dask_tls)
-    if arguments.dask_tls is not None:
+    dask, tls = (getattr(arguments, name, None) for name in ("dask", "dask_tls"))
+    if dask is not None:
+        return connect_cluster(dask, tls=tls)
+    if tls is not None:
         raise ProblemError("--dask-tls goes with --dask.")
     return nullcontext((None, None)) if arguments.jobs == 1 else _start_processes(arguments.jobs)
 

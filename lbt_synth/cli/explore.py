@@ -7,8 +7,7 @@ import sys
 from argparse import Namespace
 from pathlib import Path
 
-from lbt_synth.cli.display import load_shown
-from lbt_synth.cli.loop_inputs import load_designs
+from lbt_synth.cli.loop_inputs import load_designs, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.explore.exploration import explore, quick_view, whole_view

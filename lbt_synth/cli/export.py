@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.output import Report
@@ -16,7 +14,7 @@ from lbt_synth.interop import export, frame_cost, target_named
 from lbt_synth.interop.pipeline import target_names
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import fact, fact_table, facts, json_record
+from lbt_synth.storage.rows import fact, facts
 
 _OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
 
@@ -38,7 +36,6 @@ def run(arguments: Namespace) -> Report:
     digest = file_sha256(arguments.gain, GainFileError)
     with show_spinner("exporting", quiet=arguments.json):
         written = export(output, design, arguments.target, gain_digest=digest, **options)
-    cost = written.cost or frame_cost(design)
     report = Report(
         data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
     )
@@ -50,22 +47,12 @@ def run(arguments: Namespace) -> Report:
         measurements=fact(measurements, "measurements"),
         commands=fact(commands, "commands"),
         error=fact(written.error, "difference from the controller", **largest),
-        **_in_single(written.error_single, largest),
     )
-    report.data |= {"frame_cost": json_record(cost), **json_record(what)}
-    report.tables.append(fact_table("Export", what, *([cost] if written.cost else [])))
+    report.add_facts("Export", what)
+    if arguments.target == "c" and not design.other_sensors:
+        report.add_facts("Cost per frame", frame_cost(design), key="frame_cost")
     if written.checks:
         report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
     report.notes += [f"note: {note}." for note in written.notes]
     report.note_files(written.files)
     return report
-
-
-def _in_single(error: float | None, unit: dict[str, str]) -> dict[str, Any]:
-    """Return the facts on single precision, where the target may have it."""
-    if error is None:
-        return {}
-    return {
-        "error_single": fact(error, "  in single precision", **unit),
-        "stable_single": fact(math.isfinite(error), "  stable in single precision"),
-    }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli import loop_records
-from lbt_synth.cli.display import choose_unit
+from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.identification import LoopRecord, SpectrumRecord, accelerometer_transfers, identify

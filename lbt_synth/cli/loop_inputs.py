@@ -1,18 +1,76 @@
-"""What several commands put into a loop: options, designs and truths."""
+"""What several commands load and say: designs, truths, units, and reference designs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from argparse import Namespace
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import printable
-from lbt_synth.config import Config
+from lbt_synth.config import Config, load_config
+from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.models import Truth
+from lbt_synth.loop import least_residual
+from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_or_none
+from lbt_synth.models import Truth, nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
+from lbt_synth.studies import compare_in_truth
+
+_MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
+_WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
+_NAME = "this design"
+
+
+def choose_unit(
+    arguments: Namespace, diameter_m: float | None = None, configured: str | None = None
+) -> None:
+    """Show wavefronts in the unit that was asked for; an angle needs the telescope's diameter."""
+    asked = getattr(arguments, "show_unit", None) or arguments.unit
+    name = (asked if asked in UNITS else None) or configured or "nm"
+    if name in LENGTHS:
+        show_in(name, LENGTHS[name])
+        return
+    if diameter_m is None:
+        raise ProblemError(
+            f"a wavefront is shown in {name} by the telescope's diameter, which is not known here. "
+            "Give telescope.diameter_m in the configuration, --diameter-m with a record, or take "
+            "nm."
+        )
+    mas = nm_per_mas(diameter_m)
+    show_in(name, mas if name == "mas" else mas * _MAS_PER_URAD)
+
+
+def load_shown(arguments: Namespace, config: Config | None = None) -> Config:
+    """Load the configuration of a command, if it has none, and show wavefronts in its unit."""
+    config = load_config(arguments.config) if config is None else config
+    choose_unit(arguments, config.imaging.diameter_m, config.settings.units)
+    return config
+
+
+def choose_wavefront_unit(arguments: Namespace) -> None:
+    """Show wavefronts of all modes in the unit that was asked for, which cannot be an angle."""
+    if arguments.unit not in (None, *LENGTHS):
+        raise ProblemError(
+            f"--unit {arguments.unit} is an angle of tip and tilt, and this command shows other "
+            f"modes, too. Try {' or '.join(LENGTHS)}."
+        )
+    choose_unit(arguments)
+
+
+def choose_design_unit(arguments: Namespace, *designs: Design) -> None:
+    """Show wavefronts in the unit that was asked for, by the configurations in gain files."""
+    if arguments.unit is None:
+        return
+    texts = {each.configuration for each in designs if each.configuration}
+    found = {config_from_text(text, Path("gain file")).imaging.diameter_m for text in texts}
+    choose_unit(arguments, found.pop() if len(found) == 1 else None)
 
 
 def load_design(path: str, *, any_sensors: bool = False) -> Design:
@@ -81,3 +139,46 @@ def truth_at_sensor_gain(config: Config, sensor_gain: float | None) -> Truth:
     if sensor_gain is None:
         return config.truth
     return replace(config.truth, sensor_gain=sensor_gain / config.sensor_gain)
+
+
+def say_limit(limit: ResidualLimit, config: Config) -> str:
+    """Return the sentence on the limit of a truth, and on what other sensors can add to it."""
+    least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
+    suite = config.hardware.suite
+    if not suite.sensors:
+        return f"least residual of any linear controller in the truth: {least}"
+    said = f"least residual of any linear controller of the loop's own sensor in the truth: {least}"
+    floor = limit_or_none(lambda: least_residual(config.hardware, config.truth))
+    if floor is None:
+        return f"{said}; with the other sensors it is less"
+    why = ", even if accelerometers knew all vibrations in advance" * bool(suite.channels)
+    return (
+        f"{said}; of all sensors not less than {nm_text(floor.rms_nm, '.6g', unit='nm rms')}{why}"
+    )
+
+
+def add_truth(
+    report: Report, design: Design, config: Config, *, without: Collection[str] = ()
+) -> None:
+    """Add what a design leaves in the truth, beside reference designs and the limit.
+
+    A reference design that the design is itself is left out.
+    """
+    if config.truth.drifts:
+        report.notes.append(
+            "note: a vibration of the truth drifts, so that its residual has no exact value; "
+            "lbt-synth simulate runs it."
+        )
+        return
+    found = compare_in_truth({_NAME: design}, config, without=without)
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    report.add_rows("truth", caption, found.rows, without=_WITHOUT)
+    report.data |= {
+        "truth_limit_nm": None if found.limit is None else found.limit.rms_nm,
+        "wavelength_um": config.imaging.wavelength_um,
+        "truth_warnings": found.warnings[_NAME],
+    }
+    if found.limit is not None:
+        report.notes.append(say_limit(found.limit, config))
+    report.notes += [f"warning: {text}." for text in found.warnings[_NAME]]
+    report.notes += [f"note: {text}" for text in found.notes]

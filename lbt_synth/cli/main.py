@@ -20,12 +20,11 @@ import threading
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lbt_synth.cli.parser import build_parser, command_module, command_options
 from lbt_synth.cli.streams import discard, print_error
-from lbt_synth.errors import ConfigError, LbtSynthError, OutputError, SynthesisError
+from lbt_synth.errors import ConfigError, LbtSynthError, SynthesisError
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.thread_limits import limit_threads
 
@@ -41,11 +40,6 @@ _NAME = re.compile(
     rf"(?<![\w.'\"/-])(?:(?:(?<=^)|(?<=: )|(?<=; )){_WORD}(?= must )|(?<=give ){_WORD}"
     r"|[a-z]+(?:_[a-z]+)+)(?!\w|=|\(|\[|\.\w)"
 )
-_CONFIGURATION, _GAIN, _STUDY, _TELEMETRY = "configuration", "gain file", "study file", "telemetry"
-_RECORD = "record"  # telemetry, or what no other kind is
-_EXPECTED = {"config": _CONFIGURATION, "gain": _GAIN, "gains": _GAIN, "study": _STUDY}
-_EXPECTED |= dict.fromkeys(("file", "files", "source"), _RECORD)
-_ENDINGS = {".png": "figure", ".pdf": "figure", ".svg": "figure", ".html": "page"}
 
 
 class Terminated(KeyboardInterrupt):
@@ -96,8 +90,6 @@ def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:
 
 def _say_error(error: LbtSynthError, arguments: Namespace) -> str:
     """Return the message of an error in the words of a command that was run."""
-    if not isinstance(error, OutputError) and (misplaced := _misplaced_files(arguments)):
-        return misplaced
     message = str(error)
     cause: BaseException | None = error
     while cause is not None:
@@ -125,49 +117,6 @@ def _say_names(message: str, arguments: Namespace) -> str:
         return " ".join([options[word], *words])
 
     return _NAME.sub(name, _SETTING.sub(setting, message))
-
-
-def _misplaced_files(arguments: Namespace) -> str:
-    """Return which files of a command are of another kind than they stand for, if any are."""
-    wrong = [
-        (path, kind, wanted)
-        for place, wanted in _EXPECTED.items()
-        for path in _as_list(getattr(arguments, place, None))
-        if (kind := file_kind(Path(path))) not in ("", wanted)
-        and (kind, wanted) != (_TELEMETRY, _RECORD)
-    ]
-    text = "; ".join(f"{path} is a {kind}, expected a {wanted}" for path, kind, wanted in wrong)
-    text = text.replace("is a telemetry", "is telemetry")
-    exchanged = len(wrong) == 2 and wrong[0][1:] == wrong[1][:0:-1]
-    return f"{text}.{' Exchange them.' if exchanged else ''}" if text else ""
-
-
-def _as_list(given: object) -> list[str]:
-    words = given if isinstance(given, list) else [given]
-    return [word for word in words if isinstance(word, str)]  # some options have such names, too
-
-
-def file_kind(path: Path) -> str:
-    """Return what a file is, as far as this package knows its kind."""
-    from lbt_synth.config.load import read_mapping
-    from lbt_synth.files import load_gain
-    from lbt_synth.identification.records.from_file import is_telemetry
-
-    if path.suffix.lower() in (".yaml", ".yml"):
-        try:
-            content = read_mapping(path)
-        except ConfigError:
-            return ""
-        return _STUDY if "controllers" in content else _CONFIGURATION if "loop" in content else ""
-    if path.suffix.lower() in _ENDINGS and path.is_file():
-        return _ENDINGS[path.suffix.lower()]
-    if is_telemetry(path):
-        return _TELEMETRY
-    try:
-        load_gain(path)
-    except LbtSynthError:
-        return ""
-    return _GAIN
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth import models
-from lbt_synth.cli.display import choose_wavefront_unit
+from lbt_synth.cli.loop_inputs import choose_wavefront_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner

@@ -5,24 +5,19 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from rich import table as rich_table
-from rich.box import SIMPLE_HEAD
-from rich.cells import cell_len
-from rich.console import Console
-from rich.text import Text
 
 from lbt_synth.cli.streams import printable
 from lbt_synth.storage.rows import cell_text, fact_table, json_record, json_units, row_table
-from lbt_synth.storage.tables import Table
+from lbt_synth.storage.tables import Table, text_lines
 
 _WIDTH = 200  # where the output is no terminal
-_LONGEST_NUMBER = 20  # letters; a longer word may be broken
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
 
 
@@ -92,62 +87,12 @@ class Report:
         if as_json:
             print(json.dumps(json_value(self.data), allow_nan=False))
             return
-        console = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
-        with console.capture() as captured:  # rich ends the process on a broken pipe
-            for line in self.opening:
-                console.print(printable(line), markup=False, soft_wrap=True)
-            for table in self.tables:
-                for part in _fit_width(table, console.width):
-                    console.print(part)
-            for line in self.notes:
-                console.print(printable(line), markup=False, soft_wrap=True)
-        sys.stdout.write(captured.get())
-
-
-def _fit_width(table: Table, room: int) -> list[rich_table.Table]:
-    """Set a table in as many parts as its numbers need, each with all rows and some columns."""
-    parts = [table]
-    for most in range(max(len(table.headings) - 1, 1), 0, -1):
-        parts = list(table.by_columns(most))
-        if all(sum(_widths(part)[1]) + _frame(part) <= room for part in parts):
-            break
-    return [_printable(part, room) for part in parts]
-
-
-def _frame(table: Table) -> int:
-    """Width of what stands around and between the columns."""
-    return 3 * len(table.headings) + 1
-
-
-def _widths(table: Table) -> tuple[list[int], list[int]]:
-    """Widths of the columns in which no cell is broken, and in which no number is."""
-    columns = [
-        [heading, *(row[i].text for row in table.cells() if i < len(row) > 1)]
-        for i, heading in enumerate(table.headings)
-    ]
-    whole = [max(cell_len(printable(text)) for text in column) for column in columns]
-    words = [max(cell_len(word) for word in printable(" ".join(c)).split()) for c in columns]
-    return whole, [min(word, _LONGEST_NUMBER) for word in words]
-
-
-def _printable(table: Table, room: int) -> rich_table.Table:
-    widths, least = _widths(table)
-    while sum(widths) > room - _frame(table) and max(widths) > 1:
-        broken = [i for i, width in enumerate(widths) if width > least[i]] or range(len(widths))
-        widths[max(broken, key=widths.__getitem__)] -= 1
-    out = rich_table.Table(
-        title=Text(printable(table.caption), style="bold"), title_justify="left", box=SIMPLE_HEAD
-    )
-    for i, (heading, width) in enumerate(zip(table.headings, widths, strict=True)):
-        out.add_column(
-            Text(printable(heading)),
-            justify="left" if i in (0, *table.words) else "right",
-            width=width,
-            overflow="fold",
-        )
-    for row in table.cells():
-        out.add_row(*(Text(printable(cell.text)) for cell in row))
-    return out
+        room = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
+        lacks_line = "─".encode(sys.stdout.encoding or "utf-8", "replace") == b"?"
+        rule = "-" if lacks_line else "─"
+        lines = [line for table in self.tables for line in text_lines(table, room, rule=rule)]
+        for line in (*self.opening, *lines, *self.notes):
+            print(printable(line))
 
 
 def json_value(value: Any) -> Any:

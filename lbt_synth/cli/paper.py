@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import dataclass
 from pathlib import Path
 
-from lbt_synth.cli.display import choose_unit
+from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import track_progress
 from lbt_synth.design import FilterDesign
@@ -41,19 +40,22 @@ def run(arguments: Namespace) -> Report:
             table_iii(), total=2 * len(TABLE_III), what="Table III", quiet=arguments.json
         )
     )
-    result = write_paper(folder, rows)
+    second, third = table_ii(), compare_with_paper(rows)
+    filters = paper_filters()
+    files = write_paper(folder, rows, second, third, filters)
+    ratio = filters[1].gamma_requested / filters[1].gamma_least
     columns = {
-        method: rms_difference([e for e in result.table_iii if e.method == method])
-        for method in dict.fromkeys(entry.method for entry in result.table_iii)
+        method: rms_difference([e for e in third if e.method == method])
+        for method in dict.fromkeys(entry.method for entry in third)
     }
     with own_display_unit():  # JSON stays in nm
         parameters = parameter_rows()
     report = Report(
         data={
-            "table_ii": [json_record(entry) for entry in result.table_ii],
-            "table_iii": [json_record(entry) for entry in result.table_iii],
+            "table_ii": [json_record(entry) for entry in second],
+            "table_iii": [json_record(entry) for entry in third],
             "table_iii_rms_points": columns,
-            "hinf_gamma_ratio": _gamma_ratio(result),
+            "hinf_gamma_ratio": ratio,
             "parameters": [
                 dict(zip(("name", "value", "origin"), row, strict=True)) for row in parameters
             ],
@@ -61,19 +63,14 @@ def run(arguments: Namespace) -> Report:
         notes=[
             "Table III, rms difference: "
             + ", ".join(f"{design_title(m)} {d:.2f} points" for m, d in columns.items()),
-            f"H-infinity: bound at {_gamma_ratio(result):.3f} times the least at 20 Hz",
+            f"H-infinity: bound at {ratio:.3f} times the least at 20 Hz",
         ],
     )
     report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
-    for number, entries in (("II", result.table_ii), ("III", result.table_iii)):
+    for number, entries in (("II", second), ("III", third)):
         _add_comparison(report, f"Table {number}: Strehl ratio [%] at 2.2 um", entries)
-    report.note_files(result.files)
+    report.note_files(files)
     return report
-
-
-def _gamma_ratio(result: PaperResult) -> float:
-    design = result.hinf
-    return design.gamma_requested / design.gamma_least
 
 
 def _add_comparison(report: Report, title: str, entries: list[TableEntry]) -> None:
@@ -91,21 +88,14 @@ def _add_comparison(report: Report, title: str, entries: list[TableEntry]) -> No
     report.add_table(title, headings, lines.values())
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PaperResult:
-    """What the command computed and wrote."""
-
-    table_ii: list[TableEntry]  # Ours beside the paper's
-    table_iii: list[TableEntry]
-    kalman: FilterDesign  # At the true frequency
-    hinf: FilterDesign
-    files: list[Path]  # The files that were written
-
-
-def write_paper(folder: Path, rows: list[RobustnessRow]) -> PaperResult:
+def write_paper(
+    folder: Path,
+    rows: list[RobustnessRow],
+    second: list[TableEntry],
+    third: list[TableEntry],
+    filters: tuple[FilterDesign, FilterDesign],
+) -> list[Path]:
     """Write tables, figures and gain files of the comparison."""
-    second, third = table_ii(), compare_with_paper(rows)
-    kalman_design, hinf_design = paper_filters()
     files = [
         write_atomically(folder / name, csv_rows(entries))
         for name, entries in (("table_ii.csv", second), ("table_iii.csv", third))
@@ -115,18 +105,13 @@ def write_paper(folder: Path, rows: list[RobustnessRow]) -> PaperResult:
     files.append(write_atomically(folder / "parameters.csv", parameters))
     published = {
         name: [(e.error_hz, getattr(e, name)) for e in TABLE_III if e.error_hz is not None]
-        for name in (kalman_design.method, hinf_design.method)
+        for name in (design.method for design in filters)
     }
-    filters = {design_label(design.method): design for design in (kalman_design, hinf_design)}
+    labelled = {design_label(design.method): design for design in filters}
     for name, figure in (
         ("robustness", robustness_figure(rows, published)),
-        ("sigma", loop_figure(filters, "sigma", unit_weights=True)),
+        ("sigma", loop_figure(labelled, "sigma", unit_weights=True)),
     ):
         files += [save_figure(figure, folder / f"{name}{ending}") for ending in (".png", ".pdf")]
-    files += [
-        save_gain(folder / "paper_kalman.fits", kalman_design),
-        save_gain(folder / "paper_hinf.fits", hinf_design),
-    ]
-    return PaperResult(
-        table_ii=second, table_iii=third, kalman=kalman_design, hinf=hinf_design, files=files
-    )
+    names = ("paper_kalman.fits", "paper_hinf.fits")
+    return files + [save_gain(folder / n, one) for n, one in zip(names, filters, strict=True)]

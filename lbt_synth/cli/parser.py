@@ -1,15 +1,20 @@
-"""The parser of the command line: every command, its help and its arguments."""
+"""The command completion, and the parser of all commands, which it is made from."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any, NoReturn, cast
+from argparse import Action, ArgumentParser, Namespace
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import lbt_synth
 from lbt_synth.cli import arguments
 from lbt_synth.cli.argument_kinds import add_switch
 from lbt_synth.cli.streams import printable
-from lbt_synth.errors import ProblemError, suggest_word
+from lbt_synth.errors import suggest_word
+
+if TYPE_CHECKING:  # slow to import for --help
+    from lbt_synth.cli.output import Report
 
 # In the order of the help, each with the function that adds its arguments, whose docstring is its
 # help.
@@ -26,12 +31,17 @@ COMMANDS = {
         arguments.explore,
         *(arguments.end_to_end, arguments.end_to_end_table),
         *(arguments.mirror, arguments.modal, arguments.study, arguments.paper),
-        *(arguments.help, arguments.completion),
+        arguments.completion,
     )
 }
 
 
-_SHARED_MODULES = {"completion": "help", "end-to-end-table": "end_to_end", "verify": "show"}
+_SHARED_MODULES = {
+    "completion": "parser",
+    "end-to-end-table": "end_to_end",
+    "verify": "show",
+    **dict.fromkeys(("limits", "mirror", "tradeoff"), "comparisons"),
+}
 
 
 def command_module(name: str) -> str:
@@ -83,19 +93,10 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
     return parser
 
 
-def command_help(name: str = "") -> str:
-    """Return the help of a command, or of all where none is named."""
-    parser = build_parser(name)
-    if not name:
-        return parser.format_help()
-    if name not in COMMANDS:
-        raise ProblemError(f"there is no command {name!r}; {suggest_word(name, COMMANDS)}")
-    return _command_parser(parser, name).format_help()
-
-
 def command_options(name: str) -> dict[str, tuple[str, Any]]:
     """Return the longest spelling and the default of each option of a command, by its argument."""
-    actions = _command_parser(build_parser(name), name)._actions
+    commands = build_parser(name)._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    actions = cast(dict[str, argparse.ArgumentParser], commands)[name]._actions
     return {
         action.dest: (max(action.option_strings, key=len), action.default)
         for action in actions
@@ -103,6 +104,24 @@ def command_options(name: str) -> dict[str, tuple[str, Any]]:
     }
 
 
-def _command_parser(parser: argparse.ArgumentParser, name: str) -> argparse.ArgumentParser:
-    commands = parser._subparsers._group_actions[0].choices  # type: ignore[union-attr]
-    return cast(dict[str, argparse.ArgumentParser], commands)[name]
+def run_completion(arguments: Namespace) -> Report:
+    """Print the script of a shell, made from the arguments of all commands."""
+    import shtab  # neither is needed to build the parser of another command
+
+    from lbt_synth.cli.output import Report
+
+    parser = build_parser(*COMMANDS)
+    for action in _takes_files(parser):
+        action.complete = shtab.FILE  # type: ignore[attr-defined]
+    text = shtab.complete(parser, shell=arguments.shell)
+    return Report(data={"shell": arguments.shell, "script": text}, opening=text.splitlines())
+
+
+def _takes_files(parser: ArgumentParser) -> Iterator[Action]:
+    """Yield the arguments of all commands that may be the name of a file."""
+    for action in parser._actions:
+        if isinstance(action.choices, dict):
+            for command in action.choices.values():
+                yield from _takes_files(command)
+        elif action.choices is None and action.nargs != 0 and action.type in (None, str):
+            yield action

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from lbt_synth.cli.display import choose_design_unit
-from lbt_synth.cli.loop_inputs import load_designs
+from lbt_synth.cli.loop_inputs import choose_design_unit, load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
@@ -27,49 +27,36 @@ from lbt_synth.report.figures.loops import (
     sigma_curves,
 )
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import column, columns, fact, facts, json_record, json_units, table_row
+from lbt_synth.storage.rows import Column, Facts, columns, fact, facts, json_record, json_units
 from lbt_synth.validation import FloatArray
 
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
 
 
-@table_row
-class LoopPoint:
-    """The loop of a design, broken at one measurement, at one frequency."""
-
-    design: str = column("design", help="Name of the design, with its axes where they differ")
-    frequency_hz: float = column("frequency", unit="Hz", help="Frequency")
-    gain_db: float = column("loop gain", unit="dB", help="Gain")
-    phase_deg: float = column("phase", unit="deg", help="Phase without jumps, with the delay")
-    real: float = column("real part", help="Real part of the loop")
-    imaginary: float = column("imaginary part", help="Imaginary part of the loop")
-
-
-@table_row
-class SigmaPoint:
-    """Largest singular values of a design at one frequency; nan for what it does not have."""
-
-    design: str = column("design", help="Name of the design")
-    frequency_hz: float = column("frequency", unit="Hz", help="Frequency")
-    error: float = column("disturbances to error", help="Of the estimation error; nm of a loop")
-    rejection: float = column("phase to residual", help="Of the rejection")
-    noise_transfer: float = column("noise to residual", help="Of the noise transfer")
-
-
-@table_row
-class StepPoint:
-    """A loop at one frame after a step of one."""
-
-    design: str = column("design", help="Name of the design, with its axis where they differ")
-    time_s: float = column("time", unit="s", help="Time after the step")
-    residual: float = column("residual", help="Residual, as a part of the step")
-    command: float = column("command", help="Command, as a part of the step")
+_LOOP = (  # the loop of a design, broken at one measurement
+    ("frequency_hz", Column(heading="frequency", unit="Hz")),
+    ("gain_db", Column(heading="loop gain", unit="dB")),
+    ("phase_deg", Column(heading="phase", unit="deg")),  # without jumps, with the delay
+    ("real", Column(heading="real part")),
+    ("imaginary", Column(heading="imaginary part")),
+)
+_SIGMA = (  # largest singular values; nan for what a design does not have
+    ("frequency_hz", Column(heading="frequency", unit="Hz")),
+    ("error", Column(heading="disturbances to error")),  # nm of a loop
+    ("rejection", Column(heading="phase to residual")),
+    ("noise_transfer", Column(heading="noise to residual")),
+)
+_STEP = (  # after a step of the wavefront, as parts of it
+    ("time_s", Column(heading="time", unit="s")),
+    ("residual", Column(heading="residual")),
+    ("command", Column(heading="command")),
+)
 
 
 def run(arguments: Namespace) -> Report:
     """Print the margins of designs, and write their figure and their points."""
     view = arguments.kind
-    points, kind = _VIEWS.get(view, (_loop_points, LoopPoint))
+    points = _POINTS.get(view, _loop_points)
     require_outputs(arguments.output, inputs=arguments.gains)
     designs, gain = load_designs(arguments.gains), arguments.gain_factor
     choose_design_unit(arguments, *designs.values())
@@ -83,7 +70,7 @@ def run(arguments: Namespace) -> Report:
                 "there is nothing to draw; lbt-synth show prints the factors that are stable."
             )
         report.data["curves"] = _curves(drawn)
-        report.data["units"] |= json_units(kind)
+        report.data["units"] |= json_units(drawn[0])
         write_outputs(
             report,
             arguments.output,
@@ -95,7 +82,7 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def _curves(points: Sequence[Any]) -> dict[str, dict[str, list[float]]]:
+def _curves(points: Sequence[Facts]) -> dict[str, dict[str, list[float]]]:
     """Return lists of the numbers of each design; what it has none of is left out."""
     curves: dict[str, dict[str, list[float]]] = {}
     for point in points:
@@ -143,34 +130,35 @@ def _margins(design: Design, gain_factor: float) -> dict[str, Any]:
     return record
 
 
-def _points(kind: type[Any], design: str, *series: FloatArray) -> list[Any]:
-    """Return rows of a kind, of which the series are the numbers in the order of its fields."""
-    names = [each.name for each in columns(kind)][1:]
+def _points(kind: _Kind, design: str, *series: FloatArray) -> list[Facts]:
+    """Return rows of a kind, of which the series are the numbers in the order of its columns."""
+    columns = tuple(replace(how, name=name) for name, how in (("design", Column()), *kind))
+    names = [name for name, _ in kind]
     return [
-        kind(design=design, **dict(zip(names, map(float, numbers), strict=True)))
+        Facts(columns, {"design": design, **dict(zip(names, map(float, numbers), strict=True))})
         for numbers in zip(*series, strict=True)
     ]
 
 
-def _loop_points(designs: Mapping[str, Design], gain_factor: float) -> list[LoopPoint]:
+def _loop_points(designs: Mapping[str, Design], gain_factor: float) -> list[Facts]:
     """Return the points of the loops of designs."""
     return [
         point
         for name, _, _, broken in open_loops(closed_loops(designs, gain_factor))
         if broken is not None
         for *curves, response in [loop_points(broken)]
-        for point in _points(LoopPoint, name, *curves, response.real, response.imag)
+        for point in _points(_LOOP, name, *curves, response.real, response.imag)
     ]
 
 
-def _sigma_points(designs: Mapping[str, Design], gain_factor: float) -> list[SigmaPoint]:
+def _sigma_points(designs: Mapping[str, Design], gain_factor: float) -> list[Facts]:
     """Return the points of the curves of designs."""
     loops = closed_loops(designs, gain_factor, needed=False)
     return [
         point
         for name, (f, *parts) in sigma_curves(designs, loops).items()
         for point in _points(
-            SigmaPoint, name, f, *(np.full(f.size, np.nan) if p is None else p for p in parts)
+            _SIGMA, name, f, *(np.full(f.size, np.nan) if p is None else p for p in parts)
         )
     ]
 
@@ -201,17 +189,18 @@ def _add_step_facts(report: Report, designs: Mapping[str, Design], gain_factor: 
     report.add_rows("steps", "After a step of the wavefront", rows)
 
 
-def _step_points(designs: Mapping[str, Design], gain_factor: float) -> list[StepPoint]:
+def _step_points(designs: Mapping[str, Design], gain_factor: float) -> list[Facts]:
     """Return the points of the step responses."""
     return [
         point
         for name, step in _named_steps(designs, gain_factor)
-        for point in _points(StepPoint, name, step.time_s, step.residual, step.command)
+        for point in _points(_STEP, name, step.time_s, step.residual, step.command)
     ]
 
 
-_Points: TypeAlias = Callable[[Mapping[str, Design], float], Sequence[Any]]
-_VIEWS: Mapping[str, tuple[_Points, type[Any]]] = {  # the points of curves, but for broken loops
-    "sigma": (_sigma_points, SigmaPoint),
-    "step": (_step_points, StepPoint),
+_Kind: TypeAlias = Sequence[tuple[str, Column]]
+_Points: TypeAlias = Callable[[Mapping[str, Design], float], list[Facts]]
+_POINTS: Mapping[str, _Points] = {  # of the curves, but for those of broken loops
+    "sigma": _sigma_points,
+    "step": _step_points,
 }

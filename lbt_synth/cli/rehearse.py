@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
-from lbt_synth.cli.display import choose_config_unit, choose_unit
-from lbt_synth.cli.loop_inputs import load_design
+from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
 from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure
@@ -36,15 +36,10 @@ _ALWAYS = ("target", "file", "stroke", "wavelength_um", "output", "json", "unit"
 _FEWEST, _MOST = 256, 10_000_000  # of a record, and of a drawn disturbance
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Series:
-    """What the loops run on."""
-
-    source: str
-    disturbance: Disturbance
-    hardware: LoopHardware
-    imaging: Imaging
-    ran: tuple[FloatArray, FloatArray] | None = None  # residual and commands of the record
+# the source in words, what the loops run_rehearse on, and residual and commands of a record
+_Series: TypeAlias = tuple[
+    str, Disturbance, LoopHardware, Imaging, tuple[FloatArray, FloatArray] | None
+]
 
 
 def run(arguments: Namespace) -> Report:
@@ -57,14 +52,14 @@ def run(arguments: Namespace) -> Report:
     with show_spinner("rehearsing", quiet=arguments.json):
         recorded = arguments.file is not None
         series = (_recorded if recorded else _drawn)(arguments, design)
+        source, disturbance, hardware, imaging, ran = series
         found = rehearse(
             design,
             arguments.target,
-            series.disturbance,
-            hardware=series.hardware,
+            disturbance,
+            hardware=hardware,
             stroke=arguments.stroke,
         )
-    imaging = series.imaging
     loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
     rows = [
         _describe(
@@ -72,15 +67,15 @@ def run(arguments: Namespace) -> Report:
         )
         for name, one in loops.items()
     ]
-    if series.ran is not None:
-        residual, commands = (part[found.settle_frames :] for part in series.ran)
+    if ran is not None:
+        residual, commands = (part[found.settle_frames :] for part in ran)
 
         def ratio(camera: Imaging) -> FloatArray:
             return np.array([series_strehl(residual, camera)])
 
         rows.append(_describe("what ran", residual**2, commands, ratio, imaging, None))
     report = Report(data={"gain": arguments.gain, "target": arguments.target})
-    what = f"Rehearsal for {arguments.target} on {series.source}; {imaging.label}"
+    what = f"Rehearsal for {arguments.target} on {source}; {imaging.label}"
     report.add_rows("loops", what, rows)
     report.add_facts("The target beside the design", _difference_facts(found))
     report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
@@ -90,9 +85,7 @@ def run(arguments: Namespace) -> Report:
             "note: Strehl ratios are of tip and tilt alone; the record knows no other modes.",
         ]
     if design.hardware is not None:
-        report.notes += [
-            f"note: {text}" for text in loop_differences(design.hardware, series.hardware)
-        ]
+        report.notes += [f"note: {text}" for text in loop_differences(design.hardware, hardware)]
     if arguments.output is not None:
         figure = simulation_figure(found.target, title=f"{design.method} in {arguments.target}")
         report.note_written(save_figure(figure, arguments.output))
@@ -162,14 +155,13 @@ def _recorded(arguments: Namespace, design: Design) -> _Series:
     ran = None
     if commands is not None:
         ran = (record.measurements[start:stop] / gains, commands[start:stop])
-    return _Series(
-        source=f"{stop - start} frames of {Path(arguments.file).name}",
-        disturbance=Disturbance(
-            phase_nm=record.pseudo_open_loop(gains)[start:stop], frame_means=True
-        ),
-        hardware=replace(record.hardware, sensor_matrix=np.diag(gains)),
-        imaging=record_imaging(arguments, record),
-        ran=ran,
+    phase_nm = record.pseudo_open_loop(gains)[start:stop]
+    return (
+        f"{stop - start} frames of {Path(arguments.file).name}",
+        Disturbance(phase_nm=phase_nm, frame_means=True),
+        replace(record.hardware, sensor_matrix=np.diag(gains)),
+        record_imaging(arguments, record),
+        ran,
     )
 
 
@@ -192,7 +184,7 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
             "the gain file holds no configuration to draw a disturbance from. Give --record."
         )
     config = config_from_text(design.configuration, Path(arguments.gain))
-    choose_config_unit(arguments, config)
+    load_shown(arguments, config)
     imaging = config.imaging
     if arguments.wavelength_um is not None:
         imaging = replace(imaging, wavelength_um=arguments.wavelength_um)
@@ -200,9 +192,5 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     seed = integer(arguments.seed, "--seed", at_least=0)
     if arguments.frames is not None:
         frames = integer(arguments.frames, "--frames", at_least=1, at_most=_MOST)
-    return _Series(
-        source=f"{frames} frames of its own truth",
-        disturbance=draw_disturbance(config.truth, alone, frames=frames, seed=seed),
-        hardware=config.hardware,
-        imaging=imaging,
-    )
+    drawn = draw_disturbance(config.truth, alone, frames=frames, seed=seed)
+    return f"{frames} frames of its own truth", drawn, config.hardware, imaging, None

@@ -6,8 +6,7 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lbt_synth.cli.display import load_shown
-from lbt_synth.cli.loop_inputs import load_designs, named_difference_notes
+from lbt_synth.cli.loop_inputs import load_designs, load_shown, named_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
 
 from lbt_synth import studies
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.display import load_shown
-from lbt_synth.cli.loop_inputs import load_designs, own_sensor_notes, truth_at_sensor_gain
+from lbt_synth.cli.loop_inputs import (
+    load_designs,
+    load_shown,
+    own_sensor_notes,
+    truth_at_sensor_gain,
+)
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.parser import command_options
@@ -24,7 +28,7 @@ from lbt_synth.loop import Imaging, stable_sensor_gains
 from lbt_synth.report.designs.report import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, percent_column, row_table, table_row
+from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.studies import RobustnessMap, guaranteed_residual, robustness_map
 from lbt_synth.studies.robustness import default_methods
 from lbt_synth.studies.worst_residual import GuaranteedResidual, has_guarantee
@@ -170,43 +174,50 @@ def _stable_gains(
     return intervals
 
 
-@table_row
-class MapLine:
-    """One sensor gain and delay error of a map, at the centre and at its worst frequency error."""
-
-    sensor_gain: float = column("sensor gain", format=".3f")
-    delay_error_frames: float = column("delay error", unit="frames", format="+g")
-    stable: bool = column("stable")
-    centre: float = percent_column("Strehl at 0 Hz")
-    worst: float = percent_column("worst Strehl")
-    worst_hz: float = column("at", unit="Hz", format="+.2f")
-
-
 def _map_title(name: str, found: RobustnessMap, imaging: Imaging) -> str:
     low, high = np.min(found.errors_hz), np.max(found.errors_hz)
     return f"{name}: {imaging.label}, over frequency errors of {low:+g} to {high:+g} Hz"
 
 
-def _map_lines(found: RobustnessMap) -> list[MapLine]:
-    gains = found.sensor_gains
+def _map_points(name: str, found: RobustnessMap) -> list[Facts]:
+    """Return a row for each point of the map of a gain file."""
+    return [
+        facts(
+            file=fact(name),
+            delay_error_frames=fact(float(found.delay_errors_frames[i])),
+            sensor_gain=fact(float(found.sensor_gains[j])),
+            error_hz=fact(float(found.errors_hz[k])),
+            strehl=fact(float(strehl)),
+            residual_nm=fact(float(found.residual_nm[i, j, k])),
+            stable=fact(bool(found.stable[i, j])),
+        )
+        for (i, j, k), strehl in np.ndenumerate(found.strehl)
+    ]
+
+
+def _map_lines(found: RobustnessMap) -> list[Facts]:
+    """Return a row for some sensor gains at each delay error, with its worst frequency error."""
+    gains, lines = found.sensor_gains, []
     shown = np.arange(gains.size)
     if gains.size > _LISTED_GAINS:  # some from end to end, and the one that is nearest to 1
         some = np.linspace(0, gains.size - 1, _LISTED_GAINS - 1).round().astype(int)
         shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
-    centre = np.append(np.nonzero(found.errors_hz == 0)[0], -1)[0]
-    lines = []
+    centre = np.flatnonzero(found.errors_hz == 0)
+    percent = {"unit": "%", "scale": 100, "format": ".2f"}
     for i, delay in enumerate(found.delay_errors_frames):
         for j in shown:
             stable, strehls = bool(found.stable[i, j]), found.strehl[i, j]
             worst = int(np.argmin(strehls)) if stable else 0
+            worst_hz = found.errors_hz[worst] if stable else np.nan
+            at_centre = strehls[centre[0]] if centre.size else np.nan
             lines.append(
-                MapLine(
-                    sensor_gain=gains[j],
-                    delay_error_frames=delay,
-                    stable=stable,
-                    centre=strehls[centre] if centre >= 0 else np.nan,
-                    worst=strehls[worst],
-                    worst_hz=found.errors_hz[worst] if stable else np.nan,
+                facts(
+                    sensor_gain=fact(gains[j], "sensor gain", format=".3f"),
+                    delay_error=fact(delay, "delay error", unit="frames", format="+g"),
+                    stable=fact(stable, "stable"),
+                    centre=fact(at_centre, "Strehl at 0 Hz", **percent),
+                    worst=fact(strehls[worst], "worst Strehl", **percent),
+                    worst_hz=fact(worst_hz, "at", unit="Hz", format="+.2f"),
                 )
             )
     return lines
@@ -259,8 +270,7 @@ def _map_notes(
         late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
         ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
         notes.append(f"{name}: stable sensor gains{late}: {ends}")
-    own = design.hardware
-    assert own is not None  # _assumed_gain has refused the others
+    own = require_hardware(design, "a map")
     if own.delay_frames != config.hardware.delay_frames:
         notes.append(
             f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
@@ -272,29 +282,3 @@ def _map_notes(
             "is that of its own."
         )
     return notes
-
-
-@table_row
-class MapPoint:
-    """One point of the map of a gain file."""
-
-    file: str = column()
-    delay_error_frames: float = column()
-    sensor_gain: float = column()
-    error_hz: float = column()
-    strehl: float = column()
-    residual_nm: float = column()
-    stable: bool = column()
-
-
-def _map_points(name: str, found: RobustnessMap) -> Iterator[MapPoint]:
-    for (i, j, k), strehl in np.ndenumerate(found.strehl):
-        yield MapPoint(
-            file=name,
-            delay_error_frames=float(found.delay_errors_frames[i]),
-            sensor_gain=float(found.sensor_gains[j]),
-            error_hz=float(found.errors_hz[k]),
-            strehl=float(strehl),
-            residual_nm=float(found.residual_nm[i, j, k]),
-            stable=bool(found.stable[i, j]),
-        )

@@ -6,10 +6,9 @@ from argparse import Namespace
 from pathlib import Path
 
 from lbt_synth.cli.design import add_moving_gain, describe_design
-from lbt_synth.cli.display import choose_design_unit
+from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
-from lbt_synth.cli.truth_table import add_truth
 from lbt_synth.config.load import config_from_text
 from lbt_synth.files.gain_file.store import load_with_digest, read_design
 from lbt_synth.interop import frame_cost

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import re
 from argparse import Namespace
-from typing import Any
 
 import numpy as np
 
 from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.display import load_shown
-from lbt_synth.cli.loop_inputs import loop_difference_notes, truth_at_sensor_gain
+from lbt_synth.cli.loop_inputs import load_shown, loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
@@ -28,7 +26,6 @@ from lbt_synth.loop import (
     least_residual,
     residual_budget,
     simulate,
-    stable_sensor_gains,
     strehl,
 )
 from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_nan
@@ -144,7 +141,11 @@ def run(arguments: Namespace) -> Report:
         )
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
     loop = close_loop(config.hardware, design.controller, sensor_gain=truth.sensor_gain)
-    _require_stable(loop, design, config.sensor_gain)
+    try:
+        loop.require_stable()
+    except UnstableLoopError as error:
+        why = " ".join([str(error), *loop_difference_notes(config, design)])
+        raise UnstableLoopError(why, spectral_radius=loop.spectral_radius) from error
     settings = config.settings.simulation
     sizes = {"frames": settings.frames, "cases": settings.cases, "seed": settings.seed}
     # the same settling for all controllers, so that one seed is one weather
@@ -241,38 +242,6 @@ def _exact_answers(loop: ClosedLoop, config: Config, truth: Truth) -> Facts:
     return Facts(_EXACT, exact)
 
 
-def _require_stable(loop: ClosedLoop, design: Design, reference_gain: float) -> None:
-    """Refuse an unstable loop, and say what makes it so: mirror, sensor gain or delay."""
-    if loop.is_stable:
-        return
-    own, here = design.hardware, loop.hardware
-    low, high = stable_sensor_gains(here, design.controller)
-    if own is not None and own.mirror != here.mirror:
-        reason = (
-            "The file was designed for another mirror than that of the configuration. Design for "
-            "mirror.local_loop of the configuration, best with --method lqg."
-        )
-    elif not np.isnan(low):
-        reason = (
-            f"With this delay the design is stable at sensor gains from {low * reference_gain:.4g} "
-            f"to {high * reference_gain:.4g}; design for this gain, or for a range of them with "
-            "--method robust."
-        )
-    elif own is not None and own.delay_frames != here.delay_frames:
-        reason = (
-            f"The file was designed for a delay of {own.delay_frames:g} frames. Set "
-            f"loop.delay_frames to {own.delay_frames:g}, or design for {here.delay_frames:g}."
-        )
-    else:
-        reason = "Design for this configuration."
-    raise UnstableLoopError(
-        f"the closed loop must be stable; got an unstable one (spectral radius "
-        f"{loop.spectral_radius:.6g}) at a sensor gain of {loop.sensor_gain * reference_gain:.6g} "
-        f"and a delay of {here.delay_frames:g} frames. {reason}",
-        spectral_radius=loop.spectral_radius,
-    )
-
-
 def _simulation_notes(
     config: Config, design: Design, strehls: FloatArray, settle: int, *, drifts: bool
 ) -> list[str]:
@@ -301,17 +270,5 @@ def _first_case(
         design=design,
         controller_digest=file_sha256(gain_file, GainFileError),
         imaging=config.imaging,
-        metadata={
-            "case": 0,
-            "cases": len(simulation.commands),
-            **_one_or_each("noise_nm", truth.noise_nm),
-            **_one_or_each("model_sensor_gain", config.settings.model.sensor_gain),
-        },
+        metadata={"case": 0, "cases": len(simulation.commands)},
     )
-
-
-def _one_or_each(name: str, value: Any) -> dict[str, float]:
-    """Return a number under its name, or a list as ``name_1``, ``name_2``, ..."""
-    if np.ndim(value) == 0:
-        return {name: float(value)}
-    return {f"{name}_{i}": float(each) for i, each in enumerate(value, start=1)}

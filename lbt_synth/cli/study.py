@@ -8,8 +8,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from lbt_synth import studies
-from lbt_synth.cli.display import choose_config_unit
 from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.loop_inputs import load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import study_page, write_page
@@ -37,7 +37,7 @@ def run(arguments: Namespace) -> Report:
         require_weasyprint()
     with show_spinner("reading the study, designing", quiet=arguments.json):
         loaded = studies.load_study(arguments.study, directory=folder)
-    choose_config_unit(arguments, loaded.config)
+    load_shown(arguments, loaded.config)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:
         return _dry_run(loaded, arguments)
@@ -100,9 +100,7 @@ def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> Study
     with choose_engine(arguments) as (executor, workers):
         make_directory(folder)
         with (
-            count_progress(
-                total=loaded.samples, what="samples", quiet=arguments.json, rate=True
-            ) as count,
+            count_progress(total=loaded.samples, what="samples", quiet=arguments.json) as count,
             keep_finished(folder),
         ):
             return studies.run_study(

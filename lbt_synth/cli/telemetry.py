@@ -7,13 +7,13 @@ from dataclasses import asdict
 
 import numpy as np
 
-from lbt_synth.cli.display import choose_unit
+from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
-from lbt_synth.files.telemetry.fields import LAYERS
 from lbt_synth.files.telemetry.store import require_telemetry_name
+from lbt_synth.files.telemetry.telemetry import LAYERS
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import Facts, fact, fact_table, facts, json_record, json_units

@@ -81,7 +81,7 @@ class Config(Summarised):
 
     def _summarise(self) -> Summary:
         plant, truth = self.plant._summarise(), self.truth._summarise()
-        return Summary(tables=[*plant.tables, *truth.tables], curve=plant.curve)
+        return Summary(tables=[*plant.tables, *truth.tables])
 
     @property
     def hardware(self) -> LoopHardware:

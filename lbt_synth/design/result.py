@@ -13,9 +13,8 @@ from lbt_synth.design.certificate import Certificate, stability_check
 from lbt_synth.design.claims import Claim, Evidence
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, model_budget
-from lbt_synth.loop.closed_loop import REJECTION, reads_others
+from lbt_synth.loop.closed_loop import reads_others
 from lbt_synth.loop.least_residuals.residual_limit import (
     above_percent,
     least_model_residual,
@@ -296,7 +295,6 @@ class Design(Summarised, ABC):
         return Summary(
             tables=[fact_table("Design", facts, *margins, passed, only=_BRIEFLY)],
             notes=notes,
-            curve=sigma_sparkline(loop.rejection().lifted(), REJECTION),
         )
 
     @property

@@ -1,17 +1,28 @@
-"""Checks of a gain or telemetry file that is read: its layout version and digest."""
+"""A kind of file, of gains or telemetry: written with a digest, and checked when it is read."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lbt_synth.errors import FileError, LbtSynthError
-from lbt_synth.storage.array_file import digest, error_reason
+from lbt_synth.storage.array_file import (
+    Cards,
+    digest,
+    error_reason,
+    fits_bytes,
+    npz_bytes,
+    read_fits,
+    read_npz,
+)
+from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import FloatArray
+
+READERS = {".fits": read_fits, ".npz": read_npz}
 
 
 def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -33,15 +44,27 @@ class FileKind:
     version_error: type[FileError]
     again: str  # how such a file is made: a sentence
 
-    def decode(
+    def write(
         self,
-        content: bytes,
-        read: Callable[[bytes], tuple[dict[str, FloatArray], str]],
-        source: Path,
-    ) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+        target: Path,
+        arrays: Mapping[str, Any],
+        meta: dict[str, Any],
+        cards: Callable[[dict[str, Any]], Cards],
+        headers: Mapping[str, Cards] | None = None,
+    ) -> Path:
+        """Write arrays and metadata, with their digest, as FITS or NPZ by the ending."""
+        meta["digest"] = digest(arrays, meta)
+        text = json.dumps(meta, allow_nan=False)
+        if target.suffix.lower() == ".fits":
+            content = fits_bytes(cards(meta), arrays, text, headers=headers)
+        else:
+            content = npz_bytes(arrays, text)
+        return write_atomically(target, content)
+
+    def decode(self, content: bytes, source: Path) -> tuple[dict[str, FloatArray], dict[str, Any]]:
         """Return the arrays and the metadata, of a layout that is known and with their digest."""
         try:
-            arrays, text = read(content)
+            arrays, text = READERS[source.suffix.lower()](content)
             meta = json.loads(text, object_pairs_hook=_unique_names)
             found = digest(arrays, meta) if isinstance(meta, dict) else ""
         except Exception as error:  # foreign bytes: the decoders raise whatever they like

@@ -1,24 +1,23 @@
 """The one export: a design in the form that another program loads, proved in its arithmetic.
 
 A target says how it rounds the numbers of a design, writes them, and reads them back. Everything
-else stands here: what is refused, the rehearsal beside the controller, the proof of what was read
-from the file, its certificate. A folder of this room whose ``export`` module has a ``TARGET`` is a
-target; nothing else lists them.
+else stands here: what is refused, the rehearsal beside the controller, the proof of the numbers,
+which must be those that are read from the file, its certificate. A folder of this room whose
+``export`` module has a ``TARGET`` is a target; nothing else lists them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import pickle
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,9 +34,6 @@ from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import column, json_record, table_row
 from lbt_synth.validation import FloatArray, choice
-
-if TYPE_CHECKING:
-    from lbt_synth.interop.c.terms import FrameCost
 
 CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
 FRAMES = 2000
@@ -66,11 +62,6 @@ def _join_one(numbers: Sequence[Any], parts: Sequence[ModeDesign], count: int) -
     return numbers[0]
 
 
-def _split_one(whole: Any, parts: Sequence[ModeDesign], numbers: Sequence[Any]) -> list[list[Any]]:
-    """Return the numbers of a file that holds one design."""
-    return [[whole]]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
     """A program that runs our controllers.
@@ -96,13 +87,8 @@ class Target:
     start : callable
         ``start(numbers, limit)`` returns a twin of the program, stepped in its arithmetic. One that
         knows the limit of a command clips its commands itself.
-    single : callable, optional
-        The same numbers in single precision, which the target has or may have.
-    join, split : callable
-        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes, and
-        ``split(whole, parts, numbers)`` those of each copy of each design.
-    cost : callable, optional
-        ``cost(whole)`` counts the arithmetic of a frame.
+    join : callable
+        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes.
     facts : callable
         ``facts(whole, **options)`` returns what else the certificate names.
     remark : callable
@@ -127,10 +113,7 @@ class Target:
     computed: Callable[[Design, Any], Written]
     start: Callable[[Any, float], SteppedController]
     options: Mapping[str, Any] = field(default_factory=dict)
-    single: Callable[[Any], Any] | None = None
     join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = _join_one
-    split: Callable[[Any, Sequence[ModeDesign], Sequence[Any]], list[list[Any]]] = _split_one
-    cost: Callable[[Any], FrameCost] | None = None
     facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
     remark: Callable[[Design, Any], str] = lambda *_: ""
     hint: str
@@ -207,25 +190,18 @@ class Exported:
         Largest difference of the commands from those of the controller, over the largest command,
         in the arithmetic of the file: in the closed loop where the design is of one, on white noise
         elsewhere.
-    error_single : float or None
-        The same in single precision, inf where the loop is then unstable; None where the target
-        has no such arithmetic.
     start : callable
         ``start(limit)`` returns what was written, stepped in the arithmetic of the target.
     checks : tuple of Check
         The proof in the loop, with the numbers of the file.
-    cost : FrameCost or None
-        Arithmetic of a frame, if the target counts it.
     notes : tuple of str
         What a user should know of the export.
     """
 
     files: tuple[Path, ...]
     error: float
-    error_single: float | None
     start: Callable[[float], SteppedController]
     checks: tuple[Check, ...]
-    cost: FrameCost | None
     notes: tuple[str, ...]
 
 
@@ -341,7 +317,8 @@ def export(
         origin.append(("precision", f"single: commands within {error:.1e} of the largest one"))
     files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
     again = own.read(files, whole)
-    checks = _proved(own, parts, numbers, again, error)
+    _require_same(again, whole)
+    checks = _proved(own, pairs, error)
     require_proved(checks, f"the arithmetic of {target} ({precision} precision)", own.hint)
     _require_finite(error, precision, own.hint)
     notes = [own.remark(part.design, held) for part, held in pairs]
@@ -359,10 +336,8 @@ def export(
     return Exported(
         files=write_together(dict((*files.items(), *certificate.items()))),
         error=error,
-        error_single=_error_in_single(own, pairs, error),
         start=lambda limit: own.start(again, limit),
         checks=checks,
-        cost=own.cost(again) if own.cost else None,
         notes=tuple(notes),
     )
 
@@ -378,46 +353,45 @@ def _require_finite(error: float, precision: str, hint: str) -> None:
         )
 
 
-def _error_in_single(
-    own: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
-) -> float | None:
-    """Return the largest error in single precision, inf where a number does not fit."""
-    if own.single is None:
-        return None
-    try:
-        singles = [own.single(held) for _, held in pairs]
-    except ProblemError:
-        return float("inf")
-    if all(single is held for single, (_, held) in zip(singles, pairs, strict=True)):
-        return error
-    return max(
-        rehearsal_error(part.design, own.start(single, np.inf))
-        for single, (part, _) in zip(singles, pairs, strict=True)
-    )
+def _require_same(read: Any, written: Any) -> None:
+    """Refuse a file that holds other numbers than those that are proved."""
+    if not _is_same(read, written):
+        raise NumericalError(
+            "the file must hold the numbers that are proved; what is read from it is another.",
+            status="arithmetic",
+        )
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Return whether the numbers of a target are the same, in whatever holds them."""
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(_is_same, one, other))
+    if isinstance(one, Mapping):
+        return one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)
+    if is_dataclass(one):
+        names = (each.name for each in fields(one))
+        return all(_is_same(getattr(one, name), getattr(other, name)) for name in names)
+    return bool(one == other)
 
 
 def _proved(
-    own: Target, parts: Sequence[ModeDesign], numbers: Sequence[Any], whole: Any, error: float
+    own: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
 ) -> tuple[Check, ...]:
-    """Check the loop of each design with the numbers of a file; equal copies once."""
+    """Check the loop of each design with its numbers in the file."""
     checks: list[Check] = []
-    controlled = sum(len(part.modes) for part in parts)
-    for part, copies in zip(parts, own.split(whole, parts, numbers), strict=True):
-        seen: set[bytes] = set()
-        for held in copies:
-            key = pickle.dumps(held)
-            if key in seen:
-                continue
-            seen.add(key)
-            proof = list(prove_written(part.design, own.computed(part.design, held)))
-            if part.design.other_sensors:
-                how = "a run in which each sensor is missing for a while"
-                name = "commands in a rehearsal, difference"
-                proof.append(Check(name, error, _LARGEST_ERROR, how))
-            if len(part.modes) < controlled:
-                modes = name_modes(np.array(part.modes))
-                proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
-            checks += proof
+    controlled = sum(len(part.modes) for part, _ in pairs)
+    for part, numbers in pairs:
+        proof = list(prove_written(part.design, own.computed(part.design, numbers)))
+        if part.design.other_sensors:
+            how = "a run in which each sensor is missing for a while"
+            name = "commands in a rehearsal, difference"
+            proof.append(Check(name, error, _LARGEST_ERROR, how))
+        if len(part.modes) < controlled:
+            modes = name_modes(np.array(part.modes))
+            proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
+        checks += proof
     return tuple(checks)
 
 

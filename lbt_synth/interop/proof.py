@@ -6,7 +6,7 @@ noise that enters with the command; its variance bounds that of the target's ord
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from lbt_synth.design import Check, Design
 from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import SingleModeLoop
 from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.specification import Demand
+from lbt_synth.design.shaping.specification import Demand, Specification
 from lbt_synth.design.shaping.uncertainty import (
     LoopErrors,
     MirrorUncertainty,
@@ -168,11 +168,16 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
 def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
     """Return the sensor gains that are demanded, or 1 % less than the design holds."""
     if specifications := design.mode_specifications:
-        demands = [demand for spec in specifications for demand in spec.demands]
-        ranges = [d for d in demands if isinstance(d, LoopErrors | MovingSensorGain)]
-        return min([1.0, *(r.low for r in ranges)]), max([1.0, *(r.high for r in ranges)])
+        return demanded_gains(specifications)
     low, high = stable_sensor_gains(hardware, design.controller)
     return min(max(low * _STEP, 1 / _WIDEST), 1.0), max(min(high / _STEP, _WIDEST), 1.0)
+
+
+def demanded_gains(specifications: Iterable[Specification]) -> tuple[float, float]:
+    """Return the least and the largest sensor gain that demands name, 1 among them."""
+    demands = [demand for spec in specifications for demand in spec.demands]
+    ranges = [d for d in demands if isinstance(d, LoopErrors | MovingSensorGain)]
+    return min([1.0, *(r.low for r in ranges)]), max([1.0, *(r.high for r in ranges)])
 
 
 def scenario_gains(design: Design) -> tuple[float, ...]:

@@ -128,12 +128,6 @@ class EstimationProblem(LinearSystem):
                     "noise of its own: add a column to D."
                 )
 
-    def _shown_system(self) -> tuple[StateSpace, str]:
-        """Return the system from w to the estimated signal."""
-        D = np.zeros((len(self.L), self.B.shape[-1]))
-        system = StateSpace(A=self.A, B=self.B, C=self.L, D=D, dt_s=self.dt_s)
-        return system, "largest singular value from w to z"
-
     @property
     def n_measurements(self) -> int:
         """Number of measurements q, read or not."""

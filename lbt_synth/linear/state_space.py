@@ -31,7 +31,7 @@ from lbt_synth.linear.matrix_functions import (
 )
 from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.storage.rows import column, fact_table, table_row
-from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -142,14 +142,7 @@ class LinearSystem(Summarised):
             frame_rate_hz=None if self.dt_s == 1 else 1 / self.dt_s,
             spectral_radius=float(np.max(np.abs(np.linalg.eigvals(self.monodromy)), initial=0.0)),
         )
-        system, caption = self._shown_system()
-        curve = sigma_sparkline(system.lifted(), caption)
-        return Summary(tables=[fact_table("System", facts)], curve=curve)
-
-    def _shown_system(self) -> tuple[StateSpace, str]:
-        """Return the system of the sparkline, and what its largest singular value is."""
-        system = StateSpace(A=self.A, B=self.B, C=self.C, D=self.D, dt_s=self.dt_s)
-        return system, "largest singular value"
+        return Summary(tables=[fact_table("System", facts)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -413,14 +406,6 @@ def split_into_parts(system: StateSpace) -> list[tuple[IntArray, IntArray, State
     return parts
 
 
-def sigma_sparkline(system: StateSpace, caption: str) -> Sparkline:
-    """Return the largest singular value of a system over three decades below Nyquist."""
-    frequency_hz = np.geomspace(1e-3, 0.999, 400) / (2 * system.dt_s)
-    response = system.frequency_response(frequency_hz)
-    values = np.asarray(np.linalg.norm(response, 2, axis=(1, 2)))
-    return Sparkline(caption=caption, frequency_hz=frequency_hz, values=values)
-
-
 def balancing_scales(A: FloatArray, entry: FloatArray, leaving: FloatArray) -> FloatArray:
     """Powers of two that balance ``[[|A|, entry], [leaving', 0]]``, (n + 1,)."""
     border = np.block([[np.abs(A), entry[:, None]], [leaving[None, :], np.zeros((1, 1))]])
@@ -584,10 +569,6 @@ class Controller(LinearSystem):
         return StateSpace(
             A=self.A, B=self.B, C=self.C @ self.A, D=self.C @ self.B + self.D, dt_s=self.dt_s
         )
-
-    def _shown_system(self) -> tuple[StateSpace, str]:
-        """Return its textbook form."""
-        return self.to_statespace(), "largest singular value"
 
     def start(
         self, fallbacks: Mapping[frozenset[str], Controller] | None = None

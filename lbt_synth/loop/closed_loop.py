@@ -14,7 +14,6 @@ from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.linear.matrix_functions import component_labels
-from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
 from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
@@ -27,7 +26,6 @@ AffinePart: TypeAlias = tuple[FloatArray, FloatArray]  # A0 and A1 of ``A0[t] + 
 
 # A loop whose slowest pole is closer to the unit circle than this is called marginal.
 STABILITY_MARGIN = 1e-9
-REJECTION = "largest singular value of the rejection"
 
 
 @table_row
@@ -71,10 +69,7 @@ class ClosedLoop(Summarised):
 
     def _summarise(self) -> Summary:
         facts = self.hardware.facts(), fill_row(ClosedLoopFacts, self)
-        return Summary(
-            tables=[fact_table("Loop", *facts)],
-            curve=sigma_sparkline(self.rejection().lifted(), REJECTION),
-        )
+        return Summary(tables=[fact_table("Loop", *facts)])
 
     @property
     def reads_others(self) -> bool:

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.spectra import Spectrum, spectrum_key
 from lbt_synth.models.vibration import DriftingVibration, TrueVibration, stationary_vibrations
 from lbt_synth.storage.rows import fact_table
-from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
@@ -24,8 +23,6 @@ from lbt_synth.validation import (
     number,
     one_or_each,
 )
-
-_SHOWN_FROM_HZ, _SHOWN_TO_HZ = 0.1, 300.0  # of a sparkline
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,11 +120,7 @@ class Truth(Summarised):
         parts = self.turbulence if isinstance(self.turbulence, tuple) else (self.turbulence,)
         noise = np.asarray(self.noise_nm)
         facts = disturbance_facts(parts, self.vibrations, noise, self.sensor_gain)
-        shown = next((part for part in parts if part is not None), None)
-        return Summary(
-            tables=[fact_table("Truth", facts)],
-            curve=None if shown is None else _spectrum_sparkline(shown),
-        )
+        return Summary(tables=[fact_table("Truth", facts)])
 
     def _checked_errors(self) -> tuple[float, ...] | None:
         """Return the frequency errors, of which each vibration must have one."""
@@ -224,12 +217,3 @@ class Truth(Summarised):
         """
         noise = one_or_each(self.noise_nm, "noise_nm", measurements)
         return frozen_copy(np.broadcast_to(noise, (measurements,)))
-
-
-def _spectrum_sparkline(spectrum: Spectrum) -> Sparkline:
-    """Return the density of the turbulence from 0.1 Hz to 300 Hz or the Nyquist frequency."""
-    rate_hz = spectrum.frame_rate_hz if isinstance(spectrum, ARModel) else _SHOWN_TO_HZ * 2
-    frequency_hz = np.geomspace(_SHOWN_FROM_HZ, min(_SHOWN_TO_HZ, rate_hz / 2), 200)
-    values = spectrum.psd(frequency_hz)
-    caption = "turbulence [nm^2/Hz]"
-    return Sparkline(caption=caption, frequency_hz=frequency_hz, values=values)

@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 
 LENGTHS = {"nm": 1.0, "um": 1000.0}  # of wavefront, in nm
 UNITS = (*LENGTHS, "mas", "urad")
@@ -19,39 +18,32 @@ _NM = re.compile(r"\Anm(?=\Z|[ ²^/])")
 M_S2 = {"m/s2": 1.0, "mm/s2": 1e-3, "um/s2": 1e-6, "g": 9.80665, "mg": 9.80665e-3}  # accelerations
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DisplayUnit:
-    """A unit of wavefront or angle."""
-
-    name: str = "nm"
-    nm: float = 1.0  # of wavefront, rms over the pupil, in one unit
-
-
-_SHOWN: ContextVar[DisplayUnit] = ContextVar("shown", default=DisplayUnit())  # noqa: B039
+# name of the unit, and nm of wavefront, rms over the pupil, in one unit
+_SHOWN: ContextVar[tuple[str, float]] = ContextVar("shown", default=("nm", 1.0))
 
 
 @contextmanager
 def own_display_unit() -> Iterator[None]:
     """Let what is inside choose a unit, and forget it afterwards."""
-    token = _SHOWN.set(DisplayUnit())
+    token = _SHOWN.set(("nm", 1.0))
     try:
         yield
     finally:
         _SHOWN.reset(token)
 
 
-def show_in(unit: DisplayUnit) -> None:
-    """Choose the unit of what is printed and drawn from now on."""
-    _SHOWN.set(unit)
+def show_in(name: str, nm: float) -> None:
+    """Choose the unit of what is printed and drawn from now on, of so many nm of wavefront."""
+    _SHOWN.set((name, nm))
 
 
 def shown_unit(unit: str) -> tuple[str, float]:
     """Return what is shown for a unit such as "nm rms" or "nm²/Hz", and the factor to it."""
-    shown = _SHOWN.get()
-    if shown.nm == 1 or not _NM.match(unit):
+    name, nm = _SHOWN.get()
+    if nm == 1 or not _NM.match(unit):
         return unit, 1.0
     power = 2 if unit[2:3] in ("²", "^") else 1
-    return _NM.sub(shown.name, unit), shown.nm**-power
+    return _NM.sub(name, unit), nm**-power
 
 
 def shown_format(spec: str, factor: float) -> str:

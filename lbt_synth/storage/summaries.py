@@ -1,4 +1,4 @@
-"""What an object says of itself: a line in a debugger, some when printed, a table in a notebook."""
+"""What an object says of itself: a line in a debugger, some when it is printed."""
 
 from __future__ import annotations
 
@@ -9,21 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.storage.tables import Table
-from lbt_synth.validation import FloatArray
+from lbt_synth.storage.tables import Table, aligned
 
-_WIDTH, _HEIGHT, _EDGE = 240, 64, 3  # of a sparkline [px]
-_DECADES = 5.0  # below its peak that a sparkline shows
 _LONGEST = 100  # characters of a line in a debugger
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sparkline:
-    """A small curve on logarithmic axes."""
-
-    caption: str
-    frequency_hz: FloatArray  # (f,), above 0
-    values: FloatArray  # (f,), at least 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,13 +20,12 @@ class Summary:
 
     tables: Sequence[Table] = ()
     notes: Sequence[str] = ()
-    curve: Sparkline | None = None
 
 
 class Summarised:
     """An object whose ``repr`` is one line, and which shows its facts when it is printed.
 
-    Notebooks show the same as a table, with a sparkline where there is a curve.
+    Notebooks show the same.
     """
 
     __slots__ = ()
@@ -75,13 +62,8 @@ class Summarised:
         return "\n".join([*lines, *(f"  {note}" for note in found.notes)])
 
     def _repr_html_(self) -> str:
-        """Return the summary as HTML, for notebooks."""
-        found = self._summarise()
-        parts = [f"<p><b>{type(self).__name__}</b>: {escape(self._brief())}</p>"]
-        parts += [] if found.curve is None else [_draw_sparkline(found.curve)]
-        parts += [_html_table(table, titled=len(found.tables) > 1) for table in found.tables]
-        parts += [f"<p>{escape(note)}</p>" for note in found.notes]
-        return f"<div>{''.join(parts)}</div>"
+        """Return the summary for notebooks, which would show one line."""
+        return f"<pre>{escape(self.summary())}</pre>"
 
 
 def _short_text(value: Any) -> str:
@@ -97,54 +79,7 @@ def _text_lines(table: Table, *, titled: bool) -> list[str]:
     """Return a table as aligned lines: the rows alone, or with the caption and headings."""
     rows = [tuple(cell.text for cell in row) for row in table.cells()]
     caption = [f"  {table.caption}"] if titled else []
-    shown = [table.headings, *rows] if _has_headings(table) else rows
+    is_fact = table.headings == ("quantity", "value", "unit")  # which says no more
+    shown = rows if is_fact else [table.headings, *rows]
     widths = [max(map(len, cells)) for cells in zip(*shown, strict=True)]
-    left = (0, *table.words)
-    cells = (
-        [
-            cell.ljust(width) if i in left else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        for row in shown
-    )
-    return caption + [f"  {'  '.join(row)}".rstrip() for row in cells]
-
-
-def _has_headings(table: Table) -> bool:
-    """Return whether the headings say more than that a line is a fact."""
-    return table.headings != ("quantity", "value", "unit")
-
-
-def _html_table(table: Table, *, titled: bool) -> str:
-    caption = f"<caption>{escape(table.caption)}</caption>" if titled else ""
-    head = "".join(f'<th scope="col">{escape(text)}</th>' for text in table.headings)
-    head = f"<thead><tr>{head}</tr></thead>" if _has_headings(table) else ""
-    body = "".join(
-        f'<tr><th scope="row">{escape(first.text)}</th>'
-        f"{''.join(f'<td>{escape(cell.text)}</td>' for cell in rest)}</tr>"
-        for first, *rest in table.cells()
-    )
-    return f"<table>{caption}{head}<tbody>{body}</tbody></table>"
-
-
-def _draw_sparkline(curve: Sparkline) -> str:
-    """Return a curve as an inline SVG, its range in words below."""
-    drawn = np.isfinite(curve.values) & (curve.values > 0)
-    if np.count_nonzero(drawn) < 2:
-        return ""
-    x, y = np.log10(curve.frequency_hz[drawn]), np.log10(curve.values[drawn])
-    y = np.maximum(y, np.max(y) - _DECADES)
-    across = _EDGE + (_WIDTH - 2 * _EDGE) * (x - x[0]) / (x[-1] - x[0])
-    down = _EDGE + (_HEIGHT - 2 * _EDGE) * (np.max(y) - y) / max(float(np.ptp(y)), 1e-9)
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, down, strict=True))
-    low, high = 10 ** np.min(y), 10 ** np.max(y)
-    words = (
-        f"{curve.caption}: {low:.3g} to {high:.3g}, from {curve.frequency_hz[0]:.3g} to "
-        f"{curve.frequency_hz[-1]:.3g} Hz"
-    )
-    return (
-        f'<figure><svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{_HEIGHT}" '
-        f'viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(words)}">'
-        f'<polyline points="{points}" fill="none" stroke="currentColor" stroke-width="1.5"/></svg>'
-        f"<figcaption>{escape(words)}</figcaption></figure>"
-    )
+    return caption + [f"  {'  '.join(row)}".rstrip() for row in aligned(shown, widths, table)]

@@ -1,18 +1,21 @@
-"""Tables of text cells, and tables as CSV files."""
+"""Tables of text cells, as lines and as CSV files."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
+from textwrap import wrap
 from typing import Any
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.validation import choice, set_fields
 
 TONES = ("plain", "good", "bad", "note")
+_LONGEST_NUMBER = 20  # letters; a longer word may be broken
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how the cells begin that spreadsheets compute
 
 
@@ -64,6 +67,60 @@ class Table:
                 ),
                 words=tuple(i + 1 for i, c in enumerate(chosen) if c in self.words),
             )
+
+
+def aligned(rows: Iterable[Sequence[str]], widths: Sequence[int], table: Table) -> list[list[str]]:
+    """Return the cells of rows as wide as their columns; words are flush left, numbers right."""
+    flush = ["<" if i in (0, *table.words) else ">" for i in range(len(widths))]
+    columns = list(zip(flush, widths, strict=True))
+    return [
+        [f"{cell:{side}{width}}" for cell, (side, width) in zip(row, columns, strict=True)]
+        if len(row) == len(columns)
+        else list(row)
+        for row in rows
+    ]
+
+
+def text_lines(table: Table, room: int, *, rule: str = "─") -> list[str]:
+    """Set a table in as many parts as its numbers need, each with all rows and some columns."""
+    parts = [table]
+    for most in range(max(len(table.headings) - 1, 1), 0, -1):
+        parts = list(table.by_columns(most))
+        if all(sum(_widths(part)[1]) + _frame(part) <= room for part in parts):
+            break
+    return [line for part in parts for line in _part_lines(part, room, rule)]
+
+
+def _frame(table: Table) -> int:
+    """Width of what stands around and between the columns."""
+    return 3 * len(table.headings) + 1
+
+
+def _widths(table: Table) -> tuple[list[int], list[int]]:
+    """Widths of the columns in which no cell is broken, and in which no number is."""
+    columns = [
+        [heading, *(row[i].text for row in table.cells() if i < len(row) > 1)]
+        for i, heading in enumerate(table.headings)
+    ]
+    words = [max(map(len, " ".join(column).split()), default=0) for column in columns]
+    return [max(map(len, c)) for c in columns], [min(word, _LONGEST_NUMBER) for word in words]
+
+
+def _part_lines(table: Table, room: int, rule: str) -> list[str]:
+    """Set a table; the widest words are broken before any number is."""
+    widths, least = _widths(table)
+    while sum(widths) > room - _frame(table) and max(widths) > 1:
+        broken = [i for i, width in enumerate(widths) if width > least[i]] or range(len(widths))
+        widths[max(broken, key=widths.__getitem__)] -= 1
+    lines = []
+    for row in (table.headings, *(tuple(cell.text for cell in row) for row in table.cells())):
+        whole = row if len(row) == len(widths) else (*row, *[""] * (len(widths) - len(row)))
+        cells = [wrap(text, max(width, 1)) for text, width in zip(whole, widths, strict=True)]
+        pieces = aligned(zip_longest(*cells, fillvalue=""), widths, table)
+        lines += [f"  {'   '.join(piece)}".rstrip() for piece in pieces]
+        if len(lines) == len(pieces):
+            lines.append(f" {rule * (sum(widths) + _frame(table) - 2)}")
+    return [*wrap(table.caption, room), "", *lines, ""]
 
 
 def csv_bytes(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:

@@ -227,20 +227,20 @@ def test_a_table_that_was_killed_goes_on(tmp_path, cache):
     ]
     first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
     end = time.monotonic() + 120
-    while len(list(out.glob("cases/*.json"))) < 2:
+    while len(list(out.glob("cases/*.npz"))) < 2:
         assert first.poll() is None, "it ended before it could be killed"
         assert time.monotonic() < end
         time.sleep(0.02)
     os.kill(first.pid, signal.SIGKILL)
     first.wait()
-    kept = {p.name: p.read_text() for p in out.glob("cases/*.json")}
+    kept = {p.name: p.read_bytes() for p in out.glob("cases/*.npz")}
     assert 2 <= len(kept) < 6
     second = subprocess.run(arguments, capture_output=True, text=True, check=True, timeout=300)
     data = json.loads(second.stdout)
     assert data["runs"] == 6
-    assert len(list(out.glob("cases/*.json"))) == 6
-    for name, text in kept.items():
-        assert (out / "cases" / name).read_text() == text
+    assert len(list(out.glob("cases/*.npz"))) == 6
+    for name, content in kept.items():
+        assert (out / "cases" / name).read_bytes() == content
     assert {(e["row"], e["method"]) for e in data["entries"]} == {
         (row, method)
         for row in ("no vibration", "vibration")

@@ -13,7 +13,7 @@ from lbt_synth.cli.parser import COMMANDS
 READ_ONLY = {"show", "verify"}  # they write nothing
 
 
-WITHOUT_INPUTS = {"paper", "init", "help", "completion", "explore"}
+WITHOUT_INPUTS = {"paper", "init", "completion", "explore"}
 
 
 # Inputs by their names in a directory, and arguments; OUT is where the output goes, under the

@@ -8,7 +8,12 @@ from support.commands import run
 
 import lbt_synth as lbt
 from lbt_synth.cli import paper
-from lbt_synth.studies.paper.parameters import table_iii
+from lbt_synth.studies.paper.parameters import (
+    compare_with_paper,
+    paper_filters,
+    table_ii,
+    table_iii,
+)
 
 
 def test_paper(tmp_path, capsys):
@@ -44,12 +49,14 @@ def written(folder):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "robustness_figure", draw)
-        return paper.write_paper(folder, list(table_iii())), drawn
+        rows = list(table_iii())
+        tables = table_ii(), compare_with_paper(rows)
+        return paper.write_paper(folder, rows, *tables, paper_filters()), drawn
 
 
 def test_written_files(folder, written):
-    result, _ = written
-    assert {p.name for p in result.files} == {
+    files, _ = written
+    assert {p.name for p in files} == {
         "table_ii.csv",
         "table_iii.csv",
         "parameters.csv",

@@ -1,6 +1,9 @@
-"""What the parser says of words that are no options of a command."""
+"""The arguments of all commands, their help, and completion."""
 
 from __future__ import annotations
+
+import shutil
+import subprocess
 
 import pytest
 from support.commands import run
@@ -21,9 +24,52 @@ def test_a_mistyped_option_is_named(capsys, words, message) -> None:
     assert f"unrecognized arguments: {message}" in error
 
 
-def test_a_second_output_is_refused(capsys) -> None:
-    words = ("--method", "kalman", "-o", "a.fits")
-    for more in ("-o", "--output"):
-        status, _, error = run(capsys, "design", "a.yaml", *words, more, "b.fits")
-        assert status == 2
-        assert "argument -o/--output: give it once" in error
+def test_a_mistyped_command_is_suggested(capsys):
+    views = "known are init, design, "  # of plot, and no word is near
+    near = "did you mean design?"
+    for words, hint in ((("desgn",), near), (("bode",), views)):
+        status, out, error = run(capsys, *words)
+        assert (status, out, error.count("\n")) == (2, "", 1)
+        assert hint in error
+
+
+def test_what_can_be_left_out_is_not_called_required(capsys):
+    status, _, error = run(capsys, "robustness")
+    assert (status, "required: config (see" in error) == (2, True)
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_takes_its_script(tmp_path, capsys, shell):
+    status, out, error = run(capsys, "completion", shell)
+    assert (status, error) == (0, "")
+    assert all(word in out for word in ("tradeoff", "gamma-ratio"))
+    script = tmp_path / "script"
+    script.write_text(out)
+    if found := shutil.which(shell):
+        subprocess.run([found, "-n", script], check=True)
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("des",), "design"),
+        (("design", "--gamma-"), "--gamma-ratio"),
+        (("design", "a.yaml", "--method", "kal"), "kalman"),
+        (("show", "ga"), "gain.fits"),
+        (("init", "--telescope", "ke"), "keck"),
+    ],
+)
+def test_bash_completes(tmp_path, capsys, words, expected):
+    (tmp_path / "gain.fits").write_text("")
+    (tmp_path / "script").write_text(run(capsys, "completion", "bash")[1])
+    line = " ".join(words)
+    code = (
+        f"source ./script; COMP_WORDS=(lbt-synth {line}); COMP_CWORD={len(words)}; "
+        f"_shtab_lbt_synth lbt-synth {words[-1]} x; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    )
+    done = subprocess.run(
+        ["bash", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [expected]

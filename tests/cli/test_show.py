@@ -41,12 +41,10 @@ def test_show_prints_the_cost(tmp_path, capsys, monkeypatch, name):
     cost = lbt.interop.frame_cost(design)
     status, text, _ = run(capsys, "show", gain)
     assert status == 0
-    assert re.search(rf"form of the exported source +{cost.form} ", text)
-    assert re.search(rf"multiplications per frame +{cost.multiplications} ", text)
-    assert re.search(rf"coefficients, single +{cost.coefficient_bytes_single} +bytes", text)
+    assert re.search(rf"multiplications per frame +{cost.multiplications}\b", text)
+    assert re.search(rf"coefficients +{cost.coefficients}\b", text)
     data = json.loads(run(capsys, "show", gain, "--json")[1])["frame_cost"]
-    assert data["dense_additions"] == cost.dense_additions
-    assert data["state_bytes_double"] == cost.state_bytes_double
+    assert data["additions"] == cost.additions
 
 
 def test_show_says_what_is_only_the_files_word(tmp_path, capsys):

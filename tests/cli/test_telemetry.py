@@ -115,7 +115,7 @@ def test_bad_input_is_one_line(tmp_path, capsys, night, gain):
     for arguments, words in (
         (("telemetry", tmp_path / "none.fits"), "No such file or directory"),
         (("telemetry", damaged), "is no telemetry file, or it is damaged"),
-        (("telemetry", gain), "is a gain file, expected a record"),
+        (("telemetry", gain), "is not a telemetry file"),
         (("telemetry", night, "--format", "npz"), "--format and --precision are of what -o writes"),
         (("telemetry", night, "--precision", "float32"), "--format and --precision"),
         (("telemetry", night, "-o", tmp_path / "t.txt"), "must end in .fits, .npz or .aot.fits"),

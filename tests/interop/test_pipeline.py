@@ -177,14 +177,14 @@ def test_an_option_goes_with_its_target(tmp_path, designs):
 @pytest.mark.usefixtures("short_rehearsal")
 @pytest.mark.parametrize("name", target_names())
 def test_what_is_proved_is_what_was_read_from_the_file(tmp_path, designs, monkeypatch, name):
-    """Each file holds numbers; where one is another when it is read, the proof fails."""
+    """Each file holds numbers; where one is another when it is read, it is not written."""
     own = lbt.interop.target_named(name)
 
     def damaged(files, like):
         return louder(own.read(files, like))
 
     monkeypatch.setattr(f"lbt_synth.interop.{name}.export.TARGET", replace(own, read=damaged))
-    with pytest.raises(lbt.errors.NumericalError, match="must keep what its design promises"):
+    with pytest.raises(lbt.errors.NumericalError, match="must hold the numbers that are proved"):
         lbt.interop.export(own.path_in(tmp_path), designs["integrator"], name)
     assert not list(tmp_path.iterdir())
 

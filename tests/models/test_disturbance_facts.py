@@ -4,7 +4,7 @@ import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.models.disturbance_facts import disturbance_facts
-from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
+from lbt_synth.storage.display_unit import own_display_unit, show_in
 
 SLOW = lbt.models.ARModel(coefficients=[0.6], driving_rms_nm=8.0, frame_rate_hz=1000)
 AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
@@ -32,7 +32,7 @@ def test_the_strongest_vibrations_are_listed_by_frequency():
 
 def test_sizes_are_in_the_unit_that_is_shown():
     with own_display_unit():
-        show_in(DisplayUnit(name="mas", nm=10.0))
+        show_in("mas", 10.0)
         facts = disturbance_facts([SLOW], [line(20, 100.0)], np.array(15.0))
     assert [facts.turbulence, facts.vibrations, facts.noise_nm] == [
         "AR1 1 mas",

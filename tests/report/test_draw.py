@@ -21,7 +21,7 @@ from lbt_synth.report.draw import (
     spread_labels,
     tick_text,
 )
-from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
+from lbt_synth.storage.display_unit import own_display_unit, show_in
 
 X, Y = {"label": "x"}, {"label": "y"}
 LONG = "a very long name " * 3
@@ -182,7 +182,7 @@ def test_numbers_are_those_that_are_drawn_in_the_unit_that_is_shown():
     bars = {one.name: (one.x, list(one.y)) for one in rest}
     assert bars["first order share [%]"] == (("a.b", "first", "c"), [1, 2, 3])
     with own_display_unit():
-        show_in(DisplayUnit(name="mas", nm=10.0))
+        show_in("mas", 10.0)
         figure = every_mark()[0].figure
     (_, other) = (one for one in figure_series(figure) if one.name == "first")
     assert other.panel == "steps [mas]"

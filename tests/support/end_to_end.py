@@ -43,7 +43,7 @@ def make_run(system, *, gain=0.5, noise_nm=10.0, frames=4000, seed=0):
 def fake_results(rows, gain=0.6, strehl=0.7):
     return {
         name: {
-            "strehl": strehl + 0.01 * case["setup"]["seed"],
+            "strehl": strehl + 0.01 * case["setup"].seed,
             "other_modes_strehl": 0.85,
             "tip_rms_nm": 30.0,
             "tilt_rms_nm": 40.0,

@@ -18,7 +18,7 @@ from support.shaping import shaped_design
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.files.gain_file.store import _READERS
+from lbt_synth.files.file_checks import READERS
 from lbt_synth.models.sensor_suite import Accelerometer, Motion, SensorSuite, WavefrontSensor
 from lbt_synth.storage.array_file import digest, fits_bytes, npz_bytes
 
@@ -114,7 +114,7 @@ class GainFile:
     def __init__(self, path):
         self.ending = path.suffix[1:]
         content = path.read_bytes()
-        arrays, text = _READERS[path.suffix](content)
+        arrays, text = READERS[path.suffix](content)
         self.parts = {"arrays": dict(arrays), "meta": json.loads(text), "cards": {}}
         if self.ending == "fits":
             from astropy.io import fits

@@ -35,7 +35,7 @@ from lbt_synth.linear.output_feedback.lower_bound import (
 )
 from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
 from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
-from lbt_synth.linear.state_space import StateSpace, sigma_sparkline
+from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.summaries import Summary
 
@@ -127,8 +127,7 @@ class ControllerDesign(Design):
             without_units(fact_table("Controller", self.facts())),
             row_table("Certificate", self.certificate.checks),
         ]
-        curve = sigma_sparkline(self.closed_loop, "largest singular value from w to z")
-        return Summary(tables=tables, notes=self.notes(), curve=curve)
+        return Summary(tables=tables, notes=self.notes())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

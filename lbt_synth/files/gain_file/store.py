@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,10 @@ from lbt_synth.design.record import (
     record_design,
 )
 from lbt_synth.errors import CertificateError, GainFileError, OutputError, SchemaVersionError
-from lbt_synth.files.file_checks import FileKind
+from lbt_synth.files.file_checks import READERS, FileKind
 from lbt_synth.methods.registry import method_named
-from lbt_synth.storage.array_file import (
-    digest,
-    fits_bytes,
-    npz_bytes,
-    read_cards,
-    read_fits,
-    read_npz,
-)
-from lbt_synth.storage.atomic_files import require_ending, write_atomically
+from lbt_synth.storage.array_file import read_cards
+from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import agree, frozen_copy, number, real_array, require_instance, text
 
@@ -73,7 +66,6 @@ def write_cards(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
     return cards
 
 
-_READERS = {".fits": read_fits, ".npz": read_npz}
 _KIND = FileKind(
     name="gain file",
     schema=SCHEMA,
@@ -86,7 +78,7 @@ _KIND = FileKind(
 
 def require_gain_name(path: str | os.PathLike[str]) -> Path:
     """Refuse a file name that is not that of a gain file."""
-    return require_ending(path, "a gain file", _READERS)
+    return require_ending(path, "a gain file", READERS)
 
 
 def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
@@ -128,15 +120,8 @@ def save_gain(path: str | os.PathLike[str], design: Design) -> Path:
         require_agreement(record, _record_design(_rebuild(record), lbt_synth.__version__))
     except ValueError as error:
         raise OutputError(f"the design contradicts itself: {error}", path=target) from error
-    arrays, meta = record.arrays, record.meta
-    meta["digest"] = digest(arrays, meta)
-    words = json.dumps(meta, allow_nan=False)
-    if target.suffix.lower() == ".fits":
-        # A, B, C and D come first, as SPECULA's SsrFilterData loads them
-        content = fits_bytes(write_cards(design, meta), arrays, words)
-    else:
-        content = npz_bytes(arrays, words)
-    return write_atomically(target, content)
+    # A, B, C and D come first, as SPECULA's SsrFilterData loads them
+    return _KIND.write(target, record.arrays, record.meta, partial(write_cards, design))
 
 
 def _record_design(design: Design, version: str) -> DesignRecord:
@@ -209,9 +194,9 @@ def read_design(path: str | os.PathLike[str]) -> tuple[Design, str]:
 
     The certificate may have failed; :func:`load_gain` refuses that.
     """
-    source = require_ending(path, "a gain file", _READERS, GainFileError)
+    source = require_ending(path, "a gain file", READERS, GainFileError)
     content, ending = read_bytes(source, GainFileError), source.suffix.lower()
-    arrays, meta = _KIND.decode(content, _READERS[ending], source)
+    arrays, meta = _KIND.decode(content, source)
     found = DesignRecord({name: frozen_copy(array) for name, array in arrays.items()}, meta)
     with _KIND.rebuilding(source), np.errstate(all="ignore"):
         for name, array in arrays.items():

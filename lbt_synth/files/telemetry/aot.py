@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import FileError, OutputError, TelemetryError
-from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
-from lbt_synth.files.telemetry.time_filters import TimeFilters, integrator_gains, time_filters
+from lbt_synth.files.telemetry.telemetry import Telemetry
+from lbt_synth.files.telemetry.time_filters import integrator_gains, time_filters
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import check_fits, error_reason, read_cards
 from lbt_synth.storage.warning_filters import ignore_warnings
@@ -175,14 +175,15 @@ def _arrays(seen: Telemetry) -> dict[str, FloatArray]:
         "psf": None if seen.psf is None else [seen.psf],
     }
     if filters is not None:
-        control: FloatArray | None = filters.matrix
+        matrix, numerators, denominators = filters
+        control: FloatArray | None = matrix
         if seen.slopes is not None:
-            control = None if back is None else filters.matrix @ back
+            control = None if back is None else matrix @ back
         arrays |= {
-            "residual_commands": metres * seen.measurements @ filters.matrix.T,
+            "residual_commands": metres * seen.measurements @ matrix.T,
             "control_matrix": control,
-            "time_filter_num": filters.numerators,
-            "time_filter_den": filters.denominators,
+            "time_filter_num": numerators,
+            "time_filter_den": denominators,
         }
     out = {name: np.asarray(data) for name, data in arrays.items() if data is not None}
     for name in _OF_SUBAPERTURES & out.keys():
@@ -216,17 +217,13 @@ def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     return cards
 
 
-def _filters(seen: Telemetry) -> TimeFilters | None:
+def _filters(seen: Telemetry) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     if seen.controller is not None:
         return time_filters(seen.controller)
     gains, (m, q) = seen.integrator_gains, (seen.commands.shape[1], seen.measurements.shape[1])
     if gains is None or m != q:
         return None
-    return TimeFilters(
-        matrix=np.eye(m),
-        numerators=np.outer(gains, [0.0, 1.0]),
-        denominators=np.tile([-1.0, 1.0], (m, 1)),
-    )
+    return np.eye(m), np.outer(gains, [0.0, 1.0]), np.tile([-1.0, 1.0], (m, 1))
 
 
 def _wavelength_m(seen: Telemetry) -> float | None:
@@ -267,8 +264,7 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
     fields = _loop_fields(loops[0]) | _system_fields(system)
     if len(loops) > 1:
         fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
-    taps = fields.pop("mirror_taps", None)
-    return check_taps(Telemetry(**fields), taps)
+    return Telemetry(**fields)
 
 
 def _system_fields(system: Any) -> dict[str, Any]:
@@ -281,7 +277,6 @@ def _system_fields(system: Any) -> dict[str, Any]:
             facts |= {name: own[name] for name in _OWN_FIELDS}
             if "mirror" in own:
                 facts["mirror"] = PositionLoop(**own["mirror"])
-                facts["mirror_taps"] = own["mirror_taps"]
     telescope = system.main_telescope
     if telescope is not None:
         facts["diameter_m"] = telescope.enclosing_diameter or telescope.inscribed_diameter

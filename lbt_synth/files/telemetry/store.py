@@ -1,10 +1,11 @@
-"""Saves telemetry to files, in the package's own layout or another, and loads and checks it."""
+"""Telemetry: made of a simulation, saved to files in our layout or another, loaded and checked."""
 
 from __future__ import annotations
 
-import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth
+from lbt_synth.design import Design
 from lbt_synth.errors import OutputError, ProblemError, TelemetryError
-from lbt_synth.files.file_checks import FileKind
+from lbt_synth.files.file_checks import READERS, FileKind
 from lbt_synth.files.telemetry import aot
-from lbt_synth.files.telemetry.fields import FACTS, LAYERS, REQUIRED
-from lbt_synth.files.telemetry.telemetry import Telemetry, check_taps
+from lbt_synth.files.telemetry.telemetry import FACTS, LAYERS, REQUIRED, Scalar, Telemetry
 from lbt_synth.linear import Controller
-from lbt_synth.models import PositionLoop
-from lbt_synth.storage.array_file import (
-    Cards,
-    digest,
-    fits_bytes,
-    npz_bytes,
-    read_fits,
-    read_npz,
-)
+from lbt_synth.loop import Imaging, Simulation
+from lbt_synth.models import LoopHardware, PositionLoop
+from lbt_synth.storage.array_file import Cards
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import FloatArray, choice
+from lbt_synth.validation import FloatArray, choice, integer, require_instance
 
 PRECISIONS = ("float64", "float32")
 Meta = dict[str, Any]
@@ -125,12 +120,8 @@ def save_telemetry(
     arrays, meta = pack(telemetry, precision)
     if kind == "aot":
         return write_atomically(target, aot.to_bytes(telemetry, precision, target))
-    meta["digest"] = digest(arrays, meta)
-    text = json.dumps(meta, allow_nan=False)
-    if kind == "npz":
-        return write_atomically(target, npz_bytes(arrays, text))
-    cards, headers = primary_cards(telemetry, meta), layer_cards(telemetry)
-    return write_atomically(target, fits_bytes(cards, arrays, text, headers=headers))
+    cards = partial(primary_cards, telemetry)
+    return _KIND.write(target, arrays, meta, cards, layer_cards(telemetry))
 
 
 def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
@@ -162,13 +153,13 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     lbt_synth.errors.TelemetryError: cannot read nowhere.fits: No such file or directory.
     """
     source = Path(path)
-    if source.suffix.lower() not in (".fits", ".npz"):
+    if source.suffix.lower() not in READERS:
         raise TelemetryError(f"telemetry must end in {_ENDINGS}; got {source.name!r}.", path=source)
     content, is_fits = read_bytes(source, TelemetryError), source.suffix.lower() == ".fits"
     with _KIND.rebuilding(source):
         if is_fits and aot.is_aot(content):
             return aot.from_bytes(content, source)
-        return unpack(*_KIND.decode(content, read_fits if is_fits else read_npz, source))
+        return unpack(*_KIND.decode(content, source))
 
 
 def pack(telemetry: Telemetry, precision: str) -> tuple[dict[str, npt.NDArray[Any]], Meta]:
@@ -215,11 +206,11 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
         )
     if left:
         raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(left))}")
-    taps = fields.pop("mirror_taps", None)
+    fields.pop("mirror_taps", None)  # they follow from the mirror
     if "mirror" in meta:  # a mirror that settles at once is not in the file
         fields["mirror"] = PositionLoop(**meta["mirror"])
     fields |= {name: meta[name] for name in FACTS}
-    return check_taps(Telemetry(**fields, metadata=dict(meta["metadata"])), taps)
+    return Telemetry(**fields, metadata=dict(meta["metadata"]))
 
 
 def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]]:
@@ -228,11 +219,11 @@ def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]
         "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
         "LBTTELEM": (_KIND.version, "version of the lbt_synth telemetry layout"),
     }
-    for name, fact in FACTS.items():
+    for name, (card, comment) in FACTS.items():
         value = getattr(telemetry, name)
         too_large = isinstance(value, int) and value > _LARGEST_CARD
-        if fact.card and value is not None and not too_large:
-            cards[fact.card] = (value, fact.comment)
+        if card and value is not None and not too_large:
+            cards[card] = (value, comment)
     cards["TIMING"] = (telemetry.convention, "")
     cards["SHA256"] = (meta["digest"], "")
     return cards
@@ -250,3 +241,107 @@ def layer_cards(telemetry: Telemetry) -> dict[str, Cards]:
             cards[f"CTYPE{number}"] = (axis.upper(), "")  # FITS counts axes from the fastest
         out[name] = cards
     return out
+
+
+def telemetry_from_simulation(
+    simulation: Simulation,
+    hardware: LoopHardware,
+    *,
+    case: int = 0,
+    sensor_gain: float | None = None,
+    design: Design | None = None,
+    controller_digest: str | None = None,
+    imaging: Imaging | None = None,
+    name: str = "",
+    metadata: Mapping[str, Scalar] | None = None,
+) -> Telemetry:
+    """Telemetry of one case of a simulation.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        The simulation.
+    hardware : LoopHardware
+        The loop that was simulated.
+    case : int, optional
+        Which case, from 0.
+    sensor_gain : float, optional
+        Sensor gain of the truth, relative to the sensor matrix of the loop.
+    design : Design, optional
+        The design that ran.
+    controller_digest : str, optional
+        SHA-256 of its gain file.
+    imaging : Imaging, optional
+        The camera: gives the telescope, the wavelength and, of one or two modes, the Strehl
+        ratio of the case.
+    name : str, optional
+        Name of the system.
+    metadata : mapping, optional
+        Anything else; see :class:`Telemetry`.
+
+    Returns
+    -------
+    Telemetry
+        Series in nm, with the true phase before and after the correction.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such case, or the loop is not that of the simulation.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> lazy = lbt.integrator(path, gain=0.5)
+    >>> shake = lbt.Truth(
+    ...     turbulence=None,
+    ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
+    ... )
+    >>> run = lbt.simulate(lazy.controller, shake, hardware=path, frames=100)
+    >>> seen = lbt.files.telemetry_from_simulation(run, path, design=lazy)
+    >>> bool(abs(seen.measurements[1:] - seen.residual_nm[:-1]).max() < 1e-9)  # no noise
+    True
+    """
+    require_instance(simulation, Simulation)
+    require_instance(hardware, LoopHardware)
+    case = integer(case, "case", at_least=0)
+    cases = len(simulation.commands)
+    if case >= cases:
+        raise ProblemError(f"case must be below the number of cases, {cases}; got {case}.")
+    if simulation.frame_rate_hz != hardware.frame_rate_hz:
+        raise ProblemError(
+            f"hardware must be that of the simulation, at {simulation.frame_rate_hz:g} Hz; got "
+            f"one at {hardware.frame_rate_hz:g} Hz."
+        )
+    gains = None
+    if design is not None:
+        require_instance(design, Design)
+        if (gain := design.integrator_gain) is not None:
+            gains = np.full(hardware.n_commands, gain)
+    residual, strehl = simulation.residual_nm[case], None
+    if imaging is not None and residual.shape[1] <= 2:  # the jitter of an image has two axes
+        strehl = float(np.clip(simulation.strehl(imaging)[case], 0, 1))  # a mean of cosines
+    return Telemetry(
+        frame_rate_hz=simulation.frame_rate_hz,
+        delay_frames=hardware.delay_frames,
+        mirror=hardware.mirror,
+        commands=simulation.commands[case],
+        measurements=simulation.measurements[case],
+        residual_nm=residual,
+        total_nm=simulation.total_nm[case],
+        interaction_matrix=hardware.sensor,
+        influence_matrix=hardware.influence,
+        sensor_gain=sensor_gain,
+        controller=None if design is None else design.controller,
+        controller_name=None if design is None else design.method,
+        controller_digest=controller_digest,
+        integrator_gains=gains,
+        diameter_m=None if imaging is None else imaging.diameter_m,
+        obstruction=None if imaging is None else imaging.obstruction,
+        imaging_wavelength_um=None if imaging is None else imaging.wavelength_um,
+        strehl=strehl,
+        seed=simulation.seed,
+        name=name,
+        metadata=metadata or {},
+    )

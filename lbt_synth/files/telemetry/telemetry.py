@@ -4,27 +4,142 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.files.telemetry.fields import (
-    ARRAYS,
-    CONVENTION,
-    FACTS,
-    MOVING_CONVENTION,
-    REQUIRED,
-    Scalar,
-    check_metadata,
-)
+from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, frozen_copy, real_array, require_instance, set_fields
+from lbt_synth.validation import (
+    Count,
+    FloatArray,
+    Obstruction,
+    Positive,
+    check_fields,
+    frozen_copy,
+    real_array,
+    set_fields,
+    text,
+)
 
-_SAME_TAPS = 1e-9  # largest difference between the taps of a file and those of its mirror
+Scalar: TypeAlias = str | float | int | bool
+_LENGTHS = ("pm", "um", "mm", "m")
+_LONGEST_UNIT = 24
+
+
+class Layer(NamedTuple):
+    """One array: its field, its axes in numpy's order, its unit and its meaning.
+
+    A unit that begins with an underscore is read from the field of that name.
+    """
+
+    field: str
+    axes: str
+    unit: str
+    meaning: str
+
+    @property
+    def is_series(self) -> bool:
+        """Whether it has one row per frame."""
+        return self.axes.startswith("frame")
+
+    def unit_in(self, telemetry: Any) -> str:
+        """Return the unit that it has in a telemetry."""
+        return str(getattr(telemetry, self.unit[1:])) if self.unit[:1] == "_" else self.unit
+
+
+_TAPS = "c: phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...)"
+_MEASURED = "y(k), of the exposure of frame k-1"
+LAYERS = {  # by their names in files
+    "COMMANDS": Layer("commands", "frame, command", "_command_unit", "u(k)"),
+    "MEASURE": Layer("measurements", "frame, measurement", "_measurement_unit", _MEASURED),
+    "RESIDUAL": Layer("residual_nm", "frame, mode", "nm", "phi_res(k), corrected phase"),
+    "TOTAL": Layer("total_nm", "frame, mode", "nm", "phi_tot(k), before correction"),
+    "SLOPES": Layer("slopes", "frame, slope", "_slope_unit", "what the sensor gave"),
+    "TIMES": Layer("times_s", "frame", "s", "time of each frame"),
+    "INTERACT": Layer("interaction_matrix", "sensed, mode", "", "S"),
+    "RECONST": Layer("reconstructor", "mode, slope", "", "slopes to modes"),
+    "INFLUENC": Layer("influence_matrix", "mode, command", "", "N"),
+    "MODES": Layer("mode_maps", "mode, row, column", "", "modes, of rms 1"),
+    "PSF": Layer("psf", "row, column", "", "image of the camera"),
+    "INTGAINS": Layer("integrator_gains", "command", "", "integrator gains"),
+    "MIRROR_TAPS": Layer("mirror_taps", "age", "", _TAPS),  # follows from other fields
+}
+REQUIRED = ("commands", "measurements")
+ARRAYS = tuple(layer for layer in LAYERS.values() if layer.field != "mirror_taps")
+FACTS: Mapping[str, tuple[str, str]] = {  # their cards in a FITS header, those that have one
+    "frame_rate_hz": ("RATE_HZ", "[Hz] frame rate"),
+    "delay_frames": ("DELAY", "[frames] total delay"),
+    "sensor_gain": ("SENSGAIN", "sensor gain over the interaction matrix"),
+    "strehl": ("STREHL", "Strehl ratio"),
+    "imaging_wavelength_um": ("WAVELEN", "[um] of the image and the Strehl ratio"),
+    "psf_pixel_mas": ("PSFPIX", "[mas] pixel of the image"),
+    "diameter_m": ("DIAMETER", "[m] telescope"),
+    "obstruction": ("OBSTRUCT", "central obstruction over the diameter"),
+    "seed": ("SEED", "of the simulation"),
+    "subaperture_axes": ("", ""),
+    **dict.fromkeys(("name", "controller_name", "controller_digest"), ("", "")),
+    **dict.fromkeys(("command_unit", "measurement_unit", "slope_unit"), ("", "")),
+}
+
+
+def _check_unit(value: Any, name: str) -> None:
+    fits = isinstance(value, str) and len(value) <= _LONGEST_UNIT and value.strip() == value
+    # a FITS card does not keep a quote in every place
+    if not fits or not (value.isascii() and value.isprintable()) or "'" in value:
+        raise ProblemError(
+            f"{name} must be a word of at most {_LONGEST_UNIT} ASCII signs without a quote; got "
+            f"{value!r}."
+        )
+    if name != "slope_unit" and value in _LENGTHS:
+        raise ProblemError(f"{name} must be nm for lengths; got {value!r}. Convert them.")
+    if name == "command_unit" and not value:
+        raise ProblemError("command_unit must not be empty; write 1 for pure numbers.")
+
+
+def _check_metadata(metadata: Any) -> Mapping[str, Scalar]:
+    """Return metadata of words and scalars that nobody can change."""
+    if not isinstance(metadata, Mapping):
+        raise ProblemError(f"metadata must be a mapping; got {type(metadata).__name__}.")
+    out: dict[str, Scalar] = {}
+    for key, value in metadata.items():
+        if not isinstance(key, str) or not key:
+            raise ProblemError(f"the keys of metadata must be words; got {key!r}.")
+        out[key] = value.item() if isinstance(value, np.generic) else value
+        if not isinstance(out[key], str | float | int | bool):
+            raise ProblemError(
+                "metadata must hold texts, numbers and truth values; got "
+                f"{type(value).__name__} for {key!r}."
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise NonFiniteError(f"metadata must be finite; got {value} for {key!r}.")
+    return MappingProxyType(out)
+
+
+_CONVENTION = (
+    "Row k of every series is frame k of 1/frame_rate_hz. "
+    "y(k) = sensor_gain S phi_res(k-1) + noise(k): the measurement of frame k is of the exposure "
+    "of frame k-1. u(k) is the command computed from y up to y(k). "
+    "phi_res(k) = phi_tot(k) - phi_cor(k), {correction}. S is the interaction matrix, N the "
+    "influence matrix, each the identity where it is not given. Where slopes are recorded, "
+    "slopes(k) = sensor_gain S phi_res(k-1) + noise(k), y(k) = reconstructor slopes(k). "
+    "Units: nm rms of wavefront, unless a unit is given."
+)
+CONVENTION = _CONVENTION.format(
+    correction="phi_cor(k) = N u(k-d+1), d = delay_frames from the "
+    "middle of an exposure to the middle of the command computed from it; for d = j+1+f, "
+    "phi_cor(k) = N ((1-f) u(k-j) + f u(k-j-1))"
+)
+MOVING_CONVENTION = _CONVENTION.format(
+    correction="phi_cor(k) = N (c0 u(k) + c1 u(k-1) + c2 u(k-2) + ...) with the mirror taps c "
+    "recorded here: the weights of the commands in the position of a mirror that does not settle "
+    "at once, averaged over exposure k. They hold the whole delay: d = delay_frames as it would be "
+    "with a mirror that settles at once, and the mirror's lag after it"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,10 +237,10 @@ class Telemetry:
     (2, 1, False)
     """
 
-    frame_rate_hz: float
+    frame_rate_hz: Positive
     commands: FloatArray
     measurements: FloatArray
-    delay_frames: float | None = None
+    delay_frames: Annotated[float, ("at_least", 0), ("at_most", 1000)] | None = None
     mirror: PositionLoop | None = None
     residual_nm: FloatArray | None = None
     total_nm: FloatArray | None = None
@@ -135,34 +250,34 @@ class Telemetry:
     influence_matrix: FloatArray | None = None
     mode_maps: FloatArray | None = None
     psf: FloatArray | None = None
-    psf_pixel_mas: float | None = None
-    imaging_wavelength_um: float | None = None
-    strehl: float | None = None
+    psf_pixel_mas: Positive | None = None
+    imaging_wavelength_um: Positive | None = None
+    strehl: Annotated[float, ("at_least", 0), ("at_most", 1)] | None = None
     times_s: FloatArray | None = None
-    subaperture_axes: int = 1
+    subaperture_axes: Count = 1
     command_unit: str = "nm"
     measurement_unit: str = "nm"
     slope_unit: str = ""
-    sensor_gain: float | None = None
+    sensor_gain: Positive | None = None
     controller: Controller | None = None
     controller_name: str | None = None
     controller_digest: str | None = None
     integrator_gains: FloatArray | None = None
-    diameter_m: float | None = None
-    obstruction: float | None = None
-    seed: int | None = None
+    diameter_m: Positive | None = None
+    obstruction: Obstruction | None = None
+    seed: Annotated[int, ("at_least", 0)] | None = None
     name: str = ""
     metadata: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if each.name in FACTS and (value is not None or each.default is not None):
-                set_fields(self, **{each.name: FACTS[each.name].check(value, each.name)})
-        set_fields(self, metadata=check_metadata(self.metadata))
+        check_fields(self, metadata=_check_metadata(self.metadata))
+        for name in ("command_unit", "measurement_unit", "slope_unit"):
+            _check_unit(getattr(self, name), name)
+        for name in ("name", "controller_name", "controller_digest"):
+            if name == "name" or getattr(self, name) is not None:
+                text(getattr(self, name), name)
         self._check_arrays()
         if self.mirror is not None:
-            require_instance(self.mirror, PositionLoop)
             if self.delay_frames is None:
                 raise ProblemError("telemetry of a mirror with dynamics needs delay_frames.")
             _ = self.mirror_taps  # what does not fit is refused
@@ -206,7 +321,6 @@ class Telemetry:
             )
 
     def _check_controller(self, controller: Controller) -> None:
-        require_instance(controller, Controller, "controller")
         m, q = self.commands.shape[1], self.measurements.shape[1]
         if controller.D.shape != (m, q):
             raise DimensionError(
@@ -287,17 +401,3 @@ class Telemetry:
             influence_matrix=np.eye(n) if influence is None else influence,
             mirror=self.mirror,
         )
-
-
-def check_taps(telemetry: Telemetry, taps: npt.ArrayLike | None) -> Telemetry:
-    """Return telemetry, or refuse it if its mirror does not have the taps of its file."""
-    own = telemetry.mirror_taps
-    if (own is None) != (taps is None):
-        raise ValueError("a mirror and its taps go together; it has one of them")
-    if own is not None and taps is not None:
-        found = np.asarray(taps, dtype=np.float64)
-        size = max(own.size, found.size)
-        one, other = (np.pad(each.ravel(), (0, size - each.size)) for each in (own, found))
-        if not np.allclose(one, other, rtol=0, atol=_SAME_TAPS):
-            raise ValueError("its taps are not those of its mirror")
-    return telemetry

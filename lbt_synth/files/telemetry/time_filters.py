@@ -7,8 +7,6 @@ filter times a constant row: ``H_i(z) = f_i(z) k_i``.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from lbt_synth.linear import Controller, StateSpace
@@ -16,21 +14,16 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
 
 _POINTS = 64  # frequencies of the comparison
 _SAME = 1e-8  # largest difference, relative to the response at each frequency
-_NOTHING = 1e-14  # entries smaller than this part of the largest count as zero
+_NOTHING = 1e-14  # of the largest coefficient of a numerator; less counts as zero
+_COUPLED = 1e-9  # of the largest entry of a matrix; less is what a solver leaves of a zero
 
 
-class TimeFilters(NamedTuple):
-    """Scalar filters after a constant matrix."""
+def time_filters(controller: Controller) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return a controller as a constant matrix and scalar filters after it; None if it is none.
 
-    matrix: FloatArray  # from measurements to filter inputs, (m, q); 1 is each row's largest entry
-    numerators: FloatArray  # b_i of ``sum b_i z^i / sum a_i z^i``, (m, order + 1)
-    denominators: FloatArray  # a_i
-
-
-def time_filters(controller: Controller) -> TimeFilters | None:
-    """Return a controller's matrix and filters; None if it is not a matrix and scalar filters.
-
-    They agree with the controller's response at 64 frequencies, to 1e-8 of it.
+    The matrix (m, q) is from measurements to the inputs of the filters; the largest entry of each
+    row is 1. A filter is ``sum b_i z^i / sum a_i z^i``, with b and a (m, order + 1). They agree
+    with the controller's response at 64 frequencies, to 1e-8 of it.
     """
     system = controller.to_statespace()
     frequency = np.geomspace(1e-4, 0.497, _POINTS) / system.dt_s
@@ -41,7 +34,7 @@ def time_filters(controller: Controller) -> TimeFilters | None:
         row = _constant_row(response[:, i])
         if row is None:
             return None
-        numerator, denominator = _transfer_function(system, i, row)
+        numerator, denominator = transfer_function(system, i, row)
         scalar = np.polyval(numerator, z) / np.polyval(denominator, z)
         wrong = np.linalg.norm(scalar[:, None] * row - response[:, i], axis=1)
         if not np.all(wrong <= _SAME * np.linalg.norm(response[:, i], axis=1)):
@@ -55,7 +48,7 @@ def time_filters(controller: Controller) -> TimeFilters | None:
             for part in zip(*polynomials, strict=True)
         ]
     )
-    return TimeFilters(matrix=np.array(rows), numerators=out[0], denominators=out[1])
+    return np.array(rows), out[0], out[1]
 
 
 def integrator_gains(numerators: FloatArray, denominators: FloatArray) -> FloatArray | None:
@@ -83,23 +76,38 @@ def _constant_row(response: ComplexArray) -> FloatArray | None:
     return row
 
 
-def _transfer_function(
+def transfer_function(
     system: StateSpace, output: int, row: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Numerator and denominator, highest power first, of the scalar filter of one output."""
-    b, c = system.B @ row / (row @ row), system.C[output]
-    d = float(system.D[output] @ row / (row @ row))
-    linked = np.abs(system.A) > _NOTHING * np.max(np.abs(system.A), initial=0.0)
-    reached = np.linalg.matrix_power(linked | np.eye(len(linked), dtype=np.bool_), len(linked))
-    inside = (reached @ _significant(b)) & (_significant(c) @ reached)
-    A, b, c = system.A[np.ix_(inside, inside)], b[inside], c[inside]
-    if not inside.any():
-        return np.array([d]), np.array([1.0])
-    denominator = np.real(np.poly(A))
-    numerator = np.real(np.poly(A - np.outer(b, c))) + (d - 1) * denominator
-    numerator[~_significant(numerator)] = 0.0
-    return numerator, denominator
+    """Return the scalar filter of one output, for measurements along a row.
+
+    Numerator and denominator have their highest power first. States that the measurements do not
+    drive, or that do not show in the output, are left out. What overflows is not a number.
+    """
+    size = row @ row
+    b, c, d = system.B @ row / size, system.C[output], float(system.D[output] @ row / size)
+    linked = is_significant(system.A) | np.eye(system.n_states, dtype=np.bool_)
+    reached = np.linalg.matrix_power(linked, system.n_states)
+    inside = (reached @ is_significant(b)) & (is_significant(c) @ reached)
+    A = system.A[np.ix_(inside, inside)]
+    with np.errstate(all="ignore"):
+        entry = np.outer(b[inside], c[inside])
+        scale = 1 / (np.max(np.abs(entry), initial=0.0) or 1.0)
+        # det(zI - A + b c) = det(zI - A) + c adj(zI - A) b
+        den, moved = _characteristic(A), _characteristic(A - scale * entry)
+        num = d * den + (moved - den) / scale
+    num[np.abs(num) <= _NOTHING * np.max(np.abs(num))] = 0.0
+    return num, den
 
 
-def _significant(vector: FloatArray) -> BoolArray:
-    return np.asarray(np.abs(vector) > _NOTHING * np.max(np.abs(vector), initial=0.0))
+def _characteristic(A: FloatArray) -> FloatArray:
+    """Return the characteristic polynomial, highest power first."""
+    if not A.size:
+        return np.ones(1)
+    finite = bool(np.all(np.isfinite(A)))
+    return np.asarray(np.real(np.poly(A))) if finite else np.full(len(A) + 1, np.nan)
+
+
+def is_significant(entries: FloatArray) -> BoolArray:
+    """Return which entries are more than what a solver leaves of a zero."""
+    return np.asarray(np.abs(entries) > _COUPLED * np.max(np.abs(entries), initial=0.0))

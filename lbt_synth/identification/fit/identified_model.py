@@ -21,7 +21,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.storage.display_unit import nm_text, shown_format, shown_unit
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
-from lbt_synth.storage.summaries import Sparkline, Summarised, Summary
+from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
@@ -239,15 +239,8 @@ class IdentifiedModel(Summarised):
         return f"{self.hardware._brief()}, {count_text(len(self.parts), 'resonance')}"
 
     def _summarise(self) -> Summary:
-        """Return turbulence, noise, sensor and vibrations, with the spectrum of the first axis."""
-        first = self.axes[0]
-        above = first.frequency_hz > 0
-        curve = Sparkline(
-            caption="fitted spectrum [nm^2/Hz]",
-            frequency_hz=first.frequency_hz[above],
-            values=first.fitted_nm2_hz[above],
-        )
-        return Summary(tables=model_tables(self), notes=self.notes, curve=curve)
+        """Return turbulence, noise, sensor and vibrations."""
+        return Summary(tables=model_tables(self), notes=self.notes)
 
     @property
     def sensor_gains(self) -> tuple[float, ...]:

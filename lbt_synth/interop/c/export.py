@@ -26,13 +26,13 @@ from lbt_synth.interop.c.terms import (
     join,
     read_source,
     source_terms,
-    split,
     used_readings,
 )
 from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, choice
 
+MOST_TERMS = 100_000  # 10 MB of source
 MOST_GAINS = 1_000_000  # in the table: 8 MB of memory, 25 MB of source
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
@@ -54,6 +54,12 @@ def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) ->
                 "the applied commands; got form=plain. Leave it out."
             )
         terms = source_terms(design, form=kind)
+        count = int(np.count_nonzero(terms.whole)) if not several else 0
+        if count > MOST_TERMS:
+            raise ProblemError(
+                f"the terms of a controller must be at most {MOST_TERMS:,} in C, for each is "
+                f"written out; got {count:,}. Design with fewer states."
+            )
         if count_gains(terms) > MOST_GAINS:
             raise ProblemError(
                 f"the gains of all phases and fall-backs must be at most {MOST_GAINS:,} numbers in "
@@ -152,7 +158,6 @@ def _described(terms: SourceTerms) -> dict[str, Any]:
         "form": form,
         "masked": terms.masked,
         "applied": terms.applied,
-        "dense": terms.dense,
         "estimates": terms.gains[NONE].shape[1],
         "period": len(terms.read),
         "frame_s": terms.dt_s,
@@ -222,19 +227,18 @@ def _written_out(terms: SourceTerms, prefix: str) -> dict[str, Any]:
     def columns(**sizes: int) -> list[str]:
         return [f"{name}[{{}}][{j}]" for name, size in sizes.items() for j in range(size)]
 
-    out: dict[str, Any] = {"errors": [], "states": [], "commands": []}
-    if not terms.dense:
-        start = f"    const {prefix}_real u{{}} ="
-        transition, known = terms.transition, [*states, *applied]
-        if terms.masked:
-            names, line = columns(G=s, J=m), "        error[count++] ="
-            out["errors"] = sums(names, terms.innovation, known, line, begin="y[{}]")
-        else:
-            transition = np.concatenate([transition, terms.gains[NONE]], axis=2)
-        names = columns(A=s, L=m, B=q)
-        out["states"] = sums(names, transition, [*known, *readings], start)
-        new = [f"state->x[{j}]" if terms.masked else f"n{j}" for j in range(s)]
-        out["commands"] = sums(columns(C=s, D=q), terms.command[None], [*new, *readings], start)
+    out: dict[str, Any] = {"errors": []}
+    start = f"    const {prefix}_real u{{}} ="
+    transition, known = terms.transition, [*states, *applied]
+    if terms.masked:
+        names, line = columns(G=s, J=m), "        error[count++] ="
+        out["errors"] = sums(names, terms.innovation, known, line, begin="y[{}]")
+    else:
+        transition = np.concatenate([transition, terms.gains[NONE]], axis=2)
+    names = columns(A=s, L=m, B=q)
+    out["states"] = sums(names, transition, [*known, *readings], start)
+    new = [f"state->x[{j}]" if terms.masked else f"n{j}" for j in range(s)]
+    out["commands"] = sums(columns(C=s, D=q), terms.command[None], [*new, *readings], start)
     named = {kind: sorted(numbers) for kind, numbers in used.items()}
     return {**out, "constants": constants, "varying": varying, "used": named}
 
@@ -251,19 +255,9 @@ def _wrap_sum(terms: Sequence[tuple[str, str]], column: int) -> str:
 
 
 def _tables(terms: SourceTerms) -> dict[str, Any]:
-    """Return whole matrices, or the gains of each phase and of each set that is missing."""
-    tables: list[tuple[str, int, list[tuple[str, list[float]]]]] = []
-    if terms.dense:
-        s, _, m = terms.sizes
-        for name, matrix in (
-            ("transition", terms.transition[0][:, : s + m * terms.applied]),
-            ("gains", terms.gains[NONE][0]),
-            ("output", terms.command),
-        ):
-            columns = [(f"[:][{j}]", column) for j, column in enumerate(matrix.T.tolist())]
-            tables.append((name, matrix.size, columns))
+    """Return the gains of each phase and of each set that is missing, and where they begin."""
     if not terms.masked:
-        return {"tables": tables, "due": [], "first": [], "sets": 0}
+        return {"gains": [], "count": 0, "due": [], "first": [], "sets": 0}
     units, gains = tuple(terms.rows), []
     sets = [
         frozenset(unit for i, unit in enumerate(units) if mask >> i & 1)
@@ -281,8 +275,7 @@ def _tables(terms: SourceTerms) -> dict[str, Any]:
         first.append(begins)
     places = [own.start for own in terms.rows.values()]
     due = map(str, (terms.read[:, places] @ (1 << np.arange(len(places)))).tolist())
-    tables.append(("gains", count, gains))
-    return {"tables": tables, "due": list(due), "first": first, "sets": len(sets)}
+    return {"gains": gains, "count": count, "due": list(due), "first": first, "sets": len(sets)}
 
 
 def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
@@ -320,10 +313,7 @@ TARGET = Target(
     read=_read,
     computed=as_computed,
     start=lambda terms, _: RunningSource(terms),
-    single=lambda terms: terms if terms.single else terms.rounded(),
-    cost=frame_cost,
     join=join,
-    split=split,
     facts=_facts,
     hint="Try double precision.",
     endings=(".c",),

@@ -25,10 +25,8 @@ from lbt_synth.linear import Controller, StateSpace, estimator_form
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import BoolArray, FloatArray, set_fields
+from lbt_synth.validation import BoolArray, FloatArray
 
-_SMALL = 256  # up to so many entries of all matrices, every term is written out
-_LONGEST = 4096  # terms that are written out at most
 _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 NONE = frozenset[str]()  # no sensor is missing
 
@@ -70,14 +68,6 @@ class SourceTerms:
         (s, _, m), gains = self.sizes, self.gains[NONE][0]
         states, through = np.hsplit(self.command, [s])
         return np.block([[self.transition[0], gains], [states, np.zeros((m, m)), through]])
-
-    @property
-    def dense(self) -> bool:
-        """Whether matrices are multiplied in loops: there are many terms, and few are zero."""
-        if self.masked:
-            return False
-        count, size = int(np.count_nonzero(self.whole)), _matrix_size(self)
-        return size > _SMALL and (2 * count > size or count > _LONGEST)
 
     def rounded(self) -> SourceTerms:
         """Return the terms in single precision; refuse numbers that do not fit."""
@@ -236,35 +226,21 @@ def _added(terms: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(np.add.accumulate(terms, axis=1)[:, -1])
 
 
-_Places = list[list[tuple[NDArray[np.intp], NDArray[np.intp]]]]  # states and modes of each copy
-
-
-def _places(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign]) -> _Places:
-    """Return where each copy of each design has its states, and its modes."""
-    out, count = [], 0
-    for terms, part in zip(numbers, parts, strict=True):
-        copies = []
-        for modes in part.copies:
-            copies.append((np.arange(count, count + terms.sizes[0]), np.array(modes)))
-            count += terms.sizes[0]
-        out.append(copies)
-    return out
-
-
 def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int) -> SourceTerms:
     """Put controllers side by side, each as often as it has modes."""
-    first, places = numbers[0], _places(numbers, parts)
+    first, pairs = numbers[0], list(zip(numbers, parts, strict=True))
     if parts[0].copies == [tuple(range(count))]:
         return first
-    s = places[-1][-1][0][-1] + 1
+    s = sum(terms.sizes[0] * len(part.copies) for terms, part in pairs)
     transition, gains = np.zeros((1, s, s + count)), np.zeros((1, s, count))
-    command = np.zeros((count, s + count))
-    for terms, copies in zip(numbers, places, strict=True):
-        for states, modes in copies:
-            signals = np.concatenate([states, s + modes])
-            transition[0][np.ix_(states, signals)] = terms.transition[0]
-            gains[0][np.ix_(states, modes)] = terms.gains[NONE][0]
-            command[np.ix_(modes, signals)] = terms.command
+    command, start = np.zeros((count, s + count)), 0
+    for terms, modes in ((terms, list(copy)) for terms, part in pairs for copy in part.copies):
+        states = list(range(start, start + terms.sizes[0]))
+        start += terms.sizes[0]
+        signals = [*states, *(s + mode for mode in modes)]
+        transition[0][np.ix_(states, signals)] = terms.transition[0]
+        gains[0][np.ix_(states, modes)] = terms.gains[NONE][0]
+        command[np.ix_(modes, signals)] = terms.command
     return replace(
         first,
         transition=transition,
@@ -274,29 +250,6 @@ def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int
         read=np.ones((1, count), dtype=np.bool_),
         rows={"measurements": slice(0, count)},
     )
-
-
-def split(
-    whole: SourceTerms, parts: Sequence[ModeDesign], numbers: Sequence[SourceTerms]
-) -> list[list[SourceTerms]]:
-    """Return the terms of each copy of each design."""
-    if len(parts) == 1 and numbers[0].sizes == whole.sizes:
-        return [[whole]]
-    s, out = whole.sizes[0], []
-    for terms, copies in zip(numbers, _places(numbers, parts), strict=True):
-        held = []
-        for states, modes in copies:
-            signals = np.concatenate([states, s + modes])
-            held.append(
-                replace(
-                    terms,
-                    transition=whole.transition[0][np.ix_(states, signals)][None],
-                    gains={NONE: whole.gains[NONE][0][np.ix_(states, modes)][None]},
-                    command=whole.command[np.ix_(modes, signals)],
-                )
-            )
-        out.append(held)
-    return out
 
 
 def as_computed(design: Design, terms: SourceTerms) -> Written:
@@ -350,13 +303,6 @@ def read_source(text: str, like: SourceTerms) -> SourceTerms:
     code = re.sub(r"\by\[(\d+)\]", r"y\1", code)
     tables = {name: _numbers(body) for name, body in _TABLE.findall(code)}
     (s, q, m), period = like.sizes, len(like.read)
-    if "transition" in tables:  # whole matrices, by columns
-        columns = tables["transition"].reshape(-1, s).T
-        transition = np.zeros((1, s, s + m))
-        transition[0, :, : columns.shape[1]] = columns
-        gains = {NONE: tables["gains"].reshape(q, s).T[None]}
-        command = tables["output"].reshape(-1, m).T
-        return replace(like, transition=transition, gains=gains, command=command)
     factors = {"c": tables.get("c", np.zeros(0)), "v": np.zeros((period, 0))}
     if "varying" in tables:
         factors["v"] = tables["varying"].reshape(period, -1)
@@ -414,41 +360,17 @@ def _read_gains(
 
 @table_row
 class FrameCost:
-    """Arithmetic and memory of one frame of a controller, as exported and with whole matrices."""
+    """Arithmetic and memory of one frame of a controller, as exported to C."""
 
-    form: str = column(
-        "form of the exported source",
-        help='"straight line" where each non-zero term is written out, "loops" where the source '
-        "multiplies by whole matrices",
-    )
     multiplications: int = column(
         "multiplications per frame",
         help="Of the exported source; factors of 1 and -1 are no multiplications",
     )
-    dense_multiplications: int = column("  with whole matrices", help="The same of A, B, C, D")
     additions: int = column("additions per frame", help="Of the exported source")
-    dense_additions: int = column("  with whole matrices", help="The same of A, B, C, D")
-    coefficients: int = column(help="Numbers that the exported source stores")
-    states: int = column(help="Numbers that it keeps between frames: states and last commands")
-    coefficient_bytes_double: int = column("coefficients, double", unit="bytes", init=False)
-    coefficient_bytes_single: int = column("coefficients, single", unit="bytes", init=False)
-    dense_coefficients: int = column(
-        "  with whole matrices, double",
-        unit="bytes",
-        scale=8,
-        help="Numbers of the whole matrices",
+    coefficients: int = column("coefficients", help="Numbers that the exported source stores")
+    states: int = column(
+        "numbers kept between frames", help="Numbers that it keeps: states and last commands"
     )
-    state_bytes_double: int = column("state, double", unit="bytes", init=False)
-    state_bytes_single: int = column("state, single", unit="bytes", init=False)
-
-    def __post_init__(self) -> None:
-        set_fields(
-            self,
-            coefficient_bytes_double=8 * self.coefficients,
-            coefficient_bytes_single=4 * self.coefficients,
-            state_bytes_double=8 * self.states,
-            state_bytes_single=4 * self.states,
-        )
 
 
 def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
@@ -462,7 +384,7 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
     Returns
     -------
     FrameCost
-        Counts for the C source that :func:`export` writes, and for dense matrices.
+        Counts for the C source that :func:`export` writes.
 
     Raises
     ------
@@ -474,11 +396,11 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
     >>> import lbt_synth as lbt
     >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
     >>> cost = lbt.interop.frame_cost(lag)
-    >>> cost.multiplications, cost.additions, cost.dense_multiplications
-    (1, 1, 4)
+    >>> cost.multiplications, cost.additions
+    (1, 1)
     """
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
-    (s, _, m), size = terms.sizes, _matrix_size(terms)
+    s, _, m = terms.sizes
     sums = [terms.transition, terms.innovation, terms.command[None]]
     table, period = 0, len(terms.read)  # gains in a table, of a frame in which all is read
     if terms.masked:
@@ -494,21 +416,11 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
         stored += int(np.count_nonzero(factors & same))
         stored += period * int(np.count_nonzero(factors & ~same))
     return FrameCost(
-        form="loops" if terms.dense else "straight line",
-        multiplications=size if terms.dense else multiplied + table,
-        additions=size if terms.dense else written + table,
-        coefficients=size if terms.dense else stored + count_gains(terms),
+        multiplications=multiplied + table,
+        additions=written + table,
+        coefficients=stored + count_gains(terms),
         states=s + m,
-        dense_multiplications=size,
-        dense_additions=size - s - m,
-        dense_coefficients=period * size,
     )
-
-
-def _matrix_size(terms: SourceTerms) -> int:
-    """Return the entries of all matrices of a frame."""
-    s, q, m = terms.sizes
-    return (s + m) * (s + q + m * terms.applied)
 
 
 def used_readings(terms: SourceTerms, missing: frozenset[str]) -> BoolArray:

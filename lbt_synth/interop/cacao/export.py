@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,10 @@ class AppliedFilter:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PredictiveFilter:
-    """The filter from the pseudo-open-loop measurements to the commands of a design."""
+    """The filter from the pseudo-open-loop measurements to the commands of a design.
+
+    Where it is cut after some steps, ``norm`` bounds what it lacks.
+    """
 
     design: Design
     hardware: LoopHardware
@@ -200,61 +203,48 @@ class PredictiveFilter:
         return high
 
     def _is_enough(self, steps: int, loss: float) -> bool:
-        cut = CutFilter(whole=self, steps=steps)
-        if cut.norm > loss or cut.small_gain >= 1:
+        norm = self.cut_norm(steps)
+        if norm > loss or self.small_gain(norm) >= 1:
             return False
         return all(
-            cut.residual_nm(gain) <= _ROOM * loss * own for gain, (_, own) in self.sizes_nm.items()
+            self.residual_nm(gain, norm) <= _ROOM * loss * own
+            for gain, (_, own) in self.sizes_nm.items()
         )
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CutFilter:
-    """What a filter that is cut after some steps lacks, and the taps that are left, as rounded."""
-
-    whole: PredictiveFilter
-    steps: int
-    taps: FloatArray | None = None  # (steps, m, m)
-
-    @cached_property
-    def norm(self) -> float:
-        """Bound on the norm of what is left out: what is cut off, and what taps are rounded by."""
-        system = self.whole.system
-        late = system.C @ np.linalg.matrix_power(system.A, self.steps - 1)
-        norm = float(hinf_norm(replace(system, C=late @ system.A, D=late @ system.B)))
-        if self.taps is not None:
-            off = self.whole.taps(self.steps) - self.taps
+    def cut_norm(self, steps: int, taps: FloatArray | None = None) -> float:
+        """Bound the norm of what is cut off after some steps, and what taps are rounded by."""
+        late = self.system.C @ np.linalg.matrix_power(self.system.A, steps - 1)
+        rest = replace(self.system, C=late @ self.system.A, D=late @ self.system.B)
+        norm = float(hinf_norm(rest))
+        if taps is not None:
+            off = self.taps(steps) - taps
             norm += float(np.sum(np.linalg.norm(off, ord=2, axis=(1, 2))))
         return norm
 
-    def _gain_around(self, gain: float) -> float:
-        return self.whole.off(gain) * self.whole.at(gain)[2] * self.norm
+    def small_gain(self, norm: float) -> float:
+        """Bound the gain around the loop of what is left out; below 1 it keeps that stable."""
+        return norm / self.least_distance(norm)
 
-    @cached_property
-    def small_gain(self) -> float:
-        """Bound on the gain around the loop of what is left out; below 1 it keeps that stable."""
-        return self.norm / self.whole.least_distance(self.norm)
+    def _peak(self, gain: float, norm: float) -> float:
+        """Bound 1 / D' at a sensor gain."""
+        around = self.off(gain) * self.at(gain)[2] * norm
+        return self.at(gain)[2] / (1 - around) if around < 1 else float("inf")
 
-    def _peak(self, gain: float) -> float:
-        """Bound on 1 / D' at a sensor gain."""
-        around = self._gain_around(gain)
-        return self.whole.at(gain)[2] / (1 - around) if around < 1 else float("inf")
-
-    def response(self, gain: float) -> float:
+    def response(self, gain: float, norm: float) -> float:
         """Bound the change of the sensitivities at a sensor gain."""
-        largest = max(float(np.max(self.whole.gains(gain))), 1.0)
-        return largest * self.norm * self.whole.at(gain)[2] * self._peak(gain)
+        largest = max(float(np.max(self.gains(gain))), 1.0)
+        return largest * norm * self.at(gain)[2] * self._peak(gain, norm)
 
-    def residual_nm(self, gain: float) -> float:
+    def residual_nm(self, gain: float, norm: float) -> float:
         """Bound the rms of the residual's change at a sensor gain, over all modes."""
-        return self._peak(gain) * self.norm * self.whole.sizes_nm[gain][0]
+        return self._peak(gain, norm) * norm * self.sizes_nm[gain][0]
 
     def as_computed(self, taps: FloatArray) -> Written:
         """Return the filter of the design as a controller, and the rounding of the taps' sums.
 
         Products are added in any order.
         """
-        hardware, s = self.whole.hardware, self.whole.system
+        hardware, s = self.hardware, self.system
         m, n = hardware.modes, s.n_states
         # the last command is a state
         parameter = Controller(
@@ -268,7 +258,7 @@ class CutFilter:
         # noise in the product is part of the command; noise in the history comes as a measurement
         command = np.eye(controller.n_states, m, k=-n)
         entry = replace(controller, B=np.hstack([command, controller.B]), D=np.zeros((m, 2 * m)))
-        sizes = np.abs(np.hstack([*taps]))
+        sizes, norm = np.abs(np.hstack([*taps])), self.cut_norm(len(taps), taps)
 
         def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
             terms = sizes * np.tile(measured + commands, len(taps))
@@ -277,16 +267,16 @@ class CutFilter:
             history = 3 * commands**2 + (measured + commands) ** 2
             return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate([sums, history]))
 
-        low, high = self.whole.interval
+        low, high = self.interval
         name = f"small gain of what is left out, sensor gains {low:.4g} to {high:.4g}"
         how = "level sets, bound between gains"
         return Written(
             controllers={frozenset(): controller},
             entry=entry,
             variance=variance,
-            residual_change_nm=self.residual_nm,
-            response_change=self.response,
-            checks=(Check(name, self.small_gain, 1.0, how),),
+            residual_change_nm=partial(self.residual_nm, norm=norm),
+            response_change=partial(self.response, norm=norm),
+            checks=(Check(name, self.small_gain(norm), 1.0, how),),
         )
 
 
@@ -327,9 +317,7 @@ def _round(
 
 def _as_computed(design: Design, numbers: _Numbers) -> Written:
     """Return what is proved of a matrix."""
-    taps = -numbers[0].swapaxes(0, 1).astype(np.float64)
-    cut = CutFilter(whole=predictive_filter(design), steps=len(taps), taps=taps)
-    return cut.as_computed(taps)
+    return predictive_filter(design).as_computed(-numbers[0].swapaxes(0, 1).astype(np.float64))
 
 
 def _join(numbers: Sequence[_Numbers], parts: Sequence[ModeDesign], count: int) -> _Numbers:
@@ -349,13 +337,6 @@ def _join(numbers: Sequence[_Numbers], parts: Sequence[ModeDesign], count: int) 
         for modes in part.copies:
             whole[np.ix_(modes, range(steps), modes)] = cube
     return whole, delay
-
-
-def _split(whole: _Numbers, parts: Sequence[ModeDesign], _: object) -> list[list[_Numbers]]:
-    """Return the matrix of each copy of each design."""
-    cube, delay = whole
-    steps = range(cube.shape[1])
-    return [[(cube[np.ix_(m, steps, m)], delay) for m in part.copies] for part in parts]
 
 
 def _write(
@@ -404,9 +385,7 @@ TARGET = Target(
     read=_read,
     computed=_as_computed,
     start=lambda numbers, limit: AppliedFilter(_flat(numbers), numbers[1], limit),
-    single=lambda numbers: numbers,
     join=_join,
-    split=_split,
     facts=lambda whole, **_: {
         "steps": whole[0].shape[1],
         "latency_frames": whole[1] + 1,

@@ -18,16 +18,16 @@ from scipy.linalg import block_diag
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.files.telemetry.time_filters import is_significant, transfer_function
 from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
 from lbt_synth.interop.modes import ModeDesign
 from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
 from lbt_synth.interop.proof import ROUNDOFF, Written, prove_written, sums_variance
-from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.linear import Controller
 from lbt_synth.storage.array_file import fits_bytes, open_fits
 from lbt_synth.validation import FloatArray, frozen_copy, integer
 
 _Matrix: TypeAlias = NDArray[np.float32]
-_COUPLED = 1e-9  # of the largest entry of a matrix; less is what a solver leaves of a zero
 _NEGLIGIBLE = 1e-13  # of the largest coefficient; single precision has no use for less
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
 
@@ -61,48 +61,25 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
             f"a filter per mode needs as many commands as measurements; got {m} commands and {q} "
             "measurements. Use a target of matrices, such as c."
         )
-    A, B, C, D = (_links(getattr(system, name)) for name in "ABCD")
+    A, B, C, D = (is_significant(getattr(system, name)) for name in "ABCD")
     paths = np.linalg.matrix_power(A | np.eye(size, dtype=np.bool_), size)
-    reached, shown = paths @ B, C @ paths
-    coupled = np.argwhere((D | (C @ reached)) & ~np.eye(m, dtype=np.bool_))
+    coupled = np.argwhere((D | (C @ paths @ B)) & ~np.eye(m, dtype=np.bool_))
     if coupled.size:
         raise ProblemError(
             f"the modes must decouple; here measurement {coupled[0, 1] + 1} moves command "
             f"{coupled[0, 0] + 1}. Design with --method robust, which controls each axis alone, or "
             "use a target of matrices, such as c."
         )
-    inside = [np.flatnonzero(reached[:, mode] & shown[mode]) for mode in range(m)]
-    return [_polynomials(system, mode, states) for mode, states in enumerate(inside)]
+    return [_shortened(*transfer_function(system, mode, row)) for mode, row in enumerate(np.eye(m))]
 
 
-def _links(matrix: FloatArray) -> NDArray[np.bool_]:
-    """Return which entries couple, (rows, columns)."""
-    return np.asarray(np.abs(matrix) > _COUPLED * np.max(np.abs(matrix), initial=0.0))
-
-
-def _polynomials(
-    system: StateSpace, mode: int, states: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the quotient ``c adj(zI - A) b / det(zI - A) + d`` of some states of a mode."""
-    A = system.A[np.ix_(states, states)]
-    b, c, d = system.B[states, mode], system.C[mode, states], system.D[mode, mode]
-    with np.errstate(all="ignore"):  # what overflows is refused once it is rounded
-        den, entry = _characteristic(A), np.outer(b, c)
-        scale = 1 / (np.max(np.abs(entry), initial=0.0) or 1.0)
-        # det(zI - A + b c) = det(zI - A) + c adj(zI - A) b
-        num = d * den + (_characteristic(A - scale * entry) - den) / scale
+def _shortened(num: FloatArray, den: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Leave out the powers of ``z^-1`` that neither polynomial has."""
+    with np.errstate(all="ignore"):
         shares = [np.abs(values) / (np.max(np.abs(values)) or 1.0) for values in (num, den)]
     used = ~(np.max(shares, axis=0) <= _NEGLIGIBLE)  # what is no number is used, and refused
     count = 1 + int(np.flatnonzero(used)[-1])
     return num[:count], den[:count]
-
-
-def _characteristic(A: FloatArray) -> FloatArray:
-    """Return the characteristic polynomial, highest power first."""
-    if not A.size:
-        return np.ones(1)
-    finite = bool(np.all(np.isfinite(A)))
-    return np.asarray(np.real(np.poly(A))) if finite else np.full(len(A) + 1, np.nan)
 
 
 def direct_form(rows: FloatArray, dt_s: float) -> Controller:
@@ -253,13 +230,10 @@ TARGET = Target(
     read=_read,
     computed=_as_computed,
     start=InnerLoop,
-    single=lambda matrix: matrix,
     join=_join,
-    split=lambda matrix, parts, _: [
-        [matrix[:, list(copy)] for copy in part.copies] for part in parts
-    ],
     facts=lambda _, **options: {"sign": _SIGN},
     remark=_remark,
-    hint="Design with fewer states or less accurate models, or use a target in double precision.",
+    hint="Give an even order, design with fewer states or less accurate models, or use a target in "
+    "double precision.",
     endings=(".npy", ".fits"),
 )

@@ -20,8 +20,7 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.design.shaping.channel import Channel, laguerre_basis
 from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
 from lbt_synth.design.shaping.specification import Specification
-from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain
-from lbt_synth.interop.proof import ROUNDOFF
+from lbt_synth.interop.proof import ROUNDOFF, demanded_gains
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -166,7 +165,7 @@ def mode_loop(
             line[s] = np.hypot(line[s], np.where(covered, term.rms_nm, 0.0))
             evenly = np.where(covered, width, 0.0)
             spread[s] += term.rms_nm**2 * evenly / np.sum(evenly)
-    ranges = [d for d in specification.demands if isinstance(d, LoopErrors | MovingSensorGain)]
+    low, high = demanded_gains([specification])
     taps = sensor * np.concatenate([[0.0], single.mirror_taps])
     powers = np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(max(order + 1, taps.size))))
     return DirectFormLoop(
@@ -179,29 +178,25 @@ def mode_loop(
         noise_nm2=noise,
         line_nm=line,
         spread_nm2=spread,
-        low=min([1.0, *(r.low for r in ranges)]),
-        high=max([1.0, *(r.high for r in ranges)]),
+        low=low,
+        high=high,
     )
 
 
 def make_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
     """Return a matrix made for this arithmetic of that of a shaped design; equal modes once.
 
-    The search takes coefficients in pairs, and begins with b_0: where there is none, or an odd
-    order is needed, the rounded matrix is returned.
+    The search takes coefficients in pairs, and begins with b_0: where there is none, or the order
+    is odd, the rounded matrix is returned.
     """
-    order, used = len(exact) // 2, np.arange(len(exact))
-    rounded = exact.astype(np.float32)
-    odd = order % 2
-    if not exact[0].all() or (odd and exact[[order, -1]].any()):
+    order, rounded = len(exact) // 2, exact.astype(np.float32)
+    if order % 2 or not exact[0].all():
         return rounded
-    if odd:
-        used = np.delete(used, [order, 2 * order])
     made: dict[DirectFormLoop, NDArray[np.float32]] = {}
-    for mode, loop in enumerate(mode_loops(design, order - odd)):
+    for mode, loop in enumerate(mode_loops(design, order)):
         if loop not in made:
-            made[loop] = round_together(loop, refit(loop, exact[used, mode]))
-        rounded[used, mode] = made[loop]
+            made[loop] = round_together(loop, refit(loop, exact[:, mode]))
+        rounded[:, mode] = made[loop]
     return rounded
 
 

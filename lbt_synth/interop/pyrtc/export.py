@@ -190,7 +190,8 @@ def pol_filter(design: Design) -> PolFilter:
 def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> PolFilter:
     """Return the filter of a controller, for a response (m, m) from commands to measurements."""
     m = len(response)
-    own = replace(own, B=own.B @ response, D=own.D @ response)
+    A, B, C, D = (np.ascontiguousarray(matrix) for matrix in (own.A, own.B, own.C, own.D))
+    own = replace(own, A=A, B=B @ response, C=C, D=D @ response)
     modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
     whole = close_loop(modal, own).commanding()
     delay = max(1, int(hardware.delay_frames + 0.5))
@@ -265,9 +266,7 @@ TARGET = Target(
     read=_read,
     computed=lambda _, filters: filters[0].as_computed(),
     start=lambda filters, limit: InnerLoop(filters[0], limit),
-    single=lambda filters: filters,
     join=lambda numbers, parts, count: tuple(filters[0] for filters in numbers),
-    split=lambda whole, parts, numbers: [[(one,)] for one in whole],
     facts=lambda whole, **_: {"delay_frames": whole[0].delay_frames},
     hint="Design with less accurate models, or for lower sensor gains.",
     contents=(_CONFIG, _GAIN, _RESPONSE, _CONFIG + CERTIFICATE),

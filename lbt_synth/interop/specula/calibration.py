@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.design.modal import Reconstructor, reconstructor
-from lbt_synth.errors import OutputError
 from lbt_synth.interop.specula.optics import (
     EndToEndSystem,
     Modes,
@@ -24,7 +23,7 @@ from lbt_synth.interop.specula.optics import (
     specula_version,
 )
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
-from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _LAYOUT = 1
@@ -47,16 +46,7 @@ def cache_directory(path: str | os.PathLike[str] | None = None) -> Path:
     if path is None:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         path = Path(base) / "lbt_synth"
-    folder = Path(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot make the cache directory {folder}: {error.strerror}. "
-            "Name another one with --cache.",
-            path=folder,
-        ) from error
-    return folder
+    return make_directory(path)
 
 
 def calibrate(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,14 +20,7 @@ from lbt_synth.interop.specula.optics import EndToEndSystem, Modes, Optics
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.loop.simulation.run import SteppedController, step_controller
-from lbt_synth.models import (
-    DriftingVibration,
-    LoopHardware,
-    PositionLoop,
-    SinusoidalVibration,
-    Truth,
-    Vibration,
-)
+from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.vibration import TrueVibration
 from lbt_synth.validation import (
@@ -119,59 +111,42 @@ class EndToEndRun:
         """Residual of each mode [nm rms], (modes,)."""
         return np.asarray(np.sqrt(np.mean(self.residual_nm**2, axis=0)))
 
-    @property
-    def optical_gain(self) -> FloatArray:
-        """Gain of the sensor in the loop, for each mode, (modes,).
-
-        Regression of the measurements on the true residual, which does not yet contain the noise
-        of its measurement.
-        """
-        return self._regress(slice(None), axis=0)[0]
-
-    @property
-    def optical_gain_error(self) -> FloatArray:
-        """Standard error of each optical gain, for noise that is white, (modes,)."""
-        return self._regress(slice(None), axis=0)[1]
-
-    @property
-    def tip_tilt_gain(self) -> float:
-        """Optical gain of tip and tilt together."""
-        return float(self._regress(_TIP_TILT)[0])
-
-    @property
-    def tip_tilt_gain_error(self) -> float:
-        """Standard error of the optical gain of tip and tilt."""
-        return float(self._regress(_TIP_TILT)[1])
-
-    @property
-    def tip_tilt_noise_nm(self) -> float:
-        """Measured tip and tilt that the optical gain does not explain [nm rms per mode]."""
-        return float(self._regress(_TIP_TILT)[2])
-
-    def summary(self) -> dict[str, Any]:
-        """Return the main numbers; None stands for NaN, which JSON does not have."""
-        rms = self.rms_nm
-        return {
-            "strehl": self.strehl,
-            "strehl_error": None if math.isnan(self.strehl_error) else self.strehl_error,
-            "other_modes_strehl": self.other_modes_strehl,
-            "tip_rms_nm": float(rms[0]),
-            "tilt_rms_nm": float(rms[1]),
-            "other_modes_rms_nm": float((rms[2:] ** 2).sum() ** 0.5),
-            "tip_tilt_gain": self.tip_tilt_gain,
-            "tip_tilt_gain_error": self.tip_tilt_gain_error,
-            "tip_tilt_noise_nm": self.tip_tilt_noise_nm,
-        }
-
-    def _regress(
-        self, modes: slice, axis: int | None = None
+    def optical_gain(
+        self, modes: slice = slice(None), *, together: bool = False
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the gain of modes, each or together, its standard error, and the rest [nm rms]."""
+        """Return the gain of the sensor in the loop, of each mode or of some together.
+
+        The regression is that of the measurements on the true residual, which does not yet contain
+        the noise of its measurement. Beside the gain are its standard error, for noise that is
+        white, and what it leaves of the measurements [nm rms per mode].
+        """
+        axis = None if together else 0
         y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
         power = np.sum(phase**2, axis=axis)
         gain = np.asarray(np.sum(y * phase, axis=axis) / power)
         left = np.mean((y - gain * phase) ** 2, axis=axis)
         return gain, np.asarray(np.sqrt(left / power)), np.asarray(np.sqrt(left))
+
+    @property
+    def tip_tilt_gain(self) -> float:
+        """Optical gain of tip and tilt together."""
+        return float(self.optical_gain(_TIP_TILT, together=True)[0])
+
+    def summary(self) -> dict[str, Any]:
+        """Return the main numbers; None stands for NaN, which JSON does not have."""
+        rms, error = self.rms_nm, self.strehl_error
+        gain, gain_error, noise_nm = map(float, self.optical_gain(_TIP_TILT, together=True))
+        return {
+            "strehl": self.strehl,
+            "strehl_error": None if math.isnan(error) else error,
+            "other_modes_strehl": self.other_modes_strehl,
+            "tip_rms_nm": float(rms[0]),
+            "tilt_rms_nm": float(rms[1]),
+            "other_modes_rms_nm": float((rms[2:] ** 2).sum() ** 0.5),
+            "tip_tilt_gain": gain,
+            "tip_tilt_gain_error": gain_error,
+            "tip_tilt_noise_nm": noise_nm,
+        }
 
 
 @dataclass(kw_only=True, eq=False)
@@ -352,69 +327,6 @@ class EndToEndSetup:
     ) -> EndToEndRun:
         """Close the loop with :meth:`controller`, with options of :func:`run_end_to_end`."""
         return run_end_to_end(self, self.controller(filter, tip_tilt_gain=tip_tilt_gain), **options)
-
-    def case(
-        self,
-        controller: Controller | None,
-        *,
-        vibrations: Sequence[TrueVibration] = (),
-        seed: int = 0,
-    ) -> dict[str, Any]:
-        """Return all that a run depends on, in values that JSON can hold.
-
-        Vibrations and seed replace those of the set-up. Without a controller, integrators control
-        tip and tilt.
-        """
-        settings = asdict(replace(self, vibrations=tuple(vibrations), seed=seed, motions=()))
-        lines, system = list(settings.pop("vibrations")), settings.pop("system")
-        settings.pop("motions")  # a case has no channels
-        hardware = system.pop("hardware")  # its two matrices are the identity
-        kept = ("frame_rate_hz", "delay_frames", "mirror")
-        matrices = None
-        if controller is not None:
-            matrices = {name: getattr(controller, name).tolist() for name in "ABCD"}
-            matrices["dt_s"] = controller.dt_s
-        return {
-            "versions": {name: _installed_version(name) for name in ("lbt-synth", "specula")},
-            "system": system,
-            "hardware": {name: hardware[name] for name in kept},
-            "setup": settings,
-            "vibrations": lines,
-            "controller": matrices,
-        }
-
-
-def run_case(
-    case: Mapping[str, Any], *, cache: str | os.PathLike[str] | None = None
-) -> dict[str, Any]:
-    """Run what :meth:`EndToEndSetup.case` returned, and return its summary.
-
-    ``cache`` is the directory of calibrations and phase screens.
-    """
-    mirror = case["hardware"]["mirror"]
-    mirror = None if mirror is None else PositionLoop(**mirror)
-    system = EndToEndSystem(
-        hardware=LoopHardware(**{**case["hardware"], "mirror": mirror}), **case["system"]
-    )
-    lines = tuple(_build_vibration(line) for line in case["vibrations"])
-    setup = EndToEndSetup(system=system, vibrations=lines, **case["setup"])
-    matrices = case["controller"]
-    return setup.run(matrices and Controller(**matrices), cache=cache).summary()
-
-
-def _installed_version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _build_vibration(line: Mapping[str, Any]) -> TrueVibration:
-    """Rebuild a vibration; its fields tell which of the three types it has."""
-    values = {**line, "direction": tuple(line["direction"])}
-    if "start_hz" in line:
-        return DriftingVibration(**values)
-    return Vibration(**values) if "damping" in line else SinusoidalVibration(**values)
 
 
 def run_end_to_end(

@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
-from lbt_synth.linear.state_space import sigma_sparkline
 from lbt_synth.models.ar_model import ARModel
 from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.loop_hardware import LoopHardware
@@ -83,11 +82,7 @@ class TipTiltPlant(EstimationProblem):
     def _summarise(self) -> Summary:
         deviations = np.linalg.norm(self.own_noise_factor, axis=1)
         facts = disturbance_facts(self.turbulence, self.vibrations, deviations)
-        system, caption = self._shown_system()
-        return Summary(
-            tables=[fact_table("Plant", self.hardware.facts(), facts)],
-            curve=sigma_sparkline(system.lifted(), caption),
-        )
+        return Summary(tables=[fact_table("Plant", self.hardware.facts(), facts)])
 
     def full(self) -> FullStatePlant:
         """Return the same plant with the mirror's states, which are past commands if it settles.

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
-import functools
+import hashlib
+import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import lbt_synth
 from lbt_synth.design import Design, integrator
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop import EndToEndSetup, calibrate
-from lbt_synth.interop.specula.simulation import run_case
+from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import SinusoidalVibration, Truth
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.storage import run_cases
+from lbt_synth.storage.atomic_files import exclusive_lock
 from lbt_synth.storage.rows import column, fill_row, table_row
-from lbt_synth.studies.grid import loop_columns
+from lbt_synth.studies.grid import InlineExecutor, Parts, loop_columns
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.parameters import TABLE_II, TABLE_III, VIBRATION_HZ, PublishedRow
-from lbt_synth.validation import choice
+from lbt_synth.validation import FloatArray, choice
 
+_NUMBERS = ("strehl", "tip_tilt_gain", "tip_rms_nm", "tilt_rms_nm", "other_modes_strehl")
 CLASSICAL_GAIN = 0.5
 # "by increasing the integrator's gain"; this times the optical gain of the loop, 0.55, is the
 # effective gain that fits Table II (parameters.CLASSICAL_EFFECTIVE_GAIN)
@@ -169,9 +173,10 @@ def _plan_line(
             controller=design.controller,
             truth=replace(given.PAPER_TRUTH, vibrations=shakes),
             cases={
-                f"{name}-vibration-{vibration}-seed-{seed}": setup.case(
-                    design.controller, vibrations=shakes, seed=seed
-                )
+                f"{name}-vibration-{vibration}-seed-{seed}": {
+                    "setup": replace(setup, vibrations=shakes, motions=(), seed=seed),
+                    "controller": design.controller,
+                }
                 for seed in seeds
             },
         )
@@ -185,15 +190,15 @@ def end_to_end_tables(
     seeds: Sequence[int] = (0, 1, 2),
     row_seeds: Sequence[int] = (0,),
     tables: Sequence[str] = ("II", "III"),
-    jobs: int = 1,
     executor: Executor | None = None,
+    workers: int = 1,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[EndToEndEntry]:
     """Run Tables II and III of Agapito et al. 2008 end to end, or what is missing of them.
 
-    Each run is a case of :func:`run_cases`: started again in the same directory, only the
-    missing ones run. All controllers of a row meet the same air, vibrations and noise.
+    Each run has a file of its own: started again in the same directory with the same arguments,
+    only the missing ones run. All controllers of a row meet the same air, vibrations and noise.
 
     Parameters
     ----------
@@ -207,10 +212,10 @@ def end_to_end_tables(
         Seeds of Table II and of the row at 20 Hz; seeds of the other rows.
     tables : sequence of str, optional
         Which of "II" and "III".
-    jobs : int, optional
-        Processes.
     executor : concurrent.futures.Executor, optional
-        Runs the cases instead.
+        Runs the cases, in processes for example; it is left open. By default they run here.
+    workers : int, optional
+        How many cases the executor runs at once.
     cache : path-like, optional
         Directory for calibrations and phase screens.
     progress : callable, optional
@@ -241,7 +246,7 @@ def end_to_end_tables(
     """
     rows = plan_tables(setup, designs, seeds=seeds, row_seeds=row_seeds, tables=tables)
     return run_tables(
-        setup, rows, directory, jobs=jobs, executor=executor, cache=cache, progress=progress
+        setup, rows, directory, executor=executor, workers=workers, cache=cache, progress=progress
     )
 
 
@@ -250,22 +255,58 @@ def run_tables(
     rows: Sequence[PlannedRow],
     directory: str | os.PathLike[str],
     *,
-    jobs: int = 1,
     executor: Executor | None = None,
+    workers: int = 1,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[EndToEndEntry]:
     """Run what is missing of tables of :func:`plan_tables`; see :func:`end_to_end_tables`."""
     calibrate(setup.system, cache=cache)  # once for all processes
-    results = run_cases(
-        functools.partial(run_case, cache=cache),
-        all_cases(rows),
-        directory,
-        jobs=jobs,
-        executor=executor,
-        progress=progress,
+    cases = all_cases(rows)
+    versions = {"lbt-synth": lbt_synth.__version__, "specula": specula_version()}
+    parts = Parts(
+        folder=Path(directory),
+        columns=_NUMBERS,
+        rows=len(cases),
+        digest=_digest({"versions": versions, "cases": cases}),
     )
+    waiting = list(cases.values())
+    with exclusive_lock(parts.folder, "computation"):
+        if progress is not None:
+            progress(parts.rows - sum(stop - start for start, stop in parts.missing()))
+        parts.compute_missing(
+            _run_cases,
+            lambda some: (waiting[slice(*some)], cache),
+            part_rows=1,
+            executor=executor or InlineExecutor(),
+            in_flight=1 if executor is None else workers,
+            progress=progress or (lambda count: None),
+        )
+        numbers = np.concatenate([parts.read(path)[0] for path in parts.paths().values()])
+    results = {
+        name: dict(zip(_NUMBERS, row, strict=True))
+        for name, row in zip(cases, numbers.tolist(), strict=True)
+    }
     return make_entries(rows, results, setup)
+
+
+def _run_cases(
+    cases: Sequence[Mapping[str, Any]], cache: str | os.PathLike[str] | None
+) -> tuple[dict[str, FloatArray], list[Any]]:
+    """Return the main numbers of some runs."""
+    runs = [case["setup"].run(case["controller"], cache=cache).summary() for case in cases]
+    return {name: np.array([run[name] for run in runs]) for name in _NUMBERS}, []
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    """Return a digest of all that decides the runs: what JSON can hold, arrays and dataclasses."""
+
+    def plain(value: Any) -> Any:
+        if is_dataclass(value):
+            return {each.name: getattr(value, each.name) for each in fields(value)}
+        return value.tolist()
+
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=plain).encode()).hexdigest()
 
 
 def all_cases(rows: Iterable[PlannedRow]) -> dict[str, dict[str, Any]]:
@@ -277,11 +318,10 @@ def make_entries(
     rows: Iterable[PlannedRow], results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
 ) -> list[EndToEndEntry]:
     """Make the entries of the tables from the results of their cases."""
-    names = ("strehl", "tip_tilt_gain", "tip_rms_nm", "tilt_rms_nm", "other_modes_strehl")
     entries = []
     for row in rows:
         runs = [results[name] for name in row.cases]
-        strehls, gain, tip, tilt, others = (np.array([run[n] for run in runs]) for n in names)
+        strehls, gain, tip, tilt, others = (np.array([run[n] for run in runs]) for n in _NUMBERS)
         entry = fill_row(
             EndToEndEntry,
             row,

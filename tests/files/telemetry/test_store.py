@@ -1,4 +1,4 @@
-"""Telemetry files: what stands in them, round trips, equations that hold in the file alone, damage."""
+"""Telemetry files, and telemetry of simulations."""
 
 import json
 import os
@@ -12,10 +12,11 @@ from support.plants import lbt_axis_plant
 from support.telemetry import ENDINGS, SHELL, full, same, telemetries
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.files import Telemetry, load_telemetry, save_telemetry, telemetry_from_simulation
 from lbt_synth.files.telemetry import store
 from lbt_synth.files.telemetry.aot import lost_fields
-from lbt_synth.files.telemetry.fields import CONVENTION, LAYERS
+from lbt_synth.files.telemetry.telemetry import CONVENTION, LAYERS
 from lbt_synth.storage import array_file as archive
 
 
@@ -306,17 +307,39 @@ def test_a_settled_mirror_leaves_the_file_as_it_was(tmp_path):
     assert store.unpack(arrays, meta).mirror is None
 
 
-@pytest.mark.parametrize(
-    ("edit", "text"),
-    [
-        (lambda a, m: a.pop("MIRROR_TAPS"), "go together"),
-        (lambda a, m: m.pop("mirror"), "go together"),
-        (lambda a, m: a.update(MIRROR_TAPS=a["MIRROR_TAPS"][::-1]), "not those of its mirror"),
-        (lambda a, m: m["mirror"].update(ramp_samples=2), "not those of its mirror"),
-    ],
-)
-def test_taps_and_mirror_must_agree(edit, text):
-    arrays, meta = store.pack(full(), "float64")
-    edit(arrays, meta)
-    with pytest.raises(ValueError, match=text):
-        store.unpack(arrays, meta)
+def test_the_camera_gives_telescope_and_strehl_ratio():
+    path = lbt.LoopHardware(frame_rate_hz=800)
+    design = lbt.integrator(path, gain=0.5)
+    shake = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=200)
+    truth = lbt.Truth(turbulence=None, vibrations=(shake,))
+    run = lbt.simulate(design.controller, truth, hardware=path, frames=200, cases=2)
+    camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
+    seen = lbt.files.telemetry_from_simulation(
+        run, path, case=1, imaging=camera, name="a", metadata={"b": 1}
+    )
+    assert seen.strehl == run.strehl(camera)[1]
+    assert (seen.diameter_m, seen.obstruction, seen.imaging_wavelength_um) == (8.22, 0.11, 2.2)
+    assert (seen.name, dict(seen.metadata), seen.controller) == ("a", {"b": 1}, None)
+    three = lbt.LoopHardware(frame_rate_hz=800, modes=3)
+    slow = lbt.integrator(three, gain=0.5).controller
+    wide = lbt.simulate(slow, lbt.Truth(turbulence=None), hardware=three, frames=5)
+    assert lbt.files.telemetry_from_simulation(wide, three, imaging=camera).strehl is None
+
+
+def test_what_is_no_simulation_is_refused(axis_plant):
+    path = axis_plant.hardware
+    control = lbt.kalman(axis_plant).controller
+    run = lbt.simulate(control, lbt.Truth(turbulence=None), hardware=path, frames=5)
+    other, two = (lbt.LoopHardware(frame_rate_hz=f, modes=m) for f, m in ((500, 1), (800, 2)))
+    for parts, options, words in (
+        ((run, path), {"case": 1}, "case must be below the number of cases, 1; got 1"),
+        ((run, other), {}, "must be that of the simulation, at 800 Hz"),
+        ((3, path), {}, "expected a Simulation; got int"),
+        ((run, 3), {}, "expected a LoopHardware; got int"),
+        ((run, path), {"design": control}, "expected a Design; got Controller"),
+    ):
+        with pytest.raises(ProblemError, match=words):
+            lbt.files.telemetry_from_simulation(*parts, **options)
+    words = "interaction_matrix must have 1 measurement to match measurements"
+    with pytest.raises(DimensionError, match=words):
+        lbt.files.telemetry_from_simulation(run, two)

@@ -114,7 +114,7 @@ def test_hardware_that_is_not_known(changes, text):
         ({"metadata": {"a": [1]}}, "metadata must hold texts, numbers and truth values; got list"),
         ({"metadata": {"a": float("inf")}}, "metadata must be finite; got inf for 'a'"),
         ({"integrator_gains": [0.4]}, "integrator_gains must have 2 commands to match commands"),
-        ({"controller": 3}, "controller must be a Controller; got int"),
+        ({"controller": 3}, "expected a Controller; got int"),
         (
             {"frame_rate_hz": 801.0, "mirror": None},
             "controller must run at 801 Hz; got one for 800 Hz",

@@ -47,7 +47,7 @@ def test_the_matrix_holds_the_controller(tmp_path, designs, name):
         allowed = rounding * (sums[0] + np.abs(exact) * sums[1]) / np.abs(bottom)
         assert np.all(np.abs(found - exact) <= 1.001 * allowed + 1e-12 * np.abs(exact))
         assert relative(found, exact) < 1e-3  # so little of the whole
-    assert written.error == written.error_single < 1e-4
+    assert written.error < 1e-4
 
 
 def test_fits_and_npy_are_alike(tmp_path, designs):
@@ -83,7 +83,7 @@ def shaped_run(shaped):
     return total, noise, own[0, 1000:, 0]
 
 
-@pytest.mark.parametrize("order", [20, 15])
+@pytest.mark.parametrize("order", [20, 16])
 def test_a_shaped_design_that_single_precision_breaks_is_made_again(
     tmp_path, shaped, shaped_run, order
 ):

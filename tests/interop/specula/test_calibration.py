@@ -14,7 +14,7 @@ def test_the_cache_must_be_a_directory(tmp_path):
     from lbt_synth.interop.specula.calibration import cache_directory
 
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cache directory"):
+    with pytest.raises(OutputError, match="cannot make the directory"):
         cache_directory(tmp_path / "file" / "cache")
 
 

@@ -26,7 +26,7 @@ from lbt_synth.report.explore.exploration import (
     whole_view,
 )
 from lbt_synth.report.figures.records import exact_spectrum
-from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
+from lbt_synth.storage.display_unit import own_display_unit, show_in
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_moves_in_words(exploration):
 def test_wavefronts_in_another_unit(exploration):
     view = quick_view(exploration, "kalman", {"noise": 20.0})
     with own_display_unit():
-        show_in(DisplayUnit(name="mas", nm=10.0))
+        show_in("mas", 10.0)
         assert describe_moves(exploration, view) == "measurement noise 2 mas"
         assert " mas rms, Strehl ratio" in judge(view)
 

@@ -21,7 +21,7 @@ import lbt_synth as lbt
 from lbt_synth.report.explore import server
 from lbt_synth.report.explore.exploration import explore, quick_view, whole_view
 from lbt_synth.report.explore.server import Lane, LivePanel, Session, explore_numbers, save_view
-from lbt_synth.storage.display_unit import DisplayUnit, nm_text, own_display_unit, show_in
+from lbt_synth.storage.display_unit import nm_text, own_display_unit, show_in
 
 # numbers of all sources, by the chart that draws them
 CURVES = """
@@ -389,7 +389,7 @@ def test_a_closed_lane_drops_what_waits():
 def test_work_is_shown_in_the_unit_of_the_page():
     shown, ended = [], Event()
     with own_display_unit():
-        show_in(DisplayUnit(name="mas", nm=10.0))
+        show_in("mas", 10.0)
         lane = Lane()
     lane.submit(lambda: (shown.append(nm_text(20.0)), ended.set()))
     assert ended.wait(10)

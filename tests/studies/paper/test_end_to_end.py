@@ -1,13 +1,15 @@
 """The tables of the paper, end to end: plans and entries."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from support.end_to_end import fake_results, load_setup, make_table, plan_rows
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.studies.paper import end_to_end
 from lbt_synth.studies.paper.end_to_end import (
     all_cases,
     make_entries,
@@ -41,13 +43,13 @@ def test_the_tables_as_planned(rows):
     # the 20 Hz row of Table III is the row with vibration of Table II
     assert len(cases) == 8 * 2 + 3 * 14
     moved = [
-        c["vibrations"][0]["frequency_hz"]
+        c["setup"].vibrations[0].frequency_hz
         for n, c in cases.items()
         if n.startswith("slow-v") and "none" not in n
     ]
     assert sorted(set(moved)) == sorted(40 - row.model_hz for row in TABLE_III)
     still = {
-        c["vibrations"][0]["frequency_hz"]
+        c["setup"].vibrations[0].frequency_hz
         for n, c in cases.items()
         if n.startswith("kal") and "none" not in n
     }
@@ -56,7 +58,7 @@ def test_the_tables_as_planned(rows):
 
 def test_seeds_are_shared_by_the_controllers(rows):
     for row in rows:
-        seeds = [case["setup"]["seed"] for case in row.cases.values()]
+        seeds = [case["setup"].seed for case in row.cases.values()]
         expected = [0, 1] if row.table == "II" or row.error_hz == 0 else [0]
         assert seeds == expected
 
@@ -101,3 +103,39 @@ def test_a_design_cannot_take_the_name_of_the_papers(setup):
     design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
     with pytest.raises(ProblemError, match="the name kalman is taken"):
         plan_tables(setup, {"kalman": design})
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Set-ups that were run, by what stands in for SPECULA."""
+    seen = []
+
+    def run(setup, controller, cache):
+        seen.append(setup)
+        numbers = dict.fromkeys(("tip_tilt_gain", "other_modes_strehl"), 0.6)
+        numbers |= {"strehl": 0.7 + 0.01 * setup.seed, "tip_rms_nm": 3.0, "tilt_rms_nm": 4.0}
+        return SimpleNamespace(summary=lambda: numbers)
+
+    monkeypatch.setattr(end_to_end, "calibrate", lambda *_, **__: None)
+    monkeypatch.setattr(end_to_end, "specula_version", lambda: "1.1")
+    monkeypatch.setattr(lbt.interop.EndToEndSetup, "run", run)
+    return seen
+
+
+def test_only_what_is_missing_runs_again(tmp_path, setup, runs):
+    counted = []
+    options = {"seeds": [0, 1], "tables": ["II"], "progress": counted.append}
+    first = lbt.studies.end_to_end_tables(setup, tmp_path, **options)
+    assert len(runs) == len(list(tmp_path.glob("*.npz"))) == sum(counted) == 12
+    assert first[0].strehls == pytest.approx((70.0, 71.0))
+    for path in sorted(tmp_path.glob("*.npz"))[3:5]:
+        path.unlink()
+    again = lbt.studies.end_to_end_tables(setup, tmp_path, **options)
+    assert (len(runs), sum(counted)) == (14, 24)
+    assert [entry.strehls for entry in again] == [entry.strehls for entry in first]
+
+
+def test_runs_of_other_settings_are_not_mixed_in(tmp_path, setup, runs):
+    lbt.studies.end_to_end_tables(setup, tmp_path, seeds=[0], tables=["II"])
+    with pytest.raises(OutputError, match="is of another study"):
+        lbt.studies.end_to_end_tables(replace(setup, gain=0.4), tmp_path, seeds=[0], tables=["II"])

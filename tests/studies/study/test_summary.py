@@ -4,7 +4,7 @@ import numpy as np
 from support.study_results import cell_text, make_columns
 
 import lbt_synth as lbt
-from lbt_synth.storage.display_unit import DisplayUnit, own_display_unit, show_in
+from lbt_synth.storage.display_unit import own_display_unit, show_in
 from lbt_synth.studies.study.summary import (
     comparison_table,
     sensitivity_table,
@@ -44,7 +44,7 @@ def test_tables(small):
     assert residual["99th percentile"] == "unstable"
     assert residual["of noise"] == "20.0"
     with own_display_unit():
-        show_in(DisplayUnit(name="mas", nm=8.0))
+        show_in("mas", 8.0)
         angles = lbt.studies.summary_tables(found)[1]
     assert angles.headings[0] == "residual [mas rms]"
     assert {row[0]: row[1] for row in angles.rows if len(row) > 1}["of noise"] == "2.50"

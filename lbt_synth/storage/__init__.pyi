@@ -1,1 +1,0 @@
-from .resumable_runs import run_cases as run_cases

@@ -1,0 +1,239 @@
+"""What commands show: wavefronts in the unit that is asked for, and the configured truth."""
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+from support.commands import run
+from support.configs import with_errors
+from support.plants import LBT_YAML
+from support.robust_config import robust_writer
+
+import lbt_synth as lbt
+from lbt_synth.cli.main import main
+from lbt_synth.storage.display_unit import own_display_unit, show_in
+
+CONFIG = str(LBT_YAML)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A small configuration, a gain file for it, and a simulated night of one run."""
+    folder = tmp_path_factory.mktemp("units")
+    text = LBT_YAML.read_text().replace("cases: 4", "cases: 1")
+    small = folder / "c.yaml"
+    small.write_text(with_errors(text, -1, 1))
+    gain = str(lbt.save_gain(folder / "k.fits", lbt.load_config(small).design("kalman")))
+    assert main(["simulate", str(small), gain, "--telemetry", str(folder / "n.fits")]) == 0
+    return folder
+
+
+COMMANDS = {
+    "design": ("{}/c.yaml", "--method", "kalman", "-o", "{}/d.fits"),
+    "show": ("{}/k.fits",),
+    "simulate": ("{}/c.yaml", "{}/k.fits", "-o", "{}/s.svg"),
+    "limits": ("{}/c.yaml", "{}/k.fits", "-o", "{}/l.svg"),
+    "robustness": ("{}/c.yaml",),
+    "plot sigma": ("{}/k.fits", "-o", "{}/g.svg"),
+    "plot bode": ("{}/k.fits",),
+    "plot step": ("{}/k.fits", "-o", "{}/t.svg"),
+    "identify": ("{}/n.fits", "-o", "{}/i.yaml", "--no-figure"),
+    "rehearse": ("{}/k.fits", "--for", "matlab", "--frames", "600"),
+}
+
+
+def run_on(capsys, files, command, *options):
+    words = [word.format(files) for word in COMMANDS[command]]
+    assert main([*command.split(), *words, *options]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("unit", ["mas", "urad"])
+def test_no_nanometre_is_left(capsys, files, command, unit):
+    option = "--show-unit" if command == "identify" else "--unit"
+    out = run_on(capsys, files, command, option, unit)
+    assert unit in out
+    assert re.findall(r".*\bnm\b.*", out) == []
+
+
+def test_no_nanometre_is_left_on_a_page(capsys, files):
+    page = files / "r.html"
+    words = ["report", f"{files}/c.yaml", f"{files}/k.fits", "--unit", "mas", "-o", str(page)]
+    assert main(words) == 0
+    text = re.sub(r"(?s)<(script|style|pre)\b.*?</\1>|<[^>]+>", " ", page.read_text())
+    assert re.findall(r".*\bnm\b.*", text) == []
+    assert "mas of noise per" in " ".join(text.split())
+    capsys.readouterr()
+
+
+def test_the_numbers_are_those_of_the_diameter(capsys, files):
+    in_nm, in_mas = (
+        float(
+            re.search(r"estimation error, rms +([\d.]+)", run_on(capsys, files, "show", *o)).group(
+                1
+            )
+        )
+        for o in ((), ("--unit", "mas"))
+    )
+    assert in_nm / in_mas == pytest.approx(lbt.models.nm_per_mas(8.22), rel=1e-5)
+    assert "nm" in run_on(capsys, files, "show")  # the choice was that of one command
+
+
+def test_json_stays_in_nanometres(capsys, files):
+    one, other = (
+        json.loads(run_on(capsys, files, "limits", "--json", *o)) for o in ((), ("--unit", "mas"))
+    )
+    assert one == other
+
+
+def test_a_configuration_may_choose(capsys, files, tmp_path):
+    own = tmp_path / "own.yaml"
+    own.write_text((files / "c.yaml").read_text() + "\nunits: mas\n")
+    assert main(["robustness", str(own)]) == 0
+    assert "residual [mas]" in capsys.readouterr().out
+    assert main(["robustness", str(own), "--unit", "nm"]) == 0
+    assert "residual [nm]" in capsys.readouterr().out
+
+
+def test_an_angle_needs_a_diameter(capsys, tmp_path):
+    plant = lbt.load_config(CONFIG).plant
+    lbt.save_gain(tmp_path / "bare.fits", lbt.kalman(plant))
+    assert main(["show", str(tmp_path / "bare.fits"), "--unit", "mas"]) == 2
+    assert "telescope's diameter, which is not known here" in capsys.readouterr().err
+
+
+def test_modes_beside_tilt_have_lengths_only(capsys, tmp_path):
+    words = ["modal", CONFIG, "--modes", "6", "-o", str(tmp_path / "m.svg")]
+    assert main([*words, "--unit", "um"]) == 0
+    out = capsys.readouterr().out
+    assert "residual [um]" in out
+    assert re.findall(r".*\bnm\b.*", out) == []
+    assert main([*words, "--unit", "mas"]) == 2
+    assert "--unit mas is an angle of tip and tilt" in capsys.readouterr().err
+
+
+def test_telemetry_is_shown_in_an_angle(capsys, files):
+    """The rms of the series, which files and JSON have in nm."""
+    path = str(files / "n.fits")
+    assert main(["telemetry", path, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["units"]["residual_nm"] == "nm"
+    assert main(["telemetry", path, "--unit", "mas"]) == 0
+    (row,) = re.findall(r"residual_nm .*", capsys.readouterr().out)
+    scale = lbt.models.nm_per_mas(data["diameter_m"])
+    assert float(row.split()[-1]) == pytest.approx(data["rms"]["residual_nm"] / scale, rel=1e-5)
+    assert row.split()[-2] == "mas"
+
+
+def test_a_demand_has_its_limit_in_the_unit():
+    step = lbt.design.shaping.CommandRms(at_most_nm=30.0, turbulence=None, noise_nm=5.0)
+    with own_display_unit():
+        show_in("mas", 10.0)
+        assert step.label == "command stroke of at most 3 mas rms"
+    assert step.label == "command stroke of at most 30 nm rms"
+
+
+LINE = "{kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}"
+SHAKEN = """
+  robust:
+    bands:
+      - {low_hz: 19.0, high_hz: 21.0, rms_mas: 80.0, axis: tip}
+    modulus_margin: 0.8
+    functions: 12
+    states: null
+"""
+
+
+def truth_of(capsys, *arguments):
+    status, text, _ = run(capsys, *arguments, "--json")
+    assert status == 0
+    return json.loads(text)
+
+
+def test_design_and_show_give_the_residual_in_the_truth(tmp_path, capsys, config):
+    gain = tmp_path / "k.fits"
+    made = truth_of(capsys, "design", LBT_YAML, "--method", "kalman", "-o", gain)
+    shown = truth_of(capsys, "show", gain)
+    loop = lbt.close_loop(config.hardware, lbt.load_gain(gain).controller)
+    exact = lbt.residual_budget(loop, config.truth)
+    for data in (made, shown):
+        ours, *others = data["truth"]
+        assert ours["design"] == "this design"
+        assert ours["residual_nm"] == pytest.approx(exact.rms_nm)
+        assert ours["strehl"] == pytest.approx(lbt.strehl(exact, config.imaging))
+        assert [row["design"] for row in others] == ["integrator", "hinf"]  # it is kalman itself
+        assert data["truth_limit_nm"] == pytest.approx(37.7777, abs=1e-4)
+        assert data["wavelength_um"] == 2.2
+        assert data["residual_nm"] == pytest.approx(205.143, abs=1e-3)  # in its model
+    status, text, _ = run(capsys, "show", gain)
+    assert status == 0
+    assert "In the truth of k.fits; Strehl ratio at 2.2 um" in text
+    assert "least residual of any linear controller in the truth: 37.7777 nm rms" in text
+
+
+def test_the_wavelength_is_that_of_the_file(tmp_path, capsys):
+    path = tmp_path / "k_band.yaml"
+    path.write_text(LBT_YAML.read_text().replace("wavelength_um: 2.2", "wavelength_um: 1.65"))
+    gain = tmp_path / "g.npz"
+    status, text, _ = run(capsys, "design", path, "--method", "integrator", "-o", gain)
+    assert (status, "In the truth of k_band.yaml; Strehl ratio at 1.65 um" in text) == (0, True)
+    assert "at 1.65 um" in run(capsys, "show", gain)[1]
+
+
+def test_a_residual_that_the_design_does_not_expect_is_a_warning(tmp_path, capsys):
+    gain = tmp_path / "g.fits"
+    still = LBT_YAML.with_name("lbt_robust.yaml")  # its model has no vibration
+    status, text, _ = run(capsys, "design", still, "--method", "kalman", "-o", gain)
+    assert status == 0
+    assert (
+        "warning: the truth leaves 776 nm in means over frames, where the design expects 12 nm"
+        in text
+    )
+    drifts = tmp_path / "drifts.yaml"
+    moving = (
+        "{kind: drift, axis: tip, frequency_hz: 20.0, end_hz: 21.0, duration_s: 9, rms_mas: 80.0}"
+    )
+    drifts.write_text(LBT_YAML.read_text().replace(LINE, moving))
+    status, text, _ = run(capsys, "design", drifts, "--method", "kalman", "-o", gain)
+    assert status == 0
+    assert "a vibration of the truth drifts" in text
+    assert "In the truth" not in text
+
+
+def test_a_demand_that_costs_residual_is_named(tmp_path, capsys):
+    model = (
+        "    kind: ar2",
+        (
+            "    kind: ar2\n  vibrations:\n"
+            "    - {axis: tip, frequency_hz: 20.0, damping: 0.005, rms_mas: 80.0}"
+        ),
+    )
+    path, gain = robust_writer(tmp_path)(SHAKEN, model=model), tmp_path / "r.fits"
+    status, text, _ = run(capsys, "design", path, "--method", "robust", "-o", gain)
+    assert status == 0
+    better = [line for line in text.splitlines() if "leaves less in the truth" in line]
+    assert better
+    assert all("it violates: modulus margin of at least 0.8" in line for line in better)
+
+
+def test_an_unstable_loop_in_the_truth_is_told(tmp_path, capsys):
+    path, gain = tmp_path / "loud.yaml", tmp_path / "g.fits"
+    text = LBT_YAML.read_text()
+    assert "sensor_gain: 1.0 " in text
+    path.write_text(text.replace("sensor_gain: 1.0 ", "sensor_gain: 3.0 "))
+    status, out, _ = run(capsys, "design", path, "--method", "kalman", "-o", gain)
+    assert status == 0
+    assert "warning: the loop is unstable in the truth." in out
+
+
+def test_a_configuration_in_a_gain_file_that_is_damaged_is_refused(tmp_path, capsys, config):
+    design = config.design("integrator")
+    assert lbt.load_gain(lbt.save_gain(tmp_path / "i.npz", design)).configuration == config.text
+    gain = lbt.save_gain(tmp_path / "g.fits", replace(design, configuration='{"version": 3}'))
+    status, _, error = run(capsys, "show", gain)
+    assert status == 2
+    assert error.startswith(f"lbt-synth: error: the configuration in {gain}: ")
+    plain = lbt.save_gain(tmp_path / "p.fits", replace(design, configuration=""))
+    assert "In the truth" not in run(capsys, "show", plain)[1]
