@@ -91,20 +91,21 @@ class Imaging:
         return 4 / (self.wavelength_um * 1e3)
 
 
-def strehl(budget: ResidualBudget, imaging: Imaging) -> float:
+def strehl(budget: ResidualBudget, imaging: Imaging) -> Any:
     """Strehl ratio, in [0, 1], of a loop's exact residual on one or two axes.
 
     Parameters
     ----------
     budget : ResidualBudget
-        Residual of tip and tilt.
+        Residual of tip and tilt, of one loop or of p.
     imaging : Imaging
         The camera.
 
     Returns
     -------
-    float
-        Long-exposure Strehl ratio, the other modes included.
+    float or (p,) ndarray
+        Long-exposure Strehl ratio, the other modes included; 0 where the image moves by more than
+        160 times its width, nan where a loop is unstable.
 
     Raises
     ------
@@ -122,9 +123,16 @@ def strehl(budget: ResidualBudget, imaging: Imaging) -> float:
     >>> round(lbt.strehl(still, lbt.Imaging(diameter_m=8.22, other_modes=0.84)), 12)
     0.84
     """
-    return jitter_strehl(
-        budget.gaussian_nm2, imaging=imaging, line_amplitudes_nm=budget.line_amplitudes_nm
-    )
+    one = budget.noise_nm2.ndim == 2
+    gaussian, lines = budget.gaussian_nm2, budget.line_amplitudes_nm
+    if one:
+        gaussian, lines = gaussian[None], lines[None]
+    stable = np.broadcast_to(budget.stable, len(gaussian))
+    out = np.where(stable, 0.0, np.nan)
+    spread = jitter_spread_nm(gaussian[stable], lines[stable])
+    near = np.flatnonzero(stable)[spread <= widest_jitter_nm(imaging)]
+    out[near] = jitter_strehls(gaussian[near], imaging=imaging, line_amplitudes_nm=lines[near])
+    return float(out[0]) if one else out
 
 
 def jitter_strehl(

@@ -22,9 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import LbtSynthError, NumericalError, OutputError, ProblemError
-from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, strehl
-from lbt_synth.loop.ensemble.evaluation import EnsembleResiduals
-from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
+from lbt_synth.loop import ClosedLoop, Imaging, ResidualBudget, residual_budget, strehl
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage import array_file
@@ -48,18 +46,13 @@ def loop_columns(
     """Return what a loop leaves in a truth, by column; nan where it is unstable."""
     if not loop.is_stable:
         return {"stable": 0.0} | dict.fromkeys(("strehl", *RESIDUALS), np.nan)
-    budget = residual_budget(loop, truth, frame_means=frame_means)
-    spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
-    # 0 beyond the widest jitter that is integrated, as in EnsembleResiduals.strehl
-    ratio = strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0
-    residuals = {column: float(getattr(budget, name)) for column, name in RESIDUALS.items()}
-    return {"stable": 1.0, "strehl": ratio} | residuals
+    return residual_columns(residual_budget(loop, truth, frame_means=frame_means), imaging)
 
 
-def stack_columns(residuals: EnsembleResiduals, imaging: Imaging) -> dict[str, FloatArray]:
-    """Return what p loops leave, by column (p,); nan where a loop is unstable."""
-    columns = {column: getattr(residuals, name) for column, name in RESIDUALS.items()}
-    return {"stable": residuals.stable * 1.0, "strehl": residuals.strehl(imaging)} | columns
+def residual_columns(budget: ResidualBudget, imaging: Imaging) -> dict[str, Any]:
+    """Return what a loop or p of them leave, by column (p,); nan where one is unstable."""
+    columns = {column: getattr(budget, name) for column, name in RESIDUALS.items()}
+    return {"stable": budget.stable * 1.0, "strehl": strehl(budget, imaging)} | columns
 
 
 def moved_lines(

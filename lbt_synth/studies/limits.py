@@ -302,7 +302,7 @@ def compare_in_truth(
 def _means_nm(design: Design, config: Config) -> float:
     """Return what a design leaves in means over frames, as it expects it."""
     loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
-    return residual_budget(loop, config.truth, frame_means=True).rms_nm
+    return float(residual_budget(loop, config.truth, frame_means=True).rms_nm)
 
 
 def _warnings(
