@@ -27,7 +27,8 @@ from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import plant_budget
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware
 from lbt_synth.validation import BoolArray, FloatArray
 

@@ -28,7 +28,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import kalman_riccati
 from lbt_synth.loop.budget import plant_budget
-from lbt_synth.loop.closed_loop import radii_by_gain
+from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
 AGELESS = Accelerometer(

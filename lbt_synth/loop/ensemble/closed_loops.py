@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear.state_space import stacked_response
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, last_frame, loop_matrices
 from lbt_synth.loop.evaluator import STILL, Evaluator, block_diagonal
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import (
@@ -274,8 +274,11 @@ def _close_part(
     start: FloatArray,
 ) -> LoopStack:
     """Close the loops of a part at one whole delay."""
-    path = {"sensor": part.sensor, "influence": part.influence}
-    ends = [loop_matrices(*part.controllers(rows), mirror=mirror, **path) for mirror in mirrors]
+    k, readings = part.controllers(rows), last_frame(part.sensor)
+    ends = [
+        loop_matrices(*k, mirror=mirror, readings=readings, influence=part.influence)
+        for mirror in mirrors
+    ]
     share, gain, n = fraction[:, None, None], gains[:, None, None], len(part.influence)
     A0, A1, B, C0, C1, D = (one + share * (two - one) for one, two in zip(*ends, strict=True))
     A, C = A0 + gain * A1, C0 + gain * C1

@@ -88,7 +88,7 @@ def ensemble_residuals(
     given = controller if isinstance(controller, list | tuple) else [controller]
     each = [as_controller(one) for one in given]
     for one in each:
-        require_matching_controller(hardware, one)
+        require_matching_controller(hardware.own_sensor_alone(), one)
     sizes, count = sorted({one.n_states for one in each}), ensemble.loops
     if len(each) not in (1, count) or len(sizes) != 1:
         raise DimensionError(

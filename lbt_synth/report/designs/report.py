@@ -29,9 +29,9 @@ from lbt_synth.loop import (
     stable_sensor_gains,
     strehl,
 )
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
-from lbt_synth.loop.moving_gain import MovingGain
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.loop.stable_range import MovingGain, radii_by_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.designs.simulation import DesignSimulation, simulate_design
