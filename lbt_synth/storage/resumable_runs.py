@@ -13,9 +13,10 @@ import json
 import os
 import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lbt_synth.errors import NumericalError, OutputError, ProblemError
 from lbt_synth.storage.atomic_files import exclusive_lock, write_atomically
@@ -25,6 +26,7 @@ from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.validation import integer
 
 Case = Mapping[str, Any]
+Key = TypeVar("Key")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}\Z")
 
 
@@ -90,50 +92,90 @@ def run_cases(
         results = {name: result for name, result in found.items() if result is not None}
         if progress is not None and results:
             progress(len(results))
-        missing = {name: case for name, case in cases.items() if name not in results}
-        with contextlib.closing(_results(function, missing, jobs, executor)) as finished:
-            for name, result in finished:
-                results[name] = _write(folder, name, digests[name], cases[name], result)
+        missing = [(name, (dict(case),)) for name, case in cases.items() if name not in results]
+        failed = []
+        with _executor(executor, min(jobs, len(missing))) as pool:
+            in_flight = calls_in_flight(pool)
+            for name, future in finished_calls(pool, function, missing, in_flight=in_flight):
+                if future.cancelled() or future.exception() is not None:
+                    failed.append(future)
+                    continue
+                results[name] = _write(folder, name, digests[name], cases[name], future.result())
                 if progress is not None:
                     progress(1)
+            if failed:
+                failed[0].result()
     return {name: results[name] for name in cases}
 
 
-def _results(
-    function: Callable[[Case], Mapping[str, Any]],
-    cases: Mapping[str, Case],
-    jobs: int,
-    executor: Executor | None,
-) -> Generator[tuple[str, Mapping[str, Any]], None, None]:
-    """Yield results as they come; if a case fails, wait for those that are running."""
-    if executor is None and (jobs == 1 or len(cases) <= 1):
-        for name, case in cases.items():
-            yield name, function(case)
-        return
-    workers = min(jobs, len(cases))
-    with _processes(workers) if executor is None else contextlib.nullcontext(executor) as pool:
-        futures = {pool.submit(function, dict(case)): name for name, case in cases.items()}
+class InlineExecutor(Executor):
+    """Executor that runs each call at once in this process."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Run a call; its error is that of the future."""
+        future: Future[Any] = Future()
         try:
-            for future in as_completed(futures):
-                if not future.cancelled() and future.exception() is None:
-                    yield futures[future], future.result()
-                else:
-                    _cancel(futures)
-        finally:
-            _cancel(futures)
-        for future in futures:  # raise the error of the first case that failed
-            if not future.cancelled():
-                future.result()
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
 
-def _cancel(futures: Iterable[Future[Any]]) -> None:
-    for future in futures:
-        future.cancel()
+def finished_calls(
+    executor: Executor,
+    function: Callable[..., Any],
+    calls: Iterable[tuple[Key, tuple[Any, ...]]],
+    *,
+    in_flight: int,
+) -> Generator[tuple[Key, Future[Any]], None, None]:
+    """Yield the keys and futures of calls as they finish, of which some are in flight at a time.
+
+    If one fails, no other begins, and those that run are waited for.
+    """
+    waiting, running = iter(calls), dict[Future[Any], Key]()
+    failed = False
+    try:
+        while True:
+            for key, arguments in islice(waiting, 0 if failed else in_flight - len(running)):
+                running[_submit(executor, function, arguments)] = key
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                failed = failed or future.cancelled() or future.exception() is not None
+                yield running.pop(future), future
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _submit(
+    executor: Executor, function: Callable[..., Any], arguments: tuple[Any, ...]
+) -> Future[Any]:
+    """Submit a call; the future has the error of an executor that is broken."""
+    try:
+        return executor.submit(function, *arguments)
+    except Exception as error:
+        future: Future[Any] = Future()
+        future.set_exception(error)
+        return future
+
+
+def calls_in_flight(executor: Executor, workers: int | None = None) -> int:
+    """Return how many calls an executor has at a time: two a worker, so that none waits."""
+    if isinstance(executor, InlineExecutor):
+        return 1
+    return 2 * (workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
 @contextlib.contextmanager
-def _processes(workers: int) -> Iterator[Executor]:
-    """Provide processes; an error in the block ends them at once."""
+def _executor(executor: Executor | None, workers: int) -> Iterator[Executor]:
+    """Provide an executor: that of the caller, this process, or others.
+
+    An error in the block ends other processes at once.
+    """
+    if executor is not None or workers <= 1:
+        yield executor or InlineExecutor()
+        return
     try:
         with limit_threads(), WorkerPool(workers) as pool:
             yield pool

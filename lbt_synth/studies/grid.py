@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,6 +28,7 @@ from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.storage.input_files import read_bytes
+from lbt_synth.storage.resumable_runs import finished_calls
 from lbt_synth.validation import FloatArray
 
 Rows = tuple[int, int]  # the first, and the one after the last
@@ -73,19 +74,6 @@ def moved_lines(
             )
         moved.append((line, frequencies))
     return moved
-
-
-class InlineExecutor(futures.Executor):
-    """Executor that runs each call at once in this process."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
-        """Run a call; its error is that of the future."""
-        future: futures.Future[Any] = futures.Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,27 +148,19 @@ class Parts:
         """
         if make_directory(self.folder).is_symlink():
             refuse(self.folder, "is a link; expected a directory.")
-        waiting = iter(
+        ranges = (
             (first, min(first + part_rows, stop))
             for start, stop in self.missing()
             for first in range(start, stop, part_rows)
         )
-        running: dict[futures.Future[tuple[Result, float]], Rows] = {}
-        try:
-            while True:
-                for rows in islice(waiting, in_flight - len(running)):
-                    with _explain_failure(rows):
-                        running[executor.submit(timed, function, *arguments(rows))] = rows
-                if not running:
-                    return
-                for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
-                    rows = running.pop(future)
-                    with _explain_failure(rows):
-                        self.write(rows, *future.result())
-                    progress(rows[1] - rows[0])
-        finally:
-            for future in running:
-                future.cancel()
+        calls = ((rows, (function, *arguments(rows))) for rows in ranges)
+        with contextlib.closing(
+            finished_calls(executor, timed, calls, in_flight=in_flight)
+        ) as finished:
+            for rows, future in finished:
+                with _explain_failure(rows):
+                    self.write(rows, *future.result())
+                progress(rows[1] - rows[0])
 
 
 def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:

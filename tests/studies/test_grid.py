@@ -21,9 +21,10 @@ from support.studies import (
 
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
+from lbt_synth.storage.resumable_runs import InlineExecutor
 from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.grid import InlineExecutor, Parts
+from lbt_synth.studies.grid import Parts
 
 
 def test_a_sweep_knows_what_is_missing(tmp_path):
