@@ -1,5 +1,4 @@
 from .broken_loops import broken_loops as broken_loops
-from .budget import model_budget as model_budget
 from .budget import residual_budget as residual_budget
 from .budget import settling_error as settling_error
 from .closed_loop import ClosedLoop as ClosedLoop

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
@@ -30,15 +29,18 @@ from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
-def residual_budget(loop: ClosedLoop, truth: Truth, *, frame_means: bool = False) -> ResidualBudget:
+def residual_budget(
+    loop: ClosedLoop, truth: Truth | TipTiltPlant, *, frame_means: bool = False
+) -> ResidualBudget:
     """Exact stationary residual of a loop under a truth, as the camera sees it.
 
     Parameters
     ----------
     loop : ClosedLoop
         The loop; its sensor gain must be the truth's.
-    truth : Truth
-        Disturbances.
+    truth : Truth or TipTiltPlant
+        Disturbances. Where a plant's model is the truth, each mode has its own turbulence, and the
+        processes are of means over frames; its turbulence, vibrations and noise enter any loop.
     frame_means : bool, optional
         Whether the phase of a frame is one number, as in a simulator that steps by frames. What
         moves within a frame is then left out, and rms and spectra are those of these numbers.
@@ -74,93 +76,52 @@ def residual_budget(loop: ClosedLoop, truth: Truth, *, frame_means: bool = False
     >>> shake = lbt.Truth(turbulence=None, vibrations=(line,))
     >>> round(lbt.residual_budget(loop, shake).within_nm, 1)
     36.1
-    """
-    require_instance(loop, ClosedLoop, "loop")
-    loop.require_stable()
-    require_true_gain(loop.sensor_gain, truth)
-    noise_nm = truth.noise_per_measurement(loop.hardware.n_measurements)
-    lines = stationary_vibrations(truth.vibrations)
-    return _budget(
-        loop,
-        truth.turbulence_groups(loop.hardware.modes),
-        list(zip(lines, _motions(loop, truth.motions, len(lines)), strict=True)),
-        np.diag(noise_nm),
-        of_means=frame_means,
-        frame_means=frame_means,
-    )
 
+    A Kalman filter leaves in its own model what it expects:
 
-def model_budget(
-    loop: ClosedLoop, plant: TipTiltPlant, *, frame_means: bool = False
-) -> ResidualBudget:
-    """Exact stationary residual of a loop where a plant's model is the truth.
-
-    Each mode has its own turbulence and each measurement its own noise, as in the plant. The
-    processes of a plant are of means over frames.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        A loop of the plant's hardware, around any controller.
-    plant : TipTiltPlant
-        Turbulence, vibrations and noise.
-    frame_means : bool, optional
-        As in :func:`residual_budget`.
-
-    Returns
-    -------
-    ResidualBudget
-        Covariances by origin.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is unstable or marginally stable.
-    ProblemError
-        If the loop has another sensor, mirror or delay than the plant.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
     >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
     >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
     >>> design = lbt.kalman(plant)
-    >>> loop = lbt.close_loop(plant.hardware, design.controller)
-    >>> budget = lbt.loop.model_budget(loop, plant, frame_means=True)
+    >>> budget = lbt.residual_budget(design.close(plant.hardware), plant, frame_means=True)
     >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-9)
     True
     """
-    require_instance(plant, TipTiltPlant)
-    require_instance(loop, ClosedLoop)
-    one, other = loop.hardware, plant.hardware
-    pairs = [(loop.sensor_gain * one.sensor, other.sensor), (one.influence, other.influence)]
-    alike = (
-        all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=0) for a, b in pairs)
-        and one.delay_frames == other.delay_frames
-        and one.mirror == other.mirror
-    )
-    if not alike:
-        raise ProblemError(
-            "the loop must have the plant's sensor, mirror and delay; got another. Close it with "
-            "close_loop(plant.hardware, controller)."
-        )
-    return plant_budget(loop, plant, frame_means=frame_means)
-
-
-def plant_budget(
-    loop: ClosedLoop, plant: TipTiltPlant, *, frame_means: bool = False
-) -> ResidualBudget:
-    """Return what a plant's disturbances and noise leave in any loop, at its own sensor gain."""
+    require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
-    return _budget(
-        loop,
-        [(model, (mode,)) for mode, model in enumerate(plant.turbulence)],
-        list(
-            zip(plant.vibrations, _motions(loop, plant.motions, len(plant.vibrations)), strict=True)
-        ),
-        plant.own_noise_factor,
-        of_means=True,
-        frame_means=frame_means,
+    lines: Sequence[Vibration | SinusoidalVibration]
+    turbulence: Sequence[tuple[Spectrum, Sequence[int]]]
+    if isinstance(truth, TipTiltPlant):
+        turbulence = [(model, (mode,)) for mode, model in enumerate(truth.turbulence)]
+        lines, of_means, noise = truth.vibrations, True, truth.own_noise_factor
+    else:
+        require_instance(truth, Truth)
+        require_true_gain(loop.sensor_gain, truth)
+        turbulence, of_means = truth.turbulence_groups(loop.hardware.modes), frame_means
+        lines = stationary_vibrations(truth.vibrations)
+        noise = np.diag(truth.noise_per_measurement(loop.hardware.n_measurements))
+    pairs = list(zip(lines, _motions(loop, truth.motions, len(lines)), strict=True))
+    rows, n = loop_evaluator(loop, frame_means=frame_means), loop.hardware.modes
+    steady = np.zeros((2, n, n))
+    for spectrum, modes in turbulence:
+        steady += _of_spectrum(loop, rows, spectrum, np.eye(n)[None, :, list(modes)])
+    propagated = rows.of_noise(_noise_factor(loop, noise)[None]).mean(axis=0)
+    resonances = [(line, motion) for line, motion in pairs if isinstance(line, Vibration)]
+    shaken = _of_lines(loop, rows, resonances, of_means=of_means)
+    amplitudes: list[ComplexArray] = []
+    for line, motion in pairs:
+        if isinstance(line, SinusoidalVibration):
+            f = np.full(len(rows.A), line.frequency_hz / loop.hardware.frame_rate_hz)
+            entry = line.amplitude_nm * _sinusoid_entry(loop, line, motion)
+            left, within = rows.of_sinusoids(f, entry[None])
+            # what repeats with the period turns one sinusoid into several
+            amplitudes += list(np.fft.fft(left, axis=0) / len(left))
+            shaken[1] += within.mean(axis=0)
+    return ResidualBudget(
+        turbulence_nm2=frozen_copy(steady[0]),
+        noise_nm2=frozen_copy(propagated[0]),
+        random_vibration_nm2=frozen_copy(shaken[0]),
+        within_nm2=frozen_copy(steady[1] + shaken[1] + propagated[1]),
+        line_amplitudes_nm=np.array(amplitudes, dtype=np.complex128).reshape(-1, n),
     )
 
 
@@ -224,44 +185,6 @@ def _evaluator(
         start=np.full(s.period, loop.hardware.delay_frames - 1),
         in_image=in_image,
         phases=s.period,
-    )
-
-
-def _budget(
-    loop: ClosedLoop,
-    turbulence: Sequence[tuple[Spectrum, Sequence[int]]],
-    lines: Sequence[tuple[Vibration | SinusoidalVibration, Mapping[str, Motion]]],
-    noise_factor: FloatArray,
-    *,
-    of_means: bool,
-    frame_means: bool,
-) -> ResidualBudget:
-    """Return what spectra of some modes, lines and noise leave in a loop.
-
-    The rms of resonances is of means over frames, or of all moments.
-    """
-    rows, n = loop_evaluator(loop, frame_means=frame_means), loop.hardware.modes
-    steady = np.zeros((2, n, n))
-    for spectrum, modes in turbulence:
-        steady += _of_spectrum(loop, rows, spectrum, np.eye(n)[None, :, list(modes)])
-    noise = rows.of_noise(_noise_factor(loop, noise_factor)[None]).mean(axis=0)
-    resonances = [(line, motion) for line, motion in lines if isinstance(line, Vibration)]
-    shaken = _of_lines(loop, rows, resonances, of_means=of_means)
-    amplitudes: list[ComplexArray] = []
-    for line, motion in lines:
-        if isinstance(line, SinusoidalVibration):
-            f = np.full(len(rows.A), line.frequency_hz / loop.hardware.frame_rate_hz)
-            entry = line.amplitude_nm * _sinusoid_entry(loop, line, motion)
-            left, within = rows.of_sinusoids(f, entry[None])
-            # what repeats with the period turns one sinusoid into several
-            amplitudes += list(np.fft.fft(left, axis=0) / len(left))
-            shaken[1] += within.mean(axis=0)
-    return ResidualBudget(
-        turbulence_nm2=frozen_copy(steady[0]),
-        noise_nm2=frozen_copy(noise[0]),
-        random_vibration_nm2=frozen_copy(shaken[0]),
-        within_nm2=frozen_copy(steady[1] + shaken[1] + noise[1]),
-        line_amplitudes_nm=np.array(amplitudes, dtype=np.complex128).reshape(-1, n),
     )
 
 

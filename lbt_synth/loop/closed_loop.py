@@ -16,7 +16,7 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
 from lbt_synth.models.sensor_suite import OWN_SENSOR
-from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
+from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance
 
@@ -26,15 +26,6 @@ Readings: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 # A loop whose slowest pole is closer to the unit circle than this is called marginal.
 STABILITY_MARGIN = 1e-9
 REJECTION = "largest singular value of the rejection"
-
-
-@table_row
-class ClosedLoopFacts:
-    """What a closed loop is."""
-
-    sensor_gain: float = column("sensor gain over the assumed one")
-    is_stable: bool = column("stable")
-    spectral_radius: float = column("largest modulus of a pole")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,9 +59,13 @@ class ClosedLoop(Summarised):
         return f"{self.hardware._brief()}, sensor gain {self.sensor_gain:.4g}"
 
     def _summarise(self) -> Summary:
-        facts = self.hardware.facts(), fill_row(ClosedLoopFacts, self)
+        own = facts(
+            sensor_gain=fact(self.sensor_gain, "sensor gain over the assumed one"),
+            is_stable=fact(self.is_stable, "stable"),
+            spectral_radius=fact(self.spectral_radius, "largest modulus of a pole"),
+        )
         return Summary(
-            tables=[fact_table("Loop", *facts)],
+            tables=[fact_table("Loop", self.hardware.facts(), own)],
             curve=sigma_sparkline(self.rejection().lifted(), REJECTION),
         )
 

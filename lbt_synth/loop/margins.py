@@ -10,7 +10,7 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
 from lbt_synth.linear.state_space import pointwise_response
-from lbt_synth.loop.broken_loops import broken_loops
+from lbt_synth.loop.broken_loops import gain_crossings
 from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.loop.loop_errors import FRAGILE_DB, FRAGILE_FRAMES, errors_together
 from lbt_synth.loop.stable_range import delay_margin_frames, stable_sensor_gains
@@ -171,7 +171,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
-    crossings = [point for broken in broken_loops(loop) for point in broken.gain_crossings]
+    crossings = gain_crossings(loop)
     delay, early = (delay_margin_frames(loop, sign=sign) for sign in (1, -1))
     disk = _disk_margin(loop)
     return LoopMargins(

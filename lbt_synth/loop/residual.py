@@ -11,20 +11,12 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.models import Truth
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fact_table, fill_row, nm_column, table_row
+from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
-
-@table_row
-class BudgetFacts:
-    """The residual by origin."""
-
-    rms_nm: float = nm_column("residual", unit="nm rms")
-    turbulence_nm: float = nm_column("  turbulence", unit="nm rms")
-    vibration_nm: float = nm_column("  vibrations", unit="nm rms")
-    noise_nm: float = nm_column("  noise", unit="nm rms")
-    within_nm: float = nm_column("  within frames", unit="nm rms")
+_ORIGINS = {"turbulence": "turbulence", "vibration": "vibrations", "noise": "noise"}
+_ORIGINS |= {"within": "within frames"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +49,13 @@ class ResidualBudget(Summarised):
         return f"{nm_text(self.rms_nm, '.4g')} rms, {modes} modes"
 
     def _summarise(self) -> Summary:
-        return Summary(tables=[fact_table("Residual", fill_row(BudgetFacts, self))])
+        headings = {"rms_nm": "residual"} | {
+            f"{name}_nm": f"  {heading}" for name, heading in _ORIGINS.items()
+        }
+        nm = {"unit": "nm rms", "format": ".1f"}
+        named = {name: fact(getattr(self, name), text, **nm) for name, text in headings.items()}
+        rows = facts(**named)
+        return Summary(tables=[fact_table("Residual", rows)])
 
     @property
     def gaussian_nm2(self) -> FloatArray:

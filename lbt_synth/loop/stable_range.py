@@ -197,37 +197,42 @@ def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
         return -np.inf, np.inf
     b, c = U[:, :1] * sizes[0], V[:1]
     T = StateSpace(A=start[0] + nominal * slope[0], B=b, C=c, D=np.zeros((1, 1))).balanced()
-    responses = real_responses(T)
+    responses = crossings(T)[1].real
     changes = 1 / responses[responses != 0]
     below, above = changes[changes < 0], changes[changes > 0]
     return nominal + below.max(initial=-np.inf), nominal + above.min(initial=np.inf)
 
 
-def real_responses(T: StateSpace) -> FloatArray:
-    """Return the responses of a system of one input and output that are real, on the unit circle.
+def crossings(T: StateSpace, *, real_part: float | None = None) -> tuple[FloatArray, ComplexArray]:
+    """Return where a response from one input to one output is real on the unit circle, and it.
 
-    There ``T(z) = T(1/z)``; between the angles of the pencil the imaginary part keeps its sign.
+    With a real part, where it has that. The angles [rad] are within 0 and pi. Where it is real,
+    ``T(z) = T(1/z)``; between the angles of the pencil the sign does not change.
     """
-    found = popov_angles(T.A, T.B, np.zeros_like(T.A), T.C, np.zeros_like(T.D), sign=-1.0)
-    angles = fold_angles(found, 0.0, np.pi)
+    Q, R, sign = np.zeros_like(T.A), np.zeros_like(T.D), -1.0
+    if real_part is not None:
+        R, sign = 2 * (T.D - real_part), 1.0
+    angles = fold_angles(popov_angles(T.A, T.B, Q, T.C, R, sign=sign), 0.0, np.pi)
     form = schur_form(T)
 
     def response(at: FloatArray) -> ComplexArray:
         return np.asarray(schur_response(form, np.exp(1j * at))[:, 0, 0])
 
-    def imaginary(at: FloatArray) -> FloatArray:
-        return response(at).imag
+    def value(at: FloatArray) -> FloatArray:
+        there = response(at)
+        return there.imag if real_part is None else there.real - real_part
 
     middle = (angles[1:] + angles[:-1]) / 2
-    signs = np.sign(imaginary(middle))
+    signs = np.sign(value(middle))
     known = response(angles)
-    real = np.abs(known.imag) <= _REAL * np.abs(known)
-    (turns,) = np.nonzero((signs[1:] * signs[:-1] < 0) & ~real[1:-1])  # of an inaccurate angle
+    zero = np.abs(value(angles)) <= _REAL * np.abs(known)
+    (turns,) = np.nonzero((signs[1:] * signs[:-1] < 0) & ~zero[1:-1])  # of an inaccurate angle
     crossed = np.zeros(0)
     if turns.size:
         ends = middle[turns], middle[turns + 1]
-        crossed = find_root(imaginary, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
-    return np.concatenate([known[real].real, response(crossed).real])
+        crossed = find_root(value, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
+    places = np.sort(np.concatenate([angles[zero], crossed]))
+    return places, response(places)
 
 
 def stepped_range(
