@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.loop.evaluator import STILL, Evaluator
+from lbt_synth.loop.loop_errors import append_taps
 from lbt_synth.loop.residual import ResidualBudget, require_true_gain
 from lbt_synth.models import (
     ARModel,
@@ -21,7 +21,7 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.mirror.frame_rate_system import Hold
+from lbt_synth.models.mirror.frame_rate_system import Hold, instant_mirror
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density
@@ -409,23 +409,15 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
 
 
 def _difference_loop(loop: ClosedLoop) -> StateSpace:
-    """Loop whose first outputs are the settled mirror's position less the real one."""
-    s, n, m = loop.system, loop.hardware.modes, loop.hardware.n_commands
-    if loop.hardware.mirror is None:  # it leaves nothing, not even rounding
-        C, D = np.vstack([0 * s.C[:n], s.C[n:]]), np.vstack([0 * s.D[:n], s.D[n:]])
-        return replace(s, C=C, D=D)
-    ideal = replace(loop.hardware, mirror=None).mirror_system.whole
-    real = loop.hardware.mirror_system.whole
-    each, influence = np.eye(m), loop.hardware.influence
-    command, through = s.C[n : n + m], s.D[n : n + m]
-    entry = np.kron(np.concatenate([ideal.B, real.B])[:, None], each)
-    position = influence @ np.kron(np.concatenate([ideal.C, -real.C]), each)
-    direct = (ideal.D - real.D) * influence
-    past = np.kron(block_diag(ideal.A, real.A), each)
-    return StateSpace(
-        A=np.block([[s.A, np.zeros((s.n_states, len(past)))], [entry @ command, past]]),
-        B=np.vstack([s.B, entry @ through]),
-        C=np.block([[direct @ command, position], [s.C[n:], np.zeros((len(s.C) - n, len(past)))]]),
-        D=np.vstack([direct @ through, s.D[n:]]),
-        dt_s=s.dt_s,
-    )
+    """Return the loop whose outputs are the settled mirror's position less the real one.
+
+    The real one is the phase less the residual.
+    """
+    hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
+    if hardware.mirror is None:  # it leaves nothing, not even rounding
+        return replace(s, C=0 * s.C[:n], D=0 * s.D[:n])
+    settled = append_taps(loop.commanding(), instant_mirror(hardware.delay_frames).taps)
+    C, D = hardware.influence @ settled.C, hardware.influence @ settled.D + s.D[:n]
+    C[:, : s.n_states] += s.C[:n]
+    D[:, :n] -= np.eye(n)
+    return replace(settled, C=C, D=D)
