@@ -94,9 +94,13 @@ def run_cases(
             progress(len(results))
         missing = [(name, (dict(case),)) for name, case in cases.items() if name not in results]
         failed = []
-        with _executor(executor, min(jobs, len(missing))) as pool:
-            in_flight = calls_in_flight(pool)
-            for name, future in finished_calls(pool, function, missing, in_flight=in_flight):
+        with (
+            _executor(executor, min(jobs, len(missing))) as pool,
+            contextlib.closing(
+                finished_calls(pool, function, missing, in_flight=calls_in_flight(pool))
+            ) as finished,
+        ):
+            for name, future in finished:
                 if future.cancelled() or future.exception() is not None:
                     failed.append(future)
                     continue
