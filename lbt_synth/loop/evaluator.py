@@ -32,8 +32,9 @@ from lbt_synth.validation import ComplexArray, FloatArray
 
 # of k processes of means over frames: coefficients (k, r) and driving rms (k,), or one for all
 Process: TypeAlias = tuple[FloatArray, FloatArray]
-# from cycles per frame (f,) and entries (k or 1, n, w) to the rows of a loop, piece by piece
-_Response: TypeAlias = Callable[[FloatArray, FloatArray], Iterable[ComplexArray]]
+# from cycles per frame (f,), the share (f,) of a phase that its means are, and entries (k or 1, n,
+# w), to the rows of a loop, piece by piece
+_Response: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], Iterable[ComplexArray]]
 
 STILL = Hold(start=0.0, edges=np.array([0.0, 1.0]), C=np.zeros((1, 0)), D=np.ones(1))
 _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
@@ -222,24 +223,29 @@ class Evaluator:
 
         The frequencies are in cycles per frame.
         """
-        share = np.sinc(f)[:, None] if self.in_image else np.ones((1, 1))
-        rows = (self.response or self._response)(f, entry)
+        share = np.sinc(f) if self.in_image else np.ones(f.size)
+        rows = (self.response or self._response)(f, share, entry)
         if self.hold is None:
-            yield from ((1.0, share * left) for left in rows)
+            yield from ((1.0, left) for left in rows)
             return
         # as seen from the middle of the frame, where the mean has its phase
-        late = np.exp(2j * np.pi * f[:, None] * (self.start - self.hold.start - 0.5))
+        turn = 2 * np.pi * f[:, None] * (self.start - self.hold.start - 0.5)
+        late = np.empty(turn.shape, dtype=np.complex128)
+        np.cos(turn, out=late.real)  # a complex exp takes twice as long
+        np.sin(turn, out=late.imag)
         means, enters = self.hold.phase_means(f), np.moveaxis(entry, 0, -1)[:, :, None]
         for g, (weight, positions) in enumerate(zip(self.hold.weights, rows, strict=True)):
-            yield float(weight), means[:, g, None] * late * enters - share * positions
+            left = (means[:, g, None] * enters) * late
+            left -= positions
+            yield float(weight), left
 
-    def _response(self, f: FloatArray, entry: FloatArray) -> ComplexArray:
-        """Return the rows of one loop for unit phases, (g, n, w, f, k)."""
+    def _response(self, f: FloatArray, share: FloatArray, entry: FloatArray) -> ComplexArray:
+        """Return the rows of one loop for phases whose means are a share, (g, n, w, f, k)."""
         used = np.flatnonzero(np.any(entry[0], axis=1))
         s = self.system()
         s = replace(s, B=s.B[..., used], D=s.D[..., used])
         response = s.phase_response(f * self.frame_rate_hz)
-        rows = np.einsum("fkru,uw->rwfk", response, entry[0, used])
+        rows = np.einsum("f,fkru,uw->rwfk", share, response, entry[0, used])
         return np.asarray(rows.reshape(-1, self.modes, *rows.shape[1:]))
 
     def _at(self, f: FloatArray) -> ComplexArray:
@@ -253,8 +259,11 @@ class Evaluator:
 def _power(left: ComplexArray) -> FloatArray:
     """Powers (n, n, f, k) of residuals (n, w, f, k), summed over the columns."""
     x, y = left.real, left.imag
-    powers = (x[:, None, i] * x[:, i] + y[:, None, i] * y[:, i] for i in range(left.shape[1]))
-    return np.asarray(sum(powers))
+    out = x[:, None, 0] * x[:, 0]
+    out += y[:, None, 0] * y[:, 0]
+    for i in range(1, left.shape[1]):
+        out += x[:, None, i] * x[:, i] + y[:, None, i] * y[:, i]
+    return np.asarray(out)
 
 
 def companions(coefficients: FloatArray) -> FloatArray:

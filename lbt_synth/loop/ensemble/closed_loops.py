@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -83,33 +84,44 @@ class LoopStack:
     def image_powers(self, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Powers (f, k) that a unit phase of all moments and unit noise leave, for one mode."""
         f, hold = np.angle(z) / (2 * np.pi), self.hold or STILL
-        command, positions = self._commands(z)[0, 0], self._positions(z)
         late = np.exp(2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
-        turn = np.sinc(f)[:, None] * self.sensor_gains / z[:, None]
-        mirrored = command * turn * self.part.sensor[0, 0]
-        squares = (np.abs(positions) ** 2 @ hold.weights)[:, None]
-        crossed = (positions * hold.phase_means(f).conj() @ hold.weights)[:, None] * late.conj()
-        of_phase = 1 - 2 * np.real(crossed * mirrored) + squares * np.abs(mirrored) ** 2
-        return of_phase, squares * np.abs(command) ** 2
+        means = hold.phase_means(f)
+        of_phase = (1 - np.abs(means) ** 2 @ hold.weights)[:, None]
+        of_noise: Any = 0.0
+        for g, (weight, position) in enumerate(
+            zip(hold.weights, self.responses(f, np.sinc(f), held=True), strict=True)
+        ):
+            left = means[:, g, None] * late - position[0, 0]
+            of_phase = of_phase + weight * np.abs(left) ** 2
+            of_noise = of_noise + weight * np.abs(position[0, 0]) ** 2
+        seen = np.sinc(f)[:, None] * self.part.sensor[0, 0] * self.sensor_gains
+        return of_phase, of_noise / seen**2
 
-    def responses(self, f: FloatArray, *, held: bool) -> Iterator[ComplexArray]:
-        """Yield what unit phases leave of the means over frames, (n, n, f, k).
+    def responses(self, f: FloatArray, share: FloatArray, *, held: bool) -> Iterator[ComplexArray]:
+        """Yield what phases leave of the means over frames, which are a share (f,) of them.
 
         Where commands are held it is the mirror's mean position, in each piece of the hold. The
-        frequencies are in cycles per frame.
+        frequencies are in cycles per frame, the responses (n, n, f, k).
         """
-        z = np.exp(2j * np.pi * f)
+        z, part = np.exp(2j * np.pi * f), self.part
+        controller = np.moveaxis(stacked_response(part.controllers(self.loops), z), (2, 3), (0, 1))
+        # from a phase to what commands do to the modes, at a gain of 1 and without the mirror
+        path = np.einsum("nm,mq...,qr->nr...", part.influence, controller, part.sensor)
+        path = path / z[:, None]
+        first, second = (_mirror_response(mirror, z)[:, None] for mirror in self.mirrors)
+        loop = self.sensor_gains * (first * path)
+        if np.any(self.fraction):
+            loop += (self.sensor_gains * self.fraction) * ((second - first) * path)
+        loop += np.eye(len(path))[:, :, None, None]
+        rejection, denominator = _inverses(loop)
         if not held:
-            _, rejection, denominator = self._parts(z)
-            yield rejection / denominator
+            yield rejection * (share[:, None] / denominator)
             return
-        commands, sensor = self._commands(z), self.part.sensor
-        seen = commands * sensor[0, 0]
-        if sensor.size > 1:
-            seen = np.einsum("nq...,qm->nm...", commands, sensor)
-        seen = seen * (self.sensor_gains / z[:, None])
+        closed = rejection * (self.sensor_gains / denominator)
         for position in self._positions(z).T:
-            yield position[:, None] * seen
+            entering = (share * position)[:, None] * path
+            single = len(path) == 1
+            yield closed * entering if single else np.einsum("nm...,mr...->nr...", closed, entering)
 
     def rows(self, *, held: bool) -> tuple[FloatArray, FloatArray]:
         """Return C (k, g, n, s) and D (k, g, n, n + q) of what :meth:`responses` are of."""
@@ -119,34 +131,12 @@ class LoopStack:
         commands = self.command_C, self.command_D
         return (self.hold or STILL).positions(self.part.influence, commands, first)
 
-    def _commands(self, z: ComplexArray) -> ComplexArray:
-        """Return what commands for unit noise do to the modes, (n, q, f, k)."""
-        unit, rejection, denominator = self._parts(z)
-        return np.asarray(
-            sum(rejection[:, j, None] * unit[j] for j in range(len(unit))) / denominator
-        )
-
     def _positions(self, z: ComplexArray) -> ComplexArray:
         """Return the mirror's mean position in each piece of a hold for unit commands, (f, g)."""
         hold, first = self.hold or STILL, self.mirrors[0]
         core = hold.C.shape[1]  # the first states of the mirror
         parts = (first.A[:core, :core], first.B[:core, None], hold.C, hold.D[:, None])
         return stacked_response(tuple(part[None] for part in parts), z)[:, 0, :, 0]
-
-    def _parts(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Return ``N K``, and the rejection over its denominator, for points z, (., ., f, k)."""
-        part, turn = self.part, self.sensor_gains / z[:, None]
-        controller = np.moveaxis(stacked_response(part.controllers(self.loops), z), (2, 3), (0, 1))
-        unit = np.einsum("nm,mq...->nq...", part.influence, controller)
-        path = unit * _mirror_response(self.mirrors[0], z)[:, None]
-        if np.any(self.fraction):
-            second = unit * _mirror_response(self.mirrors[1], z)[:, None]
-            path = path + self.fraction * (second - path)
-        sensor = part.sensor[..., None, None]
-        loop = np.eye(len(part.influence), dtype=np.complex128)[:, :, None, None]
-        for j in range(path.shape[1]):
-            loop = loop + path[:, j, None] * (sensor[j] * turn)
-        return (unit, *_inverses(loop))
 
 
 def stack_evaluator(
@@ -161,8 +151,9 @@ def stack_evaluator(
     D = _join_inputs([one for _, one in rows], sizes)
     poles = np.concatenate([stack.poles.ravel() for stack, _ in members])
 
-    def response(f: FloatArray, entry: FloatArray) -> Iterator[ComplexArray]:
-        for pieces in zip(*(stack.responses(f, held=held) for stack, _ in members), strict=True):
+    def response(f: FloatArray, share: FloatArray, entry: FloatArray) -> Iterator[ComplexArray]:
+        parts = (stack.responses(f, share, held=held) for stack, _ in members)
+        for pieces in zip(*parts, strict=True):
             yield _entered(pieces, entry)
 
     return Evaluator(
