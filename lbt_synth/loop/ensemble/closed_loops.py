@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -84,18 +83,15 @@ class LoopStack:
     def image_powers(self, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Powers (f, k) that a unit phase of all moments and unit noise leave, for one mode."""
         f, hold = np.angle(z) / (2 * np.pi), self.hold or STILL
+        path, rejection, denominator = self._parts(z)
+        seen = (rejection * path)[0, 0] * (self.sensor_gains / denominator)
+        positions, means = self._positions(z), hold.phase_means(f)
         late = np.exp(2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
-        means = hold.phase_means(f)
-        of_phase = (1 - np.abs(means) ** 2 @ hold.weights)[:, None]
-        of_noise: Any = 0.0
-        for g, (weight, position) in enumerate(
-            zip(hold.weights, self.responses(f, np.sinc(f), held=True), strict=True)
-        ):
-            left = means[:, g, None] * late - position[0, 0]
-            of_phase = of_phase + weight * np.abs(left) ** 2
-            of_noise = of_noise + weight * np.abs(position[0, 0]) ** 2
-        seen = np.sinc(f)[:, None] * self.part.sensor[0, 0] * self.sensor_gains
-        return of_phase, of_noise / seen**2
+        mirrored = np.sinc(f)[:, None] * seen
+        squares = (np.abs(positions) ** 2 @ hold.weights)[:, None]
+        crossed = (positions * means.conj() @ hold.weights)[:, None] * late.conj()
+        of_phase = 1 - 2 * np.real(crossed * mirrored) + squares * np.abs(mirrored) ** 2
+        return of_phase, squares * np.abs(seen / (self.part.sensor[0, 0] * self.sensor_gains)) ** 2
 
     def responses(self, f: FloatArray, share: FloatArray, *, held: bool) -> Iterator[ComplexArray]:
         """Yield what phases leave of the means over frames, which are a share (f,) of them.
@@ -103,22 +99,12 @@ class LoopStack:
         Where commands are held it is the mirror's mean position, in each piece of the hold. The
         frequencies are in cycles per frame, the responses (n, n, f, k).
         """
-        z, part = np.exp(2j * np.pi * f), self.part
-        controller = np.moveaxis(stacked_response(part.controllers(self.loops), z), (2, 3), (0, 1))
-        # from a phase to what commands do to the modes, at a gain of 1 and without the mirror
-        path = np.einsum("nm,mq...,qr->nr...", part.influence, controller, part.sensor)
-        path = path / z[:, None]
-        first, second = (_mirror_response(mirror, z)[:, None] for mirror in self.mirrors)
-        loop = self.sensor_gains * (first * path)
-        if np.any(self.fraction):
-            loop += (self.sensor_gains * self.fraction) * ((second - first) * path)
-        loop += np.eye(len(path))[:, :, None, None]
-        rejection, denominator = _inverses(loop)
+        path, rejection, denominator = self._parts(np.exp(2j * np.pi * f))
         if not held:
             yield rejection * (share[:, None] / denominator)
             return
         closed = rejection * (self.sensor_gains / denominator)
-        for position in self._positions(z).T:
+        for position in self._positions(np.exp(2j * np.pi * f)).T:
             entering = (share * position)[:, None] * path
             single = len(path) == 1
             yield closed * entering if single else np.einsum("nm...,mr...->nr...", closed, entering)
@@ -130,6 +116,22 @@ class LoopStack:
         first = self.part.matrices[0].shape[-1]  # the states of the mirror follow
         commands = self.command_C, self.command_D
         return (self.hold or STILL).positions(self.part.influence, commands, first)
+
+    def _parts(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return the path of phases, and the rejection over its denominator, (n, n, f, k).
+
+        The path is to what commands do to the modes, at a gain of 1 and without the mirror.
+        """
+        part = self.part
+        controller = np.moveaxis(stacked_response(part.controllers(self.loops), z), (2, 3), (0, 1))
+        path = np.einsum("nm,mq...,qr->nr...", part.influence, controller, part.sensor)
+        path = path / z[:, None]
+        first, second = (_mirror_response(mirror, z)[:, None] for mirror in self.mirrors)
+        loop = self.sensor_gains * (first * path)
+        if np.any(self.fraction):
+            loop += (self.sensor_gains * self.fraction) * ((second - first) * path)
+        loop += np.eye(len(path))[:, :, None, None]
+        return (path, *_inverses(loop))
 
     def _positions(self, z: ComplexArray) -> ComplexArray:
         """Return the mirror's mean position in each piece of a hold for unit commands, (f, g)."""
