@@ -59,7 +59,7 @@ def delays() -> None:
             noise_nm=pole.R,
         )
         found = [
-            lbt.loop.model_budget(lbt.close_loop(plant.hardware, d.controller), plant).rms_nm
+            lbt.residual_budget(lbt.close_loop(plant.hardware, d.controller), plant).rms_nm
             for d in (lbt.kalman(plant), lbt.lqg(plant))
         ]
         limit = least_model_residual(plant).rms_nm

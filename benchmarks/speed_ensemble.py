@@ -48,7 +48,9 @@ def fixed_design() -> dict[int, Row]:
         )
 
         def ours(met: lbt.loop.LoopEnsemble = ensemble) -> object:
-            return lbt.loop.ensemble_residuals(controller, hardware, met).strehl(config.imaging)
+            return lbt.strehl(
+                lbt.loop.ensemble_residuals(controller, hardware, met), config.imaging
+            )
 
         def peer(f: np.ndarray = frequency, g: np.ndarray = gain, d: np.ndarray = delay) -> object:
             found = []

@@ -299,7 +299,7 @@ def main(folder: str = "out", averages: int = AVERAGES) -> None:
     print("\nunder the model; certificate; states of the controller; modulus margin")
     for name, loop in loops.items():
         passed = "passed" if made[name].certificate.passed else "failed"
-        budget = lbt.loop.model_budget(loop, plant)
+        budget = lbt.residual_budget(loop, plant)
         states = made[name].controller.n_states
         margin = lbt.loop_margins(loop).modulus
         print(f"{name:28s}{budget.rms_nm:11.1f} nm   {passed}{states:8d}{margin:8.2f}")

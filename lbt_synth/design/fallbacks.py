@@ -23,7 +23,7 @@ from lbt_synth.design.certificate import (
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import EstimationProblem, StateSpace, kalman_riccati
 from lbt_synth.loop import ClosedLoop, close_loop
-from lbt_synth.loop.budget import model_readings, plant_budget
+from lbt_synth.loop.budget import model_readings, residual_budget
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy
@@ -180,7 +180,7 @@ def failure_rows(
         unseen = failed_loop(plant, gains, fallback.missing)
         zero_nm = frozen_nm = None
         if unseen.is_stable:
-            zero_nm = plant_budget(unseen, plant, frame_means=True).rms_nm
+            zero_nm = residual_budget(unseen, plant, frame_means=True).rms_nm
             frozen_nm = float(np.hypot(zero_nm, _offset_nm(unseen, readings)))
         switched = failed_loop(plant, fallback.gains, fallback.missing)
         rows.append(
@@ -190,7 +190,7 @@ def failure_rows(
                 zero_nm=zero_nm,
                 frozen_nm=frozen_nm,
                 fallback_radius=switched.spectral_radius,
-                fallback_nm=plant_budget(switched, plant, frame_means=True).rms_nm,
+                fallback_nm=residual_budget(switched, plant, frame_means=True).rms_nm,
                 must_switch=not unseen.is_stable,
             )
         )

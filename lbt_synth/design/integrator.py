@@ -358,7 +358,8 @@ def _ensemble_variances(
         factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
         scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
         loops = replace(ensemble, loops=gains.size)
-        return residuals_from_matrices(scaled, hardware, loops, in_image=True).rms_nm ** 2
+        residuals = residuals_from_matrices(scaled, hardware, loops, in_image=True)
+        return np.asarray(residuals.rms_nm**2)
 
     return variances
 

@@ -12,7 +12,7 @@ from lbt_synth.design.certificate import LEVEL_SETS, Check
 from lbt_synth.design.claims import Claim, Evidence
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, hinf_norm
-from lbt_synth.loop import ClosedLoop, broken_loops, close_loop
+from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.loop.broken_loops import phase_margin_deg
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import Positive, check_fields, frozen_copy
@@ -115,7 +115,7 @@ class IntegratorLaw:
         """Return the margins of a stable loop that are demanded, by the names of the demands."""
         found = {}
         if self.phase_margin_deg is not None:
-            found["phase_margin_deg"] = phase_margin_deg(broken_loops(loop))
+            found["phase_margin_deg"] = phase_margin_deg(loop)
         if self.modulus_margin is not None:
             found["modulus_margin"] = 1 / hinf_norm(loop.output_sensitivity()).upper
         return found

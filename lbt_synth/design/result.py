@@ -13,7 +13,7 @@ from lbt_synth.design.certificate import Certificate, stability_check
 from lbt_synth.design.claims import Claim, Evidence
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, model_budget
+from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget
 from lbt_synth.loop.closed_loop import reads_others
 from lbt_synth.loop.least_residuals.residual_limit import (
     above_percent,
@@ -370,7 +370,7 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
     if plant is None:
         return {}
     loop = close_loop(plant.hardware, design.controller)
-    residual_nm = model_budget(loop, plant).rms_nm if loop.is_stable else np.nan
+    residual_nm = residual_budget(loop, plant).rms_nm if loop.is_stable else np.nan
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}

@@ -26,8 +26,9 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
-from lbt_synth.loop.budget import plant_budget
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
+from lbt_synth.loop.budget import residual_budget
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware
 from lbt_synth.validation import BoolArray, FloatArray
 
@@ -130,7 +131,7 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
             if not loops[0].is_stable:
                 losses.append(np.inf)
                 break
-            after, before = (plant_budget(loop, design.problem).rms_nm for loop in loops)
+            after, before = (residual_budget(loop, design.problem).rms_nm for loop in loops)
             losses.append(after / before - 1)
         name_of_loss = f"residual with {name}, loss"
         checks += [

@@ -31,21 +31,6 @@ def panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArra
     return middle + half * x, half * w
 
 
-def compress_rule(
-    nodes: FloatArray, weights: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the rule with fewer nodes that is exact for the same polynomials below 2 count.
-
-    Nodes are within (0, 1) and weights not negative, (n,) each. The new nodes are the eigenvalues
-    of the multiplication by x on the polynomials below ``count`` (G. H. Golub, J. H. Welsch, Math.
-    Comp. 23, 221 (1969), doi:10.1090/S0025-5718-69-99647-1).
-    """
-    root = np.sqrt(weights)[:, None]
-    basis, _ = np.linalg.qr(root * np.polynomial.chebyshev.chebvander(2 * nodes - 1, count - 1))
-    new, vectors = np.linalg.eigh(basis.T @ (nodes[:, None] * basis))
-    return new, ((basis.T @ root)[:, 0] @ vectors) ** 2
-
-
 def _panel_integrals(
     integrand: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray, order: int
 ) -> FloatArray:

@@ -1,5 +1,4 @@
 from .broken_loops import broken_loops as broken_loops
-from .budget import model_budget as model_budget
 from .budget import residual_budget as residual_budget
 from .budget import settling_error as settling_error
 from .closed_loop import ClosedLoop as ClosedLoop
@@ -12,13 +11,13 @@ from .least_residuals.band_limit import least_worst_residual as least_worst_resi
 from .least_residuals.residual_limit import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins
-from .margins import stable_sensor_gains as stable_sensor_gains
-from .moving_gain import moving_gain as moving_gain
 from .residual import ResidualBudget as ResidualBudget
 from .simulation.disturbances import Disturbance as Disturbance
 from .simulation.run import Simulation as Simulation
 from .simulation.run import simulate as simulate
 from .simulation.run import step_response as step_response
+from .stable_range import moving_gain as moving_gain
+from .stable_range import stable_sensor_gains as stable_sensor_gains
 from .strehl import Imaging as Imaging
 from .strehl import jitter_strehl as jitter_strehl
 from .strehl import series_strehl as series_strehl

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize.elementwise import find_root
 
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
+from lbt_synth.linear.state_space import split_into_parts
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop
+from lbt_synth.loop.stable_range import crossings
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only
 
 _SAME = 1e-9  # difference of sensitivities of equal axes
@@ -46,43 +46,8 @@ class BrokenLoop:
     # (f,): frequencies up to half the frame rate [Hz], more of them around resonances
     frequency_hz: FloatArray
     response: ComplexArray  # (f,): the loop gain; the loop is critical where it is -1
-    at: Callable[[FloatArray], ComplexArray]  # the same at other frequencies
-
-    @property
-    def gain_crossings(self) -> tuple[MarginPoint, ...]:
-        """Where the gain is one, with increasing frequency."""
-        return tuple(self._crossings(lambda response: np.abs(response) - 1, last=True))
-
-    @property
-    def phase_crossings(self) -> tuple[MarginPoint, ...]:
-        """Where the phase is -180 degrees, with increasing frequency."""
-        across = self._crossings(lambda response: response.imag, last=False)
-        for end in (0.0, float(self.frequency_hz[-1])):  # where a response is real
-            with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator's is inf
-                response = complex(self.at(np.array([end]))[0]).real
-            across.append(MarginPoint(frequency_hz=end, response=response))
-        points = (p for p in across if 1 / _LARGEST < -p.response.real < _LARGEST)
-        return tuple(sorted(points, key=lambda point: point.frequency_hz))
-
-    def _crossings(
-        self, value: Callable[[ComplexArray], FloatArray], *, last: bool
-    ) -> list[MarginPoint]:
-        """Refine where a value of the response changes its sign, at the last frequency or not."""
-        grid, level = self.frequency_hz, value(self.response[: None if last else -1])
-        (starts,) = np.nonzero(level[1:] * level[:-1] < 0)
-        if not starts.size:
-            return []
-        ends = grid[starts], grid[starts + 1]
-
-        def level_at(frequency_hz: FloatArray) -> FloatArray:
-            return value(self.at(frequency_hz))
-
-        root = find_root(level_at, ends, tolerances={"xatol": 1e-12, "xrtol": 0.0})
-        sizes = [np.abs(level_at(end)) for end in ends]
-        nearer = np.where(sizes[0] <= sizes[1], *ends)  # where only rounding had changed the sign
-        frequency_hz = np.where(root.success, root.x, nearer)
-        pairs = zip(frequency_hz.tolist(), self.at(frequency_hz).tolist(), strict=True)
-        return [MarginPoint(frequency_hz=f, response=response) for f, response in pairs]
+    gain_crossings: tuple[MarginPoint, ...]  # where the gain is one, with increasing frequency
+    phase_crossings: tuple[MarginPoint, ...]  # where the phase is -180 degrees, likewise
 
     @property
     def gain_db(self) -> FloatArray:
@@ -161,9 +126,6 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
         sensitivity = system.frequency_response(frequency_hz)
         return np.asarray(1 / np.diagonal(sensitivity, axis1=1, axis2=2) - 1)
 
-    def broken_at(measurement: int, frequency_hz: FloatArray) -> ComplexArray:
-        return broken(frequency_hz)[:, measurement]
-
     grid, responses = _refine_turns(broken, np.unique(np.concatenate([nodes, uniform])))
     shared: list[list[int]] = []
     for index, own in enumerate(responses.T):
@@ -178,10 +140,42 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
             measurements=tuple(group),
             frequency_hz=grid,
             response=read_only(responses[:, group[0]].copy()),
-            at=partial(broken_at, group[0]),
+            gain_crossings=tuple(_crossings(loop, group[0], real_part=0.5)),
+            phase_crossings=tuple(
+                point
+                for point in _crossings(loop, group[0])
+                if 1 / _LARGEST < -point.response.real < _LARGEST
+            ),
         )
         for group in shared
     )
+
+
+def gain_crossings(loop: ClosedLoop) -> list[MarginPoint]:
+    """Return where the gain is one of a stable loop, broken at each measurement in turn."""
+    measurements = range(loop.output_sensitivity().D.shape[-1])
+    return [point for i in measurements for point in _crossings(loop, i, real_part=0.5)]
+
+
+def _crossings(
+    loop: ClosedLoop, measurement: int, *, real_part: float | None = None
+) -> Iterator[MarginPoint]:
+    """Yield where the response of a broken loop is real, or where its gain is one.
+
+    The gain of ``1 / S - 1`` is one where the real part of S is a half.
+    """
+    system = loop.output_sensitivity()
+    system.require_one_phase("a broken loop", "output_sensitivity().lifted()")
+    for outputs, inputs, part in split_into_parts(system):
+        if measurement in outputs and measurement in inputs:
+            i, j = (np.flatnonzero(channels == measurement) for channels in (outputs, inputs))
+            own = replace(part, B=part.B[:, j], C=part.C[i], D=part.D[np.ix_(i, j)]).balanced()
+            angles, sensitivity = crossings(own, real_part=real_part)
+            with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is inf
+                responses = 1 / sensitivity - 1
+            frequency_hz = angles / (2 * np.pi) * loop.hardware.frame_rate_hz
+            for f, response in zip(frequency_hz.tolist(), responses.tolist(), strict=True):
+                yield MarginPoint(frequency_hz=f, response=response)
 
 
 def _refine_turns(
@@ -200,10 +194,9 @@ def _refine_turns(
     return read_only(grid), responses
 
 
-def phase_margin_deg(loops: tuple[BrokenLoop, ...]) -> float:
-    """Return the least phase margin of broken loops [deg]; inf without a gain crossing."""
-    points = (point for broken in loops for point in broken.gain_crossings)
-    return min((point.phase_deg for point in points), default=np.inf)
+def phase_margin_deg(loop: ClosedLoop) -> float:
+    """Return the least phase margin of a stable loop [deg]; inf without a gain crossing."""
+    return min((point.phase_deg for point in gain_crossings(loop)), default=np.inf)
 
 
 def _is_same(own: ComplexArray, other: ComplexArray) -> bool:

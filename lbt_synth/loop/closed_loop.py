@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -13,28 +11,19 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.held_controller import HasController, as_controller
-from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
+from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
 from lbt_synth.models.sensor_suite import OWN_SENSOR
-from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
+from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance
 
-AffinePart: TypeAlias = tuple[FloatArray, FloatArray]  # A0 and A1 of ``A0[t] + g A1[t]``
+# what sensors remember of a signal, A and B, and their measurements ``(C0 + g C1)`` times that
+Readings: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 # A loop whose slowest pole is closer to the unit circle than this is called marginal.
 STABILITY_MARGIN = 1e-9
-
-
-@table_row
-class ClosedLoopFacts:
-    """What a closed loop is."""
-
-    sensor_gain: float = column("sensor gain over the assumed one")
-    is_stable: bool = column("stable")
-    spectral_radius: float = column("largest modulus of a pole")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,8 +57,12 @@ class ClosedLoop(Summarised):
         return f"{self.hardware._brief()}, sensor gain {self.sensor_gain:.4g}"
 
     def _summarise(self) -> Summary:
-        facts = self.hardware.facts(), fill_row(ClosedLoopFacts, self)
-        return Summary(tables=[fact_table("Loop", *facts)])
+        own = facts(
+            sensor_gain=fact(self.sensor_gain, "sensor gain over the assumed one"),
+            is_stable=fact(self.is_stable, "stable"),
+            spectral_radius=fact(self.spectral_radius, "largest modulus of a pole"),
+        )
+        return Summary(tables=[fact_table("Loop", self.hardware.facts(), own)])
 
     @property
     def reads_others(self) -> bool:
@@ -188,13 +181,9 @@ def close_loop(
     """
     require_instance(hardware, LoopHardware, "hardware")
     gain = number(sensor_gain, "sensor_gain", above=0)
-    several = bool(hardware.suite.sensors)
-    plain = as_controller(controller, any_period=several)
-    if reads_others(hardware, plain):
-        system = _system_of_sensors(hardware, plain, gain, tuple(blind))
-    else:
-        A0, A1, B, C0, C1, D = checked_loop_matrices(hardware, plain)
-        system = StateSpace(A=A0 + gain * A1, B=B, C=C0 + gain * C1, D=D, dt_s=hardware.dt_s)
+    plain = as_controller(controller, any_period=bool(hardware.suite.sensors))
+    A0, A1, B, C0, C1, D = checked_loop_matrices(hardware, plain, tuple(blind))
+    system = StateSpace(A=A0 + gain * A1, B=B, C=C0 + gain * C1, D=D, dt_s=hardware.dt_s)
     return ClosedLoop(
         system=system, hardware=hardware, controller=plain, sensor_gain=gain, blind=tuple(blind)
     )
@@ -205,130 +194,51 @@ def reads_others(hardware: LoopHardware, controller: Controller) -> bool:
     return bool(hardware.suite.sensors) and controller.D.shape[-1] != hardware.n_measurements
 
 
-def _system_of_sensors(
-    hardware: LoopHardware, controller: Controller, gain: float, blind: tuple[str, ...]
-) -> StateSpace:
-    """Close the loop of all sensors; the gain is that of the loop's own."""
-    suite, period, q = hardware.suite, hardware.period, hardware.n_readings
-    n, m, rows = hardware.modes, hardware.n_commands, suite.rows(hardware)
-    shape = (controller.period, *controller.D.shape[-2:])
-    if shape != (period, m, q) or not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
-        raise ProblemError(
-            f"the controller must map {q} measurements to {m} commands in a period of {period} "
-            f"frames at {hardware.frame_rate_hz:.6g} Hz; got {shape[2]} to {shape[1]} in "
-            f"{shape[0]} at {1 / controller.dt_s:.6g} Hz."
-        )
-    exposures = [own_exposure(hardware), *other_exposures(hardware)]
-    held, k = memory(exposures, n, period), controller.to_statespace()
-    mirror = hardware.mirror_system.whole
-    A_m, B_m, C_m = mirror.repeated(m)
-    position, direct = hardware.influence @ C_m, mirror.D * hardware.influence
-    nk, nv, nh = k.n_states, len(A_m), held.n_states
-    x, v, h = slice(nk), slice(nk, nk + nv), slice(nk + nv, nk + nv + nh)
-    size = nk + nv + nh
-    # y = measured s + e, u = command s + k.D e, phi_res = phi_tot + residual s - direct k.D e
-    measured, command = np.zeros((period, q, size)), np.zeros((period, m, size))
-    measured[:, : held.C.shape[1], h] = held.C
-    measured[:, rows[OWN_SENSOR]] *= gain
-    measured[:, suite.marked(blind, hardware)] = 0.0
-    command[:, :, x] = k.C
-    command += k.D @ measured
-    residual = -direct @ command
-    residual[:, :, v] -= position
-    entry = np.zeros((period, n, n + q))
-    entry[:, :, :n], entry[:, :, n:] = np.eye(n), -direct @ k.D
-    A, B = np.zeros((period, size, size)), np.zeros((period, size, n + q))
-    A[:, x] = k.B @ measured
-    A[:, x, x] += k.A
-    B[:, x, n:] = k.B
-    A[:, v] = B_m @ command
-    A[:, v, v] += A_m
-    B[:, v, n:] = B_m @ k.D
-    A[:, h] = held.B @ residual
-    A[:, h, h] += held.A
-    B[:, h] = held.B @ entry
-    D = np.zeros((period, n + m + q, n + q))
-    D[:, :n], D[:, n : n + m, n:], D[:, n + m :, n:] = entry, k.D, np.eye(q)
-    C = np.concatenate([residual, command, measured], axis=1)
-    return StateSpace(A=A, B=B, C=C, D=D, dt_s=hardware.dt_s)
-
-
-def radii_by_gain(
-    hardware: LoopHardware, controller: Controller | HasController
-) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
-    return partial(affine_radii, parts_by_gain(hardware, controller))
-
-
-def parts_by_gain(
-    hardware: LoopHardware, controller: Controller | HasController
-) -> list[AffinePart]:
-    """Return the parts of a loop, each phase of which is affine in the gain of the own sensor.
-
-    Two loops give all.
-    """
-    plain = as_controller(controller, any_period=bool(hardware.suite.sensors))
-    if not reads_others(hardware, plain):
-        A0, A1, *_ = checked_loop_matrices(hardware, plain)
-        return affine_parts(A0[None], A1[None])
-    one, two = (_system_of_sensors(hardware, plain, g, ()).stacks()[0] for g in (1.0, 2.0))
-    return affine_parts(2 * one - two, two - one)
-
-
-def parts_by_fraction(loop: ClosedLoop, whole: int) -> list[AffinePart]:
-    """Return the parts of a loop, affine in how far its delay is beyond so many whole frames.
-
-    The mirror settles at once. The change from one whole delay to the next is ``A1``.
-    """
-    k, hardware, ends = loop.controller.to_statespace(), loop.hardware, []
-    for arrival in (whole - 1, whole):
-        mirror = tapped_mirror(np.eye(whole + 1)[arrival])
-        path = {"sensor": hardware.sensor, "influence": hardware.influence}
-        A0, A1, *_ = loop_matrices(k.A, k.B, k.C, k.D, mirror=mirror, **path)
-        ends.append(A0 + loop.sensor_gain * A1)
-    return affine_parts(ends[0][None], (ends[1] - ends[0])[None])
-
-
-def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
-    """Split matrices ``A0[t] + g A1[t]``, (N, n, n), into parts whose states act on one another.
-
-    They have the eigenvalues of the whole; equal parts are returned once.
-    """
-    links = np.any((A0 != 0) | (A1 != 0), axis=0)
-    label = component_labels(links, strong=True)
-    parts = (np.ix_(range(len(A0)), label == i, label == i) for i in np.unique(label))
-    return list(
-        {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}.values()
-    )
-
-
-def affine_radii(parts: list[AffinePart], gains: FloatArray) -> FloatArray:
-    """Return the spectral radius at each gain (g,), of the transition over all phases."""
-    factors = np.asarray(gains)[:, None, None]
-    eigenvalues = []
-    for start, slope in parts:
-        whole = np.eye(start.shape[1])
-        for A, B in zip(start, slope, strict=True):
-            whole = (A + factors * B) @ whole
-        eigenvalues.append(np.linalg.eigvals(whole))
-    return np.asarray(np.max(np.abs(np.concatenate(eigenvalues, axis=1)), axis=1))
-
-
-def checked_loop_matrices(hardware: LoopHardware, controller: Controller) -> tuple[FloatArray, ...]:
+def checked_loop_matrices(
+    hardware: LoopHardware, controller: Controller, blind: tuple[str, ...] = ()
+) -> tuple[FloatArray, ...]:
     """Return the matrices of :func:`loop_matrices`, for a controller that matches the loop."""
     require_matching_controller(hardware, controller)
     k, mirror = controller.to_statespace(), hardware.mirror_system.whole
-    path = {"sensor": hardware.sensor, "influence": hardware.influence}
-    return loop_matrices(k.A, k.B, k.C, k.D, mirror=mirror, **path)
+    readings = last_frame(hardware.sensor)
+    if reads_others(hardware, controller):
+        readings = _readings_of_all(hardware, blind)
+    return loop_matrices(
+        k.A, k.B, k.C, k.D, mirror=mirror, readings=readings, influence=hardware.influence
+    )
+
+
+def last_frame(sensor: FloatArray) -> Readings:
+    """Return the readings of a sensor (q, n) of the residual of the last frame."""
+    n = sensor.shape[1]
+    return np.zeros((n, n)), np.eye(n), np.zeros_like(sensor), sensor
+
+
+def _readings_of_all(hardware: LoopHardware, blind: tuple[str, ...]) -> Readings:
+    """Return the readings of all sensors of a loop, of which some follow nothing."""
+    suite, rows = hardware.suite, hardware.suite.rows(hardware)
+    exposures = [own_exposure(hardware), *other_exposures(hardware)]
+    held = memory(exposures, hardware.modes, hardware.period)
+    others, own = np.zeros((2, hardware.period, hardware.n_readings, held.n_states))
+    others[:, : held.C.shape[1]] = held.C
+    others[:, suite.marked(blind, hardware)] = 0.0
+    own[:, rows[OWN_SENSOR]] = others[:, rows[OWN_SENSOR]]
+    return held.A, held.B, others - own, own
 
 
 def require_matching_controller(hardware: LoopHardware, controller: Controller) -> None:
-    """Raise if a controller does not have a loop's sizes and sampling period."""
-    m, q = hardware.n_commands, hardware.n_measurements
-    if controller.D.shape != (m, q):
+    """Raise if a controller does not have a loop's sizes, period and sampling period."""
+    m, q, period = hardware.n_commands, hardware.n_measurements, 1
+    if reads_others(hardware, controller):
+        q, period = hardware.n_readings, hardware.period
+    if controller.D.shape[-2:] != (m, q) or controller.period != period:
+        wanted, got = (
+            "" if period == controller.period == 1 else f" in a period of {frames} frames"
+            for frames in (period, controller.period)
+        )
         raise DimensionError(
-            f"the controller must map {q} measurements to {m} commands; got "
-            f"{controller.B.shape[1]} to {controller.C.shape[0]}."
+            f"the controller must map {q} measurements to {m} commands{wanted}; got "
+            f"{controller.D.shape[-1]} to {controller.D.shape[-2]}{got}."
         )
     if not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
         raise ProblemError(
@@ -353,50 +263,56 @@ def loop_matrices(
     D: FloatArray,
     *,
     mirror: Response,
-    sensor: FloatArray,
+    readings: Readings,
     influence: FloatArray,
 ) -> tuple[FloatArray, ...]:
-    """Close the loop around a controller in the textbook form, or around each of a stack.
+    """Close the loop around a controller in the textbook form, each of a stack, or each phase.
 
-    ``sensor`` is (q, n), ``influence`` (n, m). Return ``A0, A1, B, C0, C1, D``, affine in the
-    sensor gain g as in ``A0 + g A1``. The state is that of the controller, of the mirror (its past
-    commands, if it settles), and the last residual phi_res(k-1).
+    ``influence`` is (n, m). Return ``A0, A1, B, C0, C1, D``, affine in the sensor gain g as in
+    ``A0 + g A1``. The state is that of the controller, of the mirror (its past commands, if it
+    settles), and what sensors remember of the residual: phi_res(k-1).
     """
-    stack, order = A.shape[:-2], A.shape[-1]
-    (q, n), m = sensor.shape, influence.shape[1]
-    states = order + mirror.n_states * m + n
+    held_A, held_B, *measuring = readings
+    stack, order = np.broadcast_shapes(A.shape[:-2], held_A.shape[:-2]), A.shape[-1]
+    (n, m), q = influence.shape, D.shape[-1]
+    states = order + mirror.n_states * m + held_A.shape[-1]
     x = slice(order)  # state of the controller
-    v = slice(order, states - n)  # state of the mirror, one response per command
-    r = slice(states - n, states)  # phi_res(k-1)
+    v = slice(order, states - held_A.shape[-1])  # state of the mirror, one response per command
+    r = slice(states - held_A.shape[-1], states)  # what sensors remember
     mirror_A, mirror_B, mirror_C = mirror.repeated(m)
     direct_influence = mirror.D * influence  # from u(k) to phi_cor(k) without a delay
 
-    # with s the whole state: y = g measured s + noise
-    measured = np.zeros((q, states))
-    measured[:, r] = sensor
+    # with s the whole state: y = (measured0 + g measured1) s + noise
+    measured0, measured1 = np.zeros((2, *measuring[0].shape[:-1], states))
+    measured0[..., r], measured1[..., r] = measuring
     # u = (command0 + g command1) s + D noise
     command0 = np.zeros((*stack, m, states))
     command0[..., x] = C
-    command1 = D @ measured
+    command0 += D @ measured0
+    command1 = D @ measured1
     # phi_res = (residual0 + g residual1) s + phi_tot - direct_influence D noise
     residual0 = -direct_influence @ command0
     residual0[..., v] -= influence @ mirror_C
     residual1 = -direct_influence @ command1
+    entry = np.zeros((*stack, n, n + q))
+    entry[..., :n], entry[..., n:] = np.eye(n), -direct_influence @ D
 
     A0, A1 = np.zeros((2, *stack, states, states))
     inputs = np.zeros((*stack, states, n + q))
-    A0[..., x, x], A1[..., x, :], inputs[..., x, n:] = A, B @ measured, B
+    A0[..., x, :], A1[..., x, :], inputs[..., x, n:] = B @ measured0, B @ measured1, B
     A0[..., v, :], A1[..., v, :] = mirror_B @ command0, mirror_B @ command1
     inputs[..., v, n:] = mirror_B @ D
+    A0[..., r, :], A1[..., r, :] = held_B @ residual0, held_B @ residual1
+    inputs[..., r, :] = held_B @ entry
+    A0[..., x, x] += A
     A0[..., v, v] += mirror_A
-    A0[..., r, :], A1[..., r, :] = residual0, residual1
-    inputs[..., r, :n], inputs[..., r, n:] = np.eye(n), -direct_influence @ D
+    A0[..., r, r] += held_A
     outputs0, outputs1 = np.zeros((2, *stack, n + m + q, states))
     outputs0[..., :n, :], outputs0[..., n : n + m, :] = residual0, command0
     outputs1[..., :n, :], outputs1[..., n : n + m, :] = residual1, command1
-    outputs1[..., n + m :, :] = measured
+    outputs0[..., n + m :, :], outputs1[..., n + m :, :] = measured0, measured1
     direct = np.zeros((*stack, n + m + q, n + q))
-    direct[..., :n, :] = inputs[..., r, :]
+    direct[..., :n, :] = entry
     direct[..., n : n + m, n:] = D
     direct[..., n + m :, n:] = np.eye(q)
     return A0, A1, inputs, outputs0, outputs1, direct

@@ -9,7 +9,8 @@ for all of a box of gains and delays: X of any other is an average of theirs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.polynomial.polynomial import polysub
@@ -21,6 +22,10 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror
 from lbt_synth.validation import FloatArray
 
+# a loop of another gain, over the one assumed, and delay [frames], and taps of
+# ``z^-1 (M_d - g M_d')``, (t,)
+LoopChange: TypeAlias = tuple[float, float, FloatArray]
+
 FRAGILE_FRAMES = 0.1  # of delay: what a camera's clock or a busy computer adds
 FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
 _MOST = 10.0  # times these errors: one frame, and a factor of 10
@@ -28,15 +33,6 @@ _POINTS = 400  # frequencies at which a box is sought, before it is proved
 _LEVEL = 1 - 1e-6  # of the real part, below which one is proved to stay
 _CLOSE = 0.99  # of a box whose sides touch the border, between the points, too
 _SHRINK = 0.97  # of a box that is not proved
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopChange:
-    """A loop of another sensor gain and delay."""
-
-    gain: float  # over the gain that is assumed
-    delay_frames: float
-    taps: FloatArray  # of ``z^-1 (M_d - g M_d')``, (t,)
 
 
 def loop_changes(
@@ -57,7 +53,7 @@ def loop_changes(
                 continue
             there = own if delay == d else instant_mirror(delay).taps
             taps = np.concatenate([[0.0], polysub(own, gain * there)])
-            changes.append(LoopChange(gain=gain, delay_frames=delay, taps=taps))
+            changes.append((gain, delay, taps))
     return changes
 
 
@@ -99,8 +95,8 @@ def errors_together(loop: ClosedLoop) -> float:
         return loop_changes(hardware, low=1 / factor, high=factor, delay_frames=late)
 
     def seems_stable(scale: float) -> bool:
-        for change in changes(scale):
-            shift = turns ** np.arange(change.taps.size) @ change.taps
+        for *_, taps in changes(scale):
+            shift = turns ** np.arange(taps.size) @ taps
             for response in responses:
                 X = shift[:, None, None] * response
                 if np.max(np.linalg.eigvalsh(X + X.conj().transpose(0, 2, 1))) >= 2:
@@ -113,8 +109,8 @@ def errors_together(loop: ClosedLoop) -> float:
         low, high = (middle, high) if seems_stable(middle) else (low, middle)
     scale = high if seems_stable(high) else low * _CLOSE
     while scale > 1e-3:
-        pairs = ((part, change) for change in changes(scale) for part in parts)
-        systems = (append_taps(part, change.taps) for part, change in pairs)
+        pairs = ((part, taps) for *_, taps in changes(scale) for part in parts)
+        systems = (append_taps(part, taps) for part, taps in pairs)
         if all(largest_real_part(system, least=_LEVEL) < 1 for system in systems):
             return scale
         scale *= _SHRINK

@@ -1,4 +1,4 @@
-"""Stability margins of a loop, and the interval of sensor gains that keeps it stable."""
+"""Stability margins of a loop."""
 
 from __future__ import annotations
 
@@ -7,32 +7,23 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.linear import Controller, StateSpace, hinf_norm
-from lbt_synth.linear.held_controller import HasController
+from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
 from lbt_synth.linear.state_space import pointwise_response
-from lbt_synth.loop.broken_loops import broken_loops
-from lbt_synth.loop.closed_loop import ClosedLoop, parts_by_fraction, parts_by_gain
-from lbt_synth.loop.ensemble.closed_loops import close_loops
-from lbt_synth.loop.ensemble.evaluation import textbook_matrices
+from lbt_synth.loop.broken_loops import gain_crossings
+from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.loop.loop_errors import FRAGILE_DB, FRAGILE_FRAMES, errors_together
-from lbt_synth.loop.stable_range import exact_range, stable_range
-from lbt_synth.models import LoopHardware
+from lbt_synth.loop.stable_range import delay_margin_frames, stable_sensor_gains
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import FloatArray, number, require_instance
+from lbt_synth.validation import FloatArray, require_instance
 
-_EXACT = 3  # frames of delay for which the margin is exact; later ones have too many states
-_INSIDE = 1e-7  # part of an exact margin by which it is less, so that the loop is stable there
-_DIVISION = 64  # of delays in which the delay margin is sought
-_FINER, _DIVISIONS = 8, 6  # of the step in which it is found
 _DISK_TOLERANCE = 1e-4  # of the disk margin, relative
 _GRID = 65  # angles at which the search for the least disk margin begins
 _MOST_INTERVALS = 5000  # of angles; a loop of two axes needs some ten
 _POINT = 1e-12  # rad per sample; a narrower interval is a point
 _MOST_RATIO = 1e8  # of scales, where nothing comes back from a channel; far from overflow
 _SWEEPS = 10  # of the balancing over all channels; two channels need one
-_LONGEST = 100  # delay up to which it is sought [frames]
 
 
 @table_row
@@ -180,8 +171,8 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
-    crossings = [point for broken in broken_loops(loop) for point in broken.gain_crossings]
-    delay, early = (_delay_margin_frames(loop, sign=sign) for sign in (1, -1))
+    crossings = gain_crossings(loop)
+    delay, early = (delay_margin_frames(loop, sign=sign) for sign in (1, -1))
     disk = _disk_margin(loop)
     return LoopMargins(
         modulus=1 / float(hinf_norm(loop.output_sensitivity())),
@@ -199,47 +190,6 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
         disk_gain_high=(2 + disk) / (2 - disk) if disk < 2 else np.inf,
         disk_phase_deg=float(np.degrees(2 * np.arctan(disk / 2))),
     )
-
-
-def stable_sensor_gains(
-    hardware: LoopHardware, controller: Controller | HasController, *, nominal: float = 1.0
-) -> tuple[float, float]:
-    """Interval of sensor gains around a nominal one for which the loop is stable.
-
-    Modes that do not mix have exact ends, from all gains at which a pole is on the unit circle.
-    Where modes mix or other sensors are read, the spectral radius is followed in steps of 1 % from
-    the nominal gain, and each end is refined by bisection.
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        Sensor, mirror and delay.
-    controller : Controller or Design
-        The controller, or a design that holds it.
-    nominal : float, optional
-        Gain inside the interval.
-
-    Returns
-    -------
-    low, high : float
-        Ends of the interval; 0 and inf when it reaches beyond a factor of 1e4.
-        Both are ``nan`` when the loop is not stable at the nominal gain.
-
-    Raises
-    ------
-    ProblemError
-        If the nominal gain is not positive, or the sizes clash.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=3, modes=1)
-    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
-    >>> low, high = lbt.loop.stable_sensor_gains(path, lazy)
-    >>> low, round(high, 6)  # 0.618034 / 0.5
-    (0.0, 1.236068)
-    """
-    return stable_range(parts_by_gain(hardware, controller), number(nominal, "nominal", above=0))
 
 
 def _disk_margin(loop: ClosedLoop) -> float:
@@ -313,52 +263,3 @@ def channel_scales(response: FloatArray) -> FloatArray:
             column = float(np.linalg.norm(scales * moduli[:, i] / scales[i]))
             scales[i] *= np.sqrt(max(column, tiny) / max(row, tiny))
     return np.asarray(np.clip(scales / scales.max(), 1 / _MOST_RATIO, 1.0))
-
-
-def _delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
-    """Least change of the delay at which the loop, as it is simulated, is unstable [frames].
-
-    It is late with the sign 1, early with -1. A part of a frame is no phase lag: an exposure then
-    sees two commands. So poles decide: exactly for some frames where modes do not mix and the
-    mirror settles at once, in steps else.
-    """
-    d, reached = loop.hardware.delay_frames, 0.0
-    longest = _LONGEST - d if sign > 0 else d - 1
-    while loop.hardware.mirror is None and reached < min(_EXACT, longest):
-        at = d + sign * reached
-        whole = int(np.floor(at) if sign > 0 else np.ceil(at) - 1)
-        ranges = [exact_range(part, at - whole) for part in parts_by_fraction(loop, whole)]
-        exact = [one for one in ranges if one is not None]
-        if len(exact) < len(ranges):
-            break
-        end = min(high for _, high in exact) if sign > 0 else max(low for low, _ in exact)
-        if 0 <= end <= 1:
-            return abs(whole + end - d) * (1 - _INSIDE)
-        reached = abs(whole + (sign > 0) - d)
-    return _stepped_delay_margin(loop, reached, longest, sign) if reached < longest else np.inf
-
-
-def _stepped_delay_margin(loop: ClosedLoop, reached: float, longest: float, sign: int) -> float:
-    """Follow the poles in steps from a change of the delay at which the loop is stable."""
-    hardware, matrices = loop.hardware, textbook_matrices([loop.controller])
-    d = hardware.delay_frames
-    # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
-    whole = sign * (np.arange(1, _LONGEST + 1) - d)
-
-    def first_unstable(low: float, high: float, steps: int) -> tuple[float, float] | None:
-        """Return the step of an equal division in which the loop becomes unstable, or None."""
-        peaks = whole[(whole > low) & (whole < high)]
-        further = np.unique(np.concatenate([np.linspace(low, high, steps + 1), peaks]))
-        gains = np.full(further.size - 1, loop.sensor_gain)
-        stable, _ = close_loops(matrices, hardware, gains, d + sign * further[1:])
-        unstable = np.flatnonzero(~stable)
-        return None if unstable.size == 0 else tuple(further[unstable[0] : unstable[0] + 2])
-
-    low, high = reached, min(reached + 1.0, longest)
-    while (step := first_unstable(low, high, _DIVISION)) is None:
-        if high >= longest:
-            return np.inf
-        low, high = high, min(2 * high, longest)
-    for _ in range(_DIVISIONS):
-        step = first_unstable(*step, _FINER) or step
-    return float(step[0])

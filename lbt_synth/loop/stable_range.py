@@ -1,30 +1,169 @@
-"""The range of a number, such as a sensor gain, in which a loop that is affine in it is stable.
+"""In which range of a gain or a delay a loop is stable: one that stays, or a gain that moves.
 
-Where the change of a part has rank one, as the gain of a measurement has, all crossings of the unit
+Every matrix is affine in the gain and, between two whole delays, in the fraction of a delay. Where
+the change of a part has rank one, as the gain of a measurement has, all crossings of the unit
 circle are found at once: ``A + d b c'`` has an eigenvalue z where ``d T(z) = 1`` with
 ``T = c' (z I - A)^-1 b``, and T is real at the angles of the eigenvalues of a symplectic pencil.
 Other parts are followed in steps.
+
+A gain that moves: at the gain c the measurement feeds back through the complementary sensitivity T.
+A gain between ``c (1 - r)`` and ``c (1 + r)`` adds the feedback ``d(k) T`` with ``|d(k)| <= r``, so
+the loop is stable, whatever d does, if it is stable at c and ``r ||T||_inf < 1``. By the bounded
+real lemma one quadratic Lyapunov function then decreases at every gain of the interval; through one
+measurement it exists for no wider interval (P. P. Khargonekar, I. R. Petersen, K. Zhou, IEEE Trans.
+Autom. Control 35, 356 (1990), doi:10.1109/9.50357). The norm is bracketed by level sets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
+from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize.elementwise import find_root
 
-from lbt_synth.linear import StateSpace
+from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.linear.held_controller import HasController, as_controller
+from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.norms import fold_angles, popov_angles
 from lbt_synth.linear.state_space import schur_form, schur_response
-from lbt_synth.loop.closed_loop import AffinePart, affine_radii
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.loop.closed_loop import (
+    ClosedLoop,
+    checked_loop_matrices,
+    close_loop,
+    last_frame,
+    loop_matrices,
+)
+from lbt_synth.loop.ensemble.closed_loops import close_loops
+from lbt_synth.loop.ensemble.evaluation import textbook_matrices
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
+from lbt_synth.storage.rows import column, fact_table, table_row
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, require_instance
+
+AffinePart: TypeAlias = tuple[FloatArray, FloatArray]  # A0 and A1 of ``A0[t] + g A1[t]``
 
 _STEP = 1.01  # ratio of neighbouring gains in the search for the ends of the interval
 _WIDEST = 1e4
 _AT_ONCE = 32  # gains, whose loops are in memory together
+_FINER = 8  # parts into which a step is divided, again and again
+_ROUNDS = 13  # for a gain, to its rounding
 _RANK = 1e-12  # of a change, a singular value over the largest that counts as zero
 _REAL = 1e-9  # of a response, an imaginary part that counts as zero
+_EXACT = 3  # frames of delay for which the margin is exact; later ones have too many states
+_INSIDE = 1e-7  # part of an exact margin by which it is less, so that the loop is stable there
+_DIVISION = 64  # of delays in which the delay margin is sought
+_DELAY_ROUNDS = 6
+_LONGEST = 100  # delay up to which it is sought [frames]
+# Largest norm that counts as below 1: a norm is accurate to 1e-7 with a pole at 1 - 1e-9, and a
+# loop with a pole nearer to the unit circle does not count as stable.
+CIRCLE_LIMIT = 1 - 1e-7
+_WIDEST_MOVING = 100.0  # factor on the loop's gain beyond which no pyramid's optical gain lies
+_BISECTIONS = 10  # of the share of an interval: the ends are then exact to 1 % or better
+_NONE = np.zeros(0)
+
+
+def radii_by_gain(
+    hardware: LoopHardware, controller: Controller | HasController
+) -> Callable[[FloatArray], FloatArray]:
+    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
+    return partial(affine_radii, parts_by_gain(hardware, controller))
+
+
+def parts_by_gain(
+    hardware: LoopHardware, controller: Controller | HasController
+) -> list[AffinePart]:
+    """Return the parts of a loop, each phase of which is affine in the gain of the own sensor."""
+    plain = as_controller(controller, any_period=bool(hardware.suite.sensors))
+    A0, A1, *_ = checked_loop_matrices(hardware, plain)
+    states = A0.shape[-1]
+    return affine_parts(A0.reshape(-1, states, states), A1.reshape(-1, states, states))
+
+
+def parts_by_fraction(loop: ClosedLoop, whole: int) -> list[AffinePart]:
+    """Return the parts of a loop, affine in how far its delay is beyond so many whole frames.
+
+    The mirror settles at once. The change from one whole delay to the next is ``A1``.
+    """
+    k, hardware, ends = loop.controller.to_statespace(), loop.hardware, []
+    readings = last_frame(hardware.sensor)
+    for arrival in (whole - 1, whole):
+        mirror = tapped_mirror(np.eye(whole + 1)[arrival])
+        A0, A1, *_ = loop_matrices(
+            k.A, k.B, k.C, k.D, mirror=mirror, readings=readings, influence=hardware.influence
+        )
+        ends.append(A0 + loop.sensor_gain * A1)
+    return affine_parts(ends[0][None], (ends[1] - ends[0])[None])
+
+
+def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
+    """Split matrices ``A0[t] + g A1[t]``, (N, n, n), into parts whose states act on one another.
+
+    They have the eigenvalues of the whole; equal parts are returned once.
+    """
+    links = np.any((A0 != 0) | (A1 != 0), axis=0)
+    label = component_labels(links, strong=True)
+    parts = (np.ix_(range(len(A0)), label == i, label == i) for i in np.unique(label))
+    return list(
+        {(A0[own].tobytes(), A1[own].tobytes()): (A0[own], A1[own]) for own in parts}.values()
+    )
+
+
+def affine_radii(parts: list[AffinePart], gains: FloatArray) -> FloatArray:
+    """Return the spectral radius at each gain (g,), of the transition over all phases."""
+    factors = np.asarray(gains)[:, None, None]
+    eigenvalues = []
+    for start, slope in parts:
+        whole = np.eye(start.shape[1])
+        for A, B in zip(start, slope, strict=True):
+            whole = (A + factors * B) @ whole
+        eigenvalues.append(np.linalg.eigvals(whole))
+    return np.asarray(np.max(np.abs(np.concatenate(eigenvalues, axis=1)), axis=1))
+
+
+def stable_sensor_gains(
+    hardware: LoopHardware, controller: Controller | HasController, *, nominal: float = 1.0
+) -> tuple[float, float]:
+    """Interval of sensor gains around a nominal one for which the loop is stable.
+
+    Modes that do not mix have exact ends, from all gains at which a pole is on the unit circle.
+    Where modes mix or other sensors are read, the spectral radius is followed in steps of 1 % from
+    the nominal gain, and each end is refined by bisection.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Sensor, mirror and delay.
+    controller : Controller or Design
+        The controller, or a design that holds it.
+    nominal : float, optional
+        Gain inside the interval.
+
+    Returns
+    -------
+    low, high : float
+        Ends of the interval; 0 and inf when it reaches beyond a factor of 1e4.
+        Both are ``nan`` when the loop is not stable at the nominal gain.
+
+    Raises
+    ------
+    ProblemError
+        If the nominal gain is not positive, or the sizes clash.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=3, modes=1)
+    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> low, high = lbt.loop.stable_sensor_gains(path, lazy)
+    >>> low, round(high, 6)  # 0.618034 / 0.5
+    (0.0, 1.236068)
+    """
+    return stable_range(parts_by_gain(hardware, controller), number(nominal, "nominal", above=0))
 
 
 def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]:
@@ -40,8 +179,7 @@ def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]
 
 
 def _range_of_part(part: AffinePart, nominal: float) -> tuple[float, float]:
-    stepped = partial(affine_radii, [part])
-    return exact_range(part, nominal) or stable_interval(stepped, nominal)
+    return exact_range(part, nominal) or stepped_range(partial(affine_radii, [part]), nominal)
 
 
 def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
@@ -59,65 +197,211 @@ def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
         return -np.inf, np.inf
     b, c = U[:, :1] * sizes[0], V[:1]
     T = StateSpace(A=start[0] + nominal * slope[0], B=b, C=c, D=np.zeros((1, 1))).balanced()
-    responses = real_responses(T)
+    responses = crossings(T)[1].real
     changes = 1 / responses[responses != 0]
     below, above = changes[changes < 0], changes[changes > 0]
     return nominal + below.max(initial=-np.inf), nominal + above.min(initial=np.inf)
 
 
-def real_responses(T: StateSpace) -> FloatArray:
-    """Return the responses of a system of one input and output that are real, on the unit circle.
+def crossings(T: StateSpace, *, real_part: float | None = None) -> tuple[FloatArray, ComplexArray]:
+    """Return where a response from one input to one output is real on the unit circle, and it.
 
-    There ``T(z) = T(1/z)``; between the angles of the pencil the imaginary part keeps its sign.
+    With a real part, where it has that. The angles [rad] are within 0 and pi. Where it is real,
+    ``T(z) = T(1/z)``; between the angles of the pencil the sign does not change.
     """
-    found = popov_angles(T.A, T.B, np.zeros_like(T.A), T.C, np.zeros_like(T.D), sign=-1.0)
-    angles = fold_angles(found, 0.0, np.pi)
+    Q, R, sign = np.zeros_like(T.A), np.zeros_like(T.D), -1.0
+    if real_part is not None:
+        R, sign = 2 * (T.D - real_part), 1.0
+    angles = fold_angles(popov_angles(T.A, T.B, Q, T.C, R, sign=sign), 0.0, np.pi)
     form = schur_form(T)
 
     def response(at: FloatArray) -> ComplexArray:
         return np.asarray(schur_response(form, np.exp(1j * at))[:, 0, 0])
 
-    def imaginary(at: FloatArray) -> FloatArray:
-        return response(at).imag
+    def value(at: FloatArray) -> FloatArray:
+        there = response(at)
+        return there.imag if real_part is None else there.real - real_part
 
     middle = (angles[1:] + angles[:-1]) / 2
-    signs = np.sign(imaginary(middle))
+    signs = np.sign(value(middle))
     known = response(angles)
-    real = np.abs(known.imag) <= _REAL * np.abs(known)
-    (turns,) = np.nonzero((signs[1:] * signs[:-1] < 0) & ~real[1:-1])  # of an inaccurate angle
+    zero = np.abs(value(angles)) <= _REAL * np.abs(known)
+    (turns,) = np.nonzero((signs[1:] * signs[:-1] < 0) & ~zero[1:-1])  # of an inaccurate angle
     crossed = np.zeros(0)
     if turns.size:
         ends = middle[turns], middle[turns + 1]
-        crossed = find_root(imaginary, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
-    return np.concatenate([known[real].real, response(crossed).real])
+        crossed = find_root(value, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
+    places = np.sort(np.concatenate([angles[zero], crossed]))
+    return places, response(places)
 
 
-def stable_interval(
+def stepped_range(
     radii: Callable[[FloatArray], FloatArray], nominal: float = 1.0
 ) -> tuple[float, float]:
-    """Return the interval around a gain in which radii (g,) of gains (g,) are below 1.
-
-    It is sought as :func:`stable_sensor_gains` says.
-    """
-
-    def is_stable(gain: float) -> bool:
-        return float(radii(np.array([gain]))[0]) < 1
-
-    if not is_stable(nominal):
-        return float("nan"), float("nan")
+    """Return the interval around a gain in which radii (g,) of gains (g,) are below 1."""
+    if not radii(np.array([nominal]))[0] < 1:
+        return np.nan, np.nan
+    count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
     ends = []
     for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
-        count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
         gains = np.asarray(nominal * ratio ** np.arange(count + 1), dtype=np.float64)
-        parts = (range(i, min(i + _AT_ONCE, count + 1)) for i in range(0, count + 1, _AT_ONCE))
-        outside = (part[i] for part in parts for i in np.flatnonzero(radii(gains[part]) >= 1))
-        first = next(outside, None)
-        if first is None:
-            ends.append(open_end)
-            continue
-        inner, outer = gains[first - 1], gains[first]
-        for _ in range(40):
-            middle = (inner + outer) / 2
-            inner, outer = (middle, outer) if is_stable(middle) else (inner, middle)
-        ends.append(float(inner))
+        steps = (gains[i : i + _AT_ONCE + 1] for i in range(0, count, _AT_ONCE))
+        end = _last_stable(lambda g: radii(g) < 1, steps, rounds=_ROUNDS)
+        ends.append(open_end if end is None else end)
     return ends[0], ends[1]
+
+
+def _last_stable(
+    are_stable: Callable[[FloatArray], BoolArray],
+    steps: Iterable[FloatArray],
+    *,
+    rounds: int,
+    further: FloatArray = _NONE,
+) -> float | None:
+    """Return the last stable number before the first that is not, None if all are stable.
+
+    Each of the steps begins with a stable number. The step in which one is unstable is divided
+    again and again; ``further`` numbers are tried wherever they lie within.
+    """
+    for numbers in steps:
+        unstable = np.flatnonzero(~are_stable(numbers[1:]))
+        for _ in range(rounds if unstable.size else 0):
+            first, last = numbers[unstable[0]], numbers[unstable[0] + 1]
+            within = further[(further - first) * (further - last) < 0]
+            numbers = np.concatenate([np.linspace(first, last, _FINER + 1), within])
+            numbers = np.sort(numbers)[:: 1 if first < last else -1]
+            unstable = np.append(np.flatnonzero(~are_stable(numbers[1:])), numbers.size - 2)
+        if unstable.size:
+            return float(numbers[unstable[0]])
+    return None
+
+
+def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
+    """Least change of the delay at which the loop, as it is simulated, is unstable [frames].
+
+    It is late with the sign 1, early with -1. A part of a frame is no phase lag: an exposure then
+    sees two commands. So poles decide: exactly for some frames where modes do not mix and the
+    mirror settles at once, in steps else.
+    """
+    d, reached = loop.hardware.delay_frames, 0.0
+    longest = _LONGEST - d if sign > 0 else d - 1
+    while loop.hardware.mirror is None and reached < min(_EXACT, longest):
+        at = d + sign * reached
+        whole = int(np.floor(at) if sign > 0 else np.ceil(at) - 1)
+        ranges = [exact_range(part, at - whole) for part in parts_by_fraction(loop, whole)]
+        exact = [one for one in ranges if one is not None]
+        if len(exact) < len(ranges):
+            break
+        end = min(high for _, high in exact) if sign > 0 else max(low for low, _ in exact)
+        if 0 <= end <= 1:
+            return abs(whole + end - d) * (1 - _INSIDE)
+        reached = abs(whole + (sign > 0) - d)
+    if reached >= longest:
+        return np.inf
+    matrices = textbook_matrices([loop.controller])
+
+    def are_stable(changes: FloatArray) -> BoolArray:
+        gains = np.full(changes.size, loop.sensor_gain)
+        return close_loops(matrices, loop.hardware, gains, d + sign * changes)[0]
+
+    # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
+    peaks = np.asarray(sign * (np.arange(1, _LONGEST + 1) - d), dtype=np.float64)
+    ends = [reached, min(reached + 1.0, longest)]
+    while ends[-1] < longest:
+        ends.append(min(2 * ends[-1], longest))
+    steps = (
+        np.union1d(np.linspace(low, high, _DIVISION + 1), peaks[(peaks > low) & (peaks < high)])
+        for low, high in pairwise(ends)
+    )
+    last = _last_stable(are_stable, steps, rounds=_DELAY_ROUNDS, further=peaks)
+    return np.inf if last is None else last
+
+
+@table_row
+class MovingGain(Summarised):
+    """Intervals of a constant and of a moving sensor gain; nan where nothing is proved.
+
+    A gain that does not move may be anywhere in the first interval. Around the loop's own gain,
+    the second has the same share of the first, in logarithms, on both sides.
+    """
+
+    constant_low: float = column("stable at each constant gain, from")
+    constant_high: float = column("  to")
+    moving_low: float = column("proved while it moves at any speed, from")
+    moving_high: float = column("  to")
+
+    def _brief(self) -> str:
+        return f"any speed {self.moving_low:.4g} to {self.moving_high:.4g}"
+
+    def _summarise(self) -> Summary:
+        return Summary(tables=[fact_table("Sensor gain that moves", self)])
+
+
+def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
+    """Return ``r ||T||_inf`` of an interval of gains, which proves it below ``CIRCLE_LIMIT``.
+
+    It is inf where the loop is not stable at the middle of the interval.
+    """
+    middle = (low + high) / 2
+    centred = close_loop(loop.hardware, loop.controller, sensor_gain=middle)
+    if not centred.is_stable:
+        return np.inf
+    S = centred.output_sensitivity()
+    T = replace(S, C=-S.C, D=np.eye(len(S.D)) - S.D)
+    return (high - low) / (2 * middle) * hinf_norm(T).upper
+
+
+def moving_gain(loop: ClosedLoop) -> MovingGain:
+    """Find the interval of a moving sensor gain in which a loop is proved stable.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The loop, stable at its sensor gain.
+
+    Returns
+    -------
+    MovingGain
+        The intervals, in sensor gains relative to the sensor matrix.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is not stable.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> moving = lbt.loop.moving_gain(lbt.close_loop(path, lazy))
+    >>> round(moving.constant_high, 3), round(moving.moving_low, 3), round(moving.moving_high, 3)
+    (2.0, 0.06, 1.527)
+    """
+    require_instance(loop, ClosedLoop, "loop")
+    loop.require_stable()
+    nominal = loop.sensor_gain
+    constant = stable_sensor_gains(loop.hardware, loop.controller, nominal=nominal)
+    ends = np.array(
+        [max(constant[0], nominal / _WIDEST_MOVING), min(constant[1], nominal * _WIDEST_MOVING)]
+    )
+
+    def interval(share: float) -> tuple[float, float]:
+        low, high = nominal * (ends / nominal) ** share
+        return float(low), float(high)
+
+    def proves(share: float) -> bool:
+        low, high = interval(share)
+        return circle_norm(loop, low=low, high=high) < CIRCLE_LIMIT
+
+    proved, failed = (1.0, 1.0) if proves(1.0) else (0.0, 1.0)
+    for _ in range(_BISECTIONS if proved < failed else 0):
+        middle = (proved + failed) / 2
+        proved, failed = (middle, failed) if proves(middle) else (proved, middle)
+    low, high = interval(proved) if proved else (np.nan, np.nan)
+    return MovingGain(
+        constant_low=constant[0],
+        constant_high=constant[1],
+        moving_low=low,
+        moving_high=high,
+    )

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.special import j0, j1
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear.quadrature import compress_rule, gauss_panels
+from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.residual import ResidualBudget
 from lbt_synth.validation import (
     ComplexArray,
@@ -36,7 +36,6 @@ from lbt_synth.validation import (
 _DIRECTIONS = 64
 _FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])  # directions to try
 _STRIPS = np.linspace(0.2, 4, 20)
-_FEW_RADII = {-1: (1.0, 20), -2: (0.3, 8)}  # by fineness: turns of phase, and radii for them
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
 
@@ -91,20 +90,21 @@ class Imaging:
         return 4 / (self.wavelength_um * 1e3)
 
 
-def strehl(budget: ResidualBudget, imaging: Imaging) -> float:
+def strehl(budget: ResidualBudget, imaging: Imaging) -> Any:
     """Strehl ratio, in [0, 1], of a loop's exact residual on one or two axes.
 
     Parameters
     ----------
     budget : ResidualBudget
-        Residual of tip and tilt.
+        Residual of tip and tilt, of one loop or of p.
     imaging : Imaging
         The camera.
 
     Returns
     -------
-    float
-        Long-exposure Strehl ratio, the other modes included.
+    float or (p,) ndarray
+        Long-exposure Strehl ratio, the other modes included; 0 where the image moves by more than
+        160 times its width, nan where a loop is unstable.
 
     Raises
     ------
@@ -122,9 +122,16 @@ def strehl(budget: ResidualBudget, imaging: Imaging) -> float:
     >>> round(lbt.strehl(still, lbt.Imaging(diameter_m=8.22, other_modes=0.84)), 12)
     0.84
     """
-    return jitter_strehl(
-        budget.gaussian_nm2, imaging=imaging, line_amplitudes_nm=budget.line_amplitudes_nm
-    )
+    one = budget.noise_nm2.ndim == 2
+    gaussian, lines = budget.gaussian_nm2, budget.line_amplitudes_nm
+    if one:
+        gaussian, lines = gaussian[None], lines[None]
+    stable = np.broadcast_to(budget.stable, len(gaussian))
+    out = np.where(stable, 0.0, np.nan)
+    spread = jitter_spread_nm(gaussian[stable], lines[stable])
+    near = np.flatnonzero(stable)[spread <= widest_jitter_nm(imaging)]
+    out[near] = jitter_strehls(gaussian[near], imaging=imaging, line_amplitudes_nm=lines[near])
+    return float(out[0]) if one else out
 
 
 def jitter_strehl(
@@ -239,16 +246,13 @@ def _choose_rules(
 ) -> IntArray:
     """Fineness and number of directions of the nodes that each jitter needs, (p, 2).
 
-    Up to a turn of phase over the pupil the integrand is nearly a polynomial, and few radii are
-    enough; beyond some 5 turns the nodes are made denser. Where the jitter is the same in all
-    directions, or small, fewer directions are enough: the equidistant sum over N directions of half
-    a turn misses only harmonics from 2 N on, which decay faster than ``exp(-2 N t)`` times the
-    largest value of the integrand on a strip of width t.
+    Beyond some 5 turns of phase over the pupil the nodes are made denser. Where the jitter is the
+    same in all directions, or small, fewer directions are enough: the equidistant sum over N
+    directions of half a turn misses only harmonics from 2 N on, which decay faster than ``exp(-2 N
+    t)`` times the largest value of the integrand on a strip of width t.
     """
     turns = np.maximum(spread * cycles_per_nm, 1e-9)
     fineness = np.maximum(0, np.ceil(np.log2(turns / 5))).astype(np.int64)
-    for few, (most, _) in _FEW_RADII.items():
-        fineness[turns <= most] = few
     variance, last = covariance[:, 0, 0], covariance[:, -1, -1]
     two = covariance.shape[1] == 2
     unequal = np.hypot(variance - last, 2 * covariance[:, 0, 1]) if two else variance
@@ -257,9 +261,7 @@ def _choose_rules(
     growth = np.outer(gaussian, np.cosh(2 * _STRIPS) - 1) + np.outer(sinusoids, np.sinh(_STRIPS))
     error = np.min(growth[:, None] - 2 * np.outer(_FEWER, _STRIPS), axis=2)
     halvings = np.sum(error < np.log(1e-15), axis=1)
-    directions = np.where(
-        fineness <= 0, _DIRECTIONS >> halvings, _DIRECTIONS << np.maximum(fineness, 0)
-    )
+    directions = np.where(fineness == 0, _DIRECTIONS >> halvings, _DIRECTIONS << fineness)
     return np.stack([fineness, directions], axis=1)
 
 
@@ -341,9 +343,6 @@ def _weighted_otf(
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    if fineness in _FEW_RADII:
-        square, weight = compress_rule(radius**2, weight, _FEW_RADII[fineness][1])
-        radius = np.sqrt(square)
     angle = np.pi * (np.arange(directions // 2 if quadrant else directions) + 0.5) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
     weights = np.repeat(weight / (weight.sum() * angle.size), angle.size)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -22,9 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import LbtSynthError, NumericalError, OutputError, ProblemError
-from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, strehl
-from lbt_synth.loop.ensemble.evaluation import EnsembleResiduals
-from lbt_synth.loop.strehl import jitter_spread_nm, widest_jitter_nm
+from lbt_synth.loop import ClosedLoop, Imaging, ResidualBudget, residual_budget, strehl
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage import array_file
@@ -48,18 +47,13 @@ def loop_columns(
     """Return what a loop leaves in a truth, by column; nan where it is unstable."""
     if not loop.is_stable:
         return {"stable": 0.0} | dict.fromkeys(("strehl", *RESIDUALS), np.nan)
-    budget = residual_budget(loop, truth, frame_means=frame_means)
-    spread = jitter_spread_nm(budget.gaussian_nm2[None], budget.line_amplitudes_nm[None])[0]
-    # 0 beyond the widest jitter that is integrated, as in EnsembleResiduals.strehl
-    ratio = strehl(budget, imaging) if spread <= widest_jitter_nm(imaging) else 0.0
-    residuals = {column: float(getattr(budget, name)) for column, name in RESIDUALS.items()}
-    return {"stable": 1.0, "strehl": ratio} | residuals
+    return residual_columns(residual_budget(loop, truth, frame_means=frame_means), imaging)
 
 
-def stack_columns(residuals: EnsembleResiduals, imaging: Imaging) -> dict[str, FloatArray]:
-    """Return what p loops leave, by column (p,); nan where a loop is unstable."""
-    columns = {column: getattr(residuals, name) for column, name in RESIDUALS.items()}
-    return {"stable": residuals.stable * 1.0, "strehl": residuals.strehl(imaging)} | columns
+def residual_columns(budget: ResidualBudget, imaging: Imaging) -> dict[str, Any]:
+    """Return what a loop or p of them leave, by column (p,); nan where one is unstable."""
+    columns = {column: getattr(budget, name) for column, name in RESIDUALS.items()}
+    return {"stable": budget.stable * 1.0, "strehl": strehl(budget, imaging)} | columns
 
 
 def moved_lines(
@@ -93,6 +87,13 @@ class InlineExecutor(futures.Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+def calls_in_flight(executor: futures.Executor, workers: int | None = None) -> int:
+    """Return how many calls an executor has at a time: two a worker, so that none waits."""
+    if isinstance(executor, InlineExecutor):
+        return 1
+    return 2 * (workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,7 +18,6 @@ from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.loop import (
     ClosedLoop,
     Imaging,
-    broken_loops,
     least_residual,
     least_worst_residual,
     residual_budget,
@@ -178,7 +177,7 @@ def limits(
         worst_nm = float(np.max(curve)) if shifts.size else residual_nm
         margin_deg = np.nan
         if loop.is_stable and not loop.reads_others:
-            margin_deg = phase_margin_deg(broken_loops(loop))
+            margin_deg = phase_margin_deg(loop)
         limit_nm, band_nm = (  # of the loop's own sensor
             np.nan if each is None or loop.reads_others else each.rms_nm for each in (limit, band)
         )
@@ -302,7 +301,7 @@ def compare_in_truth(
 def _means_nm(design: Design, config: Config) -> float:
     """Return what a design leaves in means over frames, as it expects it."""
     loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
-    return residual_budget(loop, config.truth, frame_means=True).rms_nm
+    return float(residual_budget(loop, config.truth, frame_means=True).rms_nm)
 
 
 def _warnings(

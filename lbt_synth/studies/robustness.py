@@ -46,7 +46,7 @@ from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.studies.grid import loop_columns, moved_lines, stack_columns
+from lbt_synth.studies.grid import loop_columns, moved_lines, residual_columns
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -286,7 +286,7 @@ def robustness_map(
                 ),
             )
             loops = ensemble_residuals(design.controller, hardware, ensemble)
-            columns = stack_columns(loops, imaging)
+            columns = residual_columns(loops, imaging)
             for name, numbers in maps.items():
                 numbers[d, some] = columns[name].reshape(count, errors.size)
             if advance is not None:

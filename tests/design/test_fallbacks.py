@@ -19,7 +19,7 @@ from lbt_synth.design.fallbacks import (
 )
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import kalman_riccati
-from lbt_synth.loop.budget import model_readings, plant_budget
+from lbt_synth.loop.budget import model_readings, residual_budget
 
 
 def test_every_set_of_sensors_may_fail():
@@ -72,7 +72,7 @@ def test_readings_are_residual_and_noise():
     plant = example_plant((FAST,))
     loop = failed_loop(plant, kalman_riccati(plant).gain_predictor, ())
     readings = model_readings(loop, plant)
-    left = plant_budget(loop, plant, frame_means=True).total_nm2
+    left = residual_budget(loop, plant, frame_means=True).total_nm2
     np.testing.assert_allclose(readings[:2, :2], left + 75**2 * np.eye(2), rtol=1e-9)
     power = np.diag(FAST.noise_m_s2).copy()
     for line, motion in zip(plant.vibrations, plant.motions, strict=True):

@@ -103,7 +103,7 @@ def test_the_integrator_of_a_plant_leaves_the_least_of_its_budget(delay):
     def left(gain: float) -> float:
         design = lbt.integrator(plant.hardware, gain=gain)
         loop = lbt.close_loop(plant.hardware, design.controller)
-        return lbt.loop.model_budget(loop, plant).rms_nm
+        return lbt.residual_budget(loop, plant).rms_nm
 
     gain = lbt.design.model_integrator(plant).gain
     best = minimize_scalar(left, bounds=(0.5 * gain, 1.5 * gain), options={"xatol": 1e-7})

@@ -23,7 +23,7 @@ from lbt_synth.report.figures.studies import mirror_figure
 def model_rms(plant, controller):
     """Residual of a controller in the image where the plant's model is the truth [nm]."""
     loop = lbt.close_loop(plant.hardware, controller)
-    return lbt.loop.model_budget(loop, plant).rms_nm
+    return lbt.residual_budget(loop, plant).rms_nm
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.5, 2.0, 2.25, 2.49, 3.0, 4.0])
@@ -336,7 +336,7 @@ def test_other_disturbances_meet_the_same_loop():
     residual, _ = loop_variances(moved, design.controller)
     assert np.trace(error.C @ X @ error.C.T) == pytest.approx(residual, rel=1e-8)
     loop = lbt.close_loop(plant.hardware, design.controller)
-    left = lbt.loop.model_budget(loop, moved).rms_nm
+    left = lbt.residual_budget(loop, moved).rms_nm
     assert left == pytest.approx(np.sqrt(residual), rel=0.05)  # a line is straight in the model
     with pytest.raises(lbt.errors.ProblemError, match="problem must be a TipTiltPlant"):
         design.error_system(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))

@@ -38,7 +38,7 @@ def test_the_example_holds_at_every_row_and_sensor_gain(example):
         ],
     )
     means, moving = (
-        100 * np.min(left.strehl(camera).reshape(len(gains), -1), axis=1)
+        100 * np.min(lbt.strehl(left, camera).reshape(len(gains), -1), axis=1)
         for left in (
             lbt.loop.ensemble_residuals(
                 example.controller, config.hardware, ensemble, frame_means=frame_means

@@ -6,9 +6,7 @@ import pytest
 import lbt_synth as lbt
 from lbt_synth.linear.quadrature import (
     adaptive_integral,
-    compress_rule,
     distinct_edges,
-    gauss_panels,
     graded_edges,
     pole_edges,
     refine_panels,
@@ -31,19 +29,6 @@ def test_integrals_of_stacks():
     widths = np.array([1e-4, 1e-2])
     expected = 1e-3 * (np.arctan(0.7 / widths) + np.arctan(0.3 / widths))
     assert found[:, 0, 0] == pytest.approx(expected, rel=1e-7)
-
-
-@pytest.mark.parametrize("count", [1, 5, 20])
-def test_a_compressed_rule_is_exact_for_polynomials(count):
-    """The weight x^(3/2) has the moments 1 / (k + 5/2); the rule of many nodes has a kink in it."""
-    x, w = gauss_panels(np.geomspace(1e-12, 1, 60), 12)
-    nodes, weights = compress_rule(x, w * x**1.5, count)
-    assert nodes.size == count
-    assert np.all((nodes > 0) & (nodes < 1) & (weights > 0))
-    for k in range(2 * count):
-        assert weights @ nodes**k == pytest.approx(1 / (k + 2.5), rel=1e-13)
-    missed = weights @ nodes ** (2 * count) - 1 / (2 * count + 2.5)
-    assert missed < 0  # the first power that is not exact: a Gauss rule is below x^(2n)
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-6, 1e-8])

@@ -78,20 +78,20 @@ def test_a_gain_alone_has_the_exact_interval():
     low, high = lbt.loop.stable_sensor_gains(path, loop.controller)
     assert (low, high) == (0.0, pytest.approx(1.25, rel=1e-6))
     changes = loop_changes(path, low=1.0, high=high * 0.999, delay_frames=0.0)
-    assert [(c.gain, c.delay_frames) for c in changes] == [(high * 0.999, 2.0)]
-    (change,) = changes
-    np.testing.assert_allclose(change.taps, [0, 0, 1 - high * 0.999])
+    assert [(gain, delay) for gain, delay, _ in changes] == [(high * 0.999, 2.0)]
+    ((*_, taps),) = changes
+    np.testing.assert_allclose(taps, [0, 0, 1 - high * 0.999])
 
 
 def test_loops_that_stand_for_all_are_the_corners_and_whole_delays():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=2.9)
     changes = loop_changes(path, low=0.5, high=1.5, delay_frames=0.3)
-    assert {(c.gain, round(c.delay_frames, 9)) for c in changes} == {
+    assert {(gain, round(delay, 9)) for gain, delay, _ in changes} == {
         (g, d) for g in (0.5, 1.5) for d in (2.6, 3.0, 3.2)
     }
     assert not loop_changes(path, low=1.0, high=1.0, delay_frames=0.0)
     short = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=1.0)
-    delays = {c.delay_frames for c in loop_changes(short, low=1, high=1, delay_frames=0.5)}
+    delays = {delay for _, delay, _ in loop_changes(short, low=1, high=1, delay_frames=0.5)}
     assert delays == {1.5}  # none is below one frame
 
 

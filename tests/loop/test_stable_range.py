@@ -1,13 +1,24 @@
-"""Ranges of gains in which a loop is stable, against the radii of many loops."""
+"""Ranges of gains: against radii of many loops, closed forms and common Lyapunov functions."""
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.plants import lbt_axis_plant
+from support.rational import is_positive_definite, rational
 
 import lbt_synth as lbt
-from lbt_synth.loop.closed_loop import affine_parts, affine_radii
-from lbt_synth.loop.stable_range import stable_interval, stable_range
+from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.loop.closed_loop import checked_loop_matrices
+from lbt_synth.loop.stable_range import (
+    CIRCLE_LIMIT,
+    affine_parts,
+    affine_radii,
+    circle_norm,
+    stable_range,
+    stepped_range,
+)
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 8))
@@ -39,8 +50,8 @@ def test_poles_beside_the_circle(width):
     ("low", "high", "nominal"),
     [(0.35, 1.9, 1.0), (0.0, 1.2, 1.0), (0.97, np.inf, 1.0), (0.4, 5.0, 2.0)],
 )
-def test_ends_of_a_stable_interval(low, high, nominal):
-    found = stable_interval(lambda g: np.where((low < g) & (g < high), 0.5, 1.5), nominal)
+def test_ends_of_a_stepped_range(low, high, nominal):
+    found = stepped_range(lambda g: np.where((low < g) & (g < high), 0.5, 1.5), nominal)
     assert found == pytest.approx((low, high), rel=1e-11)
 
 
@@ -48,8 +59,8 @@ def test_a_stable_interval_ends_at_a_narrow_hole():
     def radii(gains):
         return np.where((gains > 1.3) & (gains < 1.32), 1.5, 0.5)
 
-    assert stable_interval(radii) == pytest.approx((0.0, 1.3), rel=1e-11)
-    assert np.all(np.isnan(stable_interval(radii, 1.31)))
+    assert stepped_range(radii) == pytest.approx((0.0, 1.3), rel=1e-11)
+    assert np.all(np.isnan(stepped_range(radii, 1.31)))
 
 
 @pytest.mark.parametrize("method", ["kalman", "hinf", "integrator"])
@@ -64,3 +75,98 @@ def test_modes_that_mix_have_the_range_of_those_that_do_not(method):
     exact = lbt.loop.stable_sensor_gains(plain, design.controller)
     stepped = lbt.loop.stable_sensor_gains(mixed, turned)
     assert stepped == pytest.approx(exact, rel=1e-6)
+
+
+def integrator_loop(delay_frames, gain=0.5):
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay_frames, modes=1)
+    law = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=1 / 800)
+    return lbt.close_loop(path, law)
+
+
+@pytest.mark.parametrize("low", [1e-3, 0.5, 1.0, 3.0])
+def test_one_state_is_proved_exactly_where_each_constant_gain_is_stable(low):
+    """``|1 - g / 2| < 1`` at both ends is necessary and sufficient: gains up to 4."""
+    loop = integrator_loop(1)
+    assert circle_norm(loop, low=low, high=4 - 1e-5) < CIRCLE_LIMIT
+    assert circle_norm(loop, low=low, high=4 + 1e-5) > 1
+
+
+@pytest.mark.parametrize("low", [0.1, 0.8])
+@pytest.mark.parametrize("high", [0.9, 1.2, 1.35, 1.5])
+def test_an_integrator_of_two_frames_against_its_closed_form(low, high):
+    """``T = a / (z^2 - z + a)`` is largest where ``cos = (1 + a) / (4 a)``, or at frequency 0."""
+    a, r = 0.5 * (low + high) / 2, (high - low) / (high + low)
+    cosine = min((1 + a) / (4 * a), 1.0)
+    least = 4 * a * cosine**2 - 2 * (1 + a) * cosine + 1 + (1 - a) ** 2
+    expected = r * a / np.sqrt(least)
+    assert circle_norm(integrator_loop(2), low=low, high=high) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_middle_that_is_not_stable_proves_nothing():
+    assert circle_norm(integrator_loop(2), low=0.5, high=4.5) == np.inf
+
+
+def common_lyapunov(A, B):
+    """Largest ``t`` with ``P - A'PA >= t``, ``P - B'PB >= t`` and ``tr P = n``, and that P."""
+    n = len(A)
+    P, t = cp.Variable((n, n), symmetric=True), cp.Variable()
+    rests = [P - M.T @ P @ M - t * np.eye(n) for M in (A, B)]
+    bounds = [(rest + rest.T) / 2 >> 0 for rest in rests]
+    problem = cp.Problem(cp.Maximize(t), [*bounds, P >> 0, cp.trace(P) == n])
+    problem.solve(solver=cp.CLARABEL)
+    return float(t.value), P.value
+
+
+@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
+def test_a_common_lyapunov_function_exists_inside_and_none_beyond(design):
+    """The matrix inequality knows nothing of frequencies; its P is checked without rounding."""
+    plant = lbt_axis_plant()
+    loop = lbt.close_loop(plant.hardware, design(plant))
+    moving = lbt.loop.moving_gain(loop)
+    A0, A1, *_ = checked_loop_matrices(plant.hardware, loop.controller)
+    size = np.sqrt(np.diag(stationary_covariance(A0 + A1, np.eye(len(A0)))))
+    A0, A1 = (A * size / size[:, None] for A in (A0, A1))
+    for share, proved in ((0.99, True), (1.01, False)):
+        low, high = moving.moving_low**share, moving.moving_high**share
+        assert (circle_norm(loop, low=low, high=high) < CIRCLE_LIMIT) == proved
+        ends = [A0 + gain * A1 for gain in (low, high)]
+        decrease, P = common_lyapunov(*ends)
+        assert (decrease > 0) == proved
+        exact = rational((P + P.T) / 2)
+        rests = [exact - rational(A).T @ exact @ rational(A) for A in ends]
+        assert all(map(is_positive_definite, (exact, *rests))) == proved
+
+
+@pytest.mark.parametrize("modes", [1, 2])
+@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
+def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one(design, modes):
+    plant = lbt_axis_plant(modes=modes)
+    moving = lbt.loop.moving_gain(lbt.close_loop(plant.hardware, design(plant)))
+    assert moving.constant_low < moving.moving_low < 1 < moving.moving_high < moving.constant_high
+    alone = lbt_axis_plant()
+    expected = lbt.loop.moving_gain(lbt.close_loop(alone.hardware, design(alone)))
+    ends = (moving.moving_low, moving.moving_high)
+    assert ends == pytest.approx((expected.moving_low, expected.moving_high), rel=1e-4)
+
+
+def test_intervals_are_of_the_sensor_gain_whatever_the_loop_has():
+    plant = lbt_axis_plant()
+    controller = lbt.kalman(plant).controller
+    loop = lbt.close_loop(plant.hardware, controller, sensor_gain=0.5)
+    moving = lbt.loop.moving_gain(loop)
+    assert moving.moving_low < 0.5 < moving.moving_high < moving.constant_high
+    expected = lbt.loop.stable_sensor_gains(plant.hardware, controller)
+    assert (moving.constant_low, moving.constant_high) == pytest.approx(expected)
+
+
+def test_an_unstable_loop_is_refused():
+    with pytest.raises(lbt.errors.UnstableLoopError):
+        lbt.loop.moving_gain(integrator_loop(2, gain=1.5))
+
+
+def test_a_loop_that_the_gain_does_not_touch_is_proved_for_all_gains():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    idle = lbt.Controller(A=0.5, B=0.0, C=1.0, D=0.0, dt_s=1 / 800)
+    moving = lbt.loop.moving_gain(lbt.close_loop(path, idle))
+    assert (moving.moving_low, moving.moving_high) == (0.01, 100.0)
+    assert np.isinf(moving.constant_high)

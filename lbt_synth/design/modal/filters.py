@@ -21,7 +21,7 @@ from lbt_synth.design.modal.residuals import modal_residuals
 from lbt_synth.design.modal.stack import ModalFilters
 from lbt_synth.design.result import UNCERTIFIED
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.loop import model_budget
+from lbt_synth.loop import residual_budget
 from lbt_synth.models import ARModel, ModalTurbulence, PositionLoop, TipTiltPlant, tip_tilt_plant
 from lbt_synth.validation import FloatArray, frozen_copy, read_only
 
@@ -115,7 +115,7 @@ def modal_filters(
         )
         design = _design_filter(plant, modes)
         which[modes] = len(designs)
-        rms_nm[modes] = model_budget(design.close(plant.hardware), plant).rms_nm
+        rms_nm[modes] = residual_budget(design.close(plant.hardware), plant).rms_nm
         designs.append(design)
     filters = ModalFilters(
         designs=tuple(designs),

@@ -14,7 +14,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
 from lbt_synth.linear.norms import largest_real_part
 from lbt_synth.loop.loop_errors import LoopChange, append_taps, loop_changes
-from lbt_synth.loop.moving_gain import CIRCLE_LIMIT, circle_norm
+from lbt_synth.loop.stable_range import CIRCLE_LIMIT, circle_norm
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import Positive
 
@@ -83,7 +83,7 @@ class LoopErrors(CheckedFields):
         """Return the convex constraints at the points of a grid."""
         f = grid.points_hz
         rows = channel.command_rows(f)
-        changes = [change.taps for change in self._changes(channel.hardware)]
+        changes = [taps for *_, taps in self._changes(channel.hardware)]
         turns = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None]
         powers = turns ** np.arange(max(taps.size for taps in changes))
         bounds = np.full(f.size, 1 - ROOM)
@@ -96,13 +96,12 @@ class LoopErrors(CheckedFields):
         """Check the real loop, over all frequencies."""
         return tuple(
             Check(
-                f"loop change by a sensor gain of {change.gain:g} and a delay of "
-                f"{change.delay_frames:g} frames",
-                largest_real_part(append_taps(loop.parameter, change.taps)),
+                f"loop change by a sensor gain of {gain:g} and a delay of {delay_frames:g} frames",
+                largest_real_part(append_taps(loop.parameter, taps)),
                 1.0,
                 LEVEL_SETS,
             )
-            for change in self._changes(loop.hardware)
+            for gain, delay_frames, taps in self._changes(loop.hardware)
         )
 
 

@@ -15,7 +15,7 @@ from lbt_synth.identification.diagnosis.running_loop import AXES
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, jitter_strehl, model_budget
+from lbt_synth.loop import Imaging, close_loop, jitter_strehl, residual_budget
 from lbt_synth.loop.budget import line_covariance
 from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
@@ -252,7 +252,7 @@ def _covariances(
     loop = close_loop(plant.hardware, controller)
     if not loop.is_stable:
         return {}
-    budget = model_budget(loop, plant, frame_means=True)
+    budget = residual_budget(loop, plant, frame_means=True)
     out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
     for line in lines:
         parts = [line_covariance(loop, vibration) for vibration in line.vibrations]

@@ -23,7 +23,7 @@ from lbt_synth.identification.records.from_series import LEAST_QUARTER, TREND
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, loop_margins
-from lbt_synth.loop.margins import stable_sensor_gains
+from lbt_synth.loop.stable_range import stable_sensor_gains
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row

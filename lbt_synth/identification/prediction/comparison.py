@@ -27,7 +27,7 @@ from lbt_synth.identification.prediction.residual import (
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
-from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, residual_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
@@ -353,7 +353,7 @@ def _measured_replay(
 
 def _model_means(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
     """Covariance of what the plant's model leaves, in means over frames as a record has them."""
-    return model_budget(loop, plant, frame_means=True).total_nm2
+    return residual_budget(loop, plant, frame_means=True).total_nm2
 
 
 def _build_row(

@@ -6,15 +6,15 @@ that every matrix of the loop is affine in the fraction, as it is in the sensor 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
 from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.state_space import stacked_response
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, loop_matrices
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, last_frame, loop_matrices
+from lbt_synth.loop.evaluator import STILL, Evaluator, block_diagonal
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import (
     Hold,
@@ -25,9 +25,6 @@ from lbt_synth.models.mirror.frame_rate_system import (
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
-_FRACTIONS = 12  # of a delay, between which a smooth function is interpolated to 1e-10
-_CANCELS = 1e-5  # of a square that is a sum of terms of the order of 1
-_STILL = Hold(start=0.0, edges=np.array([0.0, 1.0]), C=np.zeros((1, 0)), D=np.ones(1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +58,7 @@ class LoopStack:
     mirrors: tuple[Response, Response]  # first and second, with the same states
     hold: Hold | None  # where a mirror with dynamics is within a frame; a settled one stays
     start: FloatArray  # of the hold of u(k) after the begin of exposure k [frames], (k,)
-    rows: IntArray  # which loops, (k,)
+    loops: IntArray  # which loops, (k,)
     fraction: FloatArray  # (k,)
     sensor_gains: FloatArray  # (k,)
     A: FloatArray  # (k, s, s)
@@ -74,7 +71,7 @@ class LoopStack:
 
     def take(self, which: IntArray) -> LoopStack:
         """Return some of the loops."""
-        names = ["rows", "start", "fraction", "sensor_gains", *"ABCD", "poles"]
+        names = ["loops", "start", "fraction", "sensor_gains", *"ABCD", "poles"]
         names += ["command_C", "command_D"]
         return replace(self, **{name: getattr(self, name)[which] for name in names})
 
@@ -83,136 +80,119 @@ class LoopStack:
         """Whether each command holds for one whole exposure in all of these loops."""
         return self.hold is None and not np.any(self.fraction)
 
-    @property
-    def is_single(self) -> bool:
-        """Whether these are loops of one mode, measurement and command with a settled mirror."""
-        sizes = *self.part.sensor.shape, self.part.influence.shape[1]
-        return self.hold is None and sizes == (1, 1, 1)
-
-    def single_powers(self, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Powers (f, k) of what a hold leaves of a unit mean over frames, and of unit noise.
-
-        They are those of :meth:`piece_responses` for loops that are single, in fewer operations. A
-        hold leaves ``(1 + g w) / (1 + g L)`` of the mean, g the gain, L the open loop at a gain of
-        1, and w what L through the two frames of the hold is beyond L at its arrival.
-        """
-        part, gain, late = self.part, self.sensor_gains, self.fraction
-        command = part.influence[0, 0] * stacked_response(part.controllers(self.rows), z)[..., 0, 0]
-        measured = part.sensor[0, 0] * command / z[:, None]
-        first, second = (_mirror_response(one, z)[:, None] * measured for one in self.mirrors)
-        arrival = measured * z[:, None] ** -(self.start[0] - late[0])
-        power = command.real**2 + command.imag**2
-        squares = _shared_squares if command.shape[1] == 1 else _squares
-        left, size = squares((first, second - first, arrival, np.angle(z)[:, None]), gain, late)
-        return np.divide(left, size, out=left), np.divide(power, size, out=size)
-
     def image_powers(self, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Powers (f, k) that a unit phase of all moments and unit noise leave, for one mode."""
-        commands, positions, means, late = self._over_holds(z)
-        command, weights = commands[0, 0], (self.hold or _STILL).weights
-        mirrored = command * self._turn(z) * self.part.sensor[0, 0]
-        squares = (np.abs(positions) ** 2 @ weights)[:, None]
-        crossed = (positions * means.conj() @ weights)[:, None] * late.conj()
-        of_phase = 1 - 2 * np.real(crossed * mirrored) + squares * np.abs(mirrored) ** 2
-        return of_phase, squares * np.abs(command) ** 2
-
-    def responses(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-        """Rejection (n, n, f, k) at f points and negative response to noise (n, q, f, k).
-
-        Both lack a common denominator; the inverse of its square (f, k) is returned, too.
-        """
-        unit, path, rejection, denominator = self._parts(z)
-        if len(unit) > 1:
-            path = np.asarray(sum(rejection[:, j, None] * path[j] for j in range(len(unit))))
-        scale = 1 / (denominator.real**2 + denominator.imag**2)
-        return rejection, path, scale
-
-    def piece_responses(
-        self, z: ComplexArray
-    ) -> tuple[Iterator[tuple[float, ComplexArray, ComplexArray]], FloatArray]:
-        """Residual in each piece of a hold, at f points of the upper half of the unit circle.
-
-        Yield the length of each piece [frames], and the responses to a phase of all moments (n, n,
-        f, k) and to noise (n, q, f, k). Return also the part of the phase's power that moves within
-        the pieces, (f, k).
-        """
-        commands, positions, means, late = self._over_holds(z)
-        n, hold = len(commands), self.hold or _STILL
-        of_phase = np.einsum("nq...,qm->nm...", commands, self.part.sensor) * self._turn(z)
-        rest = 1 - np.abs(means) ** 2 @ hold.weights
-
-        def pieces() -> Iterator[tuple[float, ComplexArray, ComplexArray]]:
-            for g, weight in enumerate(hold.weights):
-                position = positions[:, g, None]
-                # as seen from the middle of the frame, where the mean has its phase
-                phase = (means[:, g, None] * late) * np.eye(n)[:, :, None, None]
-                yield float(weight), phase - position * of_phase, -position * commands
-
-        return pieces(), np.broadcast_to(rest[:, None], late.shape)
-
-    def _over_holds(
-        self, z: ComplexArray
-    ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-        """Return commands (n, q, f, k) for unit noise, and mirror and phase in pieces of a hold.
-
-        Those are (f, g) each; the hold begins late by a factor (f, k).
-        """
-        unit, _, rejection, denominator = self._parts(z)
-        commands = sum(rejection[:, j, None] * unit[j] for j in range(len(unit))) / denominator
-        f, hold = np.angle(z) / (2 * np.pi), self.hold or _STILL
-        core = hold.C.shape[1]  # the first states of the mirror
-        A, B = self.mirrors[0].A[:core, :core], self.mirrors[0].B[:core, None]
-        parts = (A, B, hold.C, hold.D[:, None])
-        positions = stacked_response(tuple(part[None] for part in parts), z)[:, 0, :, 0]
+        f, hold = np.angle(z) / (2 * np.pi), self.hold or STILL
+        path, rejection, denominator = self._parts(z)
+        seen = (rejection * path)[0, 0] * (self.sensor_gains / denominator)
+        positions, means = self._positions(z), hold.phase_means(f)
         late = np.exp(2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
-        return np.asarray(commands), positions, hold.phase_means(f), late
+        mirrored = np.sinc(f)[:, None] * seen
+        squares = (np.abs(positions) ** 2 @ hold.weights)[:, None]
+        crossed = (positions * means.conj() @ hold.weights)[:, None] * late.conj()
+        of_phase = 1 - 2 * np.real(crossed * mirrored) + squares * np.abs(mirrored) ** 2
+        return of_phase, squares * np.abs(seen / (self.part.sensor[0, 0] * self.sensor_gains)) ** 2
 
-    def _turn(self, z: ComplexArray) -> ComplexArray:
-        """Return what a phase of all moments is in a measurement of one frame later, (f, k)."""
-        return np.sinc(np.angle(z) / (2 * np.pi))[:, None] * self.sensor_gains / z[:, None]
+    def responses(self, f: FloatArray, share: FloatArray, *, held: bool) -> Iterator[ComplexArray]:
+        """Yield what phases leave of the means over frames, which are a share (f,) of them.
 
-    def _parts(
-        self, z: ComplexArray
-    ) -> tuple[ComplexArray, ComplexArray, ComplexArray, ComplexArray]:
-        """Return ``N K``, ``N K`` through the mirror, and the rejection over its denominator."""
-        part = self.part
-        controller = np.moveaxis(stacked_response(part.controllers(self.rows), z), (2, 3), (0, 1))
-        unit = np.einsum("nm,mq...->nq...", part.influence, controller)
-        path, turn = (
-            unit * _mirror_response(self.mirrors[0], z)[:, None],
-            self.sensor_gains / z[:, None],
-        )
-        if np.any(self.fraction):
-            second = unit * _mirror_response(self.mirrors[1], z)[:, None]
-            path = path + self.fraction * (second - path)
-        sensor, modes = part.sensor[..., None, None], range(len(part.influence))
-        loop = np.eye(len(modes), dtype=np.complex128)[:, :, None, None]
-        for j in range(path.shape[1]):
-            loop = loop + path[:, j, None] * (sensor[j] * turn)
-        return (unit, path, *_inverses(loop))
-
-    def rejections(self, turn: FloatArray) -> ComplexArray:
-        """Rejection (k, n, n) of each loop at its own frequency [radians per frame]."""
-        n = self.C.shape[1]
-        pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
-        states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
-        return np.asarray(self.C @ states + self.D[..., :n])
-
-    def pieces_at(self, turn: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Residual (k, g, n, n) in pieces of a hold, for each loop at its own frequency.
-
-        Return also their lengths [frames], (g,), and the power that moves within them, (k,).
+        Where commands are held it is the mirror's mean position, in each piece of the hold. The
+        frequencies are in cycles per frame, the responses (n, n, f, k).
         """
-        n, f, hold = self.C.shape[1], turn / (2 * np.pi), self.hold or _STILL
-        commands, first = (self.command_C, self.command_D), self.part.matrices[0].shape[-1]
-        C, D = hold.positions(self.part.influence, commands, first)
-        pencil = np.exp(1j * turn)[:, None, None] * np.eye(self.A.shape[1]) - self.A
-        states = np.linalg.solve(pencil, self.B[..., :n].astype(np.complex128))
-        positions = (C @ states[:, None] + D[..., :n]) * np.sinc(f)[:, None, None, None]
-        late = np.exp(2j * np.pi * f * (self.start - hold.start - 0.5))
-        means = hold.phase_means(f) * late[:, None]
-        phase = means[..., None, None] * np.eye(n)
-        return phase - positions, hold.weights, 1 - np.abs(means) ** 2 @ hold.weights
+        path, rejection, denominator = self._parts(np.exp(2j * np.pi * f))
+        if not held:
+            yield rejection * (share[:, None] / denominator)
+            return
+        closed = rejection * (self.sensor_gains / denominator)
+        for position in self._positions(np.exp(2j * np.pi * f)).T:
+            entering = (share * position)[:, None] * path
+            single = len(path) == 1
+            yield closed * entering if single else np.einsum("nm...,mr...->nr...", closed, entering)
+
+    def rows(self, *, held: bool) -> tuple[FloatArray, FloatArray]:
+        """Return C (k, g, n, s) and D (k, g, n, n + q) of what :meth:`responses` are of."""
+        if not held:
+            return self.C[:, None], self.D[:, None]
+        first = self.part.matrices[0].shape[-1]  # the states of the mirror follow
+        commands = self.command_C, self.command_D
+        return (self.hold or STILL).positions(self.part.influence, commands, first)
+
+    def _parts(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return the path of phases, and the rejection over its denominator, (n, n, f, k).
+
+        The path is to what commands do to the modes, at a gain of 1 and without the mirror.
+        """
+        part = self.part
+        controller = np.moveaxis(stacked_response(part.controllers(self.loops), z), (2, 3), (0, 1))
+        path = np.einsum("nm,mq...,qr->nr...", part.influence, controller, part.sensor)
+        path = path / z[:, None]
+        first, second = (_mirror_response(mirror, z)[:, None] for mirror in self.mirrors)
+        loop = self.sensor_gains * (first * path)
+        if np.any(self.fraction):
+            loop += (self.sensor_gains * self.fraction) * ((second - first) * path)
+        loop += np.eye(len(path))[:, :, None, None]
+        return (path, *_inverses(loop))
+
+    def _positions(self, z: ComplexArray) -> ComplexArray:
+        """Return the mirror's mean position in each piece of a hold for unit commands, (f, g)."""
+        hold, first = self.hold or STILL, self.mirrors[0]
+        core = hold.C.shape[1]  # the first states of the mirror
+        parts = (first.A[:core, :core], first.B[:core, None], hold.C, hold.D[:, None])
+        return stacked_response(tuple(part[None] for part in parts), z)[:, 0, :, 0]
+
+
+def stack_evaluator(
+    members: Sequence[tuple[LoopStack, IntArray]], hardware: LoopHardware, *, in_image: bool
+) -> Evaluator:
+    """Return the evaluator of loops, of independent parts of them with the modes of each."""
+    first, _ = members[0]
+    held = in_image and not first.holds_are_frames
+    sizes = [len(stack.part.influence) for stack, _ in members]
+    rows = [stack.rows(held=held) for stack, _ in members]
+    C = block_diagonal([one for one, _ in rows])
+    D = _join_inputs([one for _, one in rows], sizes)
+    poles = np.concatenate([stack.poles.ravel() for stack, _ in members])
+
+    def response(f: FloatArray, share: FloatArray, entry: FloatArray) -> Iterator[ComplexArray]:
+        parts = (stack.responses(f, share, held=held) for stack, _ in members)
+        for pieces in zip(*parts, strict=True):
+            yield _entered(pieces, entry)
+
+    return Evaluator(
+        A=block_diagonal([stack.A for stack, _ in members]),
+        B=_join_inputs([stack.B for stack, _ in members], sizes),
+        C=C.reshape(len(C), -1, C.shape[-1]),
+        D=D.reshape(len(D), -1, D.shape[-1]),
+        modes=sum(sizes),
+        frame_rate_hz=hardware.frame_rate_hz,
+        roots=poles,
+        hold=(first.hold or STILL) if held else None,
+        start=first.start,
+        in_image=in_image,
+        phases=1,
+        response=response,
+    )
+
+
+def _join_inputs(blocks: Sequence[FloatArray], sizes: Sequence[int]) -> FloatArray:
+    """Return matrices of parts over [phases, noise] as one of all phases, then all noise."""
+    halves = [np.split(block, [n], axis=-1) for block, n in zip(blocks, sizes, strict=True)]
+    joined = [block_diagonal([half[i] for half in halves]) for i in (0, 1)]
+    return np.concatenate(joined, axis=-1)
+
+
+def _entered(pieces: tuple[ComplexArray, ...], entry: FloatArray) -> ComplexArray:
+    """Return responses of parts (n, n, f, k) to phases that enter them, (k or 1, n, w)."""
+    if len(pieces) == 1 and np.array_equal(entry, np.eye(entry.shape[1])[None]):
+        return pieces[0]
+    ends, out = np.cumsum([len(piece) for piece in pieces]), []
+    for piece, own in zip(pieces, np.split(entry, ends[:-1], axis=1), strict=True):
+        columns = (
+            sum(piece[:, m] * own[:, m, w] for m in range(len(piece)))
+            for w in range(entry.shape[2])
+        )
+        out.append(np.stack(list(columns), axis=1))
+    return np.concatenate(out)
 
 
 def close_loops(
@@ -287,8 +267,11 @@ def _close_part(
     start: FloatArray,
 ) -> LoopStack:
     """Close the loops of a part at one whole delay."""
-    path = {"sensor": part.sensor, "influence": part.influence}
-    ends = [loop_matrices(*part.controllers(rows), mirror=mirror, **path) for mirror in mirrors]
+    k, readings = part.controllers(rows), last_frame(part.sensor)
+    ends = [
+        loop_matrices(*k, mirror=mirror, readings=readings, influence=part.influence)
+        for mirror in mirrors
+    ]
     share, gain, n = fraction[:, None, None], gains[:, None, None], len(part.influence)
     A0, A1, B, C0, C1, D = (one + share * (two - one) for one, two in zip(*ends, strict=True))
     A, C = A0 + gain * A1, C0 + gain * C1
@@ -298,7 +281,7 @@ def _close_part(
         mirrors=mirrors,
         hold=hold,
         start=start,
-        rows=rows,
+        loops=rows,
         fraction=fraction,
         sensor_gains=gains,
         A=A,
@@ -332,56 +315,6 @@ def _mirrors_by_delay(
 
 def _are_stable(poles: ComplexArray) -> BoolArray:
     return np.asarray(np.max(np.abs(poles), axis=-1) < 1 - STABILITY_MARGIN)
-
-
-# of open loops: at fraction 0, how it changes to 1, at its arrival at 0, and angles of z, (f, 1)
-_Paths: TypeAlias = tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray]
-
-
-def _path_pair(paths: _Paths, late: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Open loops L at fractions of the delay, (f, k), and what each is beyond L at its arrival."""
-    first, change, arrival, turn = paths
-    through = first + late * change
-    return through, through - arrival * np.exp(-1j * turn * late)
-
-
-def _squares(paths: _Paths, gain: FloatArray, late: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``|1 + g w|^2`` and ``|1 + g L|^2``, (f, k)."""
-    through, beyond = _path_pair(paths, late)
-    pair = (1 + gain * (beyond if np.any(late) else 0 * beyond), 1 + gain * through)
-    left, size = (np.asarray(one.real**2 + one.imag**2) for one in pair)
-    return left, size
-
-
-def _shared_squares(
-    paths: _Paths, gain: FloatArray, late: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return :func:`_squares` of loops of one controller, (f, 1), by products of two matrices.
-
-    The second is a polynomial of gain and fraction; the first is one of the gain, whose
-    coefficients are interpolated between fractions.
-    """
-    first, change, *_ = paths
-    cross = 2 * (first * change.conj()).real
-    terms = [np.ones_like(cross), 2 * first.real, 2 * change.real]
-    terms += [np.abs(first) ** 2, cross, np.abs(change) ** 2]
-    powers = [gain**0, gain, gain * late, gain**2, gain**2 * late, gain**2 * late**2]
-    size = np.hstack(terms) @ np.array(powers)
-    left = np.ones_like(size)
-    if np.any(late):
-        middle, half = (late.max() + late.min()) / 2, (late.max() - late.min()) / 2 or 1.0
-        angle = np.pi * (np.arange(_FRACTIONS) + 0.5) / _FRACTIONS
-        places = middle + half * np.cos(angle)
-        _, beyond = _path_pair(paths, places)
-        degrees = np.arange(_FRACTIONS)[:, None]
-        turns = np.arccos(np.clip((late - middle) / half, -1, 1))
-        weights = np.linalg.solve(np.cos(degrees * angle), np.cos(degrees * turns))
-        coefficients = np.hstack([2 * beyond.real, np.abs(beyond) ** 2])
-        left += coefficients @ np.vstack([weights * gain, weights * gain**2])
-    poor = np.min(size, axis=0) < _CANCELS  # next to instability
-    if np.any(poor):
-        left[:, poor], size[:, poor] = _squares(paths, gain[poor], late[poor])
-    return left, size
 
 
 def _mirror_response(mirror: Response, z: ComplexArray) -> ComplexArray:

@@ -106,18 +106,14 @@ class ModeSpectrum:
             if skip:
                 ratio = np.where((x > ends[0]) & (x < ends[1]), 1.0, ratio)
             if noiseless and np.any(ratio == 0):
-                raise _VanishingError
+                raise ZeroDivisionError  # the process can be predicted exactly
             values = np.log(ratio) if noiseless else np.log1p(ratio)
             return np.asarray(values[:, None] * self.inner.weights(x))
 
         try:
             return refine_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
-        except _VanishingError:
+        except ZeroDivisionError:
             return None
-
-
-class _VanishingError(Exception):
-    """A spectrum without noise is zero over an interval: the process can be predicted exactly."""
 
 
 def decoupled_modes(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -24,14 +24,6 @@ from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 T = TypeVar("T")
-
-
-class _Limit(Protocol):
-    """A limit, over all modes."""
-
-    @property
-    def rms_nm(self) -> float:
-        """Least residual [nm rms]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -236,10 +228,10 @@ def above_percent(rms_nm: float, limit_nm: float) -> float:
     return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else np.nan
 
 
-def limit_or_nan(limit: Callable[[], _Limit]) -> float:
+def limit_or_nan(limit: Callable[[], Any]) -> float:
     """Return the least residual [nm rms], nan where it cannot be computed."""
     found = limit_or_none(limit)
-    return np.nan if found is None else found.rms_nm
+    return np.nan if found is None else float(found.rms_nm)
 
 
 def limit_or_none(limit: Callable[[], T]) -> T | None:

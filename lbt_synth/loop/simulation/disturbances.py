@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
@@ -29,6 +30,10 @@ from lbt_synth.validation import FloatArray, float_array, number
 
 # A spectrum is drawn over this many times the wanted frames, which hides the series' period.
 _PERIODS = 4
+# a vibration of a run: its mean position in each frame (cases, frames) [nm], and of an oscillator
+# unit white noise (cases, 1 + frames, 3) of the state before the first frame, and of each frame;
+# others have none (cases, 1 + frames, 0)
+DrawnLine: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,16 +127,6 @@ class Disturbance:
         return np.asarray(pieces), np.asarray(np.einsum("f,cfi->ci", moving, np.abs(bins) ** 2))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DrawnLine:
-    """A vibration of a run."""
-
-    motion: FloatArray  # (cases, frames): mean position in each frame [nm]
-    # (cases, 1 + frames, 3): of an oscillator, unit white noise of the state before the first
-    # frame, and of each frame
-    drive: FloatArray | None = None
-
-
 def draw_disturbance(
     truth: Truth,
     hardware: LoopHardware,
@@ -190,7 +185,8 @@ def draw_phase(
     """
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
-    total, lines = np.zeros((cases, frames, n)), []
+    total = np.zeros((cases, frames, n))
+    lines: list[DrawnLine] = []
     spectra, size = truth.turbulence_per_mode(n), (frames, cases)
     means = {"frame_means": frame_means}
     if truth.is_uniform and spectra[0] is not None:
@@ -205,14 +201,13 @@ def draw_phase(
         if isinstance(vibration, Vibration) and seen and oscillators:
             alone = seen_vibration(vibration, {}, (), hardware)
             drive = line_rng.standard_normal((cases, 1 + frames, alone.B.shape[-1]))
-            line = DrawnLine(motion=run_oscillator(alone, vibration, drive)[:, :, 0], drive=drive)
+            lines.append((run_oscillator(alone, vibration, drive)[:, :, 0], drive))
         else:
             time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
             motion, frequency_hz = _draw_line(vibration, hardware, time_s, cases, line_rng)
             share = 1.0 if frame_means else np.sinc(frequency_hz / hardware.frame_rate_hz)
-            line = DrawnLine(motion=share * motion)
-        lines.append(line)
-        total += line.motion[:, :, None] * direction
+            lines.append((share * motion, np.empty((cases, 1 + frames, 0))))
+        total += lines[-1][0][:, :, None] * direction
     return total, lines
 
 
@@ -239,7 +234,7 @@ def _draw_line(
 def run_oscillator(seen: SeenVibration, line: Vibration, drive: FloatArray) -> FloatArray:
     """Return mean positions and readings of a line, (cases, frames, 1 + c).
 
-    The drive is (cases, 1 + frames, inputs), as that of a :class:`DrawnLine`. Exposures that begin
+    The drive is (cases, 1 + frames, inputs), as that of a drawn line. Exposures that begin
     before the first frame see the oscillator at rest there.
     """
     A, B, C, _ = seen.stacks()
@@ -273,19 +268,19 @@ def draw_others(
     out = np.concatenate(drawn, axis=2)
     moving = checked_motions(truth.motions, suite, len(lines))
     first = out.shape[2] - len(suite.channels)  # column of the first channel
-    for vibration, line, moved in zip(truth.vibrations, lines, moving, strict=True):
+    for vibration, (motion, white), moved in zip(truth.vibrations, lines, moving, strict=True):
         seen = [first + i for i, name in enumerate(suite.channels) if name in moved]
         if not seen:
             continue
         if isinstance(vibration, Vibration):
             process = seen_vibration(vibration, moved, suite.accelerometers, hardware)
             inner = rng.standard_normal((cases, 1 + frames, process.B.shape[-1] - 3))
-            drive = np.concatenate([line.drive, inner], axis=2)
+            drive = np.concatenate([white, inner], axis=2)
             out[:, :, seen] += run_oscillator(process, vibration, drive)[:, :, 1:]
         else:
             time_s = (np.arange(frames) - zero_frame) / hardware.frame_rate_hz
             readings = [
-                _acceleration(sensor, hardware, vibration, line.motion, moved[name], time_s)
+                _acceleration(sensor, hardware, vibration, motion, moved[name], time_s)
                 for sensor in suite.accelerometers
                 for name in sensor.channels
                 if name in moved

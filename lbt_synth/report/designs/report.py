@@ -33,11 +33,11 @@ from lbt_synth.loop import (
     stable_sensor_gains,
     strehl,
 )
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN, radii_by_gain
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.least_residuals.band_limit import BandLimit
 from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
-from lbt_synth.loop.moving_gain import MovingGain
 from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.loop.stable_range import MovingGain, radii_by_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.page.html import (

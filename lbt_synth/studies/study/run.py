@@ -41,6 +41,7 @@ from lbt_synth.studies.grid import (
     InlineExecutor,
     Parts,
     Result,
+    calls_in_flight,
     refuse,
 )
 from lbt_synth.studies.study.sample import (
@@ -62,8 +63,7 @@ _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all 
 # of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
 # each sample takes milliseconds or seconds, a killed study shall lose few of them.
 _ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
-_IN_FLIGHT = 2  # parts per worker, so that none waits for the next
-_PARTS_PER_WORKER = 4  # at least, so that none waits long for the last
+_FEWEST_PARTS = 4  # and twice as many as are in flight, so that none waits long for the last
 
 _NOISELESS = "has no noise, which no configuration takes: there is none to simulate it with."
 
@@ -146,10 +146,10 @@ def run_study(
     ('results.csv', 4, 0, (4,))
     """
     require_instance(study, Study)
-    at_once = 1
-    if executor is not None:
-        at_once = workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1
-    at_once = integer(at_once, "workers", at_least=1)
+    if workers is not None:
+        integer(workers, "workers", at_least=1)
+    executor = executor or InlineExecutor()
+    in_flight = calls_in_flight(executor, workers)
     folder = Path(directory)
     refuse_replacing(output_paths(folder, study), study.inputs)
     began = time.perf_counter()
@@ -166,13 +166,13 @@ def run_study(
         if computed:
             controllers = study.controllers.values()
             together = all(are_evaluated_together(study, each) for each in controllers)
-            share = -(-study.samples // (_PARTS_PER_WORKER * at_once))
+            share = -(-study.samples // max(_FEWEST_PARTS, 2 * in_flight))
             parts.compute_missing(
                 partial(evaluate, study),
                 lambda rows: (study.values(*rows), rows[0]),
                 part_rows=min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share),
-                executor=executor or InlineExecutor(),
-                in_flight=1 if executor is None else _IN_FLIGHT * at_once,
+                executor=executor,
+                in_flight=in_flight,
                 progress=count,
             )
         contents = [parts.read(path) for path in parts.paths().values()]

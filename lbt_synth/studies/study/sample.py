@@ -21,7 +21,7 @@ from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest, fixed_design
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.studies.grid import Failure, Result, loop_columns, stack_columns
+from lbt_synth.studies.grid import Failure, Result, loop_columns, residual_columns
 from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -134,7 +134,7 @@ def _evaluate_groups(
                 matrices = ensemble.kalman_matrices(samples) if fixed is None else fixed
                 loops = ensemble.build_ensemble(samples)
                 residuals = residuals_from_matrices(matrices, hardware, loops, in_image=True)
-            columns = stack_columns(residuals, config.imaging)
+            columns = residual_columns(residuals, config.imaging)
         except EXPECTED_ERRORS:
             continue  # one of them fails; evaluating them one by one finds which
         yield rows[accepted], columns

@@ -148,7 +148,7 @@ def test_a_run_gives_the_motions_back(delay_frames):
     _, drawn = draw_phase(truth, path, rng=rng, oscillators=True, **size)
     read = draw_others(truth, path, drawn, rng, **size)
     # the wavefront sensor measures in frame k the phase of frame k - 1
-    seen = np.stack([np.roll(line.motion[0], 1) for line in drawn], axis=1)
+    seen = np.stack([np.roll(motion[0], 1) for motion, _ in drawn], axis=1)
     seen += 8 * rng.standard_normal(seen.shape)
     record = lbt.identification.loop_record(seen[1:], frame_rate_hz=rate_hz, unit="nm")
     found = lbt.identification.accelerometer_transfers(

@@ -77,7 +77,7 @@ def test_the_filter_of_a_design_has_its_residual():
     truth = lbt.Truth(turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5)
     law = fit_control_law(*run_law(design.controller, truth=truth, hardware=plant.hardware))
     loop = lbt.close_loop(plant.hardware, law_controller(law, plant.hardware.frame_rate_hz))
-    left = lbt.loop.model_budget(loop, plant, frame_means=True)
+    left = lbt.residual_budget(loop, plant, frame_means=True)
     assert left.rms_nm == pytest.approx(design.rms, rel=1e-4)
 
 

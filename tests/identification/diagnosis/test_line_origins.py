@@ -100,7 +100,7 @@ def test_squares_add_up_to_the_budget(found):
         ("best_nm", found.best_design.controller),
     ):
         loop = lbt.close_loop(plant.hardware, controller)
-        exact = lbt.loop.model_budget(loop, plant, frame_means=True)
+        exact = lbt.residual_budget(loop, plant, frame_means=True)
         values = {row.part: getattr(row, field) for row in found.costs}
         assert values["all"] == pytest.approx(exact.rms_nm, rel=1e-6)
         assert values["measurement noise"] == pytest.approx(exact.noise_nm, rel=1e-6)

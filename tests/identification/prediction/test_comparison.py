@@ -123,7 +123,7 @@ def test_the_table():
     np.testing.assert_allclose(rows[-1][1:3], limit.model_axis_nm)
     best = lbt.design.model_integrator(plant)
     loop = lbt.close_loop(plant.hardware, best.controller)
-    exact = lbt.loop.model_budget(loop, plant, frame_means=True)
+    exact = lbt.residual_budget(loop, plant, frame_means=True)
     assert table["best integrator"].model_nm == exact.rms_nm
     unknown = lbt.identification.prediction_against_data(plant, z, {}, measurements=y)["what ran"]
     assert unknown.model_nm2 is None

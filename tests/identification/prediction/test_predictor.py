@@ -137,7 +137,7 @@ def test_more_taps_come_to_the_limit_and_none_passes_it(delay):
     for taps in (1, 4, 16, 64):
         fit = lbt.identification.least_squares_predictor(z, path, taps=taps)
         loop = lbt.close_loop(path, fit.controller)
-        left.append(lbt.loop.model_budget(loop, plant, frame_means=True).rms_nm / limit)
+        left.append(lbt.residual_budget(loop, plant, frame_means=True).rms_nm / limit)
     assert np.all(np.diff(left) < 0)
     assert left[0] > 1.2
     assert 1 < left[-1] < 1.01

@@ -83,7 +83,7 @@ def test_the_bound_on_the_loss_holds(steps, gain):
     ]
     before, after = (np.sqrt(mode_variances(design, loop, slice(1)))[0] for loop in loops)
     if gain == 1:
-        own = lbt.loop.model_budget(loops[1], design.problem, frame_means=True).rms_nm
+        own = lbt.residual_budget(loops[1], design.problem, frame_means=True).rms_nm
         assert after == pytest.approx(own, rel=1e-9)
     bound = found.residual_nm(gain, found.cut_norm(steps)) / before
     assert -1e-9 < after / before - 1 <= bound + 1e-9

@@ -10,7 +10,7 @@ from lbt_synth.interop.dao import refit
 from lbt_synth.interop.dao.export import direct_form, direct_form_rows
 from lbt_synth.interop.dao.refit import ROUNDING, _widened, mode_loop, round_together
 from lbt_synth.interop.proof import _rounding_left
-from lbt_synth.loop.closed_loop import radii_by_gain
+from lbt_synth.loop.stable_range import radii_by_gain
 
 
 @pytest.fixture(scope="module")

@@ -133,7 +133,7 @@ def test_kalman_filters_reach_the_limit(delay, seed):
     limit, design = least_model_residual(plant), lbt.kalman(plant)
     means = np.sum(limit.variance_nm2 - limit.within_nm2)
     assert design.rms**2 == pytest.approx(means, rel=2e-8, abs=1e-12 * limit.rms_nm**2)
-    left = lbt.loop.model_budget(lbt.close_loop(plant.hardware, design.controller), plant)
+    left = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), plant)
     assert left.rms_nm == pytest.approx(limit.rms_nm, rel=1e-8)
     assert limit.change < 1e-6
 
@@ -146,7 +146,7 @@ def test_kalman_filters_of_fractional_delays_stay_above(delay):
     limit = lbt.loop.least_residual(plant.hardware, truth, frame_means=True).rms_nm
     assert limit < budget(design, truth).rms_nm < 1.08 * limit
     loop = lbt.close_loop(plant.hardware, design.controller)
-    left = lbt.loop.model_budget(loop, plant)
+    left = lbt.residual_budget(loop, plant)
     residual, limit, above = model_limits(design).values()
     assert residual == pytest.approx(left.rms_nm)  # not its estimation error
     assert residual**2 > design.rms**2
@@ -308,7 +308,7 @@ def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
     limit = least_model_residual(plant)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
     along = limit.directions.T * limit.variance_nm2 @ limit.directions
-    assert along == pytest.approx(lbt.loop.model_budget(loop, plant).total_nm2, rel=1e-7)
+    assert along == pytest.approx(lbt.residual_budget(loop, plant).total_nm2, rel=1e-7)
     # a little coupling changes little
     alone, nearly = (least_model_residual(coupled_plant(r, delay_frames=delay)) for r in (1, 1.001))
     assert nearly.rms_nm == pytest.approx(alone.rms_nm, rel=1e-3)
@@ -412,7 +412,7 @@ def test_the_best_filters_come_close_to_the_limit_in_the_image(delay, kind):
     limit = least_model_residual(plant).rms_nm
     for design in (lbt.kalman(plant), lbt.lqg(plant)):
         loop = lbt.close_loop(plant.hardware, design.controller)
-        left = lbt.loop.model_budget(loop, plant).rms_nm
+        left = lbt.residual_budget(loop, plant).rms_nm
         if delay % 1:  # the limit takes what lies between two samples from 32 of them
             assert limit * (1 - 1e-5) <= left < limit * (1 + 5e-3)
         else:

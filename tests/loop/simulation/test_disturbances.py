@@ -145,12 +145,12 @@ def test_readings_and_phase_of_a_run_are_those_of_one_oscillator(period, delay_f
     rng = np.random.default_rng(4)
     same, drawn = draw_phase(truth, path, rng=rng, oscillators=True, **size)
     read = draw_others(truth, path, drawn, rng, zero_frame=0, **size)[:, 100::period, 0]
-    both = np.stack([drawn[0].motion[:, 100::period].ravel(), read.ravel()])
+    both = np.stack([drawn[0][0][:, 100::period].ravel(), read.ravel()])
     expected = seen_vibration(line, motion, (channel,), path).output_covariances()[0]
     sizes = np.sqrt(np.diag(expected))
     found = np.cov(both) / np.outer(sizes, sizes)
     np.testing.assert_allclose(found, expected / np.outer(sizes, sizes), atol=0.03)
-    np.testing.assert_array_equal(same[:, :, 0], drawn[0].motion)
+    np.testing.assert_array_equal(same[:, :, 0], drawn[0][0])
 
 
 def test_a_line_that_drifts_is_read_at_its_frequency_of_the_moment():
