@@ -29,8 +29,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit import both_axes
-from lbt_synth.identification.fit.line_drift import describe_drifts, measure_drift
+from lbt_synth.identification.fit import identify
+from lbt_synth.identification.fit.departures import describe_drifts, measure_drift
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -254,10 +254,6 @@ def deviations(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, l
         "one for several, rms": [
             (x.rms_nm - np.sum(power) ** 0.5) / x.rms_error_nm for x, _, power in merged
         ],
-        "one for several, strongest": [
-            (x.frequency_hz - f[int(np.argmax(power))]) / x.frequency_error_if_several_hz
-            for x, f, power in merged
-        ],
     }
 
 
@@ -467,7 +463,7 @@ def drifts() -> None:
             run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
         )
         for name, describe in (("fit", lambda model, *_: model), ("drift", describe_drifts)):
-            with mock.patch.object(both_axes, "describe_drifts", describe):
+            with mock.patch.object(identify, "describe_drifts", describe):
                 model = lbt.identify(record)
             left_nm2 = lbt.identification.replayed_residual(
                 record.pseudo_open_loop(0.8),

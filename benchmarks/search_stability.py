@@ -27,6 +27,7 @@ import wrong_commands
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.fitting import Search, cost
+from lbt_synth.identification.fit.identify import axis_periodogram, find_axis
 
 STEP = 1e-12
 APART = 0.5  # of the log-likelihood: searches that end elsewhere
@@ -69,12 +70,8 @@ def search(
         begun, costs = time.process_time(), []
         for k in range(scales):
             scale = 1 + k * STEP
-            axis = lbt.identification.identify_axis(
-                y * scale,
-                c * scale,
-                frame_rate_hz=record.frame_rate_hz,
-                stretches=record.stretches(),
-            )
+            data = axis_periodogram(y * scale, c * scale, record.frame_rate_hz, record.stretches())
+            axis = find_axis(Search(data=data))
             is_found = axis.sensor_gain_error is not None
             costs.append(cost(Search(data=axis.data), axis.fitted_model) if is_found else np.nan)
         found[f"{name}, axis {i}"] = costs, time.process_time() - begun

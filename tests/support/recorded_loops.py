@@ -6,6 +6,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.identify import axis_periodogram, find_axis, refit_axis
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.models.resonance_spectrum import coefficients
 
@@ -48,6 +50,27 @@ def slow() -> lbt.models.ARModel:
     return lbt.models.ARModel(
         coefficients=[a1, a2], driving_rms_nm=300 * np.sqrt(drive), frame_rate_hz=RATE
     )
+
+
+def identify_series(
+    measurement: np.ndarray,
+    correction: np.ndarray | None = None,
+    *,
+    frame_rate_hz: float = RATE,
+    stretches: object = None,
+    sensor_gain: float | None = None,
+    sensor_gain_error: float = 0.0,
+    assumed_gain: float = 1.0,
+    start: lbt.identification.IdentifiedAxis | None = None,
+    **options: object,
+) -> lbt.identification.IdentifiedAxis:
+    """Identify the series of one axis, at a sensor gain with an error if it is given."""
+    data = axis_periodogram(measurement, correction, frame_rate_hz, stretches)
+    search = Search(data=data, gain=sensor_gain, **options)
+    axis = find_axis(search, assumed_gain=assumed_gain, start=start)
+    if not sensor_gain_error:
+        return axis
+    return refit_axis(axis, search, sensor_gain_error / sensor_gain, "given")
 
 
 def resonant_record(seed: int = 0) -> lbt.identification.LoopRecord:

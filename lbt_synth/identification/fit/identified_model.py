@@ -42,9 +42,6 @@ class IdentifiedLine:
         stands for a drift.
     frequency_hz, frequency_error_hz : float
         Natural frequency and its standard error [Hz].
-    separable_hz : float or None
-        How far apart two like lines have to be here to be seen as two [Hz]; closer ones look like
-        one at their mean frequency, by power. None for what is no narrow line.
     damping, damping_error : float
         Damping ratio and its standard error. If the line is not resolved, both are the largest
         damping that the record cannot distinguish from none.
@@ -77,16 +74,8 @@ class IdentifiedLine:
     prominence: float
     evidence: float
     announced: bool
-    separable_hz: float | None = None
     direction: tuple[float, ...] | None = None
     direction_error_deg: float | None = None
-
-    @property
-    def frequency_error_if_several_hz(self) -> float | None:
-        """Standard error for the strongest of several lines that look like this one [Hz]."""
-        if self.separable_hz is None:
-            return None
-        return float(np.hypot(self.frequency_error_hz, self.separable_hz / 4))
 
     @property
     def direction_deg(self) -> float | None:
@@ -304,7 +293,6 @@ class VibrationRow:
     axis: str = column("axis")  # or the direction
     frequency_hz: float = column("f", unit="Hz", format=".3f")
     frequency_error_hz: float = column("+-", unit="Hz", format=".2g")
-    frequency_error_if_several_hz: float | None = column("if several", unit="Hz", format=".2g")
     damping: str = column("damping")  # one that is not resolved has a bound, and no error
     damping_error: float | None = column("+-", format=".2g")
     rms_nm: float = nm_column("rms", format=".2f")

@@ -52,17 +52,11 @@ _NARROWEST = 1e-4  # damping ratio of a new component
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
 
-def search_model(
-    search: Search, start: SpectrumModel | None = None, *, moves: bool = True
-) -> FittedModel:
-    """Find the model of one axis; the lines of a start stay where they are without ``moves``."""
-    if start is None:
-        return search_models(search)[0]
-    return fitting.add_evidence(search, find_components(search, start, moves=moves))
-
-
 def search_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
-    """Find the model of one axis, and its rival where noise of another colour may explain it."""
+    """Find the model of one axis, and its rival where noise of another colour may explain it.
+
+    A start has been found in earlier data: there is little left to find.
+    """
     models = [find_components(search, start)]
     if start is None and _may_be_coloured(search, models[0]):
         models.append(find_components(replace(search, colour=_COLOUR), None))
@@ -115,7 +109,7 @@ def try_other_gains(
         begin = replace(search, gain=gain, colour=colour)
         try:
             known = replace(spectrum, colour=colour)
-            held = find_components(begin, known, rounds=FEW_ROUNDS, moves=False)
+            held = find_components(begin, known, moves=False)
         except NumericalError:
             continue
         free = fitting.fit(search, held.spectrum)
@@ -155,14 +149,14 @@ def find_coloured_rival(
 
 def find_components(
     search: Search,
-    start: SpectrumModel | None,
+    start: SpectrumModel | None = None,
     *,
-    rounds: int = _MOST_ROUNDS,
+    rounds: int | None = None,
     moves: bool = True,
 ) -> FittedModel:
     """Find the model: add components, prune them, and move lines (with ``moves``).
 
-    Without rounds it stays as it begins, but for what it does not need.
+    One that starts from an earlier model has few rounds.
     """
     model = None if start is None else fitting.refit(search, start)
     if model is None:
@@ -172,8 +166,8 @@ def find_components(
             "the likelihood of the spectrum is not finite. Check the units of the series."
         )
     model = _add_announced(search, fitting.prune(search, model))
-    if not rounds:
-        return model
+    if rounds is None:
+        rounds = _MOST_ROUNDS if start is None else FEW_ROUNDS
     for _ in range(rounds):
         better = _improve(search, model, moves)
         if better is None:

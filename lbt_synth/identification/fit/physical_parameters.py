@@ -55,9 +55,6 @@ _APART = 1.4  # half widths between the lines there
 _NARROWER = -0.25  # of the logarithm of the damping
 _LIKE = 0.5  # width of the prior around that
 _REACH = 20.0  # half widths around a line that are fitted
-_NEAR = 0.2  # of the logarithm of what a pair adds, where a separation is near enough
-_MOST_STEPS = 8
-_STEEPNESS = 4.0  # of what a pair adds with its separation, where nothing is known
 
 
 def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> SpectrumModel:
@@ -397,52 +394,3 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int, *, worth: float 
             away = (found.spectrum.pack() - priors.centre)[[1 - 2 * PARAMETERS, 1 - PARAMETERS]]
             best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)
     return single - best
-
-
-def measure_separations(axis: IdentifiedAxis) -> IdentifiedAxis:
-    """Return an axis each of whose lines knows how far apart two like it have to be."""
-    search, spectrum = Search(data=axis.data), axis.fitted_model.spectrum
-    centres = np.array([search.place(c)[0] for c in spectrum.components[1:]])
-    parts = list(axis.parts)
-    for k, part in enumerate(parts):
-        if part.kind == "line":
-            i = 1 + int(np.argmin(np.abs(centres - part.frequency_hz)))
-            parts[k] = replace(part, separable_hz=separable_hz(search, spectrum, i))
-    return replace(axis, parts=tuple(parts))
-
-
-def separable_hz(search: Search, spectrum: SpectrumModel, i: int) -> float:
-    """Return how far apart two like lines have to be to be seen as two in the place of line i.
-
-    There the likelihood expects as much of a pair as a split rarely adds to a single line [Hz]. At
-    most some half widths: beyond, a line is hardly seen.
-    """
-    line = spectrum.components[i]
-    centre, half = search.place(line)
-    data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
-    rest, zero = density(data, spectrum.exchange(i)), np.zeros_like(data.measured)
-    data = replace(data, measured=density(data, spectrum), crossed=zero, corrected=zero)
-    single = contrast(data, spectrum)
-    start = spectrum.alone(*(line.shift(0.0, _NARROWER, float(np.log(0.5))) for _ in range(2)))
-    places = start.pack().size - PARAMETERS * np.array([2, 1])
-    width = np.zeros(start.pack().size)
-    width[-2 * PARAMETERS :] = 2 * (0.0, np.inf, np.inf)
-    most = min(centre, _REACH * half)
-    apart, known = min(3 * half, most), []
-    for _ in range(_MOST_STEPS):
-        theta = start.pack()
-        theta[places] = line.log_frequency + np.log1p(np.array([-0.5, 0.5]) * apart / centre)
-        at = start.unpack(theta)
-        found = minimise(data, at, Priors(centre=theta, width=width), held=rest, accuracy=SEARCHED)
-        if found is None:
-            break
-        start = found.spectrum
-        known.append((np.log(apart), np.log(max(found.contrast - single, 1e-9) / _LIKELY)))
-        if abs(known[-1][1]) < _NEAR or (apart == most and known[-1][1] < 0):
-            break
-        slope = _STEEPNESS
-        if len(known) > 1:
-            run, rise = np.subtract(known[-1], known[-2])
-            slope = max(rise / run, 1.0)
-        apart = min(apart * float(np.exp(np.clip(-known[-1][1] / slope, -1, 1))), most)
-    return apart

@@ -24,7 +24,6 @@ from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_perio
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     gain_covariance,
-    measure_separations,
     standard_errors,
 )
 from lbt_synth.identification.fit.scoring import EXACT
@@ -121,14 +120,13 @@ def _describe_axis(
         evidence=(float("inf"), *(_lost(search, fit, other) for other in less)),
     )
     error = alone.sensor_gain_error
-    found = describe_axis(
+    return describe_axis(
         replace(search, data=alone.data, gain=alone.sensor_gain),
         model,
         None if error is None else error / alone.sensor_gain,
         alone.sensor_gain_note,
         shared=range(len(own.components), len(whole.components)),
     )
-    return measure_separations(found)
 
 
 def _find_part(axis: IdentifiedAxis, component: Component) -> int:

@@ -53,7 +53,7 @@ _COLUMNS = {  # attribute of a row by heading
 
 
 @table_row
-class ResidualRow:
+class PredictionRow:
     """One controller on frames that nothing was fitted to, beside what the model promises."""
 
     name: str = column("controller", help="What it is")
@@ -67,53 +67,16 @@ class ResidualRow:
     ratio: float = column("data/model", format=".3f", help="Residual on the data over that")
     strehl: float = column("Strehl, data", format=".3f", help="Strehl ratio on the data")
     model_strehl: float = column("Strehl, model", format=".3f", help="Strehl ratio by the model")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PredictionRow:
-    """One controller on the data, and by the model."""
-
-    name: str
-    # residual on the test data; None for the limit, which is no controller
-    replayed: ResidualEstimate | None
-    # (n, n) covariance that the model promises; None where the controller is not known
-    model_nm2: FloatArray | None
-    strehl: float  # of the data; nan where there is none
-    model_strehl: float  # of the model
-
-    @property
-    def model_nm(self) -> float:
-        """Residual over all axes that the model promises [nm rms]; nan if unknown."""
-        return float(np.sqrt(np.trace(self.model_nm2))) if self.model_nm2 is not None else np.nan
-
-    @property
-    def model_axis_nm(self) -> FloatArray | None:
-        """The same of each axis, (n,) [nm rms]."""
-        return None if self.model_nm2 is None else frozen_copy(np.sqrt(np.diag(self.model_nm2)))
-
-    @property
-    def replayed_nm(self) -> float:
-        """Residual over all axes on the data [nm rms]; nan if negative within its error."""
-        return np.nan if self.replayed is None else self.replayed.rms_nm
-
-    @property
-    def replayed_error_nm(self) -> float:
-        """Standard error of that [nm]."""
-        return np.nan if self.replayed is None else self.replayed.rms_error_nm
-
-    @property
-    def ratio(self) -> float:
-        """Residual on the data over what the model promises; nan where either is unknown."""
-        return self.replayed_nm / self.model_nm if self.model_nm > 0 else np.nan
+    replayed: ResidualEstimate | None  # on the test data; None for the limit, no controller
+    model_axis_nm: FloatArray | None  # (n,): promised for each axis; None if unknown
 
     @property
     def deviations(self) -> float:
         """Variance on the data less that of the model, in standard errors; nan if unknown."""
-        if self.replayed is None or self.model_nm2 is None:
+        if self.replayed is None:
             return np.nan
-        difference = self.replayed.total_nm2 - float(np.trace(self.model_nm2))
         error = self.replayed.total_error_nm2
-        return difference / error if error > 0 else np.nan
+        return (self.replayed.total_nm2 - self.model_nm**2) / error if error > 0 else np.nan
 
     @property
     def contradicts_model(self) -> bool:
@@ -359,15 +322,22 @@ def _model_means(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 def _build_row(
     name: str, found: ResidualEstimate | None, promised: FloatArray | None, imaging: Imaging | None
 ) -> PredictionRow:
-    strehl = promised_strehl = float("nan")
+    """Return a row of a residual on the data and a covariance (n, n) that the model promises."""
+    measured = np.nan if found is None else found.rms_nm
+    model = np.nan if promised is None else float(np.sqrt(np.trace(promised)))
+    strehl = promised_strehl = np.nan
     if imaging is not None and found is not None:
         strehl = found.strehl(imaging)
     if imaging is not None and promised is not None:
         promised_strehl = jitter_strehl(promised, imaging=imaging)
     return PredictionRow(
         name=name,
-        replayed=found,
-        model_nm2=None if promised is None else frozen_copy(promised),
+        replayed_nm=measured,
+        replayed_error_nm=np.nan if found is None else found.rms_error_nm,
+        model_nm=model,
+        ratio=measured / model if model > 0 else np.nan,
         strehl=strehl,
         model_strehl=promised_strehl,
+        replayed=found,
+        model_axis_nm=None if promised is None else frozen_copy(np.sqrt(np.diag(promised))),
     )

@@ -96,6 +96,11 @@ class ResidualEstimate:
         return float(np.sum(self.variance_nm2))
 
     @property
+    def measured_nm2(self) -> float:
+        """Mean square of the measured residual over all axes, noise included [nm^2]."""
+        return self.total_nm2 + float(np.trace(self.noise_nm2))
+
+    @property
     def total_error_nm2(self) -> float:
         """Standard error of the variance over all axes [nm^2]."""
         return float(np.sqrt(max(float(np.sum(self.error_nm4)), 0.0)))

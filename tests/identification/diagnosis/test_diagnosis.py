@@ -138,7 +138,7 @@ def test_data_that_contradict_the_model_of_what_ran():
     found = line_diagnosis()
     assert ", which the data contradict" not in diagnosis_verdict(found)[1]
     entries = tuple(
-        replace(entry, model_nm2=4 * entry.model_nm2) if entry.name == "what ran" else entry
+        replace(entry, model_nm=2 * entry.model_nm) if entry.name == "what ran" else entry
         for entry in found.comparison.entries
     )
     other = replace(found, comparison=replace(found.comparison, entries=entries))

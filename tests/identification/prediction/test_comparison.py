@@ -126,7 +126,7 @@ def test_the_table():
     exact = lbt.loop.model_budget(loop, plant, frame_means=True)
     assert table["best integrator"].model_nm == exact.rms_nm
     unknown = lbt.identification.prediction_against_data(plant, z, {}, measurements=y)["what ran"]
-    assert unknown.model_nm2 is None
+    assert unknown.model_axis_nm is None
     assert np.isnan([unknown.model_nm, unknown.ratio, unknown.deviations]).all()
 
 
