@@ -33,7 +33,8 @@ from lbt_synth.validation import integer, number
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
-DRIFT_DAMPING = 2.0  # damping ratio from which turbulence is a drift
+DRIFT_RATIO = 300.0  # damping ratio of a drift: of its poles, one is beyond the frame rate
+DRIFT_HZ, _DRIFT_WIDTH = 0.03, 2.0  # corner of a drift, and the width of its prior
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands at half their size
@@ -53,7 +54,6 @@ STARTING_CORNER_HZ = 50.0
 _TURBULENCE_WIDTH = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "turbulence": (np.log(0.45), 4.0),
-    "drift": (np.log(0.45), 4.0),
     "slow": (0.0, 1.0),
     "line": (np.log(0.01 / 0.99), 4.0),
 }
@@ -132,6 +132,8 @@ class Search:
     def _component_priors(self, component: Component) -> list[tuple[float, float]]:
         """Return the priors of frequency, damping and power."""
         frequency = (self.log_angle(1.0), _TURBULENCE_WIDTH)
+        if component.kind == "drift":
+            return [(self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _DRIFT_WIDTH), _FIXED, _NONE]
         damping = _DAMPING_PRIORS[component.kind]
         if component.kind == "line":
             frequency = _NONE
@@ -176,9 +178,8 @@ def fit(
     """Fit all parameters; None if no fit settles.
 
     Components of one axis that leave the band, from the first bin to the Nyquist frequency, are
-    dropped, and so is a drift whose damping ratio falls below 2, if another part can take its
-    place; those of two axes stay at its ends. A fit is given up where its log-likelihood does not
-    reach that of ``better_than`` minus a margin.
+    dropped; those of two axes stay at its ends. A fit is given up where its log-likelihood does
+    not reach that of ``better_than`` minus a margin.
     """
     data, bound = search.merge(start), float("inf")
     if better_than is not None:
@@ -189,9 +190,6 @@ def fit(
     if isinstance(start, Spectra):
         return found
     inside = found.spectrum.keep(search.covers)
-    first = inside.components[0]
-    if first.kind == "drift" and first.damping_ratio < DRIFT_DAMPING:
-        inside = inside.drop(0) or inside
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(found, contrast=contrast(search.data, found.spectrum))

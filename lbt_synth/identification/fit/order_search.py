@@ -40,7 +40,8 @@ _OTHER_NOISE = 5.0  # log-likelihood by which noise of another correlation is ex
 _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55))  # frequency [Hz] and damping ratio where a fit begins
-_DRIFT = (2.0, 30.0)  # the same of a first-order process
+_NEARLY_FIRST_ORDER = 2.0  # damping ratio from which turbulence may be a drift
+_OVERDAMPED = (2.0, 30.0)  # the same of turbulence that is nearly of first order
 _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _MOST_DRIFTS = 2  # fits of both
@@ -198,7 +199,7 @@ def _trials(
     first, *others = spectrum.components
     lines = [c for c in others if c.kind == "line"]
     has_parts = len(lines) < len(others)
-    nearly_first_order = first.kind == "drift" or first.damping_ratio > fitting.DRIFT_DAMPING
+    nearly_first_order = first.kind == "drift" or first.damping_ratio > _NEARLY_FIRST_ORDER
     # where no line can be added, a second turbulence would take the place of one
     room = len(lines) < search.most_lines
     found = find_excesses(search, spectrum)
@@ -230,8 +231,8 @@ def _other_backgrounds(
 def _begin(search: Search) -> FittedModel | None:
     """Fit the background and the clear lines.
 
-    The gain is held until the lines are there: one that is free while lines are missing runs away
-    to what explains these.
+    The gain is held until the lines and a drift are there: one that is free while these are missing
+    runs away to what explains them.
     """
     known = search if not search.finds_gain else replace(search, gain=search.starting_gains[0])
     model = fit_background(known, known.gain or 1.0)
@@ -243,6 +244,9 @@ def _begin(search: Search) -> FittedModel | None:
         model = fitting.fit(known, _add_centred(known, model.spectrum, clear))
     if model is None or not search.finds_gain:
         return model
+    trials = _other_backgrounds(known, model.spectrum, model.spectrum.lines, drifts=True)
+    drifting = (fitting.fit(known, trial, better_than=model) for trial in trials)
+    model = fitting.likeliest(known, [model, *drifting]) or model
     return fitting.fit(search, model.spectrum)
 
 
@@ -354,7 +358,7 @@ def fit_background(
         starts = _starting_drifts(known, ground, slow, 2 * white / rate)
         starts = sorted(starts, key=lambda start: contrast(smooth, start, held))[:_MOST_DRIFTS]
     else:
-        places = (*_TURBULENCE, _DRIFT)
+        places = (*_TURBULENCE, _OVERDAMPED)
         starts = [ground.add(known.component("turbulence", *place, slow)) for place in places]
     best: FittedModel | None = None
     for start in starts:
@@ -369,7 +373,8 @@ def _starting_drifts(
     search: Search, ground: SpectrumModel, slow: float, noise: float
 ) -> list[SpectrumModel]:
     """Return a drift and turbulence where fits may begin, for a slow variance and noise density."""
-    hz, ratio = _DRIFT
+    ratio = fitting.DRIFT_RATIO
+    hz = 2 * ratio * fitting.DRIFT_HZ
     powers = noise * np.array(_CROSSINGS_HZ) ** 2 * np.pi * ratio / hz  # of hz / (pi ratio f^2)
     drifts = [search.component("drift", hz, ratio, float(power)) for power in powers]
     places = product(_TURBULENCE, _SHARES)

@@ -24,7 +24,8 @@ _LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
 _JUST_ABOVE = 1e-3
 _NOTHING = float(np.log(np.finfo(float).tiny))  # as a logarithm
 
-# "slow" is another part of the turbulence; a first-order "drift" stands in the place of the first
+# "slow" is another part of the turbulence; a "drift" of first order, whose damping
+# ratio is held far above 1, stands in the place of the first
 Kind = Literal["turbulence", "drift", "slow", "line"]
 _FIRST: tuple[Kind, ...] = ("turbulence", "drift")
 

@@ -184,13 +184,24 @@ def densities(
     shape, by_colour = _log_colour(spectrum.colour, s)
     density[0] = white * np.exp(spectrum.log_noise + shape)
     density[1:], slopes = resonance_densities(frequency, ratio, white * np.exp(power), s)
-    fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
+    fall, by_corner = _log_tilt(data, spectrum.log_corner, spectrum.roll_off_order)
     rolling = [i for i, c in enumerate(components, 1) if c.kind == spectrum.rolling]
     density[rolling] *= np.exp(fall)
     _smear(data, components, density[1:], slopes)
     slopes[:, 1] *= slope[:, None]
     by_shape = np.array([by_colour * density[0], by_corner * density[rolling].sum(axis=0)])
     return density, slopes, by_shape
+
+
+def _log_tilt(
+    data: LoopPeriodogram, log_corner: float, order: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the roll-off of turbulence as frames show it, a logarithm, and its slope, (f,).
+
+    The mean over a frame takes ``sinc^2`` of the phase. A process of finite order is one of means.
+    """
+    fall, slope = log_roll_off(float(np.exp(log_corner)), order, data.half_angle_square)
+    return fall if order == 1 else fall + data.log_frame_mean, slope
 
 
 def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -257,8 +268,7 @@ def _component_density(
     s, c = data.half_angle_square, component
     own = unit_density(c.frequency, c.damping_ratio, s)
     if roll_off is not None:
-        corner, order = roll_off
-        own *= np.exp(log_roll_off(float(np.exp(corner)), order, s)[0])
+        own *= np.exp(_log_tilt(data, *roll_off)[0])
     _smear(data, [c], own[None])
     return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * own)
 

@@ -12,7 +12,7 @@ import pytest
 from support.drawn_spectra import NOISE, drawn_search, empty_search, white_noise
 from support.recorded_loops import hidden_resonance_record, identify_series, integrator_loop
 
-from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.fitting import DRIFT_RATIO, Search
 from lbt_synth.identification.fit.order_search import find_excesses, fit_background
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import SpectrumModel
@@ -76,7 +76,7 @@ def test_narrow_lines_are_hardly_touched_and_wide_ones_are_held(seed: int) -> No
 def test_a_drift_is_a_process_beside_the_turbulence(seed: int) -> None:
     search = empty_search()
     data = search.data
-    drift = search.component("drift", 2.0, 30.0, 20_000.0)  # a corner at 1/30 Hz
+    drift = search.component("drift", 20.0, DRIFT_RATIO, 20_000.0)  # a corner at 1/30 Hz
     slow = search.component("slow", 2.0, 0.4, 3000.0)
     truth = white_noise().add(drift, slow)
     drawn = drawn_search(truth, seed)
