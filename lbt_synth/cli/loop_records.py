@@ -242,7 +242,9 @@ def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
     if found.transfers:
         report.add_rows("accelerometer_lines", "Accelerometers and lines", found.transfers)
     report.add_rows("accelerometers", "Accelerometers", found.channels)
-    report.data["accelerometer_shift"] = asdict(found.shift)
+    report.data["accelerometer_shift"] = {
+        name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames", "by_phases")
+    }
     report.notes.append(f"note: {found.shift_text}")
 
 

@@ -13,23 +13,23 @@ from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.identification.prediction.predictor import least_squares_predictor
 from lbt_synth.identification.prediction.residual import (
-    Replay,
     ResidualEstimate,
     check_series,
+    check_test,
     choose_warm_up,
     estimate_replay,
+    estimate_residual,
     inverse_sensor,
-    measured_replay,
+    leave_out,
     mode_noise,
     replay,
-    replay_frames,
 )
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
-from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
@@ -230,21 +230,27 @@ def prediction_against_data(
     predictor = least_squares_predictor(series, hardware, taps=taps, stretches=fitted).controller
     chosen = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
     loops = {name: _close_stable_loop(plant, name, one) for name, one in chosen.items()}
-    every = replay_frames(runs, tested)
+    check_test(runs, tested)
     replays = {name: replay(loop, series, runs, from_rest=False) for name, loop in loops.items()}
-    warm_up = choose_warm_up(list(replays.values()), every)
-    frames = every.without(warm_up)
+    warm_up = choose_warm_up(list(replays.values()), tested)
+    kept = leave_out(runs, tested, warm_up)
     rows = []
     if measurements is not None:
         promised = None
         if running is not None:
             promised = _model_means(_close_stable_loop(plant, RAN, running), plant)
-        ran = _measured_replay(series, hardware, measurements, tested)
-        rows.append(_build_row(RAN, estimate_replay(ran, frames, noise), promised, imaging))
+        y, _ = check_series(measurements, hardware.n_measurements, tested, "measurements")
+        if len(y) != len(series):
+            raise ProblemError(
+                f"measurements must have the {len(series)} frames of open_loop; got {len(y)}."
+            )
+        residual = y @ inverse_sensor(hardware).T
+        ran = estimate_residual(np.concatenate([residual[a:b] for a, b in kept]), kept, *noise)
+        rows.append(_build_row(RAN, ran, promised, imaging))
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
     for name, loop in loops.items():
-        replayed = estimate_replay(replays[name], frames, noise)
+        replayed = estimate_replay(replays[name], kept, noise)
         rows.append(_build_row(name, replayed, _model_means(loop, plant), imaging))
     notes = [*_note_starts(rows, loops), *_note_refuted(rows)]
     try:
@@ -257,7 +263,7 @@ def prediction_against_data(
     return PredictionTable(
         entries=tuple(rows),
         fit=fitted,
-        test=frames.test,
+        test=kept,
         warm_up_frames=warm_up,
         notes=tuple(notes),
     )
@@ -300,18 +306,6 @@ def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Desig
             f"{name}: {error}", spectral_radius=error.spectral_radius
         ) from error
     return loop
-
-
-def _measured_replay(
-    open_loop: FloatArray, hardware: LoopHardware, measurements: ArrayLike, test: Stretches
-) -> Replay:
-    """Return the residual of the loop that ran, from its own measurements."""
-    y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
-    if len(y) != len(open_loop):
-        raise ProblemError(
-            f"measurements must have the {len(open_loop)} frames of open_loop; got {len(y)}."
-        )
-    return measured_replay(y @ inverse_sensor(hardware).T)
 
 
 def _model_means(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:

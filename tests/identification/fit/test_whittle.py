@@ -20,7 +20,6 @@ from lbt_synth.identification.fit.periodogram import TAPER, LoopPeriodogram, loo
 from lbt_synth.identification.fit.spectrum_model import (
     GAIN,
     Component,
-    Shared,
     Spectra,
     SpectrumModel,
 )
@@ -227,9 +226,7 @@ def both() -> LoopPeriodogram:
 
 @pytest.fixture
 def coupled() -> Spectra:
-    shared = Shared(
-        *dataclasses.astuple(line(41, 0.02, 35))[:4], log_ratio=2 * np.log(25 / 35), phase=2.5
-    )
+    shared = dataclasses.replace(line(41, 0.02, 35), log_ratio=2 * np.log(25 / 35), phase=2.5)
     return Spectra((spectrum(line(70, 0.05, 20)), spectrum()), (shared,))
 
 
@@ -265,7 +262,7 @@ def test_slopes_of_two_axes_are_those_of_differences(both, coupled, drift) -> No
     if drift:
         first = Component("drift", np.log(0.3 * W), np.log(8.0), np.log(50.0**2))
         axes = (dataclasses.replace(axis, components=(first,)) for axis in coupled.axes)
-        slow = Shared("slow", np.log(20 * W), 0.3, np.log(90.0**2), log_ratio=0.4)
+        slow = Component("slow", np.log(20 * W), 0.3, np.log(90.0**2), log_ratio=0.4)
         coupled = Spectra(tuple(axes), (*coupled.shared, slow))
     theta = coupled.pack()
     _, slope, _ = derivatives(both, coupled)
