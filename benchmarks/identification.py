@@ -5,7 +5,6 @@
     python benchmarks/identification.py --errors --colour 0.3 ...    with first-order noise
     python benchmarks/identification.py --errors --close ...         with pairs of close lines
     python benchmarks/identification.py --drifts    sinusoids and narrow resonances that drift
-    python benchmarks/identification.py --times
 
 One axis at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain 0.4 to
 1, noise 2 to 30 nm a frame (evenly in its logarithm). Even records: second-order turbulence of
@@ -482,41 +481,6 @@ def drifts() -> None:
             print(f"  {drift_hz:4.2f} Hz, {name:5s} filter leaves {left_nm2**0.5:.2f} nm: {lines}")
 
 
-def times() -> None:
-    """Print the processor time of two axes of a minute with five lines."""
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2)
-    lines = tuple(
-        lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=r, direction=d)
-        for f, r, d in (
-            (13.0, 40.0, (1.0, 0.0)),
-            (31.0, 80.0, (1.0, 0.0)),
-            (74.0, 15.0, (1.0, 0.0)),
-            (22.0, 60.0, (0.0, 1.0)),
-            (110.0, 20.0, (0.0, 1.0)),
-        )
-    )
-    air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
-    truth = lbt.Truth(turbulence=air, vibrations=lines, noise_nm=10.0, sensor_gain=0.6)
-    run = lbt.simulate(
-        lbt.integrator(path, gain=0.5).controller, truth, hardware=path, frames=60_000
-    )
-    record = lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
-    )
-    lbt.identify(record)  # imports
-    begin = time.process_time()
-    model = lbt.identify(record)
-    middle = time.process_time()
-    lbt.kalman(model.plant())
-    end = time.process_time()
-    lbt.design_from_record(record)
-    last = time.process_time()
-    print(f"lines found              {[len(axis.lines) for axis in model.axes]}")
-    print(f"identify, two axes       {middle - begin:.2f} s")
-    print(f"design                   {end - middle:.3f} s")
-    print(f"halves, test and design  {last - end:.2f} s")
-
-
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -525,13 +489,12 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--drifts", action="store_true", help="only sinusoids that drift")
-    parser.add_argument("--times", action="store_true", help="only the time of two axes")
     parser.add_argument("--errors", action="store_true", help="only the standard errors")
     parser.add_argument("--colour", type=float, default=0.0, help="of the noise, with --errors")
     parser.add_argument("--close", action="store_true", help="pairs of lines, with --errors")
     asked = parser.parse_args()
-    if asked.times or asked.drifts:
-        times() if asked.times else drifts()
+    if asked.drifts:
+        drifts()
         return
     study, show, options = studied, table, {}
     if asked.errors:

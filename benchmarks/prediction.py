@@ -69,11 +69,12 @@ def identity() -> None:
 
 
 def show(table: lbt.identification.PredictionTable) -> None:
-    for row, entry in zip(table.rows(), table.entries, strict=True):
-        name, tip, tilt, data, error, model, ratio, seen, promised = row
+    for row in table.entries:
+        tip, tilt = row.model_axis_nm if row.replayed is None else row.replayed.axis_rms_nm
         print(
-            f"| {name} | {tip:.1f}, {tilt:.1f} | {data:.1f} +- {error:.1f} | {model:.1f} | "
-            f"{ratio:.3f} | {entry.deviations:+.1f} | {100 * seen:.1f} | {100 * promised:.1f} |"
+            f"| {row.name} | {tip:.1f}, {tilt:.1f} | {row.replayed_nm:.1f} +- "
+            f"{row.replayed_error_nm:.1f} | {row.model_nm:.1f} | {row.ratio:.3f} | "
+            f"{row.deviations:+.1f} | {100 * row.strehl:.1f} | {100 * row.model_strehl:.1f} |"
         )
     print(f"fit {table.fit}, test {table.test}, {table.warm_up_frames} frames to warm up")
 

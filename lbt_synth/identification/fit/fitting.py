@@ -21,7 +21,7 @@ from lbt_synth.identification.fit.spectrum_model import (
 from lbt_synth.identification.fit.whittle import (
     FittedModel,
     Model,
-    component_densities,
+    component_density,
     contrast,
     contrasts,
     density,
@@ -342,6 +342,7 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     # the width stays
     trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
     data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
-    model = density(data, spectrum.exchange(i)) + component_densities(data, trials)
+    lines = [component_density.__wrapped__(data, trial) for trial in trials]  # none comes again
+    model = density(data, spectrum.exchange(i)) + np.array(lines)
     best = int(np.argmin(contrasts(data, spectrum.gain, model)))
     return spectrum.exchange(i, trials[best])

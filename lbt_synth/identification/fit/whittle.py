@@ -250,19 +250,9 @@ def _smear(
             slopes[i, 1, start:stop] += by_width[part]
 
 
-def component_densities(data: LoopPeriodogram, components: Sequence[Component]) -> FloatArray:
-    """Return the densities of components but for the roll-off of turbulence, (c, f)."""
-    shape = [(c.frequency, c.damping_ratio, c.log_power) for c in components]
-    frequency, ratio, power = np.array(shape).reshape(-1, 3).T
-    variance = 2 / data.frame_rate_hz * np.exp(power)
-    own, _ = resonance_densities(frequency, ratio, variance, data.half_angle_square)
-    _smear(data, components, own)
-    return own
-
-
 @lru_cache(maxsize=64)
-def _component_density(
-    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None
+def component_density(
+    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None = None
 ) -> FloatArray:
     """Return the density of a component behind a roll-off of a corner and an order, (f,)."""
     s, c = data.half_angle_square, component
@@ -279,7 +269,7 @@ def part_density(
     """Return the density of a component of a spectrum, (f,)."""
     roll_off = (spectrum.log_corner, spectrum.roll_off_order)
     rolls = component.kind == spectrum.rolling
-    return _component_density(data, component, roll_off if rolls else None)
+    return component_density(data, component, roll_off if rolls else None)
 
 
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,15 +40,6 @@ LIMIT = "limit of performance"
 _RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
 _START_SHARE = 0.01  # of a measured mean square: what a start adds above that has a note
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that chance explains
-_AXES = ("tip", "tilt")
-_COLUMNS = {  # attribute of a row by heading
-    "data_nm": "replayed_nm",
-    "data_error_nm": "replayed_error_nm",
-    "model_nm": "model_nm",
-    "data_over_model": "ratio",
-    "strehl": "strehl",
-    "model_strehl": "model_strehl",
-}
 
 
 @table_row
@@ -116,26 +106,6 @@ class PredictionTable:
             f"the table has the rows {', '.join(entry.name for entry in self.entries)}; got "
             f"{name!r}."
         )
-
-    @property
-    def headings(self) -> tuple[str, ...]:
-        """Names of the columns of :meth:`rows`, with their units."""
-        n = next(e.replayed.noise_nm2.shape[0] for e in self.entries if e.replayed is not None)
-        axes = _AXES[:n] if n <= len(_AXES) else tuple(f"axis_{i}" for i in range(n))
-        return "controller", *(f"{axis}_nm" for axis in axes), *_COLUMNS
-
-    def rows(self) -> tuple[tuple[Any, ...], ...]:
-        """Return a tuple per row, in the order of :attr:`headings`; nan where nothing is known.
-
-        The axes' columns are of the data, except in the row of the limit.
-        """
-        out = []
-        for entry in self.entries:
-            axes = entry.model_axis_nm if entry.replayed is None else entry.replayed.axis_rms_nm
-            assert axes is not None
-            values = (getattr(entry, name) for name in _COLUMNS.values())
-            out.append((entry.name, *axes.tolist(), *values))
-        return tuple(out)
 
 
 def prediction_against_data(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,57 +23,18 @@ from lbt_synth.identification.prediction.residual import (
     replay,
 )
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
+from lbt_synth.identification.stretches import Stretches, forward_splits
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import (
     FloatArray,
-    integer,
-    number,
     require_instance,
 )
 
 _LEAST_TEST_S = 1.0
 _START_S = 0.5  # after the beginning of a stretch, where a controller has just started
-
-
-def forward_splits(
-    stretches: StretchesLike | None, frames: int, *, splits: int = 3, first_share: float = 0.5
-) -> tuple[tuple[Stretches, Stretches], ...]:
-    """Divide a record into pairs of stretches, to train on and later ones to test on.
-
-    Stretches are contiguous usable frames (start, stop), in order; None is the whole record. The
-    first pair trains on ``first_share`` of the usable frames, in (0, 1); the rest is divided into
-    tests of equal length, which begin where their training ends.
-    """
-    pairs = checked_stretches(stretches, integer(frames, "frames", at_least=1))
-    count = integer(splits, "splits", at_least=1)
-    share = number(first_share, "first_share", above=0, below=1)
-    usable = sum(stop - start for start, stop in pairs)
-    first = int(share * usable)  # as of split_halves
-    cuts = first + (usable - first) * np.arange(count + 1) // count
-    if cuts[0] < 1 or np.any(np.diff(cuts) < 1):
-        raise ProblemError(
-            f"a record must leave frames to train on and to test on; got {usable} usable frames "
-            f"for {count} splits. Record more, or split less."
-        )
-    return tuple(
-        (_cut(pairs, 0, int(start)), _cut(pairs, int(start), int(stop)))
-        for start, stop in pairwise(cuts)
-    )
-
-
-def _cut(stretches: Stretches, first: int, last: int) -> Stretches:
-    """Return the usable frames from one count of them to another."""
-    out, before = [], 0
-    for start, stop in stretches:
-        low, high = max(first - before, 0), min(last - before, stop - start)
-        if low < high:
-            out.append((start + low, start + high))
-        before += stop - start
-    return tuple(out)
 
 
 def record_splits(

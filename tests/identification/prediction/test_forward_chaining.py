@@ -11,7 +11,8 @@ from support.short_split import short_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.prediction.forward_chaining import forward_split, forward_splits
+from lbt_synth.identification.prediction.forward_chaining import forward_split
+from lbt_synth.identification.stretches import forward_splits
 
 
 @pytest.fixture(scope="module")
@@ -27,34 +28,6 @@ def split(record):
 
 def frames_in(stretches):
     return np.concatenate([np.arange(start, stop) for start, stop in stretches])
-
-
-def test_tests_cover_the_rest_once_and_follow_their_training():
-    usable = [(10, 400), (450, 460), (500, 1001)]
-    pairs = forward_splits(usable, 1200, splits=4, first_share=0.4)
-    everything = frames_in(usable)
-    assert len(pairs) == 4
-    for training, test in pairs:
-        both = np.concatenate([frames_in(training), frames_in(test)])
-        assert np.array_equal(both, everything[: len(both)])
-    tests = np.concatenate([frames_in(test) for _, test in pairs])
-    assert np.array_equal(tests, everything[-len(tests) :])
-    assert len(tests) == pytest.approx(0.6 * len(everything), abs=1)
-    lengths = [len(frames_in(test)) for _, test in pairs]
-    assert max(lengths) - min(lengths) <= 1
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"splits": 0}, "splits"),
-        ({"first_share": 1.0}, "first_share"),
-        ({"splits": 7}, "10 usable frames for 7 splits"),
-    ],
-)
-def test_splits_that_a_record_cannot_have(options, words):
-    with pytest.raises(ProblemError, match=words):
-        forward_splits([(0, 10)], 10, **options)
 
 
 def test_a_replay_of_what_ran_is_what_was_measured(split):
