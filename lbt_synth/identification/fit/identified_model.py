@@ -61,6 +61,9 @@ class IdentifiedLine:
     direction_error_deg : float or None
         Standard error of the direction [degrees] of a line that both axes share. None for
         turbulence along the direction of the rms of the axes.
+    corner_hz, corner_error_hz : float or None
+        Corner beyond which the density of the turbulence falls by another f^(-5/3), as of frozen
+        flow, and its standard error [Hz].
     """
 
     kind: Kind
@@ -76,6 +79,8 @@ class IdentifiedLine:
     announced: bool
     direction: tuple[float, ...] | None = None
     direction_error_deg: float | None = None
+    corner_hz: float | None = None
+    corner_error_hz: float | None = None
 
     @property
     def direction_deg(self) -> float | None:
@@ -98,24 +103,6 @@ class IdentifiedLine:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IdentifiedTurbulence:
-    """The slow part of a spectrum: a resonance with the roll-off of tilt, or without.
-
-    Each value has its standard error.
-    """
-
-    frequency_hz: float  # natural frequency of the second-order process
-    frequency_error_hz: float
-    damping: float  # damping ratio; 1 and more: two real poles
-    damping_error: float
-    # corner beyond which the density falls by another f^(-5/3), as of frozen flow
-    corner_hz: float | None
-    corner_error_hz: float | None
-    rms_nm: float  # standard deviation of the nearest process of finite order
-    rms_error_nm: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IdentifiedAxis(Summarised):
     """One axis: turbulence, lines, noise and sensor gain.
@@ -124,8 +111,9 @@ class IdentifiedAxis(Summarised):
     ----------
     turbulence : ARModel
         The turbulence as a process of order 2 or 3.
-    turbulence_fit : IdentifiedTurbulence
-        Its parameters with standard errors.
+    turbulence_fit : IdentifiedLine
+        Its parameters with standard errors; of the rms of the process. Above a damping ratio of 1
+        it has two real poles.
     parts : tuple of IdentifiedLine
         All other resonances, by frequency. One that has a direction is this axis's share of a
         resonance of both axes.
@@ -160,7 +148,7 @@ class IdentifiedAxis(Summarised):
     """
 
     turbulence: ARModel
-    turbulence_fit: IdentifiedTurbulence
+    turbulence_fit: IdentifiedLine
     parts: tuple[IdentifiedLine, ...]
     noise_nm: float
     noise_error_nm: float

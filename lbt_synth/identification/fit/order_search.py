@@ -60,19 +60,22 @@ def search_models(search: Search, start: SpectrumModel | None = None) -> list[Fi
     A start has been found in earlier data: there is little left to find.
     """
     models = [find_components(search, start)]
-    if start is None and _may_be_coloured(search, models[0]):
-        models.append(find_components(replace(search, colour=_COLOUR), None))
+    coloured = _find_coloured(search, models[0]) if start is None else None
+    if coloured is not None:
+        models.append(coloured)
         models.sort(key=lambda trial: _cost_of_noise(search, trial))
     return [fitting.add_evidence(search, models[0]), *models[1:]]
 
 
-def _may_be_coloured(search: Search, model: FittedModel) -> bool:
-    """Whether noise that is not white may be what wide components, or a wrong gain, explain."""
-    spectrum = model.spectrum
-    if not all(c.is_narrow for c in spectrum.components[1:]):
-        return True
-    near = fitting.fit(search, replace(spectrum, colour=_COLOUR))
-    return near is not None and model.contrast - near.contrast > fitting.CHEAP
+def _find_coloured(search: Search, model: FittedModel) -> FittedModel | None:
+    """Return a model of coloured noise, where that may explain wide components or a wrong gain."""
+    near = fitting.fit(search, replace(model.spectrum, colour=_COLOUR))
+    if near is None:
+        return None
+    plain = all(c.is_narrow for c in model.spectrum.components[1:])
+    if plain and model.contrast - near.contrast <= fitting.CHEAP:
+        return None
+    return find_components(search, near.spectrum)
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:

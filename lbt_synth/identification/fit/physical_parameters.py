@@ -21,14 +21,12 @@ from lbt_synth.identification.fit.fitting import Search, close_line
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
-    IdentifiedTurbulence,
     Kind,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
 from lbt_synth.identification.fit.scoring import SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
-    DIFFERENCE,
     FittedModel,
     contrast,
     densities,
@@ -122,10 +120,12 @@ def describe_axis(
     slow = spectrum if spectrum.rolling == "turbulence" else near.spectrum
     each, _, _ = densities(data, near.spectrum)
     fitted = each.sum(axis=0) if near is model else density(data, spectrum)
-    lines = [
+    first, *lines = [
         _describe_line(search, near, i, errors, covariance, each)
-        for i in range(1, len(spectrum.components))
+        for i in range(len(spectrum.components))
     ]
+    if slow is spectrum:  # its own parameters, not those of the nearest process
+        first = _describe_line(search, model, 0, errors, covariance, each)
     background = fitted.copy()
     for line, own in zip(lines, each[2:], strict=True):
         if line.kind == "line":
@@ -138,7 +138,7 @@ def describe_axis(
     parts = [p for p in lines if p.kind != "turbulence" or p.rms_nm > _LEAST_PART * noise]
     return IdentifiedAxis(
         turbulence=process,
-        turbulence_fit=_describe_turbulence(slow, errors, covariance, process),
+        turbulence_fit=_describe_turbulence(first, slow, errors, process),
         parts=tuple(sorted(parts, key=lambda part: part.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
@@ -218,27 +218,17 @@ def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
 
 
 def _describe_turbulence(
-    spectrum: SpectrumModel, errors: SpectrumModel, covariance: FloatArray, process: ARModel
-) -> IdentifiedTurbulence:
-    """Return the parameters of the turbulence; the error of its rms is by differences."""
-    theta, rate = spectrum.pack(), process.frame_rate_hz
-
-    def rms(change: FloatArray) -> float:
-        return _turbulence_process(spectrum.unpack(theta + change), rate).rms_nm
-
-    steps = DIFFERENCE * np.eye(theta.size)
-    slope = np.log([rms(step) / rms(-step) for step in steps]) / (2 * DIFFERENCE)
-    turbulence, error, to_hz = spectrum.components[0], errors.components[0], rate / (2 * np.pi)
-    corner = float(np.exp(spectrum.log_corner)) * to_hz if spectrum.rolls_off else None
-    return IdentifiedTurbulence(
-        frequency_hz=turbulence.frequency * to_hz,
-        frequency_error_hz=turbulence.frequency * to_hz * error.log_frequency,
-        damping=turbulence.damping_ratio,
-        damping_error=turbulence.damping_ratio * turbulence.damping_slope * error.damping,
-        corner_hz=corner,
-        corner_error_hz=None if corner is None else corner * errors.log_corner,
+    line: IdentifiedLine, spectrum: SpectrumModel, errors: SpectrumModel, process: ARModel
+) -> IdentifiedLine:
+    """Return the first component as turbulence, with the rms of its process, and its corner."""
+    corner = float(np.exp(spectrum.log_corner)) * process.frame_rate_hz / (2 * np.pi)
+    return replace(
+        line,
+        kind="turbulence",
         rms_nm=process.rms_nm,
-        rms_error_nm=process.rms_nm * float(np.sqrt(slope @ covariance @ slope)),
+        rms_error_nm=process.rms_nm * line.rms_error_nm / line.rms_nm,
+        corner_hz=corner if spectrum.rolls_off else None,
+        corner_error_hz=corner * errors.log_corner if spectrum.rolls_off else None,
     )
 
 
