@@ -36,9 +36,7 @@ from lbt_synth.identification.prediction.comparison import (
 )
 from lbt_synth.identification.prediction.forward_chaining import (
     ForwardSplit,
-    compare_on_splits,
-    forward_split,
-    record_splits,
+    forward_chain,
 )
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
@@ -429,14 +427,11 @@ def choose_method(
     def build(name: str, split: ForwardSplit) -> Design:
         return design(name, split.model, method_named(name).reference_options)
 
-    def splits() -> Iterator[ForwardSplit]:
-        for i, (training, test) in enumerate(record_splits(record, _SPLITS)):
-            past = half if i == 0 else identify_past(stretches=training, start=half)
-            yield forward_split(record, training, test, model=past)
-
     tried = {name: partial(build, name) for name in quick_methods()}
     try:
-        residuals, left_out = compare_on_splits(splits(), tried)
+        residuals, left_out = forward_chain(
+            record, tried, splits=_SPLITS, first_model=half, identify_past=identify_past
+        )
     except LbtSynthError as error:
         note = f"the methods were not compared: {error}"
         return MethodChoice(method=default_method(), rows=(), notes=(note,))

@@ -7,8 +7,9 @@ all that compete on a split see the same pseudo-open-loop series and the same fr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -168,7 +169,8 @@ def forward_chain(
     *,
     splits: int = 3,
     first_share: float = 0.5,
-    progress: Callable[[int], None] | None = None,
+    first_model: IdentifiedModel | None = None,
+    identify_past: Callable[..., IdentifiedModel] | None = None,
     **options: Any,
 ) -> tuple[dict[str, ResidualEstimate], dict[str, str]]:
     """Design controllers from the past of a record, and compare them on what followed.
@@ -184,8 +186,11 @@ def forward_chain(
         Pairs of training and test.
     first_share : float, optional
         Part of the usable frames that the first pair trains on, in (0, 1); tests share the rest.
-    progress : callable, optional
-        Called with 1 after each split.
+    first_model : IdentifiedModel, optional
+        The model of the first training, if it is known.
+    identify_past : callable, optional
+        Identifies the ``stretches=`` of a later training from a model of its past, ``start=``;
+        :func:`identify` with the options by default.
     **options
         Those of :func:`identify`.
 
@@ -224,22 +229,15 @@ def forward_chain(
     (['filter', 'ran'], True)
     """
     pairs = record_splits(record, splits, first_share=first_share)
-    found = (forward_split(record, training, test, **options) for training, test in pairs)
-    return compare_on_splits(found, designs, progress=progress)
-
-
-def compare_on_splits(
-    splits: Iterable[ForwardSplit],
-    designs: Mapping[str, Callable[[ForwardSplit], Controller | Design]],
-    *,
-    progress: Callable[[int], None] | None = None,
-) -> tuple[dict[str, ResidualEstimate], dict[str, str]]:
-    """Compare designs as :func:`forward_chain` does, on splits that are already identified."""
+    model, identified = first_model, identify_past or partial(identify, record, **options)
     measured: dict[str, list[FloatArray]] = {name: [] for name in designs}
     failures: dict[str, str] = {}
     stretches: Stretches = ()
     noise, frames = list[FloatArray](), list[int]()
-    for split in splits:
+    for training, test in pairs:
+        if model is None or stretches:
+            model = identified(stretches=training, start=model)
+        split = forward_split(record, training, test, model=model, **options)
         for name, build in designs.items():
             if name in failures:
                 continue
@@ -251,8 +249,6 @@ def compare_on_splits(
         stretches += split.test
         noise.append(split.noise_nm2)
         frames.append(sum(stop - start for start, stop in split.test))
-        if progress is not None:
-            progress(1)
     if failures.keys() == designs.keys():
         reasons = "; ".join(f"{name}: {why}" for name, why in failures.items())
         raise ProblemError(f"no design can be compared on this record: {reasons or 'none given.'}")
