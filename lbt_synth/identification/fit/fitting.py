@@ -75,7 +75,6 @@ class Search:
     lowest_line_hz: float = LOWEST_LINE_HZ  # below, a component belongs to the turbulence
     most_lines: int = MOST_LINES
     announced: Sequence[tuple[float, float]] = ()  # (frequency, error) of known lines [Hz]
-    colour: float = 0.0  # of the noise, where a fit begins; 0 for white noise
     starting_gains: tuple[float, ...] = (0.6, 0.35, 1.0)  # of the sensor, where it is found
 
     def __post_init__(self) -> None:
@@ -212,13 +211,10 @@ def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel
 
 def simplify(search: Search, model: FittedModel) -> FittedModel:
     """Return the model without roll-off or colour, where that adds too little."""
-    if model.spectrum.rolls_off:
-        less = fit(search, model.spectrum.without_roll_off())
-        if less is not None and less.contrast - model.contrast < search.price / PARAMETERS:
-            model = less
-    if model.spectrum.colour:
-        less = fit(search, replace(model.spectrum, colour=0.0))
-        if less is not None and less.contrast - model.contrast < CHEAP:
+    for leave_out in (SpectrumModel.without_roll_off, SpectrumModel.without_colour):
+        plainer = leave_out(model.spectrum)
+        less = None if plainer == model.spectrum else fit(search, plainer)
+        if less is not None and cost(search, less) < cost(search, model):
             model = less
     return model
 
@@ -306,15 +302,15 @@ def close_line(
 
 
 def cost(search: Search, model: FittedModel) -> float:
-    """Return the contrast of a model plus what the criterion asks for its components."""
+    """Return the contrast of a model plus what the criterion asks for all that it has."""
     spectrum = model.spectrum
     first, *rest = spectrum.components
     # the same for any order of the search
     rest = sorted(rest, key=lambda component: component.log_frequency)
-    spectrum, others = replace(spectrum, components=(first, *rest)), range(1, 1 + len(rest))
-    return model.contrast + sum(
-        required_evidence(search, spectrum, i, earlier=True) for i in others
-    )
+    ordered, others = replace(spectrum, components=(first, *rest)), range(1, 1 + len(rest))
+    prices = [required_evidence(search, ordered, i, earlier=True) for i in others]
+    shapes = CHEAP * bool(spectrum.colour) + search.price / PARAMETERS * spectrum.rolls_off
+    return model.contrast + sum(prices) + shapes
 
 
 def add_evidence(search: Search, model: FittedModel) -> FittedModel:

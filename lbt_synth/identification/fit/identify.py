@@ -34,8 +34,8 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedModel,
 )
 from lbt_synth.identification.fit.order_search import (
-    find_coloured_rival,
     find_components,
+    is_coloured_rival,
     search_models,
     try_other_gains,
 )
@@ -418,8 +418,7 @@ def find_axis(
     model, near = _compare_gains(search, model, rivals, start)
     own = model.spectrum
     own_error = _gain_error(model)
-    coloured = find_coloured_rival(search, model, own_error)
-    near += [] if coloured is None else [coloured]
+    near += [rival for rival in rivals if is_coloured_rival(model, rival, own_error)]
     away = max((abs(each.spectrum.log_gain - own.log_gain) for each in near), default=0.0)
     colours = np.tanh([own.colour, *(each.spectrum.colour for each in near)])
     unknown = float(np.ptp(colours))  # correlation of the noise

@@ -55,27 +55,32 @@ Excess = tuple[float, Component]  # what it would add to the log-likelihood, and
 
 
 def search_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
-    """Find the model of one axis, and its rival where noise of another colour may explain it.
+    """Find the model of one axis, and its rivals with noise that is not white.
 
-    A start has been found in earlier data: there is little left to find.
+    A start has been found in earlier data: there is little left to find. A rival is searched for
+    further where it may explain wide components or a wrong gain.
     """
-    models = [find_components(search, start)]
-    coloured = _find_coloured(search, models[0]) if start is None else None
-    if coloured is not None:
+    model = find_components(search, start)
+    models, spectrum = [model], model.spectrum
+    coloured = fitting.fit(search, replace(spectrum, colour=_COLOUR))
+    if coloured is not None and not spectrum.colour:
+        plain = start is not None or all(c.is_narrow for c in spectrum.components[1:])
         models.append(coloured)
+        if not plain or fitting.cost(search, coloured) < fitting.cost(search, model):
+            models.append(find_components(search, coloured.spectrum))
         models.sort(key=lambda trial: _cost_of_noise(search, trial))
     return [fitting.add_evidence(search, models[0]), *models[1:]]
 
 
-def _find_coloured(search: Search, model: FittedModel) -> FittedModel | None:
-    """Return a model of coloured noise, where that may explain wide components or a wrong gain."""
-    near = fitting.fit(search, replace(model.spectrum, colour=_COLOUR))
-    if near is None:
-        return None
-    plain = all(c.is_narrow for c in model.spectrum.components[1:])
-    if plain and model.contrast - near.contrast <= fitting.CHEAP:
-        return None
-    return find_components(search, near.spectrum)
+def is_coloured_rival(model: FittedModel, rival: FittedModel, gain_error: float) -> bool:
+    """Whether a model of coloured noise is likelier than one of white noise, and its gain far away.
+
+    Sensors and filters make neighbouring frames alike, hardly ever opposite.
+    """
+    own, other = model.spectrum, rival.spectrum
+    is_far = abs(other.log_gain - own.log_gain) > _FAR_GAIN * gain_error
+    is_likelier = model.contrast - rival.contrast >= _SIGNIFICANT
+    return not own.colour and 0 < other.colour < _MOST_COLOUR and is_likelier and is_far
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
@@ -85,8 +90,7 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
     """
     spectrum = model.spectrum
     wide = sum(not c.is_narrow for c in spectrum.lines)
-    coloured = fitting.CHEAP * bool(spectrum.colour)
-    return _cost_with_gain(search, model) + search.price * wide + coloured
+    return _cost_with_gain(search, model) + search.price * wide
 
 
 def _cost_with_gain(search: Search, model: FittedModel) -> float:
@@ -111,7 +115,7 @@ def try_other_gains(
     for gain, colour in product(search.starting_gains, sorted({spectrum.colour, 0.0})):
         if colour == spectrum.colour and abs(np.log(gain) - spectrum.log_gain) < _SAME_GAIN:
             continue
-        begin = replace(search, gain=gain, colour=colour)
+        begin = replace(search, gain=gain)
         try:
             known = replace(spectrum, colour=colour)
             held = find_components(begin, known, moves=False)
@@ -132,24 +136,6 @@ def try_other_gains(
     if best is not model:
         best = fitting.add_evidence(search, fitting.prune(search, best, thorough=True))
     return best, near
-
-
-def find_coloured_rival(
-    search: Search, model: FittedModel, gain_error: float
-) -> FittedModel | None:
-    """Return the likelier model of coloured noise, if it moves the gain of a white one far.
-
-    Sensors and filters make neighbouring frames alike, hardly ever opposite.
-    """
-    spectrum = model.spectrum
-    if spectrum.colour:
-        return None
-    made = fitting.fit(search, replace(spectrum, colour=_COLOUR))
-    if made is None or not 0 < made.spectrum.colour < _MOST_COLOUR:
-        return None
-    is_likelier = model.contrast - made.contrast >= _SIGNIFICANT
-    is_far = abs(made.spectrum.log_gain - spectrum.log_gain) > _FAR_GAIN * gain_error
-    return made if is_likelier and is_far else None
 
 
 def find_components(
@@ -179,8 +165,8 @@ def find_components(
             break
         model = better
     if abs(model.spectrum.colour) > _MOST_COLOUR:
-        white = None if start is None else replace(start, colour=0.0)
-        return find_components(replace(search, colour=0.0), white, rounds=rounds, moves=moves)
+        white = None if start is None else start.without_colour()
+        return find_components(search, white, rounds=rounds, moves=moves)
     model = fitting.prune(search, fitting.simplify(search, model), thorough=moves)
     return _restore_turbulence(search, model)
 
@@ -227,8 +213,7 @@ def _other_backgrounds(
     search: Search, spectrum: SpectrumModel, lines: Sequence[Component], *, drifts: bool
 ) -> list[SpectrumModel]:
     """Return the model with turbulence fitted afresh beside its lines."""
-    known = replace(search, colour=spectrum.colour)
-    ground = fit_background(known, spectrum.gain, lines, drifts=drifts)
+    ground = fit_background(search, spectrum.gain, lines, drifts=drifts, colour=spectrum.colour)
     return [] if ground is None else [ground.spectrum.add(*lines)]
 
 
@@ -343,7 +328,12 @@ def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
 
 
 def fit_background(
-    search: Search, gain: float, lines: Sequence[Component] = (), *, drifts: bool = False
+    search: Search,
+    gain: float,
+    lines: Sequence[Component] = (),
+    *,
+    drifts: bool = False,
+    colour: float = 0.0,
 ) -> FittedModel | None:
     """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles.
 
@@ -357,7 +347,7 @@ def fit_background(
     white = max(float(np.median(d[f >= 0.6 * f[-1]])) * rate / 2, float(np.finfo(float).tiny))
     known = replace(search, gain=gain)
     corner = known.log_angle(fitting.STARTING_CORNER_HZ)
-    ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), search.colour, corner, ())
+    ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), colour, corner, ())
     held = density(smooth, ground.alone(*lines))
     slow = max(float(np.trapezoid(np.maximum(d - held, 0), f)) - white, 0.1 * white)
     if drifts:

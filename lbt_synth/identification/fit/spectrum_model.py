@@ -156,7 +156,11 @@ class SpectrumModel:
 
     def without_roll_off(self) -> SpectrumModel:
         """Return the model with turbulence that does not roll off."""
-        return replace(self, log_corner=float(np.log(2 * _NO_CORNER)))
+        return replace(self, log_corner=float(np.log(2 * _NO_CORNER))) if self.rolls_off else self
+
+    def without_colour(self) -> SpectrumModel:
+        """Return the model with white noise."""
+        return replace(self, colour=0.0)
 
     @property
     def rolling(self) -> Kind:
