@@ -182,7 +182,7 @@ def test_where_nothing_can_be_gained():
     found = line_diagnosis()
     best = found.row(found.best)
     entries = tuple(
-        replace(entry, replayed=best.replayed) if entry.name == "what ran" else entry
+        replace(best, name="what ran") if entry.name == "what ran" else entry
         for entry in found.comparison.entries
     )
     same = replace(found, comparison=replace(found.comparison, entries=entries))
@@ -193,7 +193,7 @@ def test_where_the_gain_is_what_is_wrong():
     found = line_diagnosis()
     best = found.row(found.best)
     entries = tuple(
-        replace(entry, replayed=best.replayed) if entry.name == "best integrator" else entry
+        replace(best, name=entry.name) if entry.name == "best integrator" else entry
         for entry in found.comparison.entries
     )
     tuned = replace(found, comparison=replace(found.comparison, entries=entries))
