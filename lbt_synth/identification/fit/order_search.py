@@ -49,7 +49,6 @@ _BANDS = 80
 _GAINS = (2 * GAINS["above"], GAINS["below"] / 2)
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
-_TINY = 1e-300
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
@@ -279,7 +278,7 @@ def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
     power, model = data.power(spectrum.gain), density(data, spectrum)
     out = []
     for worth, *ends in _excess_bands(data, power / model, least=search.price, most=room):
-        component = _band_component(search, power, model, *ends)
+        component = _highest_excess(search, power, model, slice(*ends), _WIDEST)
         if search.place(component)[0] < search.lowest_line_hz:
             slow = search.component("slow", search.place(component)[0], _WIDEST, 1.0)
             component = replace(slow, log_power=component.log_power)
@@ -301,12 +300,10 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     lowest = min(max(centre - reach, search.lowest_line_hz), centre)
     start, stop = np.searchsorted(data.frequency_hz, [lowest, centre + reach])
     rest = density(data, spectrum.exchange(i))
-    power, near = data.power(spectrum.gain), data.take(slice(int(start), int(stop)))
-    ratio = power[start:stop] / rest[start:stop]
-    for _, first, last in _excess_bands(near, ratio, least=0.0, most=1):
-        again = _band_component(search, power, rest, start + first, start + last)
-        if abs(search.place(again)[0] - centre) > 0.5 * half + step:
-            yield spectrum.exchange(i, replace(again, announced=line.announced))
+    band = slice(int(start), int(stop))
+    again = _highest_excess(search, data.power(spectrum.gain), rest, band, 0.5)
+    if abs(search.place(again)[0] - centre) > 0.5 * half + step:
+        yield spectrum.exchange(i, replace(again, announced=line.announced))
     if half > 3 * step and len(spectrum.lines) < search.most_lines:
         lower, upper = (
             line.shift(float(np.log(1 + side * half / centre)), _HALF, _HALF) for side in (-1, 1)
@@ -430,13 +427,29 @@ def _excess_bands(
     return apart[:most]
 
 
-def _band_component(
-    search: Search, power: FloatArray, model: FloatArray, start: int, stop: int
+def _highest_excess(
+    search: Search, power: FloatArray, model: FloatArray, band: slice, widest: float
 ) -> Component:
-    """Return a line of the place, width and variance of the excess in a band of bins."""
-    data, band = search.data, slice(start, stop)
-    excess = np.maximum(power[band] - model[band], 0)
-    frequency = float(np.average(data.frequency_hz[band], weights=excess + _TINY))
-    variance = max(float(np.sum(excess)), float(np.min(model[band]))) * data.step_hz
-    ratio = 0.5 * (stop - start) * data.step_hz / frequency
-    return search.component("line", frequency, float(np.clip(ratio, _NARROWEST, _WIDEST)), variance)
+    """Return a line of the place, width and variance of the highest excess in a band of bins."""
+    data, excess = search.data, power[band] - model[band]
+    count = max(1, excess.size // 2).bit_length()
+    each = [(2**k, _moving_mean(excess, 2**k)) for k in range(count)]
+    # the smoothing at which the peak is highest over its scatter, which falls with its root
+    _, smooth = max(each, key=lambda one: float(np.max(one[1])) * np.sqrt(one[0]))
+    peak = int(np.argmax(smooth))
+    low_enough = np.flatnonzero(smooth <= 0.5 * smooth[peak])
+    low = low_enough[low_enough <= peak].max(initial=0)
+    high = low_enough[low_enough >= peak].min(initial=smooth.size - 1)
+    half = max(0.5 * float(high - low - 1), 0.5) * data.step_hz
+    height = max(float(smooth[peak]), float(np.min(model[band])))
+    frequency = float(data.frequency_hz[band.start + peak])
+    ratio = min(max(half / frequency, _NARROWEST), widest)
+    return search.component("line", frequency, ratio, np.pi * half * height)
+
+
+def _moving_mean(series: FloatArray, width: int) -> FloatArray:
+    """Return the mean over a width around each value, (n,), with zeros beyond the ends."""
+    total = np.cumsum(np.append(0.0, series))
+    last = np.arange(series.size) + (width - 1) // 2 + 1
+    first = np.maximum(last - width, 0)
+    return np.asarray((total[np.minimum(last, series.size)] - total[first]) / width)
