@@ -316,7 +316,7 @@ def studied(seed: int, frames: int) -> dict:
     half, other = lbt.identification.split_halves(it.record.stretches(), it.record.frames)
     halved = lbt.identify(it.record, stretches=half)
     gain = halved.sensor_gains[0]
-    predictor = lbt.identification.least_squares_predictor(
+    predictor, _ = lbt.identification.least_squares_predictor(
         it.record.pseudo_open_loop(gain),
         it.path,
         taps=32,
@@ -335,7 +335,7 @@ def studied(seed: int, frames: int) -> dict:
             stretches=it.record.stretches(),
             test=other,
         ).total_nm2
-        for controller in (half_filter, predictor.controller)
+        for controller in (half_filter, predictor)
     ]
     error = axis.sensor_gain_error
     return {
@@ -345,7 +345,7 @@ def studied(seed: int, frames: int) -> dict:
         "errors": deviations(it, axis),
         "ratio": left(it, filter_.controller) / best,
         "limit": left(it, filter_.controller) / limit,
-        "half_ratio": left(it, half_filter) / left(it, predictor.controller),
+        "half_ratio": left(it, half_filter) / left(it, predictor),
         "replay_ratio": replays[0] / replays[1],
         "gain": axis.sensor_gain / it.truth.sensor_gain - 1,
         "gain_deviation": np.nan

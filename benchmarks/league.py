@@ -269,7 +269,7 @@ def fir_predictor(split: lbt.identification.ForwardSplit, taps: int) -> lbt.Cont
     """Return the best FIR predictor of the training."""
     return lbt.identification.least_squares_predictor(
         split.open_loop, split.hardware, taps=taps, stretches=split.training
-    ).controller
+    )[0]
 
 
 ENTRIES: dict[str, Callable[[lbt.identification.ForwardSplit], lbt.Controller | lbt.Design]] = {

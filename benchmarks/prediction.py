@@ -124,13 +124,13 @@ def predictors() -> None:
     z, limit = open_loop(y, u, model.hardware)[2:], lbt.kalman(model).rms
     for taps in (2, 4, 8, 16, 32, 64, 128):
         start = time.perf_counter()
-        fit = lbt.identification.least_squares_predictor(
+        controller, _ = lbt.identification.least_squares_predictor(
             z, model.hardware, taps=taps, stretches=[(0, len(z) // 2)]
         )
         took = time.perf_counter() - start
-        loop = lbt.close_loop(model.hardware, fit.controller)
+        loop = lbt.close_loop(model.hardware, controller)
         found = lbt.identification.replayed_residual(
-            z, fit.controller, model.hardware, noise_nm=15.5, test=[(len(z) // 2, len(z))]
+            z, controller, model.hardware, noise_nm=15.5, test=[(len(z) // 2, len(z))]
         )
         print(
             f"{taps} taps: {found.rms_nm:.2f} +- {found.rms_error_nm:.2f} nm on the data, "

@@ -197,7 +197,7 @@ def prediction_against_data(
             raise ProblemError(
                 f"a controller may not be called {name!r}; its row is taken. Give another name."
             )
-    predictor = least_squares_predictor(series, hardware, taps=taps, stretches=fitted).controller
+    predictor, _ = least_squares_predictor(series, hardware, taps=taps, stretches=fitted)
     chosen = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
     loops = {name: _close_stable_loop(plant, name, one) for name, one in chosen.items()}
     check_test(runs, tested)

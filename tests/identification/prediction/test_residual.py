@@ -380,7 +380,7 @@ def test_a_loop_that_never_forgets_keeps_its_frames_and_says_so():
     z = (a_series(SWELL, 9000, rng) + 4 * rng.standard_normal(9000))[:, None]
     quick, pole = lbt.kalman(plant), 0.99998
     # a correction of 0.1 of the mean over 50,000 frames, beside a FIR predictor of 3 frames
-    fit = lbt.identification.least_squares_predictor(z, ONE_MODE, taps=3).coefficients[0, 0]
+    fit = lbt.identification.least_squares_predictor(z, ONE_MODE, taps=3)[1][0, 0]
     A, B = np.diag([1.0, 1.0], -1)[:, :3], np.array([[1.0], [0.0], [0.0]])
     parameter = lbt.Controller(
         A=np.block([[A, np.zeros((3, 1))], [np.zeros((1, 3)), np.array([[pole]])]]),
