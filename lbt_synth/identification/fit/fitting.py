@@ -334,11 +334,13 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     centre, half = search.place(line)
     if half > 2 * step or centre <= 3 * step:
         return spectrum
-    moves = product(np.log1p(_SHIFTS * step / centre), _POWERS)
-    # the width stays
-    trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
     data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
-    lines = [component_density.__wrapped__(data, trial) for trial in trials]  # none comes again
-    model = density(data, spectrum.exchange(i)) + np.array(lines)
-    best = int(np.argmin(contrasts(data, spectrum.gain, model)))
-    return spectrum.exchange(i, trials[best])
+    rest = density(data, spectrum.exchange(i))
+    for shifts in (_SHIFTS, _SHIFTS / 8):  # the place of a sinusoid is known to a part of a bin
+        moves = product(np.log1p(shifts * step / centre), _POWERS)
+        # the width stays
+        trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
+        lines = [component_density.__wrapped__(data, trial) for trial in trials]  # none comes again
+        best = int(np.argmin(contrasts(data, spectrum.gain, rest + np.array(lines))))
+        line = trials[best]
+    return spectrum.exchange(i, line)
