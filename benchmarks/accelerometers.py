@@ -164,9 +164,9 @@ def examine(seed: int, frames: int) -> dict[str, list[float]]:
         out["motion"].append((row.motion_nm_per_nm - abs(factor)) / row.motion_error_nm_per_nm)
         out["phase"].append(off / row.phase_error_deg)
         out["error"].append(abs(row.motion_nm_per_nm / abs(factor) - 1))
-    out["by phases"] = [float(found.shift.by_phases)]
-    out["shift"] = [(found.shift.frames - it.late)] if found.shift.by_phases else []
-    out["shift errors"] = [x / found.shift.error_frames for x in out["shift"]]
+    out["by phases"] = [float(found.shift_by_phases)]
+    out["shift"] = [(found.shift_frames - it.late)] if found.shift_by_phases else []
+    out["shift errors"] = [x / found.shift_error_frames for x in out["shift"]]
     return out
 
 

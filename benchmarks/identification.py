@@ -5,7 +5,6 @@
     python benchmarks/identification.py --errors --colour 0.3 ...    with first-order noise
     python benchmarks/identification.py --errors --close ...         with pairs of close lines
     python benchmarks/identification.py --drifts    sinusoids and narrow resonances that drift
-    python benchmarks/identification.py --times
 
 One axis at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain 0.4 to
 1, noise 2 to 30 nm a frame (evenly in its logarithm). Even records: second-order turbulence of
@@ -29,8 +28,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit import both_axes
-from lbt_synth.identification.fit.line_drift import describe_drifts, measure_drift
+from lbt_synth.identification.fit import identify
+from lbt_synth.identification.fit.departures import describe_drifts, measure_drift
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -254,10 +253,6 @@ def deviations(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, l
         "one for several, rms": [
             (x.rms_nm - np.sum(power) ** 0.5) / x.rms_error_nm for x, _, power in merged
         ],
-        "one for several, strongest": [
-            (x.frequency_hz - f[int(np.argmax(power))]) / x.frequency_error_if_several_hz
-            for x, f, power in merged
-        ],
     }
 
 
@@ -321,7 +316,7 @@ def studied(seed: int, frames: int) -> dict:
     half, other = lbt.identification.split_halves(it.record.stretches(), it.record.frames)
     halved = lbt.identify(it.record, stretches=half)
     gain = halved.sensor_gains[0]
-    predictor = lbt.identification.least_squares_predictor(
+    predictor, _ = lbt.identification.least_squares_predictor(
         it.record.pseudo_open_loop(gain),
         it.path,
         taps=32,
@@ -340,7 +335,7 @@ def studied(seed: int, frames: int) -> dict:
             stretches=it.record.stretches(),
             test=other,
         ).total_nm2
-        for controller in (half_filter, predictor.controller)
+        for controller in (half_filter, predictor)
     ]
     error = axis.sensor_gain_error
     return {
@@ -350,7 +345,7 @@ def studied(seed: int, frames: int) -> dict:
         "errors": deviations(it, axis),
         "ratio": left(it, filter_.controller) / best,
         "limit": left(it, filter_.controller) / limit,
-        "half_ratio": left(it, half_filter) / left(it, predictor.controller),
+        "half_ratio": left(it, half_filter) / left(it, predictor),
         "replay_ratio": replays[0] / replays[1],
         "gain": axis.sensor_gain / it.truth.sensor_gain - 1,
         "gain_deviation": np.nan
@@ -467,7 +462,7 @@ def drifts() -> None:
             run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
         )
         for name, describe in (("fit", lambda model, *_: model), ("drift", describe_drifts)):
-            with mock.patch.object(both_axes, "describe_drifts", describe):
+            with mock.patch.object(identify, "describe_drifts", describe):
                 model = lbt.identify(record)
             left_nm2 = lbt.identification.replayed_residual(
                 record.pseudo_open_loop(0.8),
@@ -486,41 +481,6 @@ def drifts() -> None:
             print(f"  {drift_hz:4.2f} Hz, {name:5s} filter leaves {left_nm2**0.5:.2f} nm: {lines}")
 
 
-def times() -> None:
-    """Print the processor time of two axes of a minute with five lines."""
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2)
-    lines = tuple(
-        lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=r, direction=d)
-        for f, r, d in (
-            (13.0, 40.0, (1.0, 0.0)),
-            (31.0, 80.0, (1.0, 0.0)),
-            (74.0, 15.0, (1.0, 0.0)),
-            (22.0, 60.0, (0.0, 1.0)),
-            (110.0, 20.0, (0.0, 1.0)),
-        )
-    )
-    air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
-    truth = lbt.Truth(turbulence=air, vibrations=lines, noise_nm=10.0, sensor_gain=0.6)
-    run = lbt.simulate(
-        lbt.integrator(path, gain=0.5).controller, truth, hardware=path, frames=60_000
-    )
-    record = lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
-    )
-    lbt.identify(record)  # imports
-    begin = time.process_time()
-    model = lbt.identify(record)
-    middle = time.process_time()
-    lbt.kalman(model.plant())
-    end = time.process_time()
-    lbt.design_from_record(record)
-    last = time.process_time()
-    print(f"lines found              {[len(axis.lines) for axis in model.axes]}")
-    print(f"identify, two axes       {middle - begin:.2f} s")
-    print(f"design                   {end - middle:.3f} s")
-    print(f"halves, test and design  {last - end:.2f} s")
-
-
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -529,13 +489,12 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--drifts", action="store_true", help="only sinusoids that drift")
-    parser.add_argument("--times", action="store_true", help="only the time of two axes")
     parser.add_argument("--errors", action="store_true", help="only the standard errors")
     parser.add_argument("--colour", type=float, default=0.0, help="of the noise, with --errors")
     parser.add_argument("--close", action="store_true", help="pairs of lines, with --errors")
     asked = parser.parse_args()
-    if asked.times or asked.drifts:
-        times() if asked.times else drifts()
+    if asked.drifts:
+        drifts()
         return
     study, show, options = studied, table, {}
     if asked.errors:

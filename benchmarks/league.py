@@ -33,7 +33,12 @@ import lbt_synth as lbt
 from lbt_synth.design.shaping.channel import Channel, laguerre_basis, orthonormal_basis
 from lbt_synth.design.shaping.reduction import WeightedResponse, fit_poles, starting_poles
 from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.prediction.residual import check_series, inverse_sensor, invert
+from lbt_synth.identification.prediction.residual import (
+    check_series,
+    estimate_residual,
+    inverse_sensor,
+    invert,
+)
 from lbt_synth.identification.stretches import Stretches, StretchesLike
 from lbt_synth.linear import Controller
 from lbt_synth.loop import youla_controller
@@ -44,7 +49,6 @@ CHANGES = ("none", "wind", "seeing", "drifting", "dying", "flux", "gain")
 DELAY, GAIN = 2, 0.35
 AR_ORDER = 20  # of the predictor, as pyRTC's default
 GAIN_TOLERANCE = 1e-3  # of the search for the best integrator
-CHUNK_S = 0.05  # of the squares whose differences are paired
 NEAR = 0.01  # of the best residual: as good as the best
 RATE_HZ = 800.0  # of the loops for --errors
 SHIFT_HZ = 0.5  # of the lines of the wrong model
@@ -265,7 +269,7 @@ def fir_predictor(split: lbt.identification.ForwardSplit, taps: int) -> lbt.Cont
     """Return the best FIR predictor of the training."""
     return lbt.identification.least_squares_predictor(
         split.open_loop, split.hardware, taps=taps, stretches=split.training
-    ).controller
+    )[0]
 
 
 ENTRIES: dict[str, Callable[[lbt.identification.ForwardSplit], lbt.Controller | lbt.Design]] = {
@@ -282,10 +286,13 @@ ENTRIES: dict[str, Callable[[lbt.identification.ForwardSplit], lbt.Controller | 
 }
 
 
-def relative_residual(pair: lbt.identification.PairedResiduals, name: str) -> tuple[float, float]:
+def relative_residual(
+    residuals: dict[str, lbt.identification.ResidualEstimate], name: str
+) -> tuple[float, float]:
     """Return a measured residual over the least one, less 1, and its standard error."""
-    least = pair.measured_nm2(pair.best)
-    difference, error = pair.above(name, pair.best)
+    best = next(iter(residuals.values()))
+    least = best.measured_nm2
+    difference, error = residuals[name].above(best)
     ratio = np.sqrt(1 + difference / least)
     return ratio - 1, error / (2 * ratio * least)
 
@@ -295,19 +302,19 @@ def play(records: dict[str, lbt.identification.LoopRecord], splits: int) -> None
     chains = {}
     for name, record in records.items():
         try:
-            chains[name] = lbt.identification.forward_chain(record, ENTRIES, splits=splits)
+            chain = lbt.identification.forward_chain(record, ENTRIES, splits=splits)
         except lbt.LbtSynthError as error:
             print(f"{name} is not in the table: {error}")
             continue
-        for entry, why in chains[name].failures.items():
+        chains[name], failures = chain
+        for entry, why in failures.items():
             print(f"{entry} is not in the table of {name}: {why}")
     rows = []
     for entry in ENTRIES:
-        pairs = chains
         ratios = {
-            name: relative_residual(pair, entry)
-            for name, pair in pairs.items()
-            if entry in pair.squares_nm2
+            name: relative_residual(residuals, entry)
+            for name, residuals in chains.items()
+            if entry in residuals
         }
         if ratios:
             above, errors = np.array(list(ratios.values())).T
@@ -344,13 +351,6 @@ def draw_plant(rng, shift_hz: float = 0.0) -> lbt.models.TipTiltPlant:
     )
 
 
-def chunk_squares(measured) -> np.ndarray:
-    """Return the mean squares of chunks, (chunks,), of a residual (frames, 1)."""
-    size = round(CHUNK_S * RATE_HZ)
-    count = len(measured) // size
-    return np.mean(measured[: count * size, 0].reshape(count, size) ** 2, axis=1)
-
-
 def deviations(seed: int, frames: int) -> dict[str, float]:
     """Return how many standard errors two measured differences are from the truth."""
     plant = draw_plant(np.random.default_rng([3, seed]))
@@ -365,19 +365,20 @@ def deviations(seed: int, frames: int) -> dict[str, float]:
         "lines 0.5 Hz off": lbt.kalman(wrong),
         "integrator": lbt.design.model_integrator(plant),
     }
-    chunks, exact = {}, {}
+    left, exact = {}, {}
     for name, design in designs.items():
         run = lbt.simulate(
             design.controller, truth, hardware=plant.hardware, frames=frames, seed=seed,
             settle_frames=8000,
         )  # fmt: skip
-        chunks[name] = chunk_squares(run.measurements[0])
+        left[name] = estimate_residual(
+            run.measurements[0], ((0, frames),), plant.R, np.zeros((1, 1))
+        )
         loop = lbt.close_loop(plant.hardware, design.controller)
         exact[name] = lbt.residual_budget(loop, truth, frame_means=True).rms_nm ** 2
-    pair = lbt.identification.PairedResiduals(squares_nm2=chunks)
     found = {}
     for name in ("lines 0.5 Hz off", "integrator"):
-        difference, error = pair.above(name, "exact")
+        difference, error = left[name].above(left["exact"])
         found[name] = (difference - exact[name] + exact["exact"]) / error
     return found
 

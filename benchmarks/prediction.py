@@ -69,11 +69,12 @@ def identity() -> None:
 
 
 def show(table: lbt.identification.PredictionTable) -> None:
-    for row, entry in zip(table.rows(), table.entries, strict=True):
-        name, tip, tilt, data, error, model, ratio, seen, promised = row
+    for row in table.entries:
+        tip, tilt = row.model_axis_nm if row.replayed is None else row.replayed.axis_rms_nm
         print(
-            f"| {name} | {tip:.1f}, {tilt:.1f} | {data:.1f} +- {error:.1f} | {model:.1f} | "
-            f"{ratio:.3f} | {entry.deviations:+.1f} | {100 * seen:.1f} | {100 * promised:.1f} |"
+            f"| {row.name} | {tip:.1f}, {tilt:.1f} | {row.replayed_nm:.1f} +- "
+            f"{row.replayed_error_nm:.1f} | {row.model_nm:.1f} | {row.ratio:.3f} | "
+            f"{row.deviations:+.1f} | {100 * row.strehl:.1f} | {100 * row.model_strehl:.1f} |"
         )
     print(f"fit {table.fit}, test {table.test}, {table.warm_up_frames} frames to warm up")
 
@@ -123,13 +124,13 @@ def predictors() -> None:
     z, limit = open_loop(y, u, model.hardware)[2:], lbt.kalman(model).rms
     for taps in (2, 4, 8, 16, 32, 64, 128):
         start = time.perf_counter()
-        fit = lbt.identification.least_squares_predictor(
+        controller, _ = lbt.identification.least_squares_predictor(
             z, model.hardware, taps=taps, stretches=[(0, len(z) // 2)]
         )
         took = time.perf_counter() - start
-        loop = lbt.close_loop(model.hardware, fit.controller)
+        loop = lbt.close_loop(model.hardware, controller)
         found = lbt.identification.replayed_residual(
-            z, fit.controller, model.hardware, noise_nm=15.5, test=[(len(z) // 2, len(z))]
+            z, controller, model.hardware, noise_nm=15.5, test=[(len(z) // 2, len(z))]
         )
         print(
             f"{taps} taps: {found.rms_nm:.2f} +- {found.rms_error_nm:.2f} nm on the data, "

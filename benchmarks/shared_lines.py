@@ -27,7 +27,7 @@ import numpy as np
 from identification import coverage
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit import both_axes
+from lbt_synth.identification.fit import identify
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -252,7 +252,7 @@ def reach_hz(line: lbt.Vibration) -> float:
 def studied(kind: str, seed: int, frames: int) -> dict:
     """Everything that is measured of one record."""
     truth, record = run_loop(kind, seed, frames)
-    couple, alone = both_axes.couple_axes, {}
+    couple, alone = identify.couple_axes, {}
 
     def watched(record, axes, *rest):
         begin = time.process_time()
@@ -260,7 +260,7 @@ def studied(kind: str, seed: int, frames: int) -> dict:
         alone.update(axes=tuple(axes), seconds=time.process_time() - begin)
         return out
 
-    with mock.patch.object(both_axes, "couple_axes", watched):
+    with mock.patch.object(identify, "couple_axes", watched):
         model = lbt.identify(record)
     separate = replace(model, axes=alone["axes"], shared=())
     facts, false = judged(truth, model, kind)

@@ -11,10 +11,9 @@ from lbt_synth.cli.progress import count_progress
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, design_from_record
 from lbt_synth.identification.auto import LEAST_SECONDS, MethodChoice, RecordedDesign
-from lbt_synth.identification.prediction.comparison import RAN, ResidualRow
+from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fill_row
 
 
 def run(arguments: Namespace) -> Report:
@@ -76,7 +75,7 @@ def _add_comparison(
     report.add_rows(
         "held_out",
         f"Residual on the second half of the record, by models of the first; {imaging.label}",
-        [fill_row(ResidualRow, entry) for entry in table.entries],
+        list(table.entries),
     )
     report.notes += [f"note: {note}" for note in table.notes]
     best = table[found.name]

@@ -30,10 +30,10 @@ def run(arguments: Namespace) -> Report:
     loop_records.add_model(report, model)
     found: AccelerometerTransfers | None = None
     if arguments.accelerometers is not None and isinstance(record, LoopRecord):
-        readings = loop_records.read_accelerations(arguments, record)
-        found = accelerometer_transfers(model, record, readings.values, channels=readings.channels)
+        channels, values, notes = loop_records.read_accelerations(arguments, record)
+        found = accelerometer_transfers(model, record, values, channels=channels)
         loop_records.add_accelerometers(report, found)
-        report.notes += [f"note: {note}." for note in readings.notes]
+        report.notes += [f"note: {note}." for note in notes]
     report.notes += [loop_records.marked_note(note) for note in notes]
     loop_records.write_files(report, places, arguments, record, model, accelerometers=found)
     return report

@@ -26,7 +26,12 @@ from lbt_synth.identification import (
     load_record,
     require_length,
 )
-from lbt_synth.identification.accelerometers.readings import Readings, fill_missing, load_readings
+from lbt_synth.identification.accelerometers.readings import (
+    Readings,
+    fill_missing,
+    lay_beside,
+    load_readings,
+)
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.identification.commands.verdict import (
     CommandRepair,
@@ -220,7 +225,8 @@ def _expected_lines(
                 "accelerometers are compared with the recorded series; got a spectrum. Give their "
                 "lines by --lines-hz."
             )
-        values, known = fill_missing(read_accelerations(arguments, record).beside(record.frames))
+        _, readings, _ = read_accelerations(arguments, record)
+        values, known = fill_missing(lay_beside(readings, record.frames))
         lines += accelerometer_lines(
             values, record.pseudo_open_loop(), record.frame_rate_hz, usable=record.usable & known
         )
@@ -242,7 +248,9 @@ def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
     if found.transfers:
         report.add_rows("accelerometer_lines", "Accelerometers and lines", found.transfers)
     report.add_rows("accelerometers", "Accelerometers", found.channels)
-    report.data["accelerometer_shift"] = asdict(found.shift)
+    report.data["accelerometer_shift"] = {
+        name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames", "by_phases")
+    }
     report.notes.append(f"note: {found.shift_text}")
 
 

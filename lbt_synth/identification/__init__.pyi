@@ -7,16 +7,14 @@ from .commands.control_law import record_control_law as record_control_law
 from .commands.verdict import CommandRepair as CommandRepair
 from .diagnosis.diagnosis import Diagnosis as Diagnosis
 from .diagnosis.diagnosis import diagnose as diagnose
-from .fit.axis import identify_axis as identify_axis
-from .fit.both_axes import identify as identify
 from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
 from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
+from .fit.identify import identify as identify
 from .likeliest_gain import allowed_gains as allowed_gains
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .prediction.forward_chaining import ForwardSplit as ForwardSplit
-from .prediction.forward_chaining import PairedResiduals as PairedResiduals
 from .prediction.forward_chaining import forward_chain as forward_chain
 from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import ResidualEstimate as ResidualEstimate

@@ -36,11 +36,9 @@ from lbt_synth.identification.prediction.comparison import (
 )
 from lbt_synth.identification.prediction.forward_chaining import (
     ForwardSplit,
-    PairedResiduals,
-    compare_on_splits,
-    forward_split,
-    record_splits,
+    forward_chain,
 )
+from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
@@ -429,41 +427,38 @@ def choose_method(
     def build(name: str, split: ForwardSplit) -> Design:
         return design(name, split.model, method_named(name).reference_options)
 
-    def splits() -> Iterator[ForwardSplit]:
-        for i, (training, test) in enumerate(record_splits(record, _SPLITS)):
-            past = half if i == 0 else identify_past(stretches=training, start=half)
-            yield forward_split(record, training, test, model=past)
-
     tried = {name: partial(build, name) for name in quick_methods()}
     try:
-        chain = compare_on_splits(splits(), tried)
+        residuals, left_out = forward_chain(
+            record, tried, splits=_SPLITS, first_model=half, identify_past=identify_past
+        )
     except LbtSynthError as error:
         note = f"the methods were not compared: {error}"
         return MethodChoice(method=default_method(), rows=(), notes=(note,))
-    chosen, failures = default_method(), dict(chain.failures)
-    for name in _better_methods(chain):
+    chosen, failures = default_method(), dict(left_out)
+    for name in _better_methods(residuals):
         if is_safe(design(name, half, method_named(name).reference_options)):
             chosen = name
             break
         failures[name] = "its loop is unstable at a sensor gain that the record allows"
-    return _describe_choice(chosen, chain, failures)
+    return _describe_choice(chosen, residuals, failures)
 
 
-def _better_methods(residuals: PairedResiduals) -> list[str]:
+def _better_methods(residuals: Mapping[str, ResidualEstimate]) -> list[str]:
     """Return the methods that leave clearly less than the default, the best first."""
     usual = default_method()
-    if usual not in residuals.squares_nm2:
-        return list(residuals.names)
-    return [name for name in residuals.names if _is_better(residuals, name, usual)]
+    if usual not in residuals:
+        return list(residuals)
+    return [name for name, left in residuals.items() if _is_better(left, residuals[usual])]
 
 
-def _is_better(residuals: PairedResiduals, name: str, other: str) -> bool:
-    difference, error = residuals.above(other, name)
-    return difference > max(_ERRORS * error, _LEAST_SHARE * residuals.measured_nm2(other))
+def _is_better(one: ResidualEstimate, other: ResidualEstimate) -> bool:
+    difference, error = other.above(one)
+    return difference > max(_ERRORS * error, _LEAST_SHARE * other.measured_nm2)
 
 
 def _describe_choice(
-    chosen: str, residuals: PairedResiduals, failures: Mapping[str, str]
+    chosen: str, residuals: Mapping[str, ResidualEstimate], failures: Mapping[str, str]
 ) -> MethodChoice:
     """Return the choice with its table, and say by how much it is better."""
     title, usual = method_named(chosen).title, default_method()
@@ -471,20 +466,19 @@ def _describe_choice(
         f"the {method_named(name).title} is left out: {why.rstrip('.')}"
         for name, why in failures.items()
     ]
-    shown = [name for name in residuals.names if name not in failures]
+    shown = [name for name in residuals if name not in failures]
     if chosen not in shown:
         return MethodChoice(method=chosen, rows=(), notes=tuple(notes))
     rows = []
     for name in shown:
-        difference, error = residuals.above(name, chosen)
-        left = residuals.residual_nm2(name)
+        difference, error = residuals[name].above(residuals[chosen])
         rows.append(
             MethodRow(
                 name=method_named(name).title,
-                residual_nm=float(np.sqrt(left)) if left > 0 else float("nan"),
+                residual_nm=residuals[name].rms_nm,
                 above_nm2=difference,
                 above_error_nm2=error,
-                above=difference / residuals.measured_nm2(chosen),
+                above=difference / residuals[chosen].measured_nm2,
             )
         )
     if chosen == usual:
@@ -493,8 +487,8 @@ def _describe_choice(
             f"more than {_ERRORS:g} standard errors of the difference"
         )
     elif usual in shown:
-        difference, error = residuals.above(usual, chosen)
-        share = difference / residuals.measured_nm2(usual)
+        difference, error = residuals[usual].above(residuals[chosen])
+        share = difference / residuals[usual].measured_nm2
         word = (
             f"the {title} is chosen: of the frames after its training it leaves less than the "
             f"{method_named(usual).title}, by {nm_text(difference, error_nm=error, unit='nm^2')} "

@@ -21,9 +21,9 @@ from lbt_synth.identification.commands.control_law import record_control_law
 from lbt_synth.identification.commands.doubts import STEPPED, gain_dilution, rounding_share
 from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
 from lbt_synth.identification.commands.plausibility import could_have_run
-from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS, Search
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
+from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.storage.display_unit import nm_text

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import product
+from itertools import pairwise, product
 from typing import TypeAlias
+
+import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.validation import integer, number
@@ -35,9 +37,9 @@ def checked_stretches(stretches: StretchesLike | None, frames: int) -> Stretches
 
 
 def split_halves(
-    stretches: StretchesLike | None, frames: int, *, gap_frames: int = 0, fit_share: float = 0.5
+    stretches: StretchesLike | None, frames: int, *, fit_share: float = 0.5
 ) -> tuple[Stretches, Stretches]:
-    """Split a record into frames to fit and later frames to test on, with a gap between them.
+    """Split a record into frames to fit and later frames to test on.
 
     Parameters
     ----------
@@ -45,9 +47,6 @@ def split_halves(
         Contiguous usable frames, in order; None for the whole record.
     frames : int
         Frames of the record.
-    gap_frames : int, optional
-        Frames after the last one of the fit that neither half has, so that the test does not
-        know the end of the fit.
     fit_share : float, optional
         Part of the usable frames that is fitted, in (0, 1).
 
@@ -64,30 +63,47 @@ def split_halves(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> lbt.identification.split_halves([(0, 400), (500, 900)], 1000, gap_frames=20)
-    (((0, 400),), ((500, 900),))
-    >>> lbt.identification.split_halves(None, 1000, gap_frames=20)
-    (((0, 500),), ((520, 1000),))
+    >>> lbt.identification.split_halves([(0, 400), (500, 900)], 1000, fit_share=0.25)
+    (((0, 200),), ((200, 400), (500, 900)))
+    """
+    return forward_splits(stretches, frames, splits=1, first_share=fit_share)[0]
+
+
+def forward_splits(
+    stretches: StretchesLike | None, frames: int, *, splits: int = 3, first_share: float = 0.5
+) -> tuple[tuple[Stretches, Stretches], ...]:
+    """Divide a record into pairs of stretches, to train on and later ones to test on.
+
+    Stretches are contiguous usable frames (start, stop), in order; None is the whole record. The
+    first pair trains on ``first_share`` of the usable frames, in (0, 1); the rest is divided into
+    tests of equal length, which begin where their training ends.
     """
     pairs = checked_stretches(stretches, integer(frames, "frames", at_least=1))
-    gap = integer(gap_frames, "gap_frames", at_least=0)
-    share = number(fit_share, "fit_share", above=0, below=1)
-    wanted = int(share * sum(stop - start for start, stop in pairs))
-    fit, test, taken, end = [], [], 0, 0
-    for start, stop in pairs:
-        edge = min(start + wanted - taken, stop)
-        if edge > start:
-            fit.append((start, edge))
-            taken, end = taken + edge - start, edge
-        after = max(start, edge, end + gap)
-        if taken == wanted and after < stop:
-            test.append((after, stop))
-    if not fit or not test:
+    count = integer(splits, "splits", at_least=1)
+    share = number(first_share, "first_share", above=0, below=1)
+    usable = sum(stop - start for start, stop in pairs)
+    first = int(share * usable)  # as of split_halves
+    cuts = first + (usable - first) * np.arange(count + 1) // count
+    if cuts[0] < 1 or np.any(np.diff(cuts) < 1):
         raise ProblemError(
-            f"a record must leave frames to fit and to test on; got {len(fit)} stretches to fit "
-            f"and {len(test)} to test, of {frames} frames with a gap of {gap}. Record for longer."
+            f"a record must leave frames to train on and to test on; got {usable} usable frames "
+            f"for {count} splits. Record more, or split less."
         )
-    return tuple(fit), tuple(test)
+    return tuple(
+        (_cut(pairs, 0, int(start)), _cut(pairs, int(start), int(stop)))
+        for start, stop in pairwise(cuts)
+    )
+
+
+def _cut(stretches: Stretches, first: int, last: int) -> Stretches:
+    """Return the usable frames from one count of them to another."""
+    out, before = [], 0
+    for start, stop in stretches:
+        low, high = max(first - before, 0), min(last - before, stop - start)
+        if low < high:
+            out.append((start + low, start + high))
+        before += stop - start
+    return tuple(out)
 
 
 def split_frames(

@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design import FilterDesign, kalman
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
-from lbt_synth.identification.fit.axis import identify_axis
+from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
+from lbt_synth.identification.fit.identify import axis_periodogram, find_axis
 from lbt_synth.linear.block_filtering import last_state
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
@@ -42,9 +43,9 @@ class TrackingUpdate:
 class TrackingController:
     """A filter in the loop that is identified and designed again while it runs.
 
-    Every ``update_s`` seconds :func:`identify_axis` fits turbulence, lines and noise of each axis
-    to the last ``window_s`` seconds, from the last model; the sensor gain stays that of the plant.
-    The filter for them runs over the record, and takes over between two frames.
+    Every ``update_s`` seconds the fit of :func:`identify` finds turbulence, lines and noise of
+    each axis in the last ``window_s`` seconds, from the last model; the sensor gain stays that of
+    the plant. The filter for them runs over the record, and takes over between two frames.
 
     No update can stop the loop: if more than 1 % of the window's frames have no measurement, the
     fit fails, the design does not pass its certificate, or its loop would be unstable, the running
@@ -195,16 +196,11 @@ class TrackingController:
                 f"at most {100 * _MOST_SPOILT:g} % of a window's measurements may be missing; got "
                 f"{100 * share:.3g} %. The next window may have fewer."
             )
+        each = zip(self._measurements[rows].T, self._corrections[rows].T, strict=True)
+        periodograms = [axis_periodogram(y, c, hw.frame_rate_hz, None) for y, c in each]
         axes = tuple(
-            identify_axis(
-                self._measurements[rows, axis],
-                self._corrections[rows, axis],
-                frame_rate_hz=hw.frame_rate_hz,
-                sensor_gain=gain,
-                most_lines=self._most_lines,
-                start=last[axis],
-            )
-            for axis, gain in enumerate(self._gains)
+            find_axis(Search(data=data, gain=gain, most_lines=self._most_lines), start=start)
+            for data, gain, start in zip(periodograms, self._gains, last, strict=True)
         )
         model = IdentifiedModel(
             axes=axes,

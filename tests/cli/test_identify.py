@@ -182,7 +182,7 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     assert line["motion_nm_per_nm"] == pytest.approx(2, rel=0.05)
     assert [row["verdict"] for row in found["accelerometers"]] == [
         "used for 31.1 Hz",
-        "dead; adds nothing",
+        "dead",
     ]
     settings = lbt.load_config(tmp_path / "m.yaml").settings
     assert settings.sensors["accelerometer"].channels == ["m1"]

@@ -7,7 +7,6 @@ import pytest
 from support.identified_models import ONE_AXIS, SHELL, TILT, TIP, TWO, Line, Model, save_identified
 
 import lbt_synth as lbt
-from lbt_synth.identification.accelerometers.laying import ClockShift
 from lbt_synth.identification.accelerometers.transfers import (
     AccelerometerTransfers,
     ChannelRow,
@@ -160,7 +159,9 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
     found = AccelerometerTransfers(
         transfers=(row, replace(row, channel="m2", line=0, useful=False)),
         channels=tuple(ChannelRow(channel=name, noise_m_s2=2e-4, verdict="") for name in names),
-        shift=ClockShift(frames=age - 1, error_frames=0.1, by_phases=True),
+        shift_frames=age - 1,
+        shift_error_frames=0.1,
+        shift_by_phases=True,
         age_frames=age,
         rate_hz=1000.0,
     )

@@ -20,6 +20,7 @@ from lbt_synth.identification.prediction.forward_chaining import (
     forward_split,
     record_splits,
 )
+from lbt_synth.identification.prediction.residual import estimate_residual
 from lbt_synth.methods import method_named, registry
 from lbt_synth.methods.registry import default_method
 
@@ -147,8 +148,8 @@ def test_a_method_that_leaves_clearly_less_is_chosen(record, models):
             for make in (worse, lbt.kalman)
         ]
     bad, good = (np.mean(np.concatenate(left[i::2])) for i in range(2))
-    assert found.rows[1].above_nm2 == pytest.approx(bad - good, rel=0.02)  # but for part chunks
-    assert found.rows[1].above == pytest.approx((bad - good) / good, rel=0.02)
+    assert found.rows[1].above_nm2 == pytest.approx(bad - good)
+    assert found.rows[1].above == pytest.approx((bad - good) / good)
     assert found.rows[1].above_nm2 > 2 * found.rows[1].above_error_nm2
     assert (found.rows[0].above_nm2, found.rows[0].above_error_nm2) == (0, 0)
     assert "H-infinity filter is chosen" in found.notes[0]
@@ -179,30 +180,34 @@ def test_what_cannot_be_compared_leaves_the_default(record, models):
 
 
 @pytest.mark.parametrize(
-    ("difference", "scatter", "chosen"),
+    ("difference", "error", "chosen"),
     [
-        (20.0, 20.0, "hinf"),  # 20 +- 1, as 400 chunks have it
-        (2.5, 20.0, "hinf"),
-        (1.5, 20.0, "kalman"),  # within two errors
-        (0.4, 0.1, "kalman"),  # sure, but less than a thousandth
-        (-20.0, 20.0, "kalman"),
+        (20.0, 1.0, "hinf"),
+        (2.5, 1.0, "hinf"),
+        (1.5, 1.0, "kalman"),  # within two errors
+        (0.4, 0.02, "kalman"),  # sure, but less than a thousandth
+        (-20.0, 1.0, "kalman"),
     ],
 )
 def test_the_default_stays_within_two_errors(
-    record, models, monkeypatch, difference, scatter, chosen
+    record, models, monkeypatch, difference, error, chosen
 ):
-    random = np.random.default_rng(0)
-    common, own = random.standard_normal((2, 400))
-    own = (own - np.mean(own)) / np.std(own)
-    usual = 1000 + 300 * common**2
-    squares = {"kalman": usual, "hinf": usual - difference + scatter * own}
-    chain = lbt.identification.PairedResiduals(squares_nm2=squares)
-    monkeypatch.setattr(auto, "compare_on_splits", lambda *_: chain)
+    common, own = np.random.default_rng(0).standard_normal((2, 20_000))
+    common *= np.sqrt(1000 / np.mean(common**2))
+    own -= common * (common @ own) / (common @ common)
+    own *= np.sqrt(5 * error**2 / np.mean(own**2))  # its product with the common part scatters
+    share = np.sqrt(1 - (difference + 5 * error**2) / 1000)
+    left = {
+        name: estimate_residual(series[:, None], ((0, 20_000),), *np.zeros((2, 1, 1)))
+        for name, series in {"kalman": common, "hinf": share * common + own}.items()
+    }
+    ordered = dict(sorted(left.items(), key=lambda row: row[1].total_nm2))
+    monkeypatch.setattr(auto, "forward_chain", lambda *_, **__: (ordered, {}))
     found, _ = choose(record, models, {"hinf": lbt.kalman})
     assert found.method == chosen
     row = next(row for row in found.rows if row.above_nm2 != 0)
     assert abs(row.above_nm2) == pytest.approx(abs(difference))
-    assert row.above_error_nm2 == pytest.approx(scatter / 20, rel=0.2)
+    assert row.above_error_nm2 == pytest.approx(error, rel=0.2)
 
 
 def test_slow_methods_are_not_tried(monkeypatch):

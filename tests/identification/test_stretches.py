@@ -1,4 +1,4 @@
-"""Stretches of a record: halves to fit and to test on."""
+"""Stretches of a record: halves and later parts, to fit and to test on."""
 
 import numpy as np
 import pytest
@@ -6,42 +6,53 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
+from lbt_synth.identification.stretches import forward_splits
 
 
-@given(
-    st.lists(st.integers(1, 50), min_size=2, max_size=12),
-    st.integers(0, 30),
-    st.floats(0.05, 0.95),
-)
-def test_halves_are_apart_and_in_order(lengths, gap, share):
+def frames_in(stretches):
+    return np.concatenate([np.arange(start, stop) for start, stop in stretches])
+
+
+@given(st.lists(st.integers(1, 50), min_size=2, max_size=12), st.floats(0.05, 0.95))
+def test_halves_are_apart_and_in_order(lengths, share):
     ends = np.cumsum(lengths)
     stretches = [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=False)]
-    frames = int(ends[-1])
-    usable = np.zeros(frames, dtype=bool)
-    for a, b in stretches:
-        usable[a:b] = True
-    arguments = {"gap_frames": gap, "fit_share": share}
-    first = np.flatnonzero(usable)[: int(share * usable.sum())]
-    # nothing to fit, or everything after the fit lies in the gap
-    if first.size == 0 or not usable[first[-1] + 1 + gap :].any():
-        with pytest.raises(
-            lbt.errors.ProblemError, match="must leave frames to fit and to test on"
-        ):
-            lbt.identification.split_halves(stretches, frames, **arguments)
+    usable = frames_in(stretches)
+    if int(share * len(usable)) == 0:
+        with pytest.raises(lbt.errors.ProblemError, match="frames to train on and to test on"):
+            lbt.identification.split_halves(stretches, int(ends[-1]), fit_share=share)
         return
-    fit, test = lbt.identification.split_halves(stretches, frames, **arguments)
-    fitted, tested = np.zeros((2, frames), dtype=bool)
-    for mask, parts in ((fitted, fit), (tested, test)):
-        for a, b in parts:
-            assert a < b
-            assert not mask[a:b].any()
-            mask[a:b] = True
-    assert not np.any(~usable & (fitted | tested))
-    np.testing.assert_array_equal(np.flatnonzero(fitted), first)
-    last = first[-1]
-    np.testing.assert_array_equal(
-        np.flatnonzero(tested), np.flatnonzero(usable[last + 1 + gap :]) + last + 1 + gap
-    )
+    fit, test = lbt.identification.split_halves(stretches, int(ends[-1]), fit_share=share)
+    assert len(frames_in(fit)) == int(share * len(usable))
+    np.testing.assert_array_equal(np.concatenate([frames_in(fit), frames_in(test)]), usable)
+
+
+def test_tests_cover_the_rest_once_and_follow_their_training():
+    usable = [(10, 400), (450, 460), (500, 1001)]
+    pairs = forward_splits(usable, 1200, splits=4, first_share=0.4)
+    everything = frames_in(usable)
+    assert len(pairs) == 4
+    for training, test in pairs:
+        both = np.concatenate([frames_in(training), frames_in(test)])
+        assert np.array_equal(both, everything[: len(both)])
+    tests = np.concatenate([frames_in(test) for _, test in pairs])
+    assert np.array_equal(tests, everything[-len(tests) :])
+    assert len(tests) == pytest.approx(0.6 * len(everything), abs=1)
+    lengths = [len(frames_in(test)) for _, test in pairs]
+    assert max(lengths) - min(lengths) <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"splits": 0}, "splits"),
+        ({"first_share": 1.0}, "first_share"),
+        ({"splits": 7}, "10 usable frames for 7 splits"),
+    ],
+)
+def test_splits_that_a_record_cannot_have(options, words):
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        forward_splits([(0, 10)], 10, **options)
 
 
 @pytest.mark.parametrize(
@@ -60,17 +71,3 @@ def test_halves_are_apart_and_in_order(lengths, gap, share):
 def test_stretches_that_are_refused(arguments, message):
     with pytest.raises(lbt.errors.ProblemError, match=message):
         lbt.identification.split_halves(*arguments)
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"gap_frames": -1}, "gap_frames must be at least 0"),
-        ({"gap_frames": 30}, "must leave frames to fit and to test on"),
-        ({"fit_share": 0.0}, "fit_share must be above 0"),
-        ({"fit_share": 1.0}, "fit_share must be below 1"),
-    ],
-)
-def test_halves_that_are_refused(more, message):
-    with pytest.raises(lbt.errors.ProblemError, match=message):
-        lbt.identification.split_halves(None, 40, **more)

@@ -24,7 +24,6 @@ def make_bands(factors=FACTORS, noise=0.0):
             moved=0.01 * (expected * (np.arange(3) == j))[:, :, None],
             unseen=np.zeros((60, 3, 3)),
             core=np.ones((60, 1), dtype=bool),
-            follows=np.ones(59, dtype=bool),
         )
         out.append(band)
     return out

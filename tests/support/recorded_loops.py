@@ -6,6 +6,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.identify import axis_periodogram, find_axis, refit_axis
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.models.resonance_spectrum import coefficients
 
@@ -48,6 +50,27 @@ def slow() -> lbt.models.ARModel:
     return lbt.models.ARModel(
         coefficients=[a1, a2], driving_rms_nm=300 * np.sqrt(drive), frame_rate_hz=RATE
     )
+
+
+def identify_series(
+    measurement: np.ndarray,
+    correction: np.ndarray | None = None,
+    *,
+    frame_rate_hz: float = RATE,
+    stretches: object = None,
+    sensor_gain: float | None = None,
+    sensor_gain_error: float = 0.0,
+    assumed_gain: float = 1.0,
+    start: lbt.identification.IdentifiedAxis | None = None,
+    **options: object,
+) -> lbt.identification.IdentifiedAxis:
+    """Identify the series of one axis, at a sensor gain with an error if it is given."""
+    data = axis_periodogram(measurement, correction, frame_rate_hz, stretches)
+    search = Search(data=data, gain=sensor_gain, **options)
+    axis = find_axis(search, assumed_gain=assumed_gain, start=start)
+    if not sensor_gain_error:
+        return axis
+    return refit_axis(axis, search, sensor_gain_error / sensor_gain, "given")
 
 
 def resonant_record(seed: int = 0) -> lbt.identification.LoopRecord:
@@ -101,9 +124,7 @@ def drifting_record(seed: int = 337, *, gain: float = 0.4062) -> lbt.identificat
     total = lbt.models.SumSpectrum(parts=[air, drift])
     truth = lbt.Truth(turbulence=total, vibrations=(line,), noise_nm=3.403, sensor_gain=0.5859)
     law, frames = lbt.integrator(path, gain=gain).controller, int(15 * rate_hz)
-    run = lbt.simulate(
-        law, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000, frame_means=True
-    )
+    run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=2000)
     return lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=rate_hz, delay_frames=2, unit="nm"
     )
@@ -153,9 +174,11 @@ def _directed_record(
 def expected_periodogram(air: lbt.models.Spectrum, noise: float, gain: float) -> LoopPeriodogram:
     """Return what the periodograms of a minute of an integrator's loop scatter about."""
     f = np.arange(1, 30_000) / 60
+    parts = air.parts if isinstance(air, lbt.models.SumSpectrum) else (air,)
+    seen = sum(p.psd(f) * np.sinc(f / RATE) ** (2 * isinstance(p, lbt.Atmosphere)) for p in parts)
     delay = np.exp(-2j * np.pi * f / RATE)
     loop = 0.4 * delay**2 / (1 - delay)  # from measurements to the corrections in them
-    measured = gain**2 * air.psd(f) + 2 / RATE * noise**2
+    measured = gain**2 * seen + 2 / RATE * noise**2
     measured = measured / np.abs(1 + gain * loop) ** 2
     return LoopPeriodogram(
         frequency_hz=f,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import cache
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.forward_chaining import forward_split, forward_splits
+from lbt_synth.identification.prediction.forward_chaining import forward_split
+from lbt_synth.identification.stretches import forward_splits
 
 RATE, NOISE, GAIN = 500.0, 5.0, 0.8
 PATH = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)

@@ -1,10 +1,8 @@
 """Bands of frequencies around the lines of a model, and how channels follow the lines there.
 
-The transform of a stretch of a record is tapered by a sine, whose square is a cosine: values of
-white noise at neighbouring frequencies have the correlation -1/2, those farther apart none. The
-expected spectrum of a line is that of its tapered series, so lines narrower than the resolution
-keep their power. From the wavefront, the model's lines and its background, each line's motion is
-estimated as by a Wiener filter.
+Stretches of a record are transformed as for the fit. The expected spectrum of a line is that of its
+tapered series, so lines narrower than the resolution keep their power. From the wavefront, the
+model's lines and its background, each line's motion is estimated as by a Wiener filter.
 
 Given the wavefront, the readings of a channel are normal with the mean ``expected F`` and the
 variance ``noise + F* unseen F``: what the wavefront leaves open of the lines moves the channel,
@@ -20,8 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
-from lbt_synth.models.resonance_spectrum import coefficients
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, segment_transforms
+from lbt_synth.identification.fit.whittle import component_density
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
 
 NM = 1e-9
@@ -31,8 +31,7 @@ _BINS = 40.0
 _CORE_BINS = 2.0
 _PART = 0.25  # of the frequency of a line, to which its band reaches at most
 _STEPS = 30
-_INDEPENDENT = 2 / 3  # of the values of a sine-tapered transform
-_NEIGHBOURS = -0.5  # their correlation
+_INDEPENDENT = 0.94  # of the values of a tapered transform
 _DOUBT = 0.01  # chance below which a channel moves at a line more than its noise explains
 _FLOOR = 1e-9  # of a channel's power
 
@@ -48,7 +47,6 @@ class LineBand:
     moved: ComplexArray  # (f, all lines, axes): change of it for a standard error of each gain
     unseen: FloatArray  # (f, all lines, all lines): covariance that the wavefront leaves of it
     core: BoolArray  # (f, lines): frequencies of the lines themselves
-    follows: BoolArray  # (f - 1,): whether a value is a neighbour of the one before
 
 
 def line_bands(
@@ -67,16 +65,8 @@ def line_bands(
     length = max(stop - start for start, stop in stretches)
     kept = [each for each in stretches if each[1] - each[0] >= length / 4]
     series = np.hstack([wavefront, moved, readings])
-    parts = [_transform(series[start:stop], rate) for start, stop in kept]
-    frequency = np.concatenate([part[0] for part in parts])
-    values = np.concatenate([part[1] for part in parts])
-    shapes = np.concatenate(
-        [
-            np.stack([tapered_line(line, stop - start, rate) for line in lines], axis=1)
-            for start, stop in kept
-        ]
-    )
-    follows = np.diff(frequency) > 0
+    parts = [_transform(series[start:stop], lines, rate) for start, stop in kept]
+    frequency, values, shapes = (np.concatenate(each) for each in zip(*parts, strict=True))
     z, step, a = np.split(values, [axes, 2 * axes], axis=1)
     out = []
     resolution = rate / length
@@ -98,44 +88,37 @@ def line_bands(
                 moved=swing[:, None, None] * gain * step[inside, None],
                 unseen=swing[:, None, None] ** 2 * unseen,
                 core=np.abs(f[:, None] - centres) <= reach,
-                follows=(np.diff(inside) == 1) & follows[inside[:-1]],
             )
         )
     return out
 
 
-def _transform(series: FloatArray, rate: float) -> tuple[FloatArray, ComplexArray]:
-    """Return frequencies and tapered transforms (f, series), whose squares are densities."""
-    from scipy.fft import rfft
+def _transform(
+    series: FloatArray, lines: Sequence[IdentifiedLine], rate: float
+) -> tuple[FloatArray, ComplexArray, FloatArray]:
+    """Return frequencies (f,), tapered transforms (f, series), and densities of lines (f, lines).
 
-    n = len(series)
-    values = rfft(_taper(n)[:, None] * (series - series.mean(axis=0)), axis=0)
-    frequency: FloatArray = np.arange(1.0, (n + 1) // 2) * (rate / n)
-    return frequency, np.asarray(values[1 : (n + 1) // 2] * np.sqrt(4 / (rate * n)))
-
-
-def _taper(n: int) -> FloatArray:
-    return np.asarray(np.sin(np.pi * (np.arange(n) + 0.5) / n))
-
-
-def tapered_line(line: IdentifiedLine, n: int, rate: float) -> FloatArray:
-    """Return the expected density of the tapered transform of a line [nm^2/Hz], (f,)."""
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    size = int(next_fast_len(2 * n, real=True))
-    a1, a2, _ = coefficients(2 * np.pi * line.frequency_hz / rate, line.damping)
-    root = np.roots([1, -a1, -a2]).astype(complex)[0]
-    lags = np.arange(n)
-    # r(t) = Re(c root^t) with r(0) = 1 and r(1) = a1 / (1 - a2)
-    slope = (a1 / (1 - a2) - root.real) / root.imag if root.imag else 0.0
-    decay = np.exp(lags * np.log(root))
-    overlap = irfft(np.abs(rfft(_taper(n), size)) ** 2, size)[:n] * (2 / n)
-    series = line.rms_nm**2 * overlap * (decay.real + slope * decay.imag)
-    # at the frequencies k rate / n: fold the even series onto n lags
-    folded = series.copy()
-    folded[1:] += series[:0:-1]
-    spectrum = rfft(folded).real[1 : (n + 1) // 2]
-    return np.asarray(np.maximum(spectrum, 0.0) * (2 / rate))
+    The squares of the transforms are densities.
+    """
+    rows = np.arange(len(series))[None]
+    frequency, values, _ = segment_transforms(series, rows, rate, levelled=True)
+    zero = np.zeros_like(frequency)
+    data = LoopPeriodogram(
+        frequency_hz=frequency,
+        measured=zero,
+        crossed=zero,
+        corrected=zero,
+        count=zero,
+        frame_rate_hz=rate,
+        resolution_hz=rate / len(series),
+        duration_s=(len(series) - 1) / rate,
+    )
+    search = Search(data=data)
+    each = [
+        search.component("line", line.frequency_hz, line.damping, line.rms_nm**2) for line in lines
+    ]
+    shapes = [component_density(data, component) for component in each]
+    return frequency, values[:, 0].T, np.stack(shapes, axis=1)
 
 
 def _reach(line: IdentifiedLine, resolution: float, widths: float, bins: float) -> float:
@@ -217,16 +200,10 @@ def fit_band(band: LineBand, channel: int, others: ComplexArray) -> BandFit:
         whole[own] = factors
         open_part = np.einsum("j,fjk,k->f", whole.conj(), band.unseen, whole).real
     inverse = np.linalg.pinv(info)
-    variances = np.diag(inverse @ _spread(np.sqrt(weights)[:, None] * x, band) @ inverse).real
+    variances = np.diag(inverse).real / _INDEPENDENT
     change = np.einsum("fja,j->fa", band.moved, whole)
     slopes = np.asarray(-inverse @ (x.conj().T @ (weights[:, None] * change)))
     return _judge(band, a, factors, variances, slopes, noise, weights)
-
-
-def _spread(rows: ComplexArray, band: LineBand) -> ComplexArray:
-    """Return the covariance of ``rows^H n`` for tapered white noise n of variance 1."""
-    across = _NEIGHBOURS * (rows[:-1].conj().T @ (band.follows[:, None] * rows[1:]))
-    return np.asarray(rows.conj().T @ rows + across + across.conj().T)
 
 
 def _judge(

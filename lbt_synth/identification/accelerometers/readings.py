@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,20 +30,7 @@ _SAME = 1e-7  # relative, between rates that are one
 _FEWEST_READINGS = 4  # that a spline needs
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Readings:
-    """Accelerations of some channels, one row per frame of a loop."""
-
-    channels: tuple[str, ...]
-    values: FloatArray  # (frames, channels) [m/s^2], NaN where one is missing
-    notes: tuple[str, ...] = ()
-
-    def beside(self, frames: int) -> FloatArray:
-        """Return them beside a record of so many frames, NaN beyond their end."""
-        out = np.full((frames, len(self.channels)), np.nan)
-        both = min(frames, len(self.values))
-        out[:both] = self.values[:both]
-        return out
+Readings = tuple[tuple[str, ...], FloatArray, tuple[str, ...]]  # channels, values, notes
 
 
 def load_readings(
@@ -56,8 +42,9 @@ def load_readings(
 ) -> Readings:
     """Read accelerations from a file of any format that records have, one column per channel.
 
-    Their rate is that of their times or of the header, if it is not given. At another rate than
-    the loop's they are laid on its frames.
+    Return the names of the channels, their values (frames, channels) [m/s^2], NaN where one is
+    missing, and notes. Their rate is that of their times or of the header, if it is not given. At
+    another rate than the loop's they are laid on its frames.
     """
     source = Path(path)
     contents = read_contents(source)
@@ -84,7 +71,14 @@ def load_readings(
             f"readings of {', '.join(shifted)} have an offset, which a filter takes for motion: "
             "subtract it before they reach the loop"
         )
-    return Readings(channels=tuple(names), values=values, notes=tuple(notes))
+    return tuple(names), values, tuple(notes)
+
+
+def lay_beside(values: FloatArray, frames: int) -> FloatArray:
+    """Return readings (n, channels) beside a record of so many frames, NaN beyond their end."""
+    out = np.full((frames, values.shape[1]), np.nan)
+    out[: len(values)] = values[:frames]
+    return out
 
 
 def _is_offset(series: FloatArray) -> bool:

@@ -1,4 +1,11 @@
-"""How each channel of accelerometers moves with each line of an identified model."""
+"""How each channel of accelerometers moves with each line of an identified model.
+
+Readings are laid beside the wavefront, and fitted there. They may lag behind it by some frames. A
+shift turns the phase of every frequency in proportion. Within a narrow line that slope is hard to
+see. Over several lines it is seen well if the channels move with or against the wavefront, phases 0
+or 180 degrees, as parts of a stiff structure do. That is tested, not assumed: where the phases
+differ, or another shift explains them as well, only the slope within the lines counts.
+"""
 
 from __future__ import annotations
 
@@ -11,32 +18,41 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design.fallbacks import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.laying import (
-    ClockShift,
-    Pair,
-    chance,
-    clock_shift,
-    lay_and_fit,
+from lbt_synth.identification.accelerometers.line_bands import (
+    NM,
+    BandFit,
+    LineBand,
+    fit_band,
+    line_bands,
 )
-from lbt_synth.identification.accelerometers.line_bands import NM
 from lbt_synth.identification.accelerometers.readings import as_columns, fill_missing
-from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.records.faults import find_saturated
+from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
+from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
 from lbt_synth.storage.rows import column, row_table, table_row
 from lbt_synth.storage.tables import Table
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number
 
 _TINY = 1e-300
 _EXTRA = f"left out, because others show more and a design takes {MOST_UNITS - 1} channels"
-_LEFT_OUT = ("dead", "saturated")
 _FEWEST_VALUES = 4  # a series of no more different numbers is rounding
 _ROUNDING = 1e-12  # of the largest number
 _LEAST_M_S2 = 1e-6  # far below what any accelerometer resolves
-_CLIPPED = 10  # frames at the ends, at least
-_DRIFT = 100.0  # power at low frequencies over the median
-_SLOW_HZ = 1.0
+_PASSES = 3
+_NEAR_S = 1.0  # within which a shift is refined
+_ROUNDS = 3  # in which the skirts of strong lines leave the bands of others
+_STEP = 0.5  # frames
+_FINE = 0.01
+_RIVAL = 6.9  # of the logarithm of the likelihood: 1000 times less likely
+_CHANCE = 1e-3  # of phases as far from 0 and 180 degrees
+_TURN = 0.3  # rad, of the edges of a band from one lag that is tried to the next
+_CLEARLY = 10.0  # by which a shift must be likelier than none before readings are moved by it
+
+Pair = tuple[LineBand, BandFit, int, int]  # band, fit of the channel, line of the band, channel
+Shift = tuple[float, float, bool]  # frames, standard error, whether phases of lines give it
 
 
 @table_row
@@ -93,7 +109,12 @@ class AccelerometerTransfers:
     # each channel with each line, in the convention of the model's configuration
     transfers: tuple[TransferRow, ...]
     channels: tuple[ChannelRow, ...]  # each channel with its noise and a verdict
-    shift: ClockShift  # lag of the readings behind the wavefront, as they were given
+    # by how many frames the readings, as they were given, lag behind the wavefront's measurement of
+    # the same frame; above 0 if they come late
+    shift_frames: float
+    shift_error_frames: float  # standard error; infinite without any line
+    # whether phases of several lines give it, or the slope of the phase within lines
+    shift_by_phases: bool
     # age of a reading for which the phases hold; 1 is the wavefront's of the same frame
     age_frames: int
     rate_hz: float  # readings per second, after averaging
@@ -117,8 +138,8 @@ class AccelerometerTransfers:
                 "no channel shows a line, so the clocks were not compared. If lines should show, "
                 "check the rate of the readings, and when they began (accelerometer_rate_hz)."
             )
-        size = f"{self.shift.frames:.3g} +- {self.shift.error_frames:.2g} frames"
-        if self.shift.by_phases:
+        size = f"{self.shift_frames:.3g} +- {self.shift_error_frames:.2g} frames"
+        if self.shift_by_phases:
             return f"the accelerometers lag behind the wavefront by {size}, by the phases of lines."
         return (
             f"the phases of the lines do not tell the shift of the clocks from motions out of "
@@ -208,17 +229,15 @@ def accelerometer_transfers(
         )
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
     largest = int(number(largest_shift_s, "largest_shift_s", at_least=0) * model.frame_rate_hz)
-    faults = [
-        _channel_fault(raw, model.frame_rate_hz) if filled.any() else "dead"
-        for raw, filled in zip(given.T, readings.T, strict=True)
-    ]
-    live = [c for c, fault in enumerate(faults) if fault not in _LEFT_OUT]
+    live = [c for c, series in enumerate(readings.T) if _is_live(series[good])]
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
     if not live or not places:
         return AccelerometerTransfers(
             transfers=(),
-            channels=_channel_rows(names, (), {}, faults),
-            shift=clock_shift((), largest),
+            channels=_channel_rows(names, (), {}, live),
+            shift_frames=0.0,
+            shift_error_frames=float("inf"),
+            shift_by_phases=False,
             age_frames=1,
             rate_hz=model.frame_rate_hz,
         )
@@ -226,7 +245,9 @@ def accelerometer_transfers(
     widest = max(line.damping * line.frequency_hz for line in lines)
     tried = len(live) * len(lines) * (1 + np.ceil(4 * widest * largest / model.frame_rate_hz))
     limit = alarm / tried
-    lag, fits, shift = lay_and_fit(model, record, readings[:, live], good, lines, largest, limit)
+    lag, fits, (shift, error, by_phases) = lay_and_fit(
+        model, record, readings[:, live], good, lines, largest, limit
+    )
     rows = [_row(fit, names[live[fit[3]]], places, model, limit) for fit in fits]
     rows.sort(key=lambda row: (names.index(row.channel), row.frequency_hz))
     noises = {live[c]: _noise(fits, c, model.frame_rate_hz, limit) for c in range(len(live))}
@@ -234,49 +255,36 @@ def accelerometer_transfers(
     best = _best_channels(shown, {names[c]: noise for c, noise in noises.items()}, model)
     return AccelerometerTransfers(
         transfers=tuple(replace(row, useful=row.useful and row.channel in best) for row in rows),
-        channels=_channel_rows(names, rows, noises, faults, best),
-        shift=replace(shift, frames=shift.frames + lag),
+        channels=_channel_rows(names, rows, noises, live, best),
+        shift_frames=shift + lag,
+        shift_error_frames=error,
+        shift_by_phases=by_phases,
         age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
     )
 
 
-def _channel_fault(readings: FloatArray, rate_hz: float) -> str:
-    """Return dead, saturated, drifting, or an empty text, for the readings (frames,) of one."""
-    readings = readings[np.isfinite(readings)]
+def _is_live(readings: FloatArray) -> bool:
+    """Return whether the readings (frames,) of a channel are more than rounding."""
     values = np.unique(readings)
     rounding = _ROUNDING * max(float(np.max(np.abs(values), initial=0.0)), _LEAST_M_S2)
-    if values.size <= _FEWEST_VALUES or np.ptp(values) <= rounding:
-        return "dead"
-    if np.sum(find_saturated(readings, np.ones(readings.size, dtype=np.bool_))) >= _CLIPPED:
-        return "saturated"
-    return "drifting" if _drifts(readings, rate_hz) else ""
-
-
-def _drifts(readings: FloatArray, rate_hz: float) -> bool:
-    from scipy.signal import periodogram
-
-    frequency, power = periodogram(readings, rate_hz, window="cosine")
-    slow = (frequency > 0) & (frequency < _SLOW_HZ)
-    if not slow.any():
-        return False
-    return bool(np.mean(power[slow]) > _DRIFT * np.median(power[1:]))
+    return bool(values.size > _FEWEST_VALUES and np.ptp(values) > rounding)
 
 
 def _channel_rows(
     names: Sequence[str],
     rows: Sequence[TransferRow],
     noises: Mapping[int, float],
-    faults: Sequence[str],
+    live: Sequence[int],
     best: Sequence[str] = (),
 ) -> tuple[ChannelRow, ...]:
     return tuple(
         ChannelRow(
             channel=name,
             noise_m_s2=noises.get(c, float("nan")),
-            verdict=_verdict(name, rows, fault, name in best),
+            verdict=_verdict(name, rows, name in best) if c in live else "dead",
         )
-        for c, (name, fault) in enumerate(zip(names, faults, strict=True))
+        for c, name in enumerate(names)
     )
 
 
@@ -340,9 +348,175 @@ def _best_channels(
     return best
 
 
-def _verdict(name: str, rows: Sequence[TransferRow], fault: str, best: bool) -> str:
-    """Return what a channel is used for, and what is wrong with it, in words."""
+def _verdict(name: str, rows: Sequence[TransferRow], best: bool) -> str:
+    """Return what a channel is used for, in words."""
     lines = [f"{row.frequency_hz:.3g}" for row in rows if row.channel == name and row.useful]
     use = f"{'used for' if best else 'shows'} {', '.join(lines)} Hz" if lines else "adds nothing"
-    extra = _EXTRA if lines and not best else ""
-    return "; ".join(text for text in (extra, fault, use) if text)
+    return f"{_EXTRA}; {use}" if lines and not best else use
+
+
+def lay_and_fit(
+    model: IdentifiedModel,
+    record: LoopRecord,
+    readings: FloatArray,
+    good: BoolArray,
+    lines: Sequence[IdentifiedLine],
+    largest: int,
+    limit: float,
+) -> tuple[int, list[Pair], Shift]:
+    """Lay readings beside the wavefront, and fit them there.
+
+    Return by how many frames they are late, the fits, and the shift beyond the whole frames.
+    """
+    gains, lag = np.array(model.sensor_gains), 0
+    errors = np.array([axis.sensor_gain_error or 0.0 for axis in model.axes])
+    series = record.pseudo_open_loop(gains)
+    moved = record.pseudo_open_loop(gains + errors) - series
+    near = round(_NEAR_S * model.frame_rate_hz)
+
+    def bands(stretches: Stretches) -> list[LineBand]:
+        laid = readings[np.clip(np.arange(record.frames) + lag, 0, len(readings) - 1)]
+        return line_bands(model, lines, series, moved, laid, stretches)
+
+    def side_by_side() -> Stretches:
+        frames = np.arange(record.frames) + lag
+        known = (frames >= 0) & (frames < len(readings))
+        usable = record.usable & known & good[np.where(known, frames, 0)]
+        found = tuple((int(a), int(b)) for a, b in runs(usable) if b - a >= SHORTEST_SEGMENT)
+        if not found:
+            raise ProblemError(
+                f"record and accelerations must have {SHORTEST_SEGMENT} usable frames in a row "
+                f"side by side; they have {record.frames} and {len(readings)} frames."
+            )
+        return found
+
+    lag = likeliest_lag(bands(side_by_side()), largest)
+    for step in range(_PASSES):
+        fits = fit_pairs(bands(side_by_side()))
+        shift, error, by_phases = clock_shift([fit for fit in fits if chance(fit) < limit], near)
+        sure = by_phases or abs(shift) > 3 * error
+        if step == _PASSES - 1 or not sure or not round(shift):
+            break
+        lag += round(shift)
+    return lag, fits, (shift, error, by_phases)
+
+
+def fit_pairs(bands: Sequence[LineBand]) -> list[Pair]:
+    """Return the fit of every channel with every line."""
+    out: list[Pair] = []
+    for channel in range(bands[0].readings.shape[1]):
+        factors = np.zeros(bands[0].expected.shape[1], dtype=complex)
+        for _ in range(_ROUNDS):
+            fits = [fit_band(band, channel, factors) for band in bands]
+            for band, fit in zip(bands, fits, strict=True):
+                factors[list(band.lines)] = fit.factors
+        out += [
+            (band, fit, j, channel)
+            for band, fit in zip(bands, fits, strict=True)
+            for j in range(len(band.lines))
+        ]
+    return out
+
+
+def chance(pair: Pair) -> float:
+    """Return the probability that a channel without the line shows as much."""
+    return float(pair[1].chances[pair[2]])
+
+
+def likeliest_lag(bands: Sequence[LineBand], largest: int) -> int:
+    """Return the whole number of frames at which readings and wavefront agree best."""
+    lags = np.arange(-largest, largest + 1.0)
+    total = np.zeros(lags.size)
+    for band in bands:
+        middle = float(np.mean(band.angle[[0, -1]]))
+        away = band.angle - middle  # a product changes over lags as slowly as the band is narrow
+        step = max(int(_TURN / float(np.max(np.abs(away), initial=_TURN / lags.size))), 1)
+        tried = np.append(np.arange(-largest, largest, step), largest).astype(float)
+        turns = np.exp(1j * tried[:, None] * away)
+        for line in band.lines:
+            products = band.expected[:, line, None].conj() * band.readings
+            power = np.sum(np.abs(products) ** 2, axis=0)
+            seen = power > 0
+            sizes = np.sum(np.abs(turns @ products[:, seen]) ** 2 / power[seen], axis=1)
+            total += np.interp(lags, tried, sizes)
+    best = int(np.argmax(total))
+    return int(lags[best]) if total[best] > total[largest] + _CLEARLY else 0
+
+
+def clock_shift(pairs: Sequence[Pair], largest: float) -> Shift:
+    """Return the shift of the readings of the pairs of channel and line, within +- ``largest``."""
+    from scipy.special import chdtrc
+
+    if not pairs:
+        return 0.0, float("inf"), False
+    lags = np.arange(-largest, largest + _STEP / 2, _STEP)
+    free, real = _evidence(pairs, lags)
+    place, error = _peak(pairs, float(lags[np.argmax(real)]), 1)
+    both = _evidence(pairs, np.array([place]))
+    peaks = np.flatnonzero((real[1:-1] > real[:-2]) & (real[1:-1] > real[2:])) + 1
+    rivals = (np.abs(lags[peaks] - place) > 2 * _STEP) & (real[peaks] > both[1][0] - _RIVAL)
+    misfit, others = 2 * float(both[0][0] - both[1][0]), len(pairs) - 1
+    if others and not rivals.any() and chdtrc(others, misfit) > _CHANCE:
+        spread = np.sqrt(max(misfit / others, 1.0))
+        error = float(np.hypot(error * spread, _gain_error(pairs)))
+        return place, error, True
+    place, error = _peak(pairs, float(lags[np.argmax(free)]), 0)
+    return place, error, False
+
+
+def _gain_error(pairs: Sequence[Pair]) -> float:
+    """Return what errors of the sensor gains leave of the shift by phases [frames].
+
+    They turn the factors of all lines and channels at once.
+    """
+    slope, size = 0.0, 0.0
+    for band, fit, j, _ in pairs:
+        turn = (fit.slopes[j] / fit.factors[j]).imag  # [rad] per standard error of each gain
+        angle = float(np.mean(band.angle[band.core[:, j]]))
+        weight = 2 * abs(fit.factors[j]) ** 2 / fit.variances[j]
+        slope, size = slope + weight * angle * turn, size + weight * angle**2
+    return float(np.linalg.norm(slope / size))
+
+
+def _evidence(pairs: Sequence[Pair], lags: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return log-likelihoods over lags, for factors of any phase and for real ones."""
+    free, real = np.zeros(lags.size), np.zeros(lags.size)
+    for band, fit, j, _ in pairs:
+        sums, size = _matched(band, fit, j, lags)
+        free += np.abs(sums) ** 2 / size
+        real += sums.real**2 / size
+    return free, real
+
+
+def _matched(band: LineBand, fit: BandFit, j: int, lags: FloatArray) -> tuple[ComplexArray, float]:
+    """Return products of readings and expectation over lags, and the size of the latter.
+
+    The other lines of the band are taken away.
+    """
+    core, x = band.core[:, j], band.expected[:, list(band.lines)]
+    alone = fit.readings - x @ fit.factors + x[:, j] * fit.factors[j]
+    seen = (x[:, j].conj() * fit.weights)[core]
+    turns = np.exp(1j * lags[:, None] * band.angle[core])
+    scale = abs(fit.factors[j]) ** 2 / max(fit.variances[j], np.finfo(float).tiny)
+    size = float((np.abs(x[core, j]) ** 2 * fit.weights[core]).sum())
+    # in units in which the log-likelihood of the fit itself is that of its errors
+    size *= max(abs(fit.factors[j]) ** 2 * size / scale, 1.0)
+    return turns @ (seen * alone[core]), size
+
+
+def _peak(pairs: Sequence[Pair], near: float, which: int) -> tuple[float, float]:
+    """Return the place of a maximum near a lag and its standard error [frames]."""
+    for step in (_STEP / 5, _FINE):
+        lags = np.arange(-10.0, 11.0) * step + near
+        near = float(lags[np.argmax(_evidence(pairs, lags)[which])])
+    width = 0.05
+    for _ in range(12):  # a step over which the likelihood changes by about 1
+        low, top, high = _evidence(pairs, np.array([near - width, near, near + width]))[which]
+        curvature = (2 * top - low - high) / width**2
+        if 2 * top - low - high > 1 or curvature <= 0:
+            break
+        width *= 2
+    if curvature <= 0:
+        return near, float("inf")
+    place = near + width * (high - low) / (2 * (2 * top - low - high))
+    return place, float(1 / np.sqrt(curvature))

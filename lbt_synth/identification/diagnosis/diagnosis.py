@@ -37,14 +37,13 @@ from lbt_synth.identification.diagnosis.running_loop import (
     loop_row,
     running_controller,
 )
-from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
     RAN,
     PredictionRow,
     PredictionTable,
-    ResidualRow,
     prediction_against_data,
 )
 from lbt_synth.identification.records.record import LoopRecord, require_length
@@ -56,7 +55,6 @@ from lbt_synth.methods.registry import all_methods, reference_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fill_row
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.validation import require_instance
 
@@ -133,15 +131,13 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
 
     @property
-    def residuals(self) -> tuple[ResidualRow, ...]:
+    def residuals(self) -> tuple[PredictionRow, ...]:
         """Rows of the comparison, for tables."""
-        entries = () if self.comparison is None else self.comparison.entries
-        return tuple(fill_row(ResidualRow, entry) for entry in entries)
+        return () if self.comparison is None else self.comparison.entries
 
     def row(self, name: str) -> PredictionRow | None:
         """Return a row of the comparison, None where there is none."""
-        entries = () if self.comparison is None else self.comparison.entries
-        return next((entry for entry in entries if entry.name == name), None)
+        return next((row for row in self.residuals if row.name == name), None)
 
 
 def diagnose(

@@ -21,7 +21,7 @@ from lbt_synth.identification.fit.spectrum_model import (
 from lbt_synth.identification.fit.whittle import (
     FittedModel,
     Model,
-    component_densities,
+    component_density,
     contrast,
     contrasts,
     density,
@@ -33,7 +33,8 @@ from lbt_synth.validation import integer, number
 
 LOWEST_LINE_HZ = 3.0
 MOST_LINES = 20
-DRIFT_DAMPING = 2.0  # damping ratio from which turbulence is a drift
+DRIFT_RATIO = 300.0  # damping ratio of a drift: of its poles, one is beyond the frame rate
+DRIFT_HZ, _DRIFT_WIDTH = 0.03, 2.0  # corner of a drift, and the width of its prior
 GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands at half their size
@@ -53,7 +54,6 @@ STARTING_CORNER_HZ = 50.0
 _TURBULENCE_WIDTH = 1.5  # width around 1 Hz of the frequency of a part of the turbulence
 _DAMPING_PRIORS = {  # of the odds, but for the turbulence
     "turbulence": (np.log(0.45), 4.0),
-    "drift": (np.log(0.45), 4.0),
     "slow": (0.0, 1.0),
     "line": (np.log(0.01 / 0.99), 4.0),
 }
@@ -75,7 +75,6 @@ class Search:
     lowest_line_hz: float = LOWEST_LINE_HZ  # below, a component belongs to the turbulence
     most_lines: int = MOST_LINES
     announced: Sequence[tuple[float, float]] = ()  # (frequency, error) of known lines [Hz]
-    colour: float = 0.0  # of the noise, where a fit begins; 0 for white noise
     starting_gains: tuple[float, ...] = (0.6, 0.35, 1.0)  # of the sensor, where it is found
 
     def __post_init__(self) -> None:
@@ -132,6 +131,8 @@ class Search:
     def _component_priors(self, component: Component) -> list[tuple[float, float]]:
         """Return the priors of frequency, damping and power."""
         frequency = (self.log_angle(1.0), _TURBULENCE_WIDTH)
+        if component.kind == "drift":
+            return [(self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _DRIFT_WIDTH), _FIXED, _NONE]
         damping = _DAMPING_PRIORS[component.kind]
         if component.kind == "line":
             frequency = _NONE
@@ -176,9 +177,8 @@ def fit(
     """Fit all parameters; None if no fit settles.
 
     Components of one axis that leave the band, from the first bin to the Nyquist frequency, are
-    dropped, and so is a drift whose damping ratio falls below 2, if another part can take its
-    place; those of two axes stay at its ends. A fit is given up where its log-likelihood does not
-    reach that of ``better_than`` minus a margin.
+    dropped; those of two axes stay at its ends. A fit is given up where its log-likelihood does
+    not reach that of ``better_than`` minus a margin.
     """
     data, bound = search.merge(start), float("inf")
     if better_than is not None:
@@ -189,9 +189,6 @@ def fit(
     if isinstance(start, Spectra):
         return found
     inside = found.spectrum.keep(search.covers)
-    first = inside.components[0]
-    if first.kind == "drift" and first.damping_ratio < DRIFT_DAMPING:
-        inside = inside.drop(0) or inside
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(found, contrast=contrast(search.data, found.spectrum))
@@ -214,13 +211,10 @@ def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel
 
 def simplify(search: Search, model: FittedModel) -> FittedModel:
     """Return the model without roll-off or colour, where that adds too little."""
-    if model.spectrum.rolls_off:
-        less = fit(search, model.spectrum.without_roll_off())
-        if less is not None and less.contrast - model.contrast < search.price / PARAMETERS:
-            model = less
-    if model.spectrum.colour:
-        less = fit(search, replace(model.spectrum, colour=0.0))
-        if less is not None and less.contrast - model.contrast < CHEAP:
+    for leave_out in (SpectrumModel.without_roll_off, SpectrumModel.without_colour):
+        plainer = leave_out(model.spectrum)
+        less = None if plainer == model.spectrum else fit(search, plainer)
+        if less is not None and cost(search, less) < cost(search, model):
             model = less
     return model
 
@@ -308,15 +302,15 @@ def close_line(
 
 
 def cost(search: Search, model: FittedModel) -> float:
-    """Return the contrast of a model plus what the criterion asks for its components."""
+    """Return the contrast of a model plus what the criterion asks for all that it has."""
     spectrum = model.spectrum
     first, *rest = spectrum.components
     # the same for any order of the search
     rest = sorted(rest, key=lambda component: component.log_frequency)
-    spectrum, others = replace(spectrum, components=(first, *rest)), range(1, 1 + len(rest))
-    return model.contrast + sum(
-        required_evidence(search, spectrum, i, earlier=True) for i in others
-    )
+    ordered, others = replace(spectrum, components=(first, *rest)), range(1, 1 + len(rest))
+    prices = [required_evidence(search, ordered, i, earlier=True) for i in others]
+    shapes = CHEAP * bool(spectrum.colour) + search.price / PARAMETERS * spectrum.rolls_off
+    return model.contrast + sum(prices) + shapes
 
 
 def add_evidence(search: Search, model: FittedModel) -> FittedModel:
@@ -340,10 +334,13 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     centre, half = search.place(line)
     if half > 2 * step or centre <= 3 * step:
         return spectrum
-    moves = product(np.log1p(_SHIFTS * step / centre), _POWERS)
-    # the width stays
-    trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
     data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
-    model = density(data, spectrum.exchange(i)) + component_densities(data, trials)
-    best = int(np.argmin(contrasts(data, spectrum.gain, model)))
-    return spectrum.exchange(i, trials[best])
+    rest = density(data, spectrum.exchange(i))
+    for shifts in (_SHIFTS, _SHIFTS / 8):  # the place of a sinusoid is known to a part of a bin
+        moves = product(np.log1p(shifts * step / centre), _POWERS)
+        # the width stays
+        trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
+        lines = [component_density.__wrapped__(data, trial) for trial in trials]  # none comes again
+        best = int(np.argmin(contrasts(data, spectrum.gain, rest + np.array(lines))))
+        line = trials[best]
+    return spectrum.exchange(i, line)

@@ -42,9 +42,6 @@ class IdentifiedLine:
         stands for a drift.
     frequency_hz, frequency_error_hz : float
         Natural frequency and its standard error [Hz].
-    separable_hz : float or None
-        How far apart two like lines have to be here to be seen as two [Hz]; closer ones look like
-        one at their mean frequency, by power. None for what is no narrow line.
     damping, damping_error : float
         Damping ratio and its standard error. If the line is not resolved, both are the largest
         damping that the record cannot distinguish from none.
@@ -64,6 +61,9 @@ class IdentifiedLine:
     direction_error_deg : float or None
         Standard error of the direction [degrees] of a line that both axes share. None for
         turbulence along the direction of the rms of the axes.
+    corner_hz, corner_error_hz : float or None
+        Corner beyond which the density of the turbulence falls by another f^(-5/3), as of frozen
+        flow, and its standard error [Hz].
     """
 
     kind: Kind
@@ -77,16 +77,10 @@ class IdentifiedLine:
     prominence: float
     evidence: float
     announced: bool
-    separable_hz: float | None = None
     direction: tuple[float, ...] | None = None
     direction_error_deg: float | None = None
-
-    @property
-    def frequency_error_if_several_hz(self) -> float | None:
-        """Standard error for the strongest of several lines that look like this one [Hz]."""
-        if self.separable_hz is None:
-            return None
-        return float(np.hypot(self.frequency_error_hz, self.separable_hz / 4))
+    corner_hz: float | None = None
+    corner_error_hz: float | None = None
 
     @property
     def direction_deg(self) -> float | None:
@@ -109,24 +103,6 @@ class IdentifiedLine:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IdentifiedTurbulence:
-    """The slow part of a spectrum: a resonance with the roll-off of tilt, or without.
-
-    Each value has its standard error.
-    """
-
-    frequency_hz: float  # natural frequency of the second-order process
-    frequency_error_hz: float
-    damping: float  # damping ratio; 1 and more: two real poles
-    damping_error: float
-    # corner beyond which the density falls by another f^(-5/3), as of frozen flow
-    corner_hz: float | None
-    corner_error_hz: float | None
-    rms_nm: float  # standard deviation of the nearest process of finite order
-    rms_error_nm: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IdentifiedAxis(Summarised):
     """One axis: turbulence, lines, noise and sensor gain.
@@ -135,8 +111,9 @@ class IdentifiedAxis(Summarised):
     ----------
     turbulence : ARModel
         The turbulence as a process of order 2 or 3.
-    turbulence_fit : IdentifiedTurbulence
-        Its parameters with standard errors.
+    turbulence_fit : IdentifiedLine
+        Its parameters with standard errors; of the rms of the process. Above a damping ratio of 1
+        it has two real poles.
     parts : tuple of IdentifiedLine
         All other resonances, by frequency. One that has a direction is this axis's share of a
         resonance of both axes.
@@ -171,7 +148,7 @@ class IdentifiedAxis(Summarised):
     """
 
     turbulence: ARModel
-    turbulence_fit: IdentifiedTurbulence
+    turbulence_fit: IdentifiedLine
     parts: tuple[IdentifiedLine, ...]
     noise_nm: float
     noise_error_nm: float
@@ -297,7 +274,6 @@ class VibrationRow:
     axis: str = column("axis")  # or the direction
     frequency_hz: float = column("f", unit="Hz", format=".3f")
     frequency_error_hz: float = column("+-", unit="Hz", format=".2g")
-    frequency_error_if_several_hz: float | None = column("if several", unit="Hz", format=".2g")
     damping: str = column("damping")  # one that is not resolved has a bound, and no error
     damping_error: float | None = column("+-", format=".2g")
     rms_nm: float = nm_column("rms", format=".2f")

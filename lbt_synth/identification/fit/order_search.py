@@ -40,7 +40,8 @@ _OTHER_NOISE = 5.0  # log-likelihood by which noise of another correlation is ex
 _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55))  # frequency [Hz] and damping ratio where a fit begins
-_DRIFT = (2.0, 30.0)  # the same of a first-order process
+_NEARLY_FIRST_ORDER = 2.0  # damping ratio from which turbulence may be a drift
+_OVERDAMPED = (2.0, 30.0)  # the same of turbulence that is nearly of first order
 _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _MOST_DRIFTS = 2  # fits of both
@@ -52,31 +53,33 @@ _NARROWEST = 1e-4  # damping ratio of a new component
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
 
-def search_model(
-    search: Search, start: SpectrumModel | None = None, *, moves: bool = True
-) -> FittedModel:
-    """Find the model of one axis; the lines of a start stay where they are without ``moves``."""
-    if start is None:
-        return search_models(search)[0]
-    return fitting.add_evidence(search, find_components(search, start, moves=moves))
-
-
 def search_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
-    """Find the model of one axis, and its rival where noise of another colour may explain it."""
-    models = [find_components(search, start)]
-    if start is None and _may_be_coloured(search, models[0]):
-        models.append(find_components(replace(search, colour=_COLOUR), None))
+    """Find the model of one axis, and its rivals with noise that is not white.
+
+    A start has been found in earlier data: there is little left to find. A rival is searched for
+    further where it may explain wide components or a wrong gain.
+    """
+    model = find_components(search, start)
+    models, spectrum = [model], model.spectrum
+    coloured = fitting.fit(search, replace(spectrum, colour=_COLOUR))
+    if coloured is not None and not spectrum.colour:
+        plain = start is not None or all(c.is_narrow for c in spectrum.components[1:])
+        models.append(coloured)
+        if not plain or fitting.cost(search, coloured) < fitting.cost(search, model):
+            models.append(find_components(search, coloured.spectrum))
         models.sort(key=lambda trial: _cost_of_noise(search, trial))
     return [fitting.add_evidence(search, models[0]), *models[1:]]
 
 
-def _may_be_coloured(search: Search, model: FittedModel) -> bool:
-    """Whether noise that is not white may be what wide components, or a wrong gain, explain."""
-    spectrum = model.spectrum
-    if not all(c.is_narrow for c in spectrum.components[1:]):
-        return True
-    near = fitting.fit(search, replace(spectrum, colour=_COLOUR))
-    return near is not None and model.contrast - near.contrast > fitting.CHEAP
+def is_coloured_rival(model: FittedModel, rival: FittedModel, gain_error: float) -> bool:
+    """Whether a model of coloured noise is likelier than one of white noise, and its gain far away.
+
+    Sensors and filters make neighbouring frames alike, hardly ever opposite.
+    """
+    own, other = model.spectrum, rival.spectrum
+    is_far = abs(other.log_gain - own.log_gain) > _FAR_GAIN * gain_error
+    is_likelier = model.contrast - rival.contrast >= _SIGNIFICANT
+    return not own.colour and 0 < other.colour < _MOST_COLOUR and is_likelier and is_far
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
@@ -86,8 +89,7 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
     """
     spectrum = model.spectrum
     wide = sum(not c.is_narrow for c in spectrum.lines)
-    coloured = fitting.CHEAP * bool(spectrum.colour)
-    return _cost_with_gain(search, model) + search.price * wide + coloured
+    return _cost_with_gain(search, model) + search.price * wide
 
 
 def _cost_with_gain(search: Search, model: FittedModel) -> float:
@@ -112,10 +114,10 @@ def try_other_gains(
     for gain, colour in product(search.starting_gains, sorted({spectrum.colour, 0.0})):
         if colour == spectrum.colour and abs(np.log(gain) - spectrum.log_gain) < _SAME_GAIN:
             continue
-        begin = replace(search, gain=gain, colour=colour)
+        begin = replace(search, gain=gain)
         try:
             known = replace(spectrum, colour=colour)
-            held = find_components(begin, known, rounds=FEW_ROUNDS, moves=False)
+            held = find_components(begin, known, moves=False)
         except NumericalError:
             continue
         free = fitting.fit(search, held.spectrum)
@@ -135,34 +137,16 @@ def try_other_gains(
     return best, near
 
 
-def find_coloured_rival(
-    search: Search, model: FittedModel, gain_error: float
-) -> FittedModel | None:
-    """Return the likelier model of coloured noise, if it moves the gain of a white one far.
-
-    Sensors and filters make neighbouring frames alike, hardly ever opposite.
-    """
-    spectrum = model.spectrum
-    if spectrum.colour:
-        return None
-    made = fitting.fit(search, replace(spectrum, colour=_COLOUR))
-    if made is None or not 0 < made.spectrum.colour < _MOST_COLOUR:
-        return None
-    is_likelier = model.contrast - made.contrast >= _SIGNIFICANT
-    is_far = abs(made.spectrum.log_gain - spectrum.log_gain) > _FAR_GAIN * gain_error
-    return made if is_likelier and is_far else None
-
-
 def find_components(
     search: Search,
-    start: SpectrumModel | None,
+    start: SpectrumModel | None = None,
     *,
-    rounds: int = _MOST_ROUNDS,
+    rounds: int | None = None,
     moves: bool = True,
 ) -> FittedModel:
     """Find the model: add components, prune them, and move lines (with ``moves``).
 
-    Without rounds it stays as it begins, but for what it does not need.
+    One that starts from an earlier model has few rounds.
     """
     model = None if start is None else fitting.refit(search, start)
     if model is None:
@@ -172,16 +156,16 @@ def find_components(
             "the likelihood of the spectrum is not finite. Check the units of the series."
         )
     model = _add_announced(search, fitting.prune(search, model))
-    if not rounds:
-        return model
+    if rounds is None:
+        rounds = _MOST_ROUNDS if start is None else FEW_ROUNDS
     for _ in range(rounds):
         better = _improve(search, model, moves)
         if better is None:
             break
         model = better
     if abs(model.spectrum.colour) > _MOST_COLOUR:
-        white = None if start is None else replace(start, colour=0.0)
-        return find_components(replace(search, colour=0.0), white, rounds=rounds, moves=moves)
+        white = None if start is None else start.without_colour()
+        return find_components(search, white, rounds=rounds, moves=moves)
     model = fitting.prune(search, fitting.simplify(search, model), thorough=moves)
     return _restore_turbulence(search, model)
 
@@ -204,7 +188,7 @@ def _trials(
     first, *others = spectrum.components
     lines = [c for c in others if c.kind == "line"]
     has_parts = len(lines) < len(others)
-    nearly_first_order = first.kind == "drift" or first.damping_ratio > fitting.DRIFT_DAMPING
+    nearly_first_order = first.kind == "drift" or first.damping_ratio > _NEARLY_FIRST_ORDER
     # where no line can be added, a second turbulence would take the place of one
     room = len(lines) < search.most_lines
     found = find_excesses(search, spectrum)
@@ -228,16 +212,15 @@ def _other_backgrounds(
     search: Search, spectrum: SpectrumModel, lines: Sequence[Component], *, drifts: bool
 ) -> list[SpectrumModel]:
     """Return the model with turbulence fitted afresh beside its lines."""
-    known = replace(search, colour=spectrum.colour)
-    ground = fit_background(known, spectrum.gain, lines, drifts=drifts)
+    ground = fit_background(search, spectrum.gain, lines, drifts=drifts, colour=spectrum.colour)
     return [] if ground is None else [ground.spectrum.add(*lines)]
 
 
 def _begin(search: Search) -> FittedModel | None:
     """Fit the background and the clear lines.
 
-    The gain is held until the lines are there: one that is free while lines are missing runs away
-    to what explains these.
+    The gain is held until the lines and a drift are there: one that is free while these are missing
+    runs away to what explains them.
     """
     known = search if not search.finds_gain else replace(search, gain=search.starting_gains[0])
     model = fit_background(known, known.gain or 1.0)
@@ -249,6 +232,9 @@ def _begin(search: Search) -> FittedModel | None:
         model = fitting.fit(known, _add_centred(known, model.spectrum, clear))
     if model is None or not search.finds_gain:
         return model
+    trials = _other_backgrounds(known, model.spectrum, model.spectrum.lines, drifts=True)
+    drifting = (fitting.fit(known, trial, better_than=model) for trial in trials)
+    model = fitting.likeliest(known, [model, *drifting]) or model
     return fitting.fit(search, model.spectrum)
 
 
@@ -339,7 +325,12 @@ def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
 
 
 def fit_background(
-    search: Search, gain: float, lines: Sequence[Component] = (), *, drifts: bool = False
+    search: Search,
+    gain: float,
+    lines: Sequence[Component] = (),
+    *,
+    drifts: bool = False,
+    colour: float = 0.0,
 ) -> FittedModel | None:
     """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles.
 
@@ -353,14 +344,14 @@ def fit_background(
     white = max(float(np.median(d[f >= 0.6 * f[-1]])) * rate / 2, float(np.finfo(float).tiny))
     known = replace(search, gain=gain)
     corner = known.log_angle(fitting.STARTING_CORNER_HZ)
-    ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), search.colour, corner, ())
+    ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), colour, corner, ())
     held = density(smooth, ground.alone(*lines))
     slow = max(float(np.trapezoid(np.maximum(d - held, 0), f)) - white, 0.1 * white)
     if drifts:
         starts = _starting_drifts(known, ground, slow, 2 * white / rate)
         starts = sorted(starts, key=lambda start: contrast(smooth, start, held))[:_MOST_DRIFTS]
     else:
-        places = (*_TURBULENCE, _DRIFT)
+        places = (*_TURBULENCE, _OVERDAMPED)
         starts = [ground.add(known.component("turbulence", *place, slow)) for place in places]
     best: FittedModel | None = None
     for start in starts:
@@ -375,7 +366,8 @@ def _starting_drifts(
     search: Search, ground: SpectrumModel, slow: float, noise: float
 ) -> list[SpectrumModel]:
     """Return a drift and turbulence where fits may begin, for a slow variance and noise density."""
-    hz, ratio = _DRIFT
+    ratio = fitting.DRIFT_RATIO
+    hz = 2 * ratio * fitting.DRIFT_HZ
     powers = noise * np.array(_CROSSINGS_HZ) ** 2 * np.pi * ratio / hz  # of hz / (pi ratio f^2)
     drifts = [search.component("drift", hz, ratio, float(power)) for power in powers]
     places = product(_TURBULENCE, _SHARES)

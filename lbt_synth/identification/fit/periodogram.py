@@ -62,6 +62,11 @@ class LoopPeriodogram:
         return half_angle_square(self.frequency_hz, self.frame_rate_hz)
 
     @cached_property
+    def log_frame_mean(self) -> FloatArray:
+        """Logarithm of the power that the mean over a frame leaves, (f,)."""
+        return np.asarray(2 * np.log(np.sinc(self.frequency_hz / self.frame_rate_hz)))
+
+    @cached_property
     def periods(self) -> FloatArray:
         """Periods of each frequency within a tapered segment, (f,)."""
         assert self.duration_s is not None

@@ -21,14 +21,12 @@ from lbt_synth.identification.fit.fitting import Search, close_line
 from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
-    IdentifiedTurbulence,
     Kind,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
 from lbt_synth.identification.fit.scoring import SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
-    DIFFERENCE,
     FittedModel,
     contrast,
     densities,
@@ -55,9 +53,6 @@ _APART = 1.4  # half widths between the lines there
 _NARROWER = -0.25  # of the logarithm of the damping
 _LIKE = 0.5  # width of the prior around that
 _REACH = 20.0  # half widths around a line that are fitted
-_NEAR = 0.2  # of the logarithm of what a pair adds, where a separation is near enough
-_MOST_STEPS = 8
-_STEEPNESS = 4.0  # of what a pair adds with its separation, where nothing is known
 
 
 def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> SpectrumModel:
@@ -125,10 +120,12 @@ def describe_axis(
     slow = spectrum if spectrum.rolling == "turbulence" else near.spectrum
     each, _, _ = densities(data, near.spectrum)
     fitted = each.sum(axis=0) if near is model else density(data, spectrum)
-    lines = [
+    first, *lines = [
         _describe_line(search, near, i, errors, covariance, each)
-        for i in range(1, len(spectrum.components))
+        for i in range(len(spectrum.components))
     ]
+    if slow is spectrum:  # its own parameters, not those of the nearest process
+        first = _describe_line(search, model, 0, errors, covariance, each)
     background = fitted.copy()
     for line, own in zip(lines, each[2:], strict=True):
         if line.kind == "line":
@@ -141,7 +138,7 @@ def describe_axis(
     parts = [p for p in lines if p.kind != "turbulence" or p.rms_nm > _LEAST_PART * noise]
     return IdentifiedAxis(
         turbulence=process,
-        turbulence_fit=_describe_turbulence(slow, errors, covariance, process),
+        turbulence_fit=_describe_turbulence(first, slow, errors, process),
         parts=tuple(sorted(parts, key=lambda part: part.frequency_hz)),
         noise_nm=noise,
         noise_error_nm=min(noise * errors.log_noise / 2, innovation),
@@ -221,27 +218,17 @@ def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
 
 
 def _describe_turbulence(
-    spectrum: SpectrumModel, errors: SpectrumModel, covariance: FloatArray, process: ARModel
-) -> IdentifiedTurbulence:
-    """Return the parameters of the turbulence; the error of its rms is by differences."""
-    theta, rate = spectrum.pack(), process.frame_rate_hz
-
-    def rms(change: FloatArray) -> float:
-        return _turbulence_process(spectrum.unpack(theta + change), rate).rms_nm
-
-    steps = DIFFERENCE * np.eye(theta.size)
-    slope = np.log([rms(step) / rms(-step) for step in steps]) / (2 * DIFFERENCE)
-    turbulence, error, to_hz = spectrum.components[0], errors.components[0], rate / (2 * np.pi)
-    corner = float(np.exp(spectrum.log_corner)) * to_hz if spectrum.rolls_off else None
-    return IdentifiedTurbulence(
-        frequency_hz=turbulence.frequency * to_hz,
-        frequency_error_hz=turbulence.frequency * to_hz * error.log_frequency,
-        damping=turbulence.damping_ratio,
-        damping_error=turbulence.damping_ratio * turbulence.damping_slope * error.damping,
-        corner_hz=corner,
-        corner_error_hz=None if corner is None else corner * errors.log_corner,
+    line: IdentifiedLine, spectrum: SpectrumModel, errors: SpectrumModel, process: ARModel
+) -> IdentifiedLine:
+    """Return the first component as turbulence, with the rms of its process, and its corner."""
+    corner = float(np.exp(spectrum.log_corner)) * process.frame_rate_hz / (2 * np.pi)
+    return replace(
+        line,
+        kind="turbulence",
         rms_nm=process.rms_nm,
-        rms_error_nm=process.rms_nm * float(np.sqrt(slope @ covariance @ slope)),
+        rms_error_nm=process.rms_nm * line.rms_error_nm / line.rms_nm,
+        corner_hz=corner if spectrum.rolls_off else None,
+        corner_error_hz=corner * errors.log_corner if spectrum.rolls_off else None,
     )
 
 
@@ -397,52 +384,3 @@ def split_gain(search: Search, spectrum: SpectrumModel, i: int, *, worth: float 
             away = (found.spectrum.pack() - priors.centre)[[1 - 2 * PARAMETERS, 1 - PARAMETERS]]
             best = min(best, found.contrast + float(np.sum((away / _LIKE) ** 2)) / 2)
     return single - best
-
-
-def measure_separations(axis: IdentifiedAxis) -> IdentifiedAxis:
-    """Return an axis each of whose lines knows how far apart two like it have to be."""
-    search, spectrum = Search(data=axis.data), axis.fitted_model.spectrum
-    centres = np.array([search.place(c)[0] for c in spectrum.components[1:]])
-    parts = list(axis.parts)
-    for k, part in enumerate(parts):
-        if part.kind == "line":
-            i = 1 + int(np.argmin(np.abs(centres - part.frequency_hz)))
-            parts[k] = replace(part, separable_hz=separable_hz(search, spectrum, i))
-    return replace(axis, parts=tuple(parts))
-
-
-def separable_hz(search: Search, spectrum: SpectrumModel, i: int) -> float:
-    """Return how far apart two like lines have to be to be seen as two in the place of line i.
-
-    There the likelihood expects as much of a pair as a split rarely adds to a single line [Hz]. At
-    most some half widths: beyond, a line is hardly seen.
-    """
-    line = spectrum.components[i]
-    centre, half = search.place(line)
-    data = search.merge(spectrum).window(centre - _REACH * half, centre + _REACH * half)
-    rest, zero = density(data, spectrum.exchange(i)), np.zeros_like(data.measured)
-    data = replace(data, measured=density(data, spectrum), crossed=zero, corrected=zero)
-    single = contrast(data, spectrum)
-    start = spectrum.alone(*(line.shift(0.0, _NARROWER, float(np.log(0.5))) for _ in range(2)))
-    places = start.pack().size - PARAMETERS * np.array([2, 1])
-    width = np.zeros(start.pack().size)
-    width[-2 * PARAMETERS :] = 2 * (0.0, np.inf, np.inf)
-    most = min(centre, _REACH * half)
-    apart, known = min(3 * half, most), []
-    for _ in range(_MOST_STEPS):
-        theta = start.pack()
-        theta[places] = line.log_frequency + np.log1p(np.array([-0.5, 0.5]) * apart / centre)
-        at = start.unpack(theta)
-        found = minimise(data, at, Priors(centre=theta, width=width), held=rest, accuracy=SEARCHED)
-        if found is None:
-            break
-        start = found.spectrum
-        known.append((np.log(apart), np.log(max(found.contrast - single, 1e-9) / _LIKELY)))
-        if abs(known[-1][1]) < _NEAR or (apart == most and known[-1][1] < 0):
-            break
-        slope = _STEEPNESS
-        if len(known) > 1:
-            run, rise = np.subtract(known[-1], known[-2])
-            slope = max(rise / run, 1.0)
-        apart = min(apart * float(np.exp(np.clip(-known[-1][1] / slope, -1, 1))), most)
-    return apart

@@ -24,7 +24,6 @@ from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_perio
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     gain_covariance,
-    measure_separations,
     standard_errors,
 )
 from lbt_synth.identification.fit.scoring import EXACT
@@ -32,7 +31,6 @@ from lbt_synth.identification.fit.spectrum_model import (
     GAIN,
     SHARED,
     Component,
-    Shared,
     Spectra,
     damping_parameter,
 )
@@ -121,14 +119,13 @@ def _describe_axis(
         evidence=(float("inf"), *(_lost(search, fit, other) for other in less)),
     )
     error = alone.sensor_gain_error
-    found = describe_axis(
+    return describe_axis(
         replace(search, data=alone.data, gain=alone.sensor_gain),
         model,
         None if error is None else error / alone.sensor_gain,
         alone.sensor_gain_note,
         shared=range(len(own.components), len(whole.components)),
     )
-    return measure_separations(found)
 
 
 def _find_part(axis: IdentifiedAxis, component: Component) -> int:
@@ -384,7 +381,7 @@ def _share(spectra: Spectra, strong: int, weak: int | None, line: NDArray[np.ine
                 spectra = spectra.on_axis(i, axis.exchange(place))
     own, on = next((c, i) for i, c in enumerate(before) if c is not None and c.name == strong)
     ratio = 2 * float(np.log(np.abs(line[1] / line[0])))
-    resonance = Shared(
+    resonance = Component(
         own.kind,
         own.log_frequency,
         own.damping,
@@ -427,7 +424,7 @@ def _with_shared_turbulence(spectra: Spectra, coherence: float) -> Spectra:
     less = float(np.log1p(-part))
     for i, (axis, slow) in enumerate(zip(spectra.axes, own, strict=True)):
         spectra = spectra.on_axis(i, axis.exchange(0, slow.shift(0.0, 0.0, less)))
-    resonance = Shared(
+    resonance = Component(
         "slow",
         0.5 * (own[0].log_frequency + own[1].log_frequency),
         damping_parameter("slow", ratio),

@@ -24,7 +24,8 @@ _LEAST = 0.05  # damping ratio of turbulence; narrower components are lines
 _JUST_ABOVE = 1e-3
 _NOTHING = float(np.log(np.finfo(float).tiny))  # as a logarithm
 
-# "slow" is another part of the turbulence; a first-order "drift" stands in the place of the first
+# "slow" is another part of the turbulence; a "drift" of first order, whose damping
+# ratio is held far above 1, stands in the place of the first
 Kind = Literal["turbulence", "drift", "slow", "line"]
 _FIRST: tuple[Kind, ...] = ("turbulence", "drift")
 
@@ -34,7 +35,9 @@ class Component:
     """A resonance, by the numbers that a fit varies.
 
     The damping ratio zeta of the first one is above 0.05, that of all others below 1: their
-    ``damping`` is ``log(zeta - 0.05)`` and ``log(zeta / (1 - zeta))``.
+    ``damping`` is ``log(zeta - 0.05)`` and ``log(zeta / (1 - zeta))``. One that two axes share has
+    the cross-spectrum ``sqrt(S1 S2) e^(i phase)``, and its power is that on the first axis: with a
+    phase of 0 or pi it moves along a line, with any other on an ellipse.
     """
 
     kind: Kind
@@ -43,6 +46,10 @@ class Component:
     log_power: float  # of the variance, in units of the measurement
     announced: tuple[float, float] | None = None  # log_frequency known beforehand, and its error
     name: int = 0  # by which a search for what axes share finds it again
+    log_ratio: float = 0.0  # of its variance on the second axis over that on the first
+    phase: float = 0.0  # by which the first axis is ahead
+    before: tuple[Component | None, Component | None] = (None, None)  # what it has replaced
+    holds_ratio: bool = False  # whether the ratio is not fitted
 
     @property
     def frequency(self) -> float:
@@ -76,6 +83,11 @@ class Component:
         """Return a component of another kind with the same spectrum, as far as it can have that."""
         ratio = self.damping_ratio
         return replace(self, kind=kind, damping=damping_parameter(kind, ratio), announced=None)
+
+    def on(self, axis: int) -> Component:
+        """Return what one axis shows of a component that two share."""
+        power = self.log_power + axis * self.log_ratio
+        return Component(self.kind, self.log_frequency, self.damping, power, self.announced)
 
     def shift(self, log_frequency: float, damping: float, log_power: float) -> Component:
         """Return the component with its numbers changed by these."""
@@ -144,7 +156,11 @@ class SpectrumModel:
 
     def without_roll_off(self) -> SpectrumModel:
         """Return the model with turbulence that does not roll off."""
-        return replace(self, log_corner=float(np.log(2 * _NO_CORNER)))
+        return replace(self, log_corner=float(np.log(2 * _NO_CORNER))) if self.rolls_off else self
+
+    def without_colour(self) -> SpectrumModel:
+        """Return the model with white noise."""
+        return replace(self, colour=0.0)
 
     @property
     def rolling(self) -> Kind:
@@ -189,30 +205,11 @@ class SpectrumModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Shared(Component):
-    """A resonance of two axes, with the cross-spectrum ``sqrt(S1 S2) e^(i phase)``.
-
-    With a phase of 0 or pi it moves along a line, with any other on an ellipse. Its power is that
-    on the first axis.
-    """
-
-    log_ratio: float = 0.0  # of its variance on the second axis over that on the first
-    phase: float = 0.0  # by which the first axis is ahead
-    before: tuple[Component | None, Component | None] = (None, None)  # what it has replaced
-    holds_ratio: bool = False  # whether the ratio is not fitted
-
-    def on(self, axis: int) -> Component:
-        """Return what one axis shows of it."""
-        power = self.log_power + axis * self.log_ratio
-        return Component(self.kind, self.log_frequency, self.damping, power, self.announced)
-
-
-@dataclass(frozen=True, slots=True)
 class Spectra:
     """The spectra of one or two axes, and the resonances that two share."""
 
     axes: tuple[SpectrumModel, ...]
-    shared: tuple[Shared, ...] = ()
+    shared: tuple[Component, ...] = ()
 
     @property
     def starts(self) -> list[int]:

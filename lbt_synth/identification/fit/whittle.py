@@ -184,13 +184,24 @@ def densities(
     shape, by_colour = _log_colour(spectrum.colour, s)
     density[0] = white * np.exp(spectrum.log_noise + shape)
     density[1:], slopes = resonance_densities(frequency, ratio, white * np.exp(power), s)
-    fall, by_corner = log_roll_off(float(np.exp(spectrum.log_corner)), spectrum.roll_off_order, s)
+    fall, by_corner = _log_tilt(data, spectrum.log_corner, spectrum.roll_off_order)
     rolling = [i for i, c in enumerate(components, 1) if c.kind == spectrum.rolling]
     density[rolling] *= np.exp(fall)
     _smear(data, components, density[1:], slopes)
     slopes[:, 1] *= slope[:, None]
     by_shape = np.array([by_colour * density[0], by_corner * density[rolling].sum(axis=0)])
     return density, slopes, by_shape
+
+
+def _log_tilt(
+    data: LoopPeriodogram, log_corner: float, order: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the roll-off of turbulence as frames show it, a logarithm, and its slope, (f,).
+
+    The mean over a frame takes ``sinc^2`` of the phase. A process of finite order is one of means.
+    """
+    fall, slope = log_roll_off(float(np.exp(log_corner)), order, data.half_angle_square)
+    return fall if order == 1 else fall + data.log_frame_mean, slope
 
 
 def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -239,26 +250,15 @@ def _smear(
             slopes[i, 1, start:stop] += by_width[part]
 
 
-def component_densities(data: LoopPeriodogram, components: Sequence[Component]) -> FloatArray:
-    """Return the densities of components but for the roll-off of turbulence, (c, f)."""
-    shape = [(c.frequency, c.damping_ratio, c.log_power) for c in components]
-    frequency, ratio, power = np.array(shape).reshape(-1, 3).T
-    variance = 2 / data.frame_rate_hz * np.exp(power)
-    own, _ = resonance_densities(frequency, ratio, variance, data.half_angle_square)
-    _smear(data, components, own)
-    return own
-
-
 @lru_cache(maxsize=64)
-def _component_density(
-    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None
+def component_density(
+    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None = None
 ) -> FloatArray:
     """Return the density of a component behind a roll-off of a corner and an order, (f,)."""
     s, c = data.half_angle_square, component
     own = unit_density(c.frequency, c.damping_ratio, s)
     if roll_off is not None:
-        corner, order = roll_off
-        own *= np.exp(log_roll_off(float(np.exp(corner)), order, s)[0])
+        own *= np.exp(_log_tilt(data, *roll_off)[0])
     _smear(data, [c], own[None])
     return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * own)
 
@@ -269,7 +269,7 @@ def part_density(
     """Return the density of a component of a spectrum, (f,)."""
     roll_off = (spectrum.log_corner, spectrum.roll_off_order)
     rolls = component.kind == spectrum.rolling
-    return _component_density(data, component, roll_off if rolls else None)
+    return component_density(data, component, roll_off if rolls else None)
 
 
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,23 +12,23 @@ from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.identification.prediction.predictor import least_squares_predictor
 from lbt_synth.identification.prediction.residual import (
-    Replay,
     ResidualEstimate,
     check_series,
+    check_test,
     choose_warm_up,
     estimate_replay,
+    estimate_residual,
     inverse_sensor,
-    measured_replay,
+    leave_out,
     mode_noise,
     replay,
-    replay_frames,
 )
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, residual_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
-from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
@@ -41,19 +40,10 @@ LIMIT = "limit of performance"
 _RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
 _START_SHARE = 0.01  # of a measured mean square: what a start adds above that has a note
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that chance explains
-_AXES = ("tip", "tilt")
-_COLUMNS = {  # attribute of a row by heading
-    "data_nm": "replayed_nm",
-    "data_error_nm": "replayed_error_nm",
-    "model_nm": "model_nm",
-    "data_over_model": "ratio",
-    "strehl": "strehl",
-    "model_strehl": "model_strehl",
-}
 
 
 @table_row
-class ResidualRow:
+class PredictionRow:
     """One controller on frames that nothing was fitted to, beside what the model promises."""
 
     name: str = column("controller", help="What it is")
@@ -67,53 +57,16 @@ class ResidualRow:
     ratio: float = column("data/model", format=".3f", help="Residual on the data over that")
     strehl: float = column("Strehl, data", format=".3f", help="Strehl ratio on the data")
     model_strehl: float = column("Strehl, model", format=".3f", help="Strehl ratio by the model")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PredictionRow:
-    """One controller on the data, and by the model."""
-
-    name: str
-    # residual on the test data; None for the limit, which is no controller
-    replayed: ResidualEstimate | None
-    # (n, n) covariance that the model promises; None where the controller is not known
-    model_nm2: FloatArray | None
-    strehl: float  # of the data; nan where there is none
-    model_strehl: float  # of the model
-
-    @property
-    def model_nm(self) -> float:
-        """Residual over all axes that the model promises [nm rms]; nan if unknown."""
-        return float(np.sqrt(np.trace(self.model_nm2))) if self.model_nm2 is not None else np.nan
-
-    @property
-    def model_axis_nm(self) -> FloatArray | None:
-        """The same of each axis, (n,) [nm rms]."""
-        return None if self.model_nm2 is None else frozen_copy(np.sqrt(np.diag(self.model_nm2)))
-
-    @property
-    def replayed_nm(self) -> float:
-        """Residual over all axes on the data [nm rms]; nan if negative within its error."""
-        return np.nan if self.replayed is None else self.replayed.rms_nm
-
-    @property
-    def replayed_error_nm(self) -> float:
-        """Standard error of that [nm]."""
-        return np.nan if self.replayed is None else self.replayed.rms_error_nm
-
-    @property
-    def ratio(self) -> float:
-        """Residual on the data over what the model promises; nan where either is unknown."""
-        return self.replayed_nm / self.model_nm if self.model_nm > 0 else np.nan
+    replayed: ResidualEstimate | None  # on the test data; None for the limit, no controller
+    model_axis_nm: FloatArray | None  # (n,): promised for each axis; None if unknown
 
     @property
     def deviations(self) -> float:
         """Variance on the data less that of the model, in standard errors; nan if unknown."""
-        if self.replayed is None or self.model_nm2 is None:
+        if self.replayed is None:
             return np.nan
-        difference = self.replayed.total_nm2 - float(np.trace(self.model_nm2))
         error = self.replayed.total_error_nm2
-        return difference / error if error > 0 else np.nan
+        return (self.replayed.total_nm2 - self.model_nm**2) / error if error > 0 else np.nan
 
     @property
     def contradicts_model(self) -> bool:
@@ -153,26 +106,6 @@ class PredictionTable:
             f"the table has the rows {', '.join(entry.name for entry in self.entries)}; got "
             f"{name!r}."
         )
-
-    @property
-    def headings(self) -> tuple[str, ...]:
-        """Names of the columns of :meth:`rows`, with their units."""
-        n = next(e.replayed.noise_nm2.shape[0] for e in self.entries if e.replayed is not None)
-        axes = _AXES[:n] if n <= len(_AXES) else tuple(f"axis_{i}" for i in range(n))
-        return "controller", *(f"{axis}_nm" for axis in axes), *_COLUMNS
-
-    def rows(self) -> tuple[tuple[Any, ...], ...]:
-        """Return a tuple per row, in the order of :attr:`headings`; nan where nothing is known.
-
-        The axes' columns are of the data, except in the row of the limit.
-        """
-        out = []
-        for entry in self.entries:
-            axes = entry.model_axis_nm if entry.replayed is None else entry.replayed.axis_rms_nm
-            assert axes is not None
-            values = (getattr(entry, name) for name in _COLUMNS.values())
-            out.append((entry.name, *axes.tolist(), *values))
-        return tuple(out)
 
 
 def prediction_against_data(
@@ -264,24 +197,30 @@ def prediction_against_data(
             raise ProblemError(
                 f"a controller may not be called {name!r}; its row is taken. Give another name."
             )
-    predictor = least_squares_predictor(series, hardware, taps=taps, stretches=fitted).controller
+    predictor, _ = least_squares_predictor(series, hardware, taps=taps, stretches=fitted)
     chosen = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
     loops = {name: _close_stable_loop(plant, name, one) for name, one in chosen.items()}
-    every = replay_frames(runs, tested)
+    check_test(runs, tested)
     replays = {name: replay(loop, series, runs, from_rest=False) for name, loop in loops.items()}
-    warm_up = choose_warm_up(list(replays.values()), every)
-    frames = every.without(warm_up)
+    warm_up = choose_warm_up(list(replays.values()), tested)
+    kept = leave_out(runs, tested, warm_up)
     rows = []
     if measurements is not None:
         promised = None
         if running is not None:
             promised = _model_means(_close_stable_loop(plant, RAN, running), plant)
-        ran = _measured_replay(series, hardware, measurements, tested)
-        rows.append(_build_row(RAN, estimate_replay(ran, frames, noise), promised, imaging))
+        y, _ = check_series(measurements, hardware.n_measurements, tested, "measurements")
+        if len(y) != len(series):
+            raise ProblemError(
+                f"measurements must have the {len(series)} frames of open_loop; got {len(y)}."
+            )
+        residual = y @ inverse_sensor(hardware).T
+        ran = estimate_residual(np.concatenate([residual[a:b] for a, b in kept]), kept, *noise)
+        rows.append(_build_row(RAN, ran, promised, imaging))
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
     for name, loop in loops.items():
-        replayed = estimate_replay(replays[name], frames, noise)
+        replayed = estimate_replay(replays[name], kept, noise)
         rows.append(_build_row(name, replayed, _model_means(loop, plant), imaging))
     notes = [*_note_starts(rows, loops), *_note_refuted(rows)]
     try:
@@ -294,7 +233,7 @@ def prediction_against_data(
     return PredictionTable(
         entries=tuple(rows),
         fit=fitted,
-        test=frames.test,
+        test=kept,
         warm_up_frames=warm_up,
         notes=tuple(notes),
     )
@@ -339,18 +278,6 @@ def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Desig
     return loop
 
 
-def _measured_replay(
-    open_loop: FloatArray, hardware: LoopHardware, measurements: ArrayLike, test: Stretches
-) -> Replay:
-    """Return the residual of the loop that ran, from its own measurements."""
-    y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
-    if len(y) != len(open_loop):
-        raise ProblemError(
-            f"measurements must have the {len(open_loop)} frames of open_loop; got {len(y)}."
-        )
-    return measured_replay(y @ inverse_sensor(hardware).T)
-
-
 def _model_means(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
     """Covariance of what the plant's model leaves, in means over frames as a record has them."""
     return residual_budget(loop, plant, frame_means=True).total_nm2
@@ -359,15 +286,22 @@ def _model_means(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 def _build_row(
     name: str, found: ResidualEstimate | None, promised: FloatArray | None, imaging: Imaging | None
 ) -> PredictionRow:
-    strehl = promised_strehl = float("nan")
+    """Return a row of a residual on the data and a covariance (n, n) that the model promises."""
+    measured = np.nan if found is None else found.rms_nm
+    model = np.nan if promised is None else float(np.sqrt(np.trace(promised)))
+    strehl = promised_strehl = np.nan
     if imaging is not None and found is not None:
         strehl = found.strehl(imaging)
     if imaging is not None and promised is not None:
         promised_strehl = jitter_strehl(promised, imaging=imaging)
     return PredictionRow(
         name=name,
-        replayed=found,
-        model_nm2=None if promised is None else frozen_copy(promised),
+        replayed_nm=measured,
+        replayed_error_nm=np.nan if found is None else found.rms_error_nm,
+        model_nm=model,
+        ratio=measured / model if model > 0 else np.nan,
         strehl=strehl,
         model_strehl=promised_strehl,
+        replayed=found,
+        model_axis_nm=None if promised is None else frozen_copy(np.sqrt(np.diag(promised))),
     )

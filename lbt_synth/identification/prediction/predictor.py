@@ -8,7 +8,7 @@ replay measures, for fractional delays and mirrors that move as well.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -32,18 +32,6 @@ _MOST_TAPS = 1000
 _LEAST_ROWS = 4  # frames per coefficient
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LeastSquaresPredictor:
-    """A predictor fitted to a record, as a controller."""
-
-    # (n, n, taps): what z_j(k-l) adds to the correction of mode i that u(k) commands
-    coefficients: FloatArray
-    # (n,), mean square of the measured residual of each mode in the fit, with noise
-    fitted_nm2: FloatArray
-    frames: int  # frames that were fitted
-    controller: Controller  # from y(k) to u(k), stable for the sensor gain of the fit
-
-
 def least_squares_predictor(
     open_loop: ArrayLike,
     hardware: LoopHardware,
@@ -53,7 +41,7 @@ def least_squares_predictor(
     stretches: StretchesLike | None = None,
     coupled: bool = False,
     ridge: float = 0.0,
-) -> LeastSquaresPredictor:
+) -> tuple[Controller, FloatArray]:
     """Fit the FIR predictor of least residual to a record, and make it a controller.
 
     Parameters
@@ -76,9 +64,11 @@ def least_squares_predictor(
 
     Returns
     -------
-    LeastSquaresPredictor
-        Coefficients and controller. The filter is its Youla parameter
-        (:func:`youla_controller`): the loop is stable for any coefficients.
+    controller : Controller
+        From y(k) to u(k). The filter is its Youla parameter (:func:`youla_controller`): the loop
+        is stable for any coefficients, at the sensor gain of the fit.
+    coefficients : (n, n, taps) ndarray
+        What z_j(k-l) adds to the correction of mode i that u(k) commands.
 
     Raises
     ------
@@ -95,8 +85,8 @@ def least_squares_predictor(
     >>> slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=10.0, frame_rate_hz=800)
     >>> idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / 800)
     >>> run = lbt.simulate(idle, lbt.Truth(turbulence=slow), hardware=path, frames=20_000)
-    >>> fit = lbt.identification.least_squares_predictor(run.total_nm[0], path, taps=1)
-    >>> bool(abs(fit.coefficients[0, 0, 0] - 0.81) < 0.02)
+    >>> _, taps = lbt.identification.least_squares_predictor(run.total_nm[0], path, taps=1)
+    >>> bool(abs(taps[0, 0, 0] - 0.81) < 0.02)
     True
     """
     require_instance(hardware, LoopHardware)
@@ -118,12 +108,11 @@ def least_squares_predictor(
             f"frames to fit, beside {count} and the mirror's at the beginning of each stretch; got "
             f"{len(X)}. Record more, or lower taps."
         )
-    coefficients, fitted = np.zeros((n, n, count)), np.zeros(n)
+    coefficients = np.zeros((n, n, count))
     for i in range(n):
         seen = slice(None) if coupled else slice(i, i + 1)
         regressors = X[:, seen].reshape(len(X), unknowns)
         found = _solve_least_squares(regressors, Z[:, i], share)
-        fitted[i] = np.mean((Z[:, i] - regressors @ found) ** 2)
         coefficients[i, seen] = found.reshape(-1, count)
     # an FIR filter of z from y to u, whose states are the last z
     parameter = Controller(
@@ -134,12 +123,7 @@ def least_squares_predictor(
         dt_s=hardware.dt_s,
     )
     believed = replace(hardware, sensor_matrix=gain * hardware.sensor)
-    return LeastSquaresPredictor(
-        coefficients=frozen_copy(coefficients),
-        fitted_nm2=frozen_copy(fitted),
-        frames=len(X),
-        controller=youla_controller(believed, parameter),
-    )
+    return youla_controller(believed, parameter), frozen_copy(coefficients)
 
 
 def _regression(

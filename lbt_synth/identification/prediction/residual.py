@@ -96,6 +96,11 @@ class ResidualEstimate:
         return float(np.sum(self.variance_nm2))
 
     @property
+    def measured_nm2(self) -> float:
+        """Mean square of the measured residual over all axes, noise included [nm^2]."""
+        return self.total_nm2 + float(np.trace(self.noise_nm2))
+
+    @property
     def total_error_nm2(self) -> float:
         """Standard error of the variance over all axes [nm^2]."""
         return float(np.sqrt(max(float(np.sum(self.error_nm4)), 0.0)))
@@ -186,11 +191,10 @@ def estimate_residual(
 
 
 def estimate_replay(
-    run: Replay, frames: ReplayFrames, noise: tuple[FloatArray, FloatArray]
+    run: Replay, test: Stretches, noise: tuple[FloatArray, FloatArray]
 ) -> ResidualEstimate:
     """Return the residual of a replay in the frames that count, under the :func:`mode_noise`."""
-    left = run.left_of_start(frames)
-    return estimate_residual(run.measured(frames), frames.test, *noise, left)
+    return estimate_residual(run.measured(test), test, *noise, run.left_of_start(test))
 
 
 def replayed_residual(
@@ -278,10 +282,10 @@ def replayed_residual(
     loop = close_loop(hardware, controller, sensor_gain=gain)
     loop.require_stable()
     tested = runs if test is None else checked_stretches(test, len(series))
-    frames = replay_frames(runs, tested)
+    check_test(runs, tested)
     run = replay(loop, series, runs, from_rest=from_rest)
-    warm_up = 0 if from_rest else choose_warm_up([run], frames)
-    return estimate_replay(run, frames.without(warm_up), noise)
+    warm_up = 0 if from_rest else choose_warm_up([run], tested)
+    return estimate_replay(run, leave_out(runs, tested, warm_up), noise)
 
 
 def mode_noise(
@@ -334,44 +338,34 @@ def invert(square: FloatArray, need: str) -> FloatArray:
     return np.asarray(np.linalg.inv(square))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ReplayFrames:
-    """Frames that count, in the contiguous frames that a replay runs over."""
-
-    runs: Stretches  # contiguous frames
-    test: Stretches  # frames of them that count
-
-    @property
-    def starts(self) -> tuple[int, ...]:
-        """First frame of the run of each stretch of the test."""
-        return tuple(max(a for a, _ in self.runs if a <= start) for start, _ in self.test)
-
-    @property
-    def count(self) -> int:
-        """Number of frames that count."""
-        return sum(stop - start for start, stop in self.test)
-
-    def without(self, frames: int) -> ReplayFrames:
-        """Return the test without the first frames of each run."""
-        begins = zip(self.starts, self.test, strict=True)
-        kept = [(max(start, first + frames), stop) for first, (start, stop) in begins]
-        return replace(self, test=tuple((a, b) for a, b in kept if a < b))
-
-
-def replay_frames(runs: Stretches, test: Stretches) -> ReplayFrames:
-    """Check that a test lies in contiguous frames."""
+def check_test(runs: Stretches, test: Stretches) -> None:
+    """Refuse a test that does not lie in contiguous frames, or has too few."""
     for start, stop in test:
         if not any(a <= start and stop <= b for a, b in runs):
             raise ProblemError(
                 f"the test must lie within the usable stretches; got ({start}, {stop}) in "
                 f"{', '.join(map(str, runs))}."
             )
-    found = ReplayFrames(runs=runs, test=test)
-    if found.count < FEWEST:
+    if count_frames(test) < FEWEST:
         raise ProblemError(
-            f"a residual needs at least {FEWEST} frames; got {found.count}. Record more."
+            f"a residual needs at least {FEWEST} frames; got {count_frames(test)}. Record more."
         )
-    return found
+
+
+def count_frames(test: Stretches) -> int:
+    """Return the number of frames of stretches."""
+    return sum(stop - start for start, stop in test)
+
+
+def leave_out(runs: Stretches, test: Stretches, frames: int) -> Stretches:
+    """Return a test without the first frames of each run."""
+    kept = [(max(start, _run_start(runs, start) + frames), stop) for start, stop in test]
+    return tuple((a, b) for a, b in kept if a < b)
+
+
+def _run_start(runs: Stretches, frame: int) -> int:
+    """Return where the run of a frame begins."""
+    return max(a for a, _ in runs if a <= frame)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -381,27 +375,29 @@ class Replay:
     A loop without states that are unknown, such as one that was measured, has no ``spread``.
     """
 
+    runs: Stretches  # contiguous frames
     residual: FloatArray  # (frames, n): the measured residual; nan outside the runs
     output: FloatArray  # (n, s): C
     powers: tuple[FloatArray, ...] = ()  # (s, s) each: A, A^2, A^4, ...
     spread: FloatArray | None = None  # (s, s): sum of A^k P A'^k over all k
 
-    def measured(self, frames: ReplayFrames) -> FloatArray:
+    def measured(self, test: Stretches) -> FloatArray:
         """Return the measured residual of the frames that count, (k, n)."""
-        return np.concatenate([self.residual[start:stop] for start, stop in frames.test])
+        return np.concatenate([self.residual[start:stop] for start, stop in test])
 
-    def scatter(self, frames: ReplayFrames) -> float:
+    def scatter(self, test: Stretches) -> float:
         """Return the standard error of the mean square over all axes, but for the start."""
-        e = self.measured(frames)
-        return float(np.sqrt(max(np.sum(mean_covariance(e, e, frames.test)), 0.0)))
+        e = self.measured(test)
+        return float(np.sqrt(max(np.sum(mean_covariance(e, e, test)), 0.0)))
 
-    def left_of_start(self, frames: ReplayFrames) -> FloatArray:
+    def left_of_start(self, test: Stretches) -> FloatArray:
         """Return the mean square that the start adds to the test, (n, n)."""
         n = len(self.output)
         total = np.zeros((n, n))
-        for first, (start, stop) in zip(frames.starts, frames.test, strict=True):
+        for start, stop in test:
+            first = _run_start(self.runs, start)
             total += self._energy_after(start - first) - self._energy_after(stop - first)
-        return total / frames.count
+        return total / count_frames(test)
 
     def _energy_after(self, frames: int) -> FloatArray:
         """Return the sum of the squares that the start adds from a frame on, (n, n)."""
@@ -410,12 +406,6 @@ class Replay:
             if frames >> i & 1:
                 row = row @ power
         return row @ self.spread @ row.T if self.spread is not None else 0 * row @ row.T
-
-
-def measured_replay(residual: FloatArray) -> Replay:
-    """Return the residual that a loop measured as a replay that needs no start."""
-    n = residual.shape[1]
-    return Replay(residual=residual, output=np.zeros((n, 0)))
 
 
 def replay(loop: ClosedLoop, series: FloatArray, runs: Stretches, *, from_rest: bool) -> Replay:
@@ -440,11 +430,12 @@ def replay(loop: ClosedLoop, series: FloatArray, runs: Stretches, *, from_rest: 
             moments += stationary_covariance(path.A, np.outer(last, last))
             count += len(away)
     if from_rest:
-        return Replay(residual=residual, output=path.C)
+        return Replay(runs=runs, residual=residual, output=path.C)
     powers = [path.A]
     for _ in range(len(series).bit_length()):
         powers.append(powers[-1] @ powers[-1])
     return Replay(
+        runs=runs,
         residual=residual,
         output=path.C,
         powers=tuple(powers),
@@ -452,17 +443,19 @@ def replay(loop: ClosedLoop, series: FloatArray, runs: Stretches, *, from_rest: 
     )
 
 
-def choose_warm_up(replays: Sequence[Replay], frames: ReplayFrames) -> int:
+def choose_warm_up(replays: Sequence[Replay], test: Stretches) -> int:
     """Return the frames at the beginning of each run that are better left out.
 
     It is the number for which the variances of the mean squares, by the scatter of the residual
     and by its start, have the least sum over the replays, in units of the first.
     """
-    longest = max(stop - start for start, stop in frames.runs)
+    runs = replays[0].runs
+    longest = max(stop - start for start, stop in runs)
     tried = [0, *np.unique(np.geomspace(1, longest, 60).astype(int)).tolist()]
-    kept = [(w, part) for w in tried if (part := frames.without(w)).count >= FEWEST]
+    parts = [(w, leave_out(runs, test, w)) for w in tried]
+    kept = [(w, part) for w, part in parts if count_frames(part) >= FEWEST]
     adds = np.array([[np.trace(one.left_of_start(part)) for one in replays] for _, part in kept])
-    share = np.array([frames.count / part.count for _, part in kept])
+    share = np.array([count_frames(test) / count_frames(part) for _, part in kept])
     best = 0
     for _ in range(2):  # the first scatter has the start in it
         scatter = np.array([one.scatter(kept[best][1]) for one in replays])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from support.line_bands import FACTORS, make_bands
 
-from lbt_synth.identification.accelerometers.laying import fit_pairs
 from lbt_synth.identification.accelerometers.line_bands import fit_band
+from lbt_synth.identification.accelerometers.transfers import fit_pairs
 
 
 def test_the_skirts_of_lines_of_other_bands_are_taken_away():

@@ -73,33 +73,33 @@ def write(path, heading, *columns):
 def test_times_give_the_rate_and_the_gaps(tmp_path):
     time_s = np.delete(middles(1024, 4100), slice(2000, 2040))
     path = write(tmp_path / "a.csv", "t,m1,m2", 1e3 + time_s, *shaking(time_s).T)
-    found = load_readings(path, RATE)
-    assert found.channels == ("m1", "m2")
-    missing = np.isnan(found.values[:, 0])
+    channels, values, notes = load_readings(path, RATE)
+    assert channels == ("m1", "m2")
+    missing = np.isnan(values[:, 0])
     assert 38 <= missing.sum() <= 42
     good = slice(2200, 3900)
-    expected = shaking(middles(RATE, len(found.values)))
-    np.testing.assert_allclose(found.values[good], expected[good], atol=1e-3)
-    assert any("1024" in note for note in found.notes)
+    expected = shaking(middles(RATE, len(values)))
+    np.testing.assert_allclose(values[good], expected[good], atol=1e-3)
+    assert any("1024" in note for note in notes)
 
 
 def test_units_of_headings_count(tmp_path):
     series = shaking(middles(RATE, 200))
     for unit, factor in (("g", 9.80665), ("m/s^2", 1.0), ("m s-2", 1.0), ("mm/s2", 1e-3)):
         path = write(tmp_path / "a.csv", f"m1 [{unit}],m2 [{unit}]", *series.T)
-        np.testing.assert_allclose(load_readings(path, RATE).values, factor * series, rtol=1e-9)
+        np.testing.assert_allclose(load_readings(path, RATE)[1], factor * series, rtol=1e-9)
     with pytest.raises(lbt.errors.TelemetryError, match="which is right"):
         load_readings(path, RATE, unit="g")
     path = write(tmp_path / "a.csv", "m1 [mV],m2 [mV]", *series.T)
     with pytest.raises(lbt.errors.TelemetryError, match="'mV'. Scale them"):
         load_readings(path, RATE)
-    np.testing.assert_allclose(load_readings(path, RATE, unit="mg").values, 9.80665e-3 * series)
+    np.testing.assert_allclose(load_readings(path, RATE, unit="mg")[1], 9.80665e-3 * series)
 
 
 def test_an_offset_is_said(tmp_path):
     series = shaking(middles(RATE, 2000)) + np.array([9.81, 0])
-    found = load_readings(write(tmp_path / "a.csv", "m1,m2", *series.T), RATE)
-    (note,) = (note for note in found.notes if "offset" in note)
+    _, _, notes = load_readings(write(tmp_path / "a.csv", "m1,m2", *series.T), RATE)
+    (note,) = (note for note in notes if "offset" in note)
     assert "m1 have an offset" in note
 
 

@@ -138,7 +138,7 @@ def test_data_that_contradict_the_model_of_what_ran():
     found = line_diagnosis()
     assert ", which the data contradict" not in diagnosis_verdict(found)[1]
     entries = tuple(
-        replace(entry, model_nm2=4 * entry.model_nm2) if entry.name == "what ran" else entry
+        replace(entry, model_nm=2 * entry.model_nm) if entry.name == "what ran" else entry
         for entry in found.comparison.entries
     )
     other = replace(found, comparison=replace(found.comparison, entries=entries))
@@ -182,7 +182,7 @@ def test_where_nothing_can_be_gained():
     found = line_diagnosis()
     best = found.row(found.best)
     entries = tuple(
-        replace(entry, replayed=best.replayed) if entry.name == "what ran" else entry
+        replace(best, name="what ran") if entry.name == "what ran" else entry
         for entry in found.comparison.entries
     )
     same = replace(found, comparison=replace(found.comparison, entries=entries))
@@ -193,7 +193,7 @@ def test_where_the_gain_is_what_is_wrong():
     found = line_diagnosis()
     best = found.row(found.best)
     entries = tuple(
-        replace(entry, replayed=best.replayed) if entry.name == "best integrator" else entry
+        replace(best, name=entry.name) if entry.name == "best integrator" else entry
         for entry in found.comparison.entries
     )
     tuned = replace(found, comparison=replace(found.comparison, entries=entries))

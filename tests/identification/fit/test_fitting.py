@@ -68,16 +68,10 @@ def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:
     assert np.exp(pruned.log_noise) == pytest.approx(26**2, rel=0.05)
 
 
-def resonances(
-    *places: tuple[float, float, float], drift_ratio: float | None = None
-) -> SpectrumModel:
-    """Return turbulence, and a drift before it if it has a ratio, under resonances."""
+def resonances(*places: tuple[float, float, float]) -> SpectrumModel:
+    """Return turbulence under resonances."""
     component = empty_search().component
-    if drift_ratio is None:
-        slow = white_noise().add(component("turbulence", 0.9, 0.31, 3000.0))
-    else:
-        drift = component("drift", 2.0, drift_ratio, 3000.0)
-        slow = white_noise().add(drift, component("slow", 0.9, 0.31, 3000.0))
+    slow = white_noise().add(component("turbulence", 0.9, 0.31, 3000.0))
     return slow.add(*(component("line", *place) for place in places))
 
 
@@ -105,11 +99,3 @@ def test_what_a_part_of_the_turbulence_explains_the_rest_takes_over(seed: int, p
     kept, dropped = (prune(search, several, thorough=thorough) for thorough in (False, True))
     assert [len(model.spectrum.components) for model in (kept, dropped)] == [2, 1]
     assert cost(search, dropped) < cost(search, kept) - 5
-
-
-def test_a_drift_that_oscillates_is_none() -> None:
-    search = drawn_search(resonances((30.0, 0.5, 3000.0)), 0)
-    start = resonances(drift_ratio=2.5)
-    found = fit(search, start)
-    assert found is not None
-    assert [c.kind for c in found.spectrum.components] == ["turbulence"]

@@ -10,10 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.drawn_spectra import NOISE, drawn_search, empty_search, white_noise
-from support.recorded_loops import hidden_resonance_record, integrator_loop
+from support.recorded_loops import hidden_resonance_record, identify_series, integrator_loop
 
-import lbt_synth as lbt
-from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.fitting import DRIFT_RATIO, Search
 from lbt_synth.identification.fit.order_search import find_excesses, fit_background
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import SpectrumModel
@@ -27,7 +26,7 @@ def test_lines_that_are_still_missing_do_not_carry_the_gain_away() -> None:
     y, c = integrator_loop(
         lines=lines, noise=2.9, sensor_gain=1.15, gain=0.2, frames=30_000, seed=30
     )
-    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     assert found.sensor_gain_error is not None
     assert found.sensor_gain == pytest.approx(1.15, abs=3 * found.sensor_gain_error)
     assert [line.frequency_hz for line in found.lines] == pytest.approx(
@@ -41,9 +40,7 @@ def test_rounding_does_not_move_the_search() -> None:
     record = hidden_resonance_record(3)
     y, c = record.measurements[:, 0], record.corrections()[:, 0]
     one, other = (
-        lbt.identification.identify_axis(
-            y * scale, c * scale, frame_rate_hz=RATE, stretches=record.stretches()
-        )
+        identify_series(y * scale, c * scale, frame_rate_hz=RATE, stretches=record.stretches())
         for scale in (1.0, 1.0 + 2e-12)
     )
     assert len(one.parts) == len(other.parts)
@@ -79,7 +76,7 @@ def test_narrow_lines_are_hardly_touched_and_wide_ones_are_held(seed: int) -> No
 def test_a_drift_is_a_process_beside_the_turbulence(seed: int) -> None:
     search = empty_search()
     data = search.data
-    drift = search.component("drift", 2.0, 30.0, 20_000.0)  # a corner at 1/30 Hz
+    drift = search.component("drift", 20.0, DRIFT_RATIO, 20_000.0)  # a corner at 1/30 Hz
     slow = search.component("slow", 2.0, 0.4, 3000.0)
     truth = white_noise().add(drift, slow)
     drawn = drawn_search(truth, seed)

@@ -9,19 +9,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
-from support.recorded_loops import RATE, expected_periodogram, integrator_loop
+from support.recorded_loops import RATE, expected_periodogram, identify_series, integrator_loop
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.fitting import Search, fit
-from lbt_synth.identification.fit.order_search import search_model
+from lbt_synth.identification.fit.order_search import search_models
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     describe_close_lines,
     hold_gain,
     nearest_processes,
-    separable_hz,
     split_gain,
     standard_errors,
     whiteness,
@@ -36,9 +34,7 @@ DAMPING = 0.005
 
 def test_what_is_left_out_is_not_white() -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),))
-    found = lbt.identification.identify_axis(
-        y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6, most_lines=0
-    )
+    found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6, most_lines=0)
     assert not found.lines
     assert not found.whiteness.white
     assert found.whiteness.p_value < 1e-6
@@ -64,7 +60,7 @@ def test_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
     """Without chance in the data only the model can."""
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=wind, diameter_m=8.22)
     search = Search(data=expected_periodogram(air, 5.0, 0.6))
-    model = search_model(search)
+    model = search_models(search)[0]
     error = float(np.sqrt(model.covariance[0, 0]))
     assert abs(model.spectrum.log_gain - np.log(0.6)) < 0.2 * error
     # the process of the design is near to what was fitted, down to the noise
@@ -81,7 +77,7 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=8192)
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
     search = Search(data=data, gain=0.6)
-    model = search_model(search)
+    model = search_models(search)[0]
     for power, count in ((1e-12, 0), (100.0, 1)):
         slow = search.component("slow", 1.0, 0.5, power)
         more = replace(
@@ -98,8 +94,8 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
 
 def test_errors_at_a_held_gain_are_those_of_a_free_one() -> None:
     y, c = integrator_loop(lines=((45, 0.02, 25),), gain=0.2, frames=12_000)
-    free = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    held = lbt.identification.identify_axis(
+    free = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    held = identify_series(
         y[:, 0],
         c[:, 0],
         frame_rate_hz=RATE,
@@ -114,7 +110,7 @@ def test_errors_at_a_held_gain_are_those_of_a_free_one() -> None:
 
 def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),))
-    axis = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    axis = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     search, model = Search(data=axis.data), axis.fitted_model
     errors = standard_errors(model.spectrum, model.covariance)
     more = hold_gain(search, model, 0.2)
@@ -125,9 +121,7 @@ def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
 
 def test_white_noise_says_how_well_its_colour_shows() -> None:
     frames = 8192
-    axis = lbt.identification.identify_axis(
-        np.random.default_rng(1).standard_normal(frames), frame_rate_hz=RATE
-    )
+    axis = identify_series(np.random.default_rng(1).standard_normal(frames), frame_rate_hz=RATE)
     assert axis.noise_correlation == 0
     assert axis.noise_correlation_error == pytest.approx(1 / np.sqrt(frames), rel=0.25)
 
@@ -145,16 +139,21 @@ def fit_loop(
 ) -> tuple[Search, FittedModel]:
     """Return the fit to what a minute of an integrator's loop scatters about."""
     search = Search(data=expected_periodogram(total, NOISE_NM, GAIN), gain=gain)
-    return search, search_model(search)
+    return search, search_models(search)[0]
 
 
-@pytest.mark.parametrize("wind", [8.0, 20.0])
-def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
-    """Without a roll-off beside the drift it was a quarter too low: 13 standard errors."""
-    _, model = fit_loop(disturbance(wind, 0.999, 30.0))
+@pytest.mark.parametrize(("wind", "noise_nm"), [(8.0, NOISE_NM), (20.0, NOISE_NM), (20.0, 1.0)])
+def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind: float, noise_nm: float) -> None:
+    """Without a roll-off beside the drift it was a quarter too low: 13 standard errors.
+
+    With two free poles of the drift it was a fifth too high where there is little noise.
+    """
+    total = disturbance(wind, 0.999, 30.0)
+    model = search_models(Search(data=expected_periodogram(total, noise_nm, GAIN)))[0]
     assert [c.kind for c in model.spectrum.components] == ["drift", "slow"]
     assert model.spectrum.rolls_off
-    assert model.spectrum.gain == pytest.approx(GAIN, rel=0.02)
+    assert model.spectrum.gain == pytest.approx(GAIN, rel=0.01)
+    assert np.exp(model.spectrum.log_noise / 2) == pytest.approx(noise_nm, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -242,25 +241,6 @@ def test_a_single_line_gains_nothing() -> None:
     assert split_gain(search, single, 1) == pytest.approx(0, abs=0.1)
 
 
-def test_lines_can_be_separated_where_a_split_tells_the_exact_pair() -> None:
-    def gain(separation: float) -> float:
-        search, pair, single = exact(separation, 1000.0)
-        return contrast(search.data, single) - contrast(search.data, pair)
-
-    there = brentq(lambda x: gain(x) - 5.5, 1.0, 6.0, xtol=0.01)
-    search, _, single = exact(there, 1000.0)
-    assert separable_hz(search, single, 1) == pytest.approx(40.0 * DAMPING * there, rel=0.08)
-
-
-def test_a_longer_record_or_one_of_less_noise_separates_closer_lines() -> None:
-    search, _, single = exact(0.0)
-    first = separable_hz(search, single, 1)
-    longer = replace(search, data=replace(search.data, count=10 * search.data.count))
-    loud = replace(single, log_noise=single.log_noise + np.log(1e6))
-    assert separable_hz(longer, single, 1) < 0.8 * first
-    assert separable_hz(search, loud, 1) > 1.2 * first
-
-
 def test_a_line_beside_zero_is_not_split() -> None:
     search, _, single = exact(0.0)
     slow = search.component("line", 1 / DURATION_S, DAMPING, 1.0)
@@ -279,7 +259,7 @@ def simulated(second_hz: float, seed: int):
     path = lbt.LoopHardware(frame_rate_hz=SPECTRUM_RATE, modes=1)
     run = lbt.simulate(loop.controller, truth, hardware=path, frames=30_000, seed=seed)
     y, u = run.measurements[0, :, 0], run.commands[0, :, 0]
-    return lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=SPECTRUM_RATE)
+    return identify_series(y[2:], u[:-2], frame_rate_hz=SPECTRUM_RATE)
 
 
 def test_a_note_names_the_line_that_may_be_two() -> None:

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.recorded_loops import RATE, integrator_loop, open_record, slow
+from support.recorded_loops import RATE, identify_series, integrator_loop, open_record, slow
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.fitting import Search
@@ -51,7 +51,7 @@ def test_a_line_along_a_diagonal_is_one_line(degrees: float) -> None:
 def test_a_weak_part_of_a_line_belongs_to_it() -> None:
     """Tilt alone does not show its 0.7 nm."""
     record = open_record(((shaking(1.0, rms=40), 0),), noise=12.0)
-    alone = lbt.identification.identify_axis(record.measurements[:, 1], frame_rate_hz=1000)
+    alone = identify_series(record.measurements[:, 1], frame_rate_hz=1000)
     assert not alone.lines
     (line,) = lbt.identify(record).shared
     assert line.direction_deg == pytest.approx(1, abs=4 * line.direction_error_deg)
@@ -113,7 +113,7 @@ def test_axes_that_share_nothing_are_those_that_were_found_alone() -> None:
     model = lbt.identify(record, sensor_gain=0.6)
     assert not model.shared
     for i, axis in enumerate(model.axes):
-        alone = lbt.identification.identify_axis(
+        alone = identify_series(
             record.measurements[:, i],
             record.corrections()[:, i],
             frame_rate_hz=1000,
@@ -218,7 +218,7 @@ def test_errors_hold_what_the_error_of_a_gain_moves():
 
     def couple(gain: float, error: float):
         axes = [
-            lbt.identification.identify_axis(
+            identify_series(
                 y,
                 c,
                 frame_rate_hz=RATE,
@@ -264,10 +264,6 @@ def test_a_drift_that_becomes_a_resonance_keeps_the_lines_in_their_places() -> N
         (slow,) = [part for part in axis.parts if part.kind == "turbulence"]
         assert 4.5 < slow.frequency_hz < 40  # between two lines
         assert slow.direction is None
-        for part in axis.parts:
-            if part.kind == "line":
-                assert part.separable_hz is not None
-                assert part.separable_hz < 2
     assert [round(line.frequency_hz) for line in model.shared] == [5, 40]
     for line, sign in zip(model.shared, (-1, 1), strict=True):
         assert line.direction is not None

@@ -8,7 +8,6 @@ import pytest
 from lbt_synth.identification.fit.spectrum_model import (
     SHARED,
     Component,
-    Shared,
     Spectra,
     SpectrumModel,
 )
@@ -35,7 +34,7 @@ def test_shared_resonances_have_parameters_on_both_axes() -> None:
         SpectrumModel(-0.4, 3.4, 0.3, -2.1, (turbulence, line)),
         SpectrumModel(-0.2, 3.1, 0.0, -2.0, (turbulence,)),
     )
-    shared = Shared("line", -2.0, -3.0, 4.0, log_ratio=-0.5, phase=2.5, before=(line, None))
+    shared = Component("line", -2.0, -3.0, 4.0, log_ratio=-0.5, phase=2.5, before=(line, None))
     spectra = Spectra(own, (shared,))
     theta = spectra.pack()
     assert theta.size == 10 + 7 + SHARED

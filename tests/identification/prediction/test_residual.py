@@ -26,9 +26,10 @@ from support.predictions import (
 import lbt_synth as lbt
 from lbt_synth.identification.prediction.residual import (
     choose_warm_up,
+    count_frames,
     estimate_residual,
+    leave_out,
     replay,
-    replay_frames,
 )
 
 ONE_MODE = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
@@ -329,7 +330,7 @@ def test_the_start_adds_what_the_definition_says():
     for value in [*(z[:, 0] - np.mean(z[:64])), *np.zeros(3000)]:
         moments += np.outer(state, state)
         state = path.A @ state + path.B[:, 0] * value
-    frames = replay_frames(((0, 500),), ((100, 200), (350, 500)))
+    frames = ((100, 200), (350, 500))
     row, squares = path.C, []
     for _ in range(500):
         squares.append(float((row @ moments @ row.T)[0, 0]) / 500)
@@ -345,7 +346,7 @@ def test_the_start_adds_what_replays_of_a_longer_record_show():
     for seed in range(60):
         z = a_series(SWELL, 12_000, np.random.default_rng(seed))[:, None]
         whole, late = (replay(loop, z, ((first, 12_000),), from_rest=False) for first in (0, 8000))
-        frames = replay_frames(((8000, 12_000),), ((8500, 12_000),))
+        frames = ((8500, 12_000),)
         away = (late.residual - whole.residual)[8500:]
         added.append(np.mean(away**2))
         promised.append(late.left_of_start(frames)[0, 0])
@@ -358,16 +359,16 @@ def test_frames_before_the_test_warm_the_loop_up():
     loop = slow_loop(0.05)
     after_others, after_a_gap = (((0, 4000),), 0), (((2000, 4000),), 5)
     for runs, least in (after_others, after_a_gap):
-        frames, run = replay_frames(runs, ((2000, 4000),)), replay(loop, z, runs, from_rest=False)
+        frames, run = ((2000, 4000),), replay(loop, z, runs, from_rest=False)
         warm_up = choose_warm_up([run], frames)
-        kept = frames.without(warm_up)
+        kept = leave_out(runs, frames, warm_up)
         assert least <= warm_up <= 10 * least
         assert np.trace(run.left_of_start(kept)) < 0.2 * run.scatter(kept)
         # more frames or fewer have a larger error
         errors = [
-            run.scatter(kept) ** 2 * kept.count / part.count
+            run.scatter(kept) ** 2 * count_frames(kept) / count_frames(part)
             + np.trace(run.left_of_start(part)) ** 2
-            for part in (frames.without(w) for w in (warm_up // 2, warm_up, 2 * warm_up))
+            for part in (leave_out(runs, frames, w) for w in (warm_up // 2, warm_up, 2 * warm_up))
         ]
         assert min(errors) == errors[1]
 
@@ -379,7 +380,7 @@ def test_a_loop_that_never_forgets_keeps_its_frames_and_says_so():
     z = (a_series(SWELL, 9000, rng) + 4 * rng.standard_normal(9000))[:, None]
     quick, pole = lbt.kalman(plant), 0.99998
     # a correction of 0.1 of the mean over 50,000 frames, beside a FIR predictor of 3 frames
-    fit = lbt.identification.least_squares_predictor(z, ONE_MODE, taps=3).coefficients[0, 0]
+    fit = lbt.identification.least_squares_predictor(z, ONE_MODE, taps=3)[1][0, 0]
     A, B = np.diag([1.0, 1.0], -1)[:, :3], np.array([[1.0], [0.0], [0.0]])
     parameter = lbt.Controller(
         A=np.block([[A, np.zeros((3, 1))], [np.zeros((1, 3)), np.array([[pole]])]]),

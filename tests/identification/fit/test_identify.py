@@ -1,28 +1,35 @@
-"""One axis identified: lines, noise, sensor gain, standard errors, and what is refused."""
+"""One axis and two: lines, noise, sensor gain, standard errors, notes, and what is refused."""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
+from support.eris import ERIS_FILE, eris_example, eris_model, eris_record
 from support.plants import ROOT
 from support.recorded_loops import (
+    LINE,
     expected_periodogram,
     hidden_resonance_record,
+    identify_series,
     integrator_loop,
     slow,
+    spliced_record,
 )
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.identification.fit import axis
+from lbt_synth.identification.fit import identify
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.order_search import try_other_gains
+from lbt_synth.identification.records.faults import RecordHealth
 
 RATE = 1000.0
 
@@ -32,7 +39,7 @@ FRAMES = 16_384
 
 def test_closed_loop_gives_lines_noise_and_sensor_gain() -> None:
     y, c = integrator_loop(lines=((17.0, 0.006, 40), (63.0, 0.004, 12)), frames=40_000)
-    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     assert [line.kind for line in found.lines] == ["line", "line"]
     for line, (f, z, r) in zip(found.lines, ((17.0, 0.006, 40), (63.0, 0.004, 12)), strict=True):
         assert line.frequency_hz == pytest.approx(f, abs=5 * line.frequency_error_hz)
@@ -59,7 +66,7 @@ def test_a_gain_that_a_wide_resonance_may_explain_has_a_wide_error() -> None:
     """A lower gain and one resonance less are nearly as likely as the truth."""
     record = hidden_resonance_record()
     y, u = np.asarray(record.measurements)[:, 0], np.asarray(record.commands)[:, 0]
-    found = lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=RATE)
+    found = identify_series(y[2:], u[:-2], frame_rate_hz=RATE)
     assert found.sensor_gain_error is not None
     assert abs(found.sensor_gain - 0.995) < 2 * found.sensor_gain_error
 
@@ -68,7 +75,7 @@ def test_standard_errors_are_honest() -> None:
     deviations: dict[str, list[float]] = {"f": [], "z": [], "rms": [], "noise": [], "gain": []}
     for seed in range(12):
         y, c = integrator_loop(lines=((45.0, 0.02, 25),), seed=seed, frames=12_000)
-        found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+        found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
         (line,) = found.lines
         assert found.sensor_gain_error is not None
         deviations["f"].append((line.frequency_hz - 45) / line.frequency_error_hz)
@@ -98,7 +105,7 @@ def identify_coloured(
         frames=20_000,
         seed=seed,
     )
-    return lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    return identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
 
 
 @pytest.mark.parametrize("colour", [0.1, 0.6])
@@ -134,7 +141,7 @@ def test_a_drift_is_not_taken_for_coloured_noise() -> None:
         frames=12_000,
         seed=12,
     )
-    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     assert found.noise_nm < 10
     assert found.noise_correlation == 0
     assert found.sensor_gain_error is not None
@@ -166,7 +173,7 @@ def test_a_rough_gain_has_rivals(gain: float, seed: int) -> None:
         law, truth, hardware=path, frames=2590, seed=seed, settle_frames=2000, frame_means=True
     )
     y, u = run.measurements[0, :, 0], run.commands[0, :, 0]
-    found = lbt.identification.identify_axis(y[2:], u[:-2], frame_rate_hz=rate)
+    found = identify_series(y[2:], u[:-2], frame_rate_hz=rate)
     if found.sensor_gain_error is None:
         assert "not found" in found.sensor_gain_note
         low, high = found.likely_gains or (0.0, 0.0)
@@ -186,10 +193,10 @@ def test_an_implausible_gain_is_doubted_however_well_it_is_known(
         tried.append(model.spectrum.gain)
         return try_other_gains(search, model, rivals)
 
-    monkeypatch.setattr(axis, "try_other_gains", spy)
+    monkeypatch.setattr(identify, "try_other_gains", spy)
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=12, diameter_m=8.22)
     search = Search(data=expected_periodogram(air, 5.0, gain))
-    found = axis.find_axis(search, assumed_gain=1.0, start=None)
+    found = identify.find_axis(search)
     assert bool(tried) == doubted
     assert found.sensor_gain == pytest.approx(gain, rel=0.03)  # and stays where it is right
 
@@ -198,8 +205,8 @@ def test_an_implausible_gain_is_doubted_however_well_it_is_known(
 @settings(max_examples=3, deadline=None)
 def test_units_do_not_matter(scale: float) -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=8192)
-    one = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    other = lbt.identification.identify_axis(scale * y[:, 0], scale * c[:, 0], frame_rate_hz=RATE)
+    one = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    other = identify_series(scale * y[:, 0], scale * c[:, 0], frame_rate_hz=RATE)
     assert other.sensor_gain == pytest.approx(one.sensor_gain, rel=1e-3)
     assert other.noise_nm == pytest.approx(scale * one.noise_nm, rel=1e-3)
     for a, b in zip(one.lines, other.lines, strict=True):
@@ -210,7 +217,7 @@ def test_units_do_not_matter(scale: float) -> None:
 def test_the_model_designs_a_filter_as_good_as_the_truth() -> None:
     lines = ((17.0, 0.006, 40), (63.0, 0.004, 12))
     y, c = integrator_loop(lines=lines, frames=40_000)
-    axis = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    axis = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     model = lbt.identification.IdentifiedModel(axes=(axis,), frame_rate_hz=RATE, delay_frames=2.0)
     vibrations = [
         lbt.Vibration(frequency_hz=f, damping=z, rms_nm=r, direction=(1.0,)) for f, z, r in lines
@@ -237,16 +244,14 @@ def test_the_model_designs_a_filter_as_good_as_the_truth() -> None:
 
 def test_what_the_loop_does_not_show_is_said() -> None:
     y, c = integrator_loop(gain=0.002, frames=8192, noise=20.0)
-    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, assumed_gain=0.7)
+    found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE, assumed_gain=0.7)
     assert found.sensor_gain == pytest.approx(0.7, rel=1e-12)
     assert found.sensor_gain_error is None
     assert "assumed to be 0.7, not found" in found.sensor_gain_note
-    open_loop = lbt.identification.identify_axis(y[:, 0] + 0.6 * c[:, 0], frame_rate_hz=RATE)
+    open_loop = identify_series(y[:, 0] + 0.6 * c[:, 0], frame_rate_hz=RATE)
     assert open_loop.sensor_gain == 1
     assert "open loop" in open_loop.sensor_gain_note
-    given_gain = lbt.identification.identify_axis(
-        y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6
-    )
+    given_gain = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=0.6)
     assert given_gain.sensor_gain == pytest.approx(0.6, rel=1e-12)
     assert given_gain.sensor_gain_note == "given"
 
@@ -255,9 +260,9 @@ def test_an_announced_line_is_found_where_a_search_would_not_dare() -> None:
     rng = np.random.default_rng(5)
     n = 16_384
     y = rng.standard_normal(n) + 0.05 * np.sin(2 * np.pi * 90.0 * np.arange(n) / RATE)
-    plain = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE)
-    known = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
-    wrong = lbt.identification.identify_axis(10 * y, frame_rate_hz=RATE, announced=[(140.0, 0.05)])
+    plain = identify_series(10 * y, frame_rate_hz=RATE)
+    known = identify_series(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
+    wrong = identify_series(10 * y, frame_rate_hz=RATE, announced=[(140.0, 0.05)])
     assert not plain.lines
     assert not wrong.lines
     (line,) = known.lines
@@ -267,8 +272,8 @@ def test_an_announced_line_is_found_where_a_search_would_not_dare() -> None:
 
 def test_a_start_leads_to_the_same_place() -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),))
-    once = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    again = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE, start=once)
+    once = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    again = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE, start=once)
     assert again.sensor_gain == pytest.approx(once.sensor_gain, rel=1e-3)
     assert [line.frequency_hz for line in again.lines] == pytest.approx(
         [line.frequency_hz for line in once.lines], abs=0.005
@@ -277,7 +282,7 @@ def test_a_start_leads_to_the_same_place() -> None:
 
 def test_two_close_lines_are_separated() -> None:
     y, c = integrator_loop(lines=((60.0, 0.002, 40), (61.2, 0.002, 25)), frames=40_000)
-    found = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     assert [line.frequency_hz for line in found.lines] == pytest.approx([60.0, 61.2], abs=0.1)
 
 
@@ -287,7 +292,9 @@ def test_spectrum_of_known_averages() -> None:
     density = line.psd(f) + slow().psd(f) + 0.05
     chance = np.random.default_rng(0).gamma(20.0, 1 / 20.0, f.size)
     for averages in (20.0, None):
-        found = axis.identify_spectrum(f, density * chance, frame_rate_hz=RATE, averages=averages)
+        found = identify.identify_spectrum(
+            f, density * chance, frame_rate_hz=RATE, averages=averages
+        )
         (peak,) = found.lines
         assert peak.frequency_hz == pytest.approx(52, abs=5 * peak.frequency_error_hz)
         assert peak.rms_nm == pytest.approx(30, abs=5 * peak.rms_error_nm)
@@ -326,7 +333,7 @@ def test_bad_series_are_refused(
         "frame_rate_hz": RATE,
     }
     with pytest.raises(error, match=words):
-        lbt.identification.identify_axis(**(good | change))  # type: ignore[arg-type]
+        identify_series(**(good | change))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -342,7 +349,7 @@ def test_bad_series_are_refused(
 )
 def test_bad_spectra_are_refused(f: np.ndarray, density: np.ndarray, words: str) -> None:
     with pytest.raises(ProblemError, match=words):
-        axis.identify_spectrum(f, density, frame_rate_hz=RATE)
+        identify.identify_spectrum(f, density, frame_rate_hz=RATE)
 
 
 def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:
@@ -350,9 +357,7 @@ def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:
     k = np.arange(40_000)
     wave = 300 * np.sqrt(2) * np.cos(2 * np.pi * 20.0037 * k / RATE)
     slow = np.cumsum(rng.standard_normal(k.size))
-    found = lbt.identification.identify_axis(
-        wave + slow + 5 * rng.standard_normal(k.size), frame_rate_hz=RATE
-    )
+    found = identify_series(wave + slow + 5 * rng.standard_normal(k.size), frame_rate_hz=RATE)
     (line,) = found.lines
     assert not line.resolved
     assert line.damping * line.frequency_hz * 40 == pytest.approx(0.01, rel=1e-2)
@@ -364,7 +369,7 @@ def test_a_sinusoid_is_not_resolved_and_its_rms_is_right() -> None:
 
 def test_a_line_that_is_resolved_says_so() -> None:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=20_000)
-    (line,) = lbt.identification.identify_axis(y[:, 0], c[:, 0], frame_rate_hz=RATE).lines
+    (line,) = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE).lines
     assert line.resolved
     assert line.damping == pytest.approx(0.01, abs=5 * line.damping_error)
 
@@ -398,8 +403,279 @@ def test_short_stretches_do_not_lead_to_a_sidelobe(frequency: float, stretch: in
     z = slow + 5 * rng.standard_normal(k.size)
     z += 50 * np.sqrt(2) * np.cos(2 * np.pi * frequency * k / RATE + 1)
     pieces = [(j, j + stretch) for j in range(0, k.size - stretch, stretch + 5)]
-    found = lbt.identification.identify_axis(z, frame_rate_hz=RATE, stretches=pieces)
+    found = identify_series(z, frame_rate_hz=RATE, stretches=pieces)
     (line,) = found.lines
     assert line.frequency_hz == pytest.approx(frequency, abs=0.1)
     assert line.rms_nm == pytest.approx(50, rel=0.15)
     assert found.turbulence_fit.damping > 0.05
+
+
+def joint(
+    gains: tuple[float, float], loop_gains: tuple[float, float]
+) -> lbt.identification.IdentifiedModel:
+    parts = [
+        integrator_loop(sensor_gain=g, gain=k, seed=i, frames=20_000, noise=10.0)
+        for i, (g, k) in enumerate(zip(gains, loop_gains, strict=True))
+    ]
+    y, c = (np.hstack([part[i] for part in parts]) for i in range(2))
+    u = np.vstack([c, np.zeros((2, 2))])
+    record = lbt.identification.loop_record(
+        np.vstack([np.zeros((2, 2)), y]), u, frame_rate_hz=RATE, delay_frames=2.0, unit="nm"
+    )
+    return lbt.identify(record)
+
+
+def test_axes_share_a_sensor_gain_where_they_agree() -> None:
+    same = joint((0.6, 0.6), (0.4, 0.4))
+    assert same.axes[0].sensor_gain == same.axes[1].sensor_gain
+    assert same.axes[0].sensor_gain_error is not None
+    assert same.sensor_gains[0] == pytest.approx(0.6, abs=4 * same.axes[0].sensor_gain_error)
+    other = joint((0.9, 0.4), (0.4, 0.4))
+    assert other.sensor_gains == pytest.approx((0.9, 0.4), rel=0.1)
+    assert "different sensor gains" in other.notes[0]
+    one = joint((0.6, 0.6), (0.4, 0.002))
+    assert one.axes[1].sensor_gain_note == "that of the other axis"
+    assert one.axes[0].sensor_gain == one.axes[1].sensor_gain
+
+
+def test_a_mean_gain_is_no_better_than_its_axes_agree() -> None:
+    """The error of a mean of two is half their difference where that exceeds their errors."""
+    model = joint((0.6, 0.65), (0.4, 0.4))
+    assert model.sensor_gains[0] == model.sensor_gains[1]
+    assert model.axes[0].sensor_gain_error == pytest.approx(0.025, rel=0.15)
+    agreed = joint((0.6, 0.6), (0.4, 0.4))
+    assert agreed.axes[0].sensor_gain_error < 0.013
+
+
+def test_identify_needs_what_it_needs() -> None:
+    y = np.random.default_rng(0).standard_normal((6000, 1))
+    without = lbt.identification.loop_record(y, y, frame_rate_hz=RATE, unit="nm")
+    with pytest.raises(ProblemError, match="give delay_frames"):
+        lbt.identify(without)
+    with pytest.raises(ProblemError, match="one number, or one per measurement \\(1\\)"):
+        lbt.identify(
+            lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm"), sensor_gain=[1.0, 2.0]
+        )
+    with pytest.raises(ProblemError, match="expected an IdentifiedModel"):
+        lbt.report.figures.identification_figure("model")
+
+
+def with_commands_of_size(
+    record: lbt.identification.LoopRecord, factor: float
+) -> lbt.identification.LoopRecord:
+    assert record.commands is not None
+    return replace(record, commands=factor * record.commands)
+
+
+@pytest.mark.parametrize("factor", [1 / 500, 100.0])
+def test_commands_in_other_units_are_doubted(factor: float) -> None:
+    record = spliced_record((0,), lines=LINE, frames=20_000)
+    found = lbt.identify(with_commands_of_size(record, factor))
+    doubted = any("units, signs and axes of the commands" in note for note in found.notes)
+    assert doubted or found.axes[0].sensor_gain_error is None
+
+
+@pytest.mark.parametrize(("factor", "doubted"), [(0.5, True), (0.7, False), (1.0, False)])
+def test_a_gain_above_one_is_named_as_commands_of_part_size(factor: float, doubted: bool) -> None:
+    record = spliced_record((0,), lines=LINE, frames=40_000)
+    found = lbt.identify(with_commands_of_size(record, factor))
+    assert found.axes[0].sensor_gain == pytest.approx(0.6 / factor, rel=0.05)
+    assert any("--command-scale 2" in note for note in found.notes) == doubted
+
+
+def test_wide_resonances_that_hide_the_gain_are_noted() -> None:
+    lines = ((20.0, 0.1, 60.0), (60.0, 0.3, 40.0), (130.0, 0.5, 40.0))
+    axis = lbt.identify(spliced_record((1,), lines=lines, frames=60_000, noise=8.0)).axes[0]
+    if axis.sensor_gain_error is None:
+        assert "not found" in axis.sensor_gain_note
+    else:
+        assert axis.sensor_gain == pytest.approx(0.6, abs=3 * axis.sensor_gain_error)
+
+
+def test_innovations_that_are_not_white_are_noted() -> None:
+    record = spliced_record(lines=((40, 0.01, 30.0),), frames=8192)
+    for most_lines, count in ((0, 1), (5, 0)):
+        model = lbt.identify(record, sensor_gain=0.6, most_lines=most_lines)
+        notes = [note for note in model.notes if "are not white" in note]
+        assert len(notes) == count
+        assert all("standard errors do not cover" in note for note in notes)
+
+
+def test_a_wide_resonance_is_no_turbulence() -> None:
+    axis = lbt.identify(spliced_record((1,), lines=((60.0, 0.3, 30.0),), frames=60_000)).axes[0]
+    assert axis.turbulence_fit.frequency_hz < 3
+    assert axis.turbulence.rms_nm == pytest.approx(300, rel=0.3)
+    (part,) = axis.parts
+    assert part.kind == "broad"
+    assert part.frequency_hz == pytest.approx(60, rel=0.1)
+
+
+def test_standard_errors_hold_the_error_of_the_gain() -> None:
+    deviations = []
+    for seed in range(10):
+        parts = [
+            integrator_loop(lines=((31, 0.05, 60),), gain=0.15, seed=10 * seed + i, frames=15_000)
+            for i in range(2)
+        ]
+        y, c = (np.hstack([part[i] for part in parts]) for i in range(2))
+        record = lbt.identification.loop_record(
+            y[:-2], np.vstack([c[2:], c[-2:]])[:-2], frame_rate_hz=RATE, delay_frames=2, unit="nm"
+        )
+        model = lbt.identify(record)
+        alone = identify_series(
+            y[:, 0], c[:, 0], frame_rate_hz=RATE, sensor_gain=model.sensor_gains[0]
+        )
+        deviations += [
+            (axis.lines[0].rms_nm - 60) / axis.lines[0].rms_error_nm
+            for axis in model.axes
+            if axis.lines
+        ]
+        # a gain that is given without an error makes them smaller
+        assert model.axes[0].lines[0].rms_error_nm > alone.lines[0].rms_error_nm
+    assert 0.5 < np.sqrt(np.mean(np.square(deviations))) < 1.6
+
+
+def test_the_limit_of_lines_is_kept_and_noted() -> None:
+    lines = tuple((10.0 + 12 * i, 0.004, 30.0) for i in range(8))
+    record = spliced_record(lines=lines, frames=20_000)
+    found = lbt.identify(record, most_lines=5, sensor_gain=0.6)
+    assert sum(part.kind != "turbulence" for part in found.axes[0].parts) <= 5
+    assert any("limit of 5 lines was reached" in note for note in found.notes)
+    assert not any("limit" in note for note in lbt.identify(record, sensor_gain=0.6).notes)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sensor_gain": 1e300}, "sensor_gain must be"),
+        ({"sensor_gain": "x"}, "sensor_gain must be an array of numbers"),
+        ({"announced": [31.0]}, "LinePrior"),
+        ({"start": 3}, "IdentifiedModel"),
+        ({"stretches": [(2, 4000), (3000, 5000)]}, "in order, apart"),
+        ({"stretches": [(0, 4000)]}, "usable"),
+        ({"frame_rate_hz": 900.0}, "for spectra only"),
+        ({"delay_frames": 3.0}, "with_delay"),
+    ],
+)
+def test_bad_requests(options: dict[str, object], words: str) -> None:
+    with pytest.raises(ProblemError, match=words):
+        lbt.identify(spliced_record(frames=6000), **options)  # type: ignore[arg-type]
+
+
+def test_a_dead_axis_is_named() -> None:
+    y = np.random.default_rng(0).standard_normal((6000, 2))
+    y[:, 1] = 0
+    record = lbt.identification.LoopRecord(
+        frame_rate_hz=RATE,
+        measurements=y,
+        usable=np.ones(6000, dtype=bool),
+        health=RecordHealth(frames=6000, usable=6000),
+    )
+    with pytest.raises(ProblemError, match="axis 1 of the record is constant"):
+        lbt.identify(record)
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    return eris_example()
+
+
+@pytest.fixture(scope="module")
+def seen() -> lbt.identification.SpectrumRecord:
+    return eris_record()
+
+
+@pytest.fixture(scope="module")
+def model() -> lbt.identification.IdentifiedModel:
+    return eris_model()
+
+
+def test_spectrum_without_scatter_is_taken_for_one_periodogram(example):
+    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    found = lbt.identify(plain, frame_rate_hz=1000)
+    assert len(found.notes) == 2
+    assert all("does not scatter" in note for note in found.notes)
+    for column, axis in zip(plain.density_nm2_hz.T, found.axes, strict=True):
+        assert axis.data.count[0] == 1
+        assert len(axis.lines) >= 8
+        peaks = np.array(example.peaks(plain.frequency_hz, column))[:, 0]
+        assert all(np.min(np.abs(peaks - line.frequency_hz)) < 0.06 for line in axis.lines)
+        assert all(line.rms_nm < 30 for line in axis.lines)  # 332 where it counts as a million
+
+
+@pytest.mark.parametrize(
+    "option", [{"sensor_gain": 0.5}, {"stretches": [(0, 600)]}, {"start": "model"}]
+)
+def test_a_spectrum_takes_no_options_of_series(option, model):
+    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    given = {"start": model} if "start" in option else option
+    with pytest.raises(lbt.errors.ProblemError, match="is for series of a loop"):
+        lbt.identify(plain, frame_rate_hz=1000, **given)
+
+
+def test_known_lines_are_found(model):
+    for axis, known in zip(
+        model.axes,
+        ([10, 16, 25.8, 45.5, 48.3, 96.7], [10, 16, 45.5, 48.3, 72.5, 96.7]),
+        strict=True,
+    ):
+        places = np.array([line.frequency_hz for line in axis.lines])
+        for frequency in known:
+            assert np.min(np.abs(places - frequency)) < 0.06
+    assert not model.notes
+
+
+def test_identified_rms_are_those_of_the_bins(model, seen, example):
+    strong = 0
+    for i, axis in enumerate(model.axes):
+        peaks = np.array(example.peaks(seen.frequency_hz, seen.density_nm2_hz[:, i]))
+        for line in axis.lines:
+            near = peaks[np.abs(peaks[:, 0] - line.frequency_hz) < 0.08]
+            size = np.sqrt(np.sum(near[:, 1] ** 2))
+            assert size > 0  # none is where the file has nothing
+            assert 0.4 * size < line.rms_nm < 1.4 * size
+            assert 0 < line.rms_error_nm < line.rms_nm
+            strong += abs(line.rms_nm - size) < 2 * line.rms_error_nm
+    assert strong >= 17  # of 22
+
+
+def test_kalman_removes_what_the_integrator_leaves_of_the_lines(model, seen, example):
+    met, plant = example.disturbance(seen), example.composed(model)
+    lines = {}
+    for name, design in {
+        "integrator": lbt.design.model_integrator(plant),
+        "Kalman": lbt.kalman(plant),
+    }.items():
+        assert design.certificate.passed
+        loop = lbt.close_loop(plant.hardware, design.controller)
+        parts = example.residual(loop, met)
+        lines[name] = example.rms(parts["lines"])
+        # bin by bin, without quadrature
+        f, step = seen.frequency_hz, np.median(np.diff(seen.frequency_hz))
+        excess = np.array([part.psd(f) for part in met.lines]).T
+        power = np.einsum("fij,fj->", np.abs(loop.sensitivity(f)) ** 2, excess) * step
+        assert lines[name] == pytest.approx(np.sqrt(power), rel=0.16)
+        assert example.rms(parts["total"]) ** 2 == pytest.approx(
+            sum(example.rms(parts[key]) ** 2 for key in parts if key != "total")
+        )
+        limit = lbt.loop.least_residual(plant.hardware, met.whole)
+        assert limit.rms_nm < example.rms(parts["total"])
+    assert lines["Kalman"] < 0.3 * lines["integrator"]
+
+
+def test_turbulence_of_the_plant_is_the_atmospheres(model, example):
+    plant = example.composed(model)
+    air = lbt.models.ar2_turbulence(example.AIR, frame_rate_hz=1000, noise_nm=example.NOISE_NM)
+    made = plant.vibrations[0].ar_model(1000)
+    assert made.coefficients == pytest.approx(air.coefficients, rel=1e-9)
+    assert made.rms_nm == pytest.approx(air.rms_nm, rel=1e-9)
+
+
+def test_a_printed_model_lists_its_vibrations_with_their_errors(model):
+    shown = [line.split() for line in str(model).splitlines()]
+    for part in model.parts:
+        rows = [row for row in shown if f"{part.frequency_hz:.3f}" in row]
+        assert any(f"{part.frequency_error_hz:.2g}" in row for row in rows)
+        assert any(f"{part.rms_nm:.2f}" in row for row in rows)
+    assert len(repr(model)) <= 100
+    assert len(repr(model.axes[0])) <= 100

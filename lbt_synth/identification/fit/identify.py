@@ -1,57 +1,72 @@
-"""The model of a loop from its record: both axes, with one sensor gain if they agree.
-
-Doubts about a record: jumps, where series go on elsewhere.
-"""
+"""The model of a loop from its record: each axis, then both with one sensor gain if they agree."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
-from itertools import chain, count
+from itertools import count
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from lbt_synth.errors import ProblemError
-from lbt_synth.identification.fit.axis import (
-    axis_periodogram,
-    estimate_averages,
-    find_axis,
-    identify_spectrum,
-    refit_axis,
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.fit.departures import (
+    cut_at_jumps,
+    describe_drifts,
+    find_correction_jumps,
+    find_jumps,
 )
-from lbt_synth.identification.fit.fitting import LOWEST_LINE_HZ, MOST_LINES, POSSIBLE_GAINS, Search
+from lbt_synth.identification.fit.fitting import (
+    GAINS,
+    LOWEST_LINE_HZ,
+    MOST_LINES,
+    PLAUSIBLE_GAINS,
+    POSSIBLE_GAINS,
+    Search,
+    add_evidence,
+)
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
     IdentifiedAxis,
     IdentifiedLine,
     IdentifiedModel,
 )
-from lbt_synth.identification.fit.line_drift import describe_drifts
-from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, half_angle_square, tukey
+from lbt_synth.identification.fit.order_search import (
+    find_components,
+    is_coloured_rival,
+    search_models,
+    try_other_gains,
+)
+from lbt_synth.identification.fit.periodogram import (
+    SHORTEST_SEGMENT,
+    LoopPeriodogram,
+    loop_periodogram,
+)
 from lbt_synth.identification.fit.physical_parameters import (
+    describe_axis,
     describe_close_lines,
-    measure_separations,
+    hold_gain,
+    standard_errors,
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
+from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
-from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, IntArray, require_instance
+from lbt_synth.validation import FloatArray, number, real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
 _NOT_WHITE = 1e-3  # probability of white innovations below which a note says so
-_LARGE = 12.0  # standard deviations of the change of a correction
-_UNLIKELY = 8.0  # standard deviations of the innovations
-_EDGE = 0.06  # of a stretch, at either end, where the taper hides jumps
-_CLUSTER = 20  # frames within which outliers are one jump
-_AROUND = 3  # frames left out on either side
-_SAME_JUMP = 50  # frames within which the axes have one jump
-_MOST_JUMPS = 20  # at which a record is cut
+_GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
+_POOR_GAIN = 0.1  # relative error from which a note says so
+_ROUGH_GAIN = 0.05  # relative error from which other gains are tried
+_AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
+_LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0
 
 
 def identify(
@@ -70,9 +85,14 @@ def identify(
 ) -> IdentifiedModel:
     """Identify turbulence, vibrations, noise and sensor gain of a loop from its record.
 
-    Each axis is identified separately (:func:`identify_axis`). A sensor usually has one gain for
-    tip and tilt: gains that agree within three standard errors are averaged, and the rest is
-    fitted again with the mean. An axis that does not show its gain takes that of the other.
+    The pseudo-open-loop measurement ``y(k) + g c(k)`` of an axis, with c(k) the correction that
+    y(k) contains and g the sensor gain, is g times the phase plus the noise. Its spectrum is the
+    sum of turbulence (a second-order process, with the roll-off of tilt if the data ask for it),
+    resonances and noise: white, or a first-order process where the data ask for it. The Whittle
+    likelihood chooses all parameters, the sensor gain among them, and a penalised criterion the
+    number of resonances. A sensor usually has one gain for tip and tilt: gains that agree within
+    three standard errors are averaged, and the rest is fitted again with the mean. An axis that
+    does not show its gain takes that of the other.
 
     Parameters
     ----------
@@ -84,10 +104,14 @@ def identify(
         Total delay of that loop [frames], if the record does not have it; 2 by default.
     sensor_gain : float or one per axis, optional
         Known sensor gain; like ``assumed_gain``, ``stretches`` and ``start`` for series alone.
-    assumed_gain, lowest_line_hz, most_lines
-        As for :func:`identify_axis`.
+    assumed_gain : float, optional
+        Sensor gain to use if the data do not determine it.
     announced : sequence of LinePrior, optional
         Lines that are known beforehand, for instance from accelerometers.
+    lowest_line_hz : float, optional
+        A resonance below is a part of the turbulence [Hz].
+    most_lines : int, optional
+        Most resonances above it on each axis.
     stretches : sequence of (start, stop), optional
         Frames to use; all that are usable by default.
     start : IdentifiedModel, optional
@@ -167,8 +191,6 @@ def identify(
     if len(axes) == 2:
         axes, shared, more = couple_axes(record, axes, cut, lowest_line_hz)
         notes += more
-    if not shared:
-        axes = [measure_separations(axis) for axis in axes]
     notes += _find_doubts(axes, found_gain, most_lines)
     if progress is not None and next(fits) <= total:
         progress(total, total)
@@ -259,7 +281,7 @@ def _pool_gains(
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of the gains that were found, if they agree.
 
-    An axis whose gain was found has its lines where they are. ``options`` are those of a search.
+    ``options`` are those of a search.
     Where the gains scatter by more than their errors, the error of the mean is scaled by
     ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
     """
@@ -279,9 +301,9 @@ def _pool_gains(
     own = "found in the closed loop's data" if alone else "mean of the axes"
     pooled = []
     for i, axis in enumerate(axes):
-        search, found = Search(data=axis.data, gain=gain, **options), i in found_gain
-        note = own if found else "that of the other axis"
-        pooled.append(refit_axis(axis, search, error, note, moves=not found))
+        search = Search(data=axis.data, gain=gain, **options)
+        note = own if i in found_gain else "that of the other axis"
+        pooled.append(refit_axis(axis, search, error, note))
         step()
     return pooled, "one sensor gain for all axes"
 
@@ -381,100 +403,193 @@ def _identify_spectra(
     )
 
 
-Jump = tuple[int, float]  # frame where a series goes on elsewhere, standard deviations of that
-
-
-def find_jumps(
-    series: FloatArray, axes: Sequence[IdentifiedAxis], stretches: Stretches
-) -> list[Jump]:
-    """Find where the innovations of pseudo-open-loop series (frames, axes) are far too large."""
-    each = zip(series.T, axes, strict=True)
-    return _merge_jumps([jump for one, axis in each for jump in _axis_jumps(one, axis, stretches)])
-
-
-def _axis_jumps(series: FloatArray, axis: IdentifiedAxis, stretches: Stretches) -> list[Jump]:
-    """Find the jumps of one axis, in differences over the root of the fitted spectrum."""
-    out: list[Jump] = []
-    log_f, log_density = np.log(axis.frequency_hz), np.log(axis.fitted_nm2_hz)
-    for start, stop in stretches:
-        count = stop - start - 1
-        if count < SHORTEST_SEGMENT:
-            continue
-        transform = np.fft.rfft(tukey(count) * np.diff(series[start:stop]))
-        f: FloatArray = np.arange(1.0, transform.size) * (axis.frame_rate_hz / count)
-        density = np.exp(np.interp(np.log(f), log_f, log_density))
-        power = density * half_angle_square(f, axis.frame_rate_hz) * axis.frame_rate_hz / 2
-        transform[0] = 0
-        transform[1:] /= np.sqrt(power)
-        size = np.abs(np.fft.irfft(transform, count))
-        edge = int(_EDGE * count)
-        scale = float(np.median(size)) / 0.6745
-        far = edge + np.flatnonzero(size[edge : count - edge] > _UNLIKELY * scale)
-        out += _largest_of_clusters(size / scale, far, start)
-    return out
-
-
-def find_correction_jumps(corrections: FloatArray, stretches: Stretches) -> list[Jump]:
-    """Find where the corrections (frames, axes) go on elsewhere.
-
-    A fit would choose a sensor gain at which a jump of the commands does not show: they are
-    looked for before anything is fitted.
-    """
-    inside = np.zeros(len(corrections) - 1, dtype=np.bool_)
-    for start, stop in stretches:
-        inside[start : stop - 1] = True
-    out: list[Jump] = []
-    for change in np.abs(np.diff(corrections, axis=0)).T:
-        scale = float(np.median(change[inside])) / 0.6745 if inside.any() else 0.0
-        if scale > 0:
-            far = np.flatnonzero(inside & (change > _LARGE * scale))
-            out += _largest_of_clusters(change / scale, far, 0)
-    return _merge_jumps(out)
-
-
-def _largest_of_clusters(size: FloatArray, far: IntArray, start: int) -> list[Jump]:
-    """Return the largest of each cluster of differences that are too large."""
-    out = []
-    for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _CLUSTER)):
-        if place.size:
-            best = int(place[np.argmax(size[place])])
-            out.append((start + 1 + best, float(size[best])))
-    return out
-
-
-def _merge_jumps(found: Sequence[Jump]) -> list[Jump]:
-    """Return jumps by rising frame, each place once."""
-    out: list[Jump] = []
-    for jump in sorted(found, key=lambda jump: jump[0]):
-        if not out or jump[0] - out[-1][0] > _SAME_JUMP:
-            out.append(jump)
-    return out
-
-
-def cut_at_jumps(
-    stretches: Stretches, jumps: Sequence[Jump], series: str
-) -> tuple[Stretches, list[str]]:
-    """Return stretches without the neighbourhood of the jumps of some series, and a note.
-
-    Nothing is cut if there are too many jumps.
-    """
-    if not jumps:
-        return stretches, []
-    frame, size = max(jumps, key=lambda jump: jump[1])
+def find_axis(
+    search: Search, *, assumed_gain: float = 1.0, start: IdentifiedAxis | None = None
+) -> IdentifiedAxis:
+    """Identify one axis from its periodogram."""
+    data = search.data
+    assumed = number(assumed_gain, "assumed_gain", **GAINS)
+    model, *rivals = search_models(search, None if start is None else start.fitted_model.spectrum)
+    if search.gain is not None:
+        note = "given" if data.closed else "given: the series is divided by it"
+        return describe_axis(search, model, None, note)
+    if not data.closed:
+        return describe_axis(search, model, None, "1: of an open loop it has no meaning")
+    model, near = _compare_gains(search, model, rivals, start)
+    own = model.spectrum
+    own_error = _gain_error(model)
+    near += [rival for rival in rivals if is_coloured_rival(model, rival, own_error)]
+    away = max((abs(each.spectrum.log_gain - own.log_gain) for each in near), default=0.0)
+    colours = np.tanh([own.colour, *(each.spectrum.colour for each in near)])
+    unknown = float(np.ptp(colours))  # correlation of the noise
+    error = max(own_error, away)
+    if error <= _GAIN_ERROR:
+        poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
+        if error > own_error:  # what the gain moves is as ambiguous
+            model = hold_gain(search, model, error)
+        note = f"found in the closed loop's data{poor}"
+        return describe_axis(search, model, error, note, colour_error=unknown)
+    likely = _likely_gains([model, *near], own_error) if near else None
+    search = replace(search, gain=assumed)
+    by = f" by {100 * error:.0f} %" if error < 1 else ""
     note = (
-        f"warning: {count_text(len(jumps), 'jump')} of the {series}, the largest "
-        f"at frame {frame} with {size:.0f} standard deviations"
+        f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
+        "hardly acts where the noise shows). Give it, or record with a higher loop gain"
     )
-    if len(jumps) > _MOST_JUMPS:
-        return stretches, [f"{note}; too many to cut the record there, and the model suffers"]
-    cut = cut_around(stretches, [frame for frame, _ in jumps])
-    return cut, [f"{note}; the record was cut there"]
+    model = search_models(search, model.spectrum)[0]
+    found = describe_axis(search, model, None, note, colour_error=unknown)
+    return replace(found, likely_gains=likely)
 
 
-def cut_around(stretches: Stretches, frames: Sequence[int]) -> Stretches:
-    """Return stretches without the neighbourhood of some frames."""
-    for frame in frames:
-        low, high = frame - _AROUND, frame + _AROUND
-        pieces = chain(*(((a, min(b, low)), (max(a, high), b)) for a, b in stretches))
-        stretches = tuple((a, b) for a, b in pieces if b > a)
-    return stretches
+def _gain_error(model: FittedModel) -> float:
+    """Return the standard error of the logarithm of the gain."""
+    return standard_errors(model.spectrum, model.covariance).log_gain
+
+
+def _likely_gains(models: Sequence[FittedModel], error: float) -> tuple[float, float]:
+    """Return the least and the largest gain of models, widened by the relative error of one."""
+    logs = [model.spectrum.log_gain for model in models]
+    margin = min(error, _GAIN_ERROR)
+    return float(np.exp(min(logs) - margin)), float(np.exp(max(logs) + margin))
+
+
+def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:
+    """Fit an axis again at the gain of a search, with its error."""
+    model = add_evidence(search, find_components(search, axis.fitted_model.spectrum, moves=False))
+    return describe_axis(search, hold_gain(search, model, error), error, note)
+
+
+def axis_periodogram(
+    measurement: ArrayLike,
+    correction: ArrayLike | None,
+    frame_rate_hz: float,
+    stretches: StretchesLike | None,
+) -> LoopPeriodogram:
+    """Return the periodogram of series that can be identified."""
+    y = real_array(measurement, "measurement")
+    if y.ndim != 1:
+        raise DimensionError(f"measurement must be a series (frames,); got shape {y.shape}.")
+    c = None if correction is None else real_array(correction, "correction")
+    if c is not None and c.shape != y.shape:
+        raise DimensionError(
+            f"correction must have shape {y.shape} like measurement; got {c.shape}."
+        )
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
+    longest = max(stop - begin for begin, stop in pieces)
+    if longest < 2 * SHORTEST_SEGMENT:
+        raise ProblemError(
+            f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "
+            f"longest has {longest}. Record more, or bridge short gaps."
+        )
+    if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
+        raise ProblemError("the measurement is constant: there is nothing to identify.")
+    with np.errstate(over="ignore", invalid="ignore"):
+        data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
+        finite = np.all(np.isfinite(data.power(1.0)))
+    if not finite or np.min(data.measured) <= 0:
+        raise ProblemError(
+            "the spectrum of the series overflows or vanishes; got values up to "
+            f"{np.max(np.abs(y)):.6g} nm. Check the units."
+        )
+    return data
+
+
+def identify_spectrum(
+    frequency_hz: ArrayLike,
+    density_nm2_hz: ArrayLike,
+    *,
+    frame_rate_hz: float,
+    averages: float | None = None,
+    **options: Any,
+) -> IdentifiedAxis:
+    """Identify one axis from its one-sided density (f,) [nm^2/Hz] at even frequencies (f,) [Hz].
+
+    The frequencies lie above 0 and below half the frame rate of the loop to come; the sensor gain
+    of the result is 1. The density is the mean of ``averages`` independent periodograms, by default
+    found from its scatter: one that scatters less than the mean of 1000 was smoothed, interpolated
+    or computed, and counts as one. Options are ``announced``, ``lowest_line_hz`` and ``most_lines``
+    of :class:`Search`.
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    f = real_array(frequency_hz, "frequency_hz")
+    density = real_array(density_nm2_hz, "density_nm2_hz")
+    if f.ndim != 1 or f.shape != density.shape or f.size < 32:
+        raise DimensionError(
+            "frequency_hz and density_nm2_hz must be lists of the same length, at least 32; got "
+            f"{f.shape} and {density.shape}."
+        )
+    steps = np.diff(f)
+    if np.any(steps <= 0) or f[0] <= 0 or f[-1] >= rate / 2:
+        raise ProblemError(
+            f"frequency_hz must increase from above 0 to below {rate / 2:.6g}; got {f[0]:.6g} to "
+            f"{f[-1]:.6g}. Leave the mean out, and what lies above the Nyquist frequency."
+        )
+    if np.max(steps) > 1.01 * np.min(steps):
+        raise ProblemError(
+            f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
+            f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
+        )
+    if np.any(density <= 0):
+        raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density):.6g}.")
+    if averages is None:
+        averages = estimate_averages(density) or 1.0
+    zero = np.zeros_like(f)
+    data = LoopPeriodogram(
+        frequency_hz=f,
+        measured=density,
+        crossed=zero,
+        corrected=zero,
+        count=np.full(f.size, number(averages, "averages", above=0)),
+        frame_rate_hz=rate,
+        resolution_hz=float(np.median(steps)),
+    )
+    search = Search(data=data, gain=1.0, **options)
+    note = "1: of a spectrum it has no meaning"
+    return describe_axis(search, search_models(search)[0], None, note)
+
+
+def estimate_averages(density: FloatArray) -> float | None:
+    """Return how many periodograms were averaged in a density, by its scatter about a curve.
+
+    It is the shape of a gamma distribution. None above what anybody averages: otherwise each
+    misfit would count as evidence for a line, and standard errors would vanish.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import polygamma
+    from scipy.stats import median_abs_deviation
+
+    log = np.log(density)
+    # a second difference at a distance hardly sees a curve, and not what neighbours share
+    bend = log[6:] - 2 * log[3:-3] + log[:-6]
+    scatter = median_abs_deviation(bend, scale=0.6745) ** 2 / 6
+    if scatter < polygamma(1, _MOST_AVERAGES):
+        return None
+    scatter = min(scatter, polygamma(1, _LEAST_AVERAGES))
+    low, high = np.log(_LEAST_AVERAGES) - 1e-6, np.log(_MOST_AVERAGES) + 1e-6
+    return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))
+
+
+def _compare_gains(
+    search: Search,
+    model: FittedModel,
+    rivals: Sequence[FittedModel],
+    start: IdentifiedAxis | None,
+) -> tuple[FittedModel, list[FittedModel]]:
+    """Return the likeliest model, and those of other gains that are nearly as likely.
+
+    A plausible gain has none that is well known, without anything that could explain another one;
+    nor has one that was found in earlier data with an error like that of its fit, so without any.
+    """
+    spectrum, error = model.spectrum, _gain_error(model)
+    earlier = None if start is None else start.sensor_gain_error
+    compared = (
+        start is not None
+        and earlier is not None
+        and earlier < _AMBIGUOUS * error * start.sensor_gain
+    )
+    plain = all(line.is_narrow for line in spectrum.lines) and not spectrum.colour
+    low, high = PLAUSIBLE_GAINS
+    if low <= spectrum.gain <= high and (compared or (plain and error < _ROUGH_GAIN)):
+        return model, []
+    return try_other_gains(search, model, rivals)
