@@ -28,11 +28,8 @@ from lbt_synth.identification import (
 )
 from lbt_synth.identification.accelerometers.readings import Readings, fill_missing, load_readings
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
-from lbt_synth.identification.commands.verdict import (
-    CommandRepair,
-    explain_commands,
-    repair_commands,
-)
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
+from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import axis_names, model_tables
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import LEAST_SECONDS

@@ -17,10 +17,10 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
-from lbt_synth.identification.commands.control_law import record_control_law
-from lbt_synth.identification.commands.doubts import STEPPED, gain_dilution, rounding_share
-from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
-from lbt_synth.identification.commands.plausibility import could_have_run
+from lbt_synth.identification.commands.coarse_spectrum import CoarseRecord, dispersion
+from lbt_synth.identification.commands.doubts import STEPPED, command_steps, gain_dilution
+from lbt_synth.identification.commands.repair import CommandRepair
+from lbt_synth.identification.commands.verdict import could_have_run, record_law
 from lbt_synth.identification.fit.both_axes import identify
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS, Search
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
@@ -62,7 +62,7 @@ def identify_with_gains(
     if agrees(model, allowed):
         return model, allowed
     best, excluded = _compare(record, model, allowed, options)
-    stepped = np.max(rounding_share(record)) > STEPPED
+    stepped = np.max(command_steps(record)[1]) > STEPPED
     excluded = excluded and not stepped and _is_plausible(best)
     own = np.repeat(np.array(best.sensor_gains)[:, None], 2, axis=1)
     return best, own if excluded else allowed
@@ -207,16 +207,16 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel | None = None) -> F
     coarse = CoarseRecord(record, None if model is None else _resonances(model))
     if not coarse.stretches:
         return everything
-    given = Guess(kind="as given")
-    best = coarse.compare([given])
+    given = CommandRepair()
+    contrast, gains, (misfit,) = coarse.compare([given])
     far = np.geomspace(_LEAST, _MOST, _FAR_STEPS)
-    grid = np.array([[*far, *(gain * _NEAR)] for gain in best.gain[:, 0]])
-    excess = coarse.profile(given, grid) - best.axis_contrast
-    allowed = excess < _FAR * best.dispersion(0)
+    grid = np.array([[*far, *(gain * _NEAR)] for gain in gains[:, 0]])
+    excess = coarse.profile(given, grid) - contrast
+    allowed = excess < _FAR * dispersion(misfit)
     allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
     low, high = np.array(ends, dtype=np.float64).T
-    high = high * gain_dilution(coarse) ** 2  # in steps, a gain looks smaller
+    high = high * gain_dilution(coarse)[0] ** 2  # in steps, a gain looks smaller
     intervals: FloatArray = np.clip(np.column_stack([low, high]), _LEAST, _MOST)
     running = far[_has_run(record, far)]
     if not running.size:
@@ -235,13 +235,10 @@ def _resonances(model: IdentifiedModel) -> list[list[tuple[float, float]]]:
 
 def _has_run(record: LoopRecord, gains: FloatArray) -> BoolArray:
     """Return at which gains (n,) the recorded law is stable; at all where there is no law."""
-    try:
-        law = record_control_law(record)
-    except ProblemError:
+    law = record_law(record)
+    if law is None or law.kind == "none" or law.lag_frames < 0:
         return np.ones(gains.size, dtype=np.bool_)
-    if law.kind == "none" or law.lag_frames < 0:
-        return np.ones(gains.size, dtype=np.bool_)
-    given, one = Guess(kind="as given"), np.ones((1, record.axes))
+    given, one = CommandRepair(), np.ones((1, record.axes))
     return np.array([could_have_run(given, gain * one, record, law) for gain in gains])
 
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.commands.plausibility import law_controller
+from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.prediction.comparison import PredictionRow
@@ -89,14 +88,13 @@ def law_row(law: ControlLaw) -> LawRow:
             residual=law.residual,
             coherence=law.coherence,
         )
-    matrix = law.axis_matrix
     gains = law.gain
-    flat = np.diag(gains) if matrix.kind == "diagonal" else gains.ravel()
+    flat = np.diag(gains) if law.axes_kind == "diagonal" else gains.ravel()
     return LawRow(
         law=law.kind,
         order=law.order,
         gain=", ".join(_distinct(f"{value:.4g}" for value in flat + 0.0)),
-        axes="" if len(gains) == 1 else matrix.kind,
+        axes="" if len(gains) == 1 else law.axes_kind,
         leak=", ".join(_distinct(f"{value:.5g}" for value in law.leak if np.isfinite(value))),
         lag_frames=law.lag_frames,
         residual=0.0 if law.exact else law.residual,
@@ -178,20 +176,6 @@ def doubt_commands(verdict: CommandVerdict | None) -> tuple[str, str]:
             return verdict.explanation, f"read the record with {verdict.options}"
         what, _, advice = verdict.explanation.partition(". ")
         return what, advice[:1].lower() + advice[1:] or _FIND
-    return ("", "") if verdict.law is None else _doubt_law(verdict.law)
-
-
-def _doubt_law(law: ControlLaw) -> tuple[str, str]:
-    """Say what is wrong by the law alone, for records too short for anything else."""
-    matrix = law.axis_matrix
-    if not law.exact:
-        return "", ""
-    if matrix.kind == "diagonal" and min(matrix.signs) < 0:
-        return "by their law they have the opposite sign", "turn their sign"
-    if matrix.kind == "swapped":
-        return "by their law those of the two axes are exchanged", "exchange them"
-    if law.kind == "proportional":
-        return "by their law they are increments, not positions", "add them up"
     return "", ""
 
 

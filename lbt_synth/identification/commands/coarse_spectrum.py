@@ -1,9 +1,7 @@
-"""Guesses of how the commands of a record reach its measurements, and the likelihood of each.
-
-A coarse spectrum of the pseudo-open loop, for many guesses of its corrections at once.
+"""The likelihood of repaired commands, by a coarse spectrum of the pseudo-open loop.
 
 The measurement is ``y = z - g c``, with z what an open loop would have measured and c the
-correction. Each guess of c gives another z, and z has a simple spectrum only if the guess is
+correction. Each repair gives another c and z, and z has a simple spectrum only if c is
 right: white noise, turbulence that falls, a few resonances, lines with their skirts. The
 likelihood is Whittle's, as in the fit of the model; its Jacobian is 1 because c follows from the
 past of y.
@@ -16,12 +14,11 @@ another larger (Jensen's formula).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import product
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
+from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -33,13 +30,12 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
-GuessKind: TypeAlias = Literal["as given", "matrix", "shift", "increments"]
-MOST_SHIFT_FRAMES = 3  # by which commands are tried earlier and later
 _MARGIN = 5  # frames of a stretch, on either side, that no shift leaves
 _NATURAL_GAINS = np.array([0.08, 0.28, 0.8])  # starts, of the gain that makes powers equal
 _STEADY = 1e-24  # of the measured power
 _ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 SEGMENT_S = 6.0
+CLEAR = 20.0  # nats that decide
 _SHORTEST_SEGMENT = 2 * SHORTEST_SEGMENT  # frames, where the record has them
 _MOST_SEGMENTS = 24
 _BAND, _WIDEST_BAND = 0.06, 0.02  # of its frequency, and of the frame rate
@@ -54,74 +50,13 @@ _PEAK, _SKIRT = 3.0, 1.25  # over the surroundings
 _REACH, _MOST_PEAKS = 40, 16  # frequencies on either side of a peak, peaks
 _APART = 4  # frequencies between peaks
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Guess:
-    """How recorded commands may reach the measurements."""
-
-    kind: GuessKind
-    matrix: FloatArray | None = None  # from commands to the axes of the measurements, (axes, axes)
-    shift_frames: int = 0  # by which the delay is longer than given
-
-    @property
-    def is_simple(self) -> bool:
-        """Whether the matrix, if there is one, has only signs and exchanged axes."""
-        return self.matrix is None or bool(np.all(np.isin(np.abs(self.matrix), (0, 1))))
-
-    def unturned_corrections(self, record: LoopRecord) -> FloatArray:
-        """Return the corrections in the measurements, but for the matrix, (frames, axes) [nm]."""
-        assert record.commands is not None
-        u = record.commands
-        if self.kind == "increments":
-            u = np.cumsum(u, axis=0)
-        return np.roll(past_corrections(record.mirror_taps, u), self.shift_frames, axis=0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Comparison:
-    """Guesses on one record."""
-
-    guesses: tuple[Guess, ...]
-    axis_contrast: FloatArray  # minus the log-likelihood of each axis, (axes, guesses)
-    gain: FloatArray  # best gain of the sensor, (axes, guesses)
-    misfit: FloatArray  # mean deviance of a band: about 1 if the coarse spectrum fits, (guesses,)
-
-    @property
-    def contrast(self) -> FloatArray:
-        """Minus the log-likelihood of each guess, (guesses,)."""
-        return np.asarray(self.axis_contrast.sum(axis=0))
-
-    def dispersion(self, i: int) -> float:
-        """Return the factor by which a misfit of guess i raises what decides, at least 1."""
-        return max(1.0, float(self.misfit[i]) / _ENOUGH)
-
-
-def list_guesses(record: LoopRecord, *, earliest_frames: float) -> list[Guess]:
-    """Return the guesses for a record, the first as given.
-
-    ``earliest_frames`` is the least total delay at which a correction still follows from the
-    past of the measurements.
-    """
-    assert record.delay_frames is not None
-    out = [Guess(kind="as given")]
-    out += [Guess(kind="matrix", matrix=matrix) for matrix in _matrices(record.axes)]
-    least = earliest_frames - record.delay_frames
-    shifts = range(-MOST_SHIFT_FRAMES, MOST_SHIFT_FRAMES + 1)
-    out += [Guess(kind="shift", shift_frames=k) for k in shifts if k != 0 and k >= least]
-    out.append(Guess(kind="increments"))
-    return out
-
-
-def _matrices(axes: int) -> list[FloatArray]:
-    """Return the signs and exchanges from commands to the axes of the measurements."""
-    if axes == 1:
-        return [-np.eye(1)]
-    plain = [np.diag(np.array(signs, dtype=float)) for signs in product((1, -1), repeat=2)]
-    return [*plain[1:], *(signs[:, ::-1] for signs in plain)]
+# minus the logarithm of the likelihood of each repair, its best gain, and its misfit: the mean
+# deviance of a band, about 1 if the shapes suffice
+CoarseFit: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class CoarseRecord:
-    """The transforms of one record, on which guesses are compared; none without ``stretches``.
+    """The transforms of one record, on which repairs are compared; none without ``stretches``.
 
     ``resonances`` are known ones that the spectra of the axes may show, by frequency [Hz] and
     damping ratio.
@@ -145,43 +80,43 @@ class CoarseRecord:
     def _transform(self, series: FloatArray) -> tuple[FloatArray, ComplexArray, float]:
         return segment_transforms(series, self.rows, self.record.frame_rate_hz, levelled=True)
 
-    def transform(self, guess: Guess) -> ComplexArray:
-        """Return the transforms of the corrections of a guess, (axes, segments, f)."""
-        key = (guess.kind == "increments", guess.shift_frames)
+    def _unturned(self, repair: CommandRepair) -> FloatArray:
+        """Return the corrections of repaired commands, but for the matrix, (frames, axes) [nm]."""
+        assert self.record.commands is not None
+        u = self.record.commands
+        u = np.cumsum(u, axis=0) if repair.increments else u
+        corrections = past_corrections(self.record.mirror_taps, u)
+        return np.roll(corrections, repair.shift_frames, axis=0)
+
+    def transform(self, repair: CommandRepair) -> ComplexArray:
+        """Return the transforms of the corrections of repaired commands, (axes, segments, f)."""
+        key = (repair.increments, repair.shift_frames)
         if key not in self._known:
-            self._known[key] = self._transform(guess.unturned_corrections(self.record))[1]
-        out = self._known[key]
-        return out if guess.matrix is None else np.tensordot(guess.matrix, out, 1)
+            self._known[key] = self._transform(self._unturned(repair))[1]
+        return np.tensordot(repair.turn(self.record.axes), self._known[key], 1)
 
-    def corrections(self, guess: Guess) -> FloatArray:
-        """Return the corrections of a guess as series, (frames, axes) [nm]."""
-        out = guess.unturned_corrections(self.record)
-        return out if guess.matrix is None else out @ guess.matrix.T
+    def corrections(self, repair: CommandRepair) -> FloatArray:
+        """Return the corrections of repaired commands as series, (frames, axes) [nm]."""
+        return self._unturned(repair) @ repair.turn(self.record.axes).T
 
-    def compare(self, guesses: Sequence[Guess]) -> Comparison:
-        """Return the likelihood of each guess, at its best gains."""
-        corrections = np.array([self.transform(guess) for guess in guesses])
+    def compare(self, repairs: Sequence[CommandRepair]) -> CoarseFit:
+        """Return contrast and best gain of each repair, (axes, n) each, and its misfit, (n,)."""
+        corrections = np.array([self.transform(repair) for repair in repairs])
         fits = [self._fit_axis(i, corrections[:, i]) for i in range(self.record.axes)]
         contrast, gain, misfit = (np.array(values) for values in zip(*fits, strict=True))
-        return Comparison(
-            guesses=tuple(guesses),
-            axis_contrast=contrast,
-            gain=gain,
-            misfit=np.mean(misfit, axis=0),
-        )
+        return contrast, gain, np.mean(misfit, axis=0)
 
-    def profile(self, guess: Guess, gains: FloatArray) -> FloatArray:
+    def profile(self, repair: CommandRepair, gains: FloatArray) -> FloatArray:
         """Return the contrasts (axes, n) at gains (axes, n)."""
-        each = enumerate(zip(self.transform(guess), gains, strict=True))
+        each = enumerate(zip(self.transform(repair), gains, strict=True))
         return np.array([self._axis(i, c[None]).fit_profile(g)[0] for i, (c, g) in each])
 
-    def unrelated(self) -> float:
-        """Return the contrast of commands that do not reach the measurements."""
-        nothing = np.zeros((self.record.axes, 1))
-        return float(np.sum(self.profile(Guess(kind="as given"), nothing)))
+    def unrelated(self) -> FloatArray:
+        """Return the contrast of each axis if commands do not reach the measurements, (axes,)."""
+        return self.profile(CommandRepair(), np.zeros((self.record.axes, 1)))[:, 0]
 
     def _axis(self, i: int, corrections: ComplexArray) -> CoarseAxis:
-        """Return the bands of one axis, for all guesses of its corrections."""
+        """Return the bands of one axis, for all repairs of its corrections."""
         return CoarseAxis(
             self.frequency_hz,
             self.measured[i],
@@ -192,13 +127,18 @@ class CoarseRecord:
         )
 
     def _fit_axis(self, i: int, corrections: ComplexArray) -> CoarseFit:
-        """Fit all guesses of one axis, from multiples of the gain that is natural for each."""
+        """Fit all repairs of one axis, from multiples of the gain that is natural for each."""
         high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
         level = np.mean(abs(self.measured[i][:, high]) ** 2)
         steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
         least = max(_STEADY * level, np.finfo(float).tiny)  # clipped commands may hardly move
         natural = np.sqrt(level / np.maximum(steps, least))
         return self._axis(i, corrections).fit_guesses(natural[:, None] * _NATURAL_GAINS)
+
+
+def dispersion(misfit: float) -> float:
+    """Return the factor by which a misfit raises what decides, at least 1."""
+    return max(1.0, misfit / _ENOUGH)
 
 
 def _segments(stretches: Sequence[tuple[int, int]], frame_rate_hz: float) -> IntArray:
@@ -265,11 +205,6 @@ def resonance(square: FloatArray, centre_hz: FloatArray | float, damping: float)
     """Return the spectrum of a second-order process, 1 at low frequencies."""
     centre = np.asarray(centre_hz) ** 2
     return np.asarray(centre**2 / ((square - centre) ** 2 + 4 * damping**2 * centre * square))
-
-
-# minus the logarithm of the likelihood of each guess, its best gain, and its misfit: the mean
-# deviance of a band, about 1 if the shapes suffice; (guesses,) each
-CoarseFit = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class CoarseAxis:
