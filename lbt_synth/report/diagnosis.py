@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.diagnosis import NARROW, diagnosis_verdict
-from lbt_synth.identification.diagnosis.running_loop import AXES, command_row, law_row
+from lbt_synth.identification.diagnosis.running_loop import AXES, law_facts
 from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
@@ -86,7 +86,7 @@ def _spectrum_charts(found: Diagnosis) -> list[Chart]:
     if found.model is None:
         return []
     designs = {} if found.best_design is None else {found.best: found.best_design}
-    lines = [f"{number_text(line.row.frequency_hz)} Hz" for line in found.lines]
+    lines = [f"{number_text(line.frequency_hz)} Hz" for line in found.lines]
     figure = identification_figure(found.model, designs=designs)
     return [chart("identification", figure, lines=listing_text(lines) or "none")]
 
@@ -107,18 +107,19 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
         channels.append(Table(caption="Faults", headings=HEADINGS, rows=faults, words=(1, 2, 6)))
     commands, law = found.commands, found.law
     loop = {
-        "How the commands reach the measurements": commands and [command_row(commands)],
-        "Control law in use, from y to u": law and [law_row(law)],
+        "How the commands reach the measurements": commands and [commands.facts()],
+        "Control law in use, from y to u": law and [law_facts(law)],
         "Loop": found.loop and [found.loop],
     }
     best = f" (best design: {found.best})" if found.best else ""
+    half = "whole record" if found.comparison is None else "first half"
     unseen = "Residual on the second half of the record, by models of the first"
     residuals = {
-        f"What each part leaves by the model of the whole record{best}": found.costs,
+        f"What each part leaves by the model of the {half}{best}": found.costs,
         f"{unseen}; {found.imaging.label}": found.residuals,
     }
     given = found.given
-    lines = {"Vibrations, and where they come from": [line.row for line in found.lines]}
+    lines = {"Vibrations, and where they come from": found.lines}
     return {
         "record": channels,
         "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],

@@ -50,10 +50,12 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
+from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_instance
 
 AS_GIVEN = "as given"
+_FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
 _MOST_SHIFT_FRAMES = 3  # by which commands are tried earlier and later
 _CLEAR_FINER = 8.0  # nats that decide by the criterion of the fit
@@ -104,12 +106,34 @@ class CommandVerdict:
         return f"{self.repair.options} {delay}".strip()
 
     @property
+    def doubt(self) -> str:
+        """What is wrong with the commands, without advice; empty if nothing is."""
+        return "" if self.accepted else self.explanation.partition(". ")[0]
+
+    @property
+    def advice(self) -> str:
+        """What to do about it; empty if nothing is wrong."""
+        if self.accepted:
+            return ""
+        if self.options:
+            return f"read the record with {self.options}"
+        advice = self.explanation.partition(". ")[2]
+        return advice[:1].lower() + advice[1:] or _FIND
+
+    @property
     def overruled(self) -> tuple[str, ...]:
         """What a design assumes that is made although the record is refused."""
         if self.accepted:
             return ()
-        what = self.explanation.partition(". ")[0]  # without advice
-        return (f"the record is right, although its commands look as if {what}",)
+        return (f"the record is right, although its commands look as if {self.doubt}",)
+
+    def facts(self) -> Facts:
+        """Return the verdict as a row of a table."""
+        return facts(
+            explanation=fact(self.explanation, "the commands"),
+            nats=fact(self.nats, "evidence", format=".0f"),
+            repair=fact(self.options, "repair"),
+        )
 
     def require_accepted(self) -> None:
         """Refuse a record that something else explains better; name the options that repair it."""

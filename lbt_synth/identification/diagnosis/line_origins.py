@@ -6,7 +6,7 @@ What each part of the disturbance costs a loop, in nm and in Strehl ratio.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import field
 
 import numpy as np
 from scipy.signal import detrend
@@ -18,7 +18,7 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, jitter_strehl, model_budget
 from lbt_synth.loop.budget import line_covariance
 from lbt_synth.models import TipTiltPlant, Vibration
-from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
+from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import ComplexArray, FloatArray
 
 _SEGMENTS = 16
@@ -41,24 +41,24 @@ class LineRow:
     )
     direction_error_deg: float = column("+-", unit="deg", format=".2g", help="Its error")
     origin: str = column("origin", help="Where it is from")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LineOrigin:
-    """A line of all axes, and the vibrations of the plant that it is made of."""
-
-    row: LineRow
-    vibrations: tuple[Vibration, ...]
+    vibrations: tuple[Vibration, ...] = field(default=())  # of the plant, that it is made of
 
     @property
     def name(self) -> str:
         """What tables of costs call it."""
-        return f"line at {self.row.frequency_hz:.4g} Hz"
+        return f"line at {self.frequency_hz:.4g} Hz"
+
+    @property
+    def where(self) -> str:
+        """Along what it shakes, to go on in a sentence; empty where that is not known."""
+        if self.origin in AXES:
+            return f" in {self.origin}"
+        return "" if np.isnan(self.direction_deg) else f" along {self.direction_deg:.0f} deg"
 
 
 def line_origins(
     model: IdentifiedModel, series: FloatArray, stretches: Stretches
-) -> tuple[LineOrigin, ...]:
+) -> tuple[LineRow, ...]:
     """Return the lines of a model by frequency, with their origin in a series (frames, axes)."""
     found = [
         (i, part)
@@ -77,22 +77,23 @@ def line_origins(
             groups.append([(i, part)])
     lines = [_describe(group, model, series, stretches) for group in groups]
     lines += [_describe_shared(line) for line in model.shared if line.kind != "turbulence"]
-    return tuple(sorted(lines, key=lambda line: line.row.frequency_hz))
+    return tuple(sorted(lines, key=lambda line: line.frequency_hz))
 
 
-def _describe_shared(line: IdentifiedLine) -> LineOrigin:
+def _describe_shared(line: IdentifiedLine) -> LineRow:
     """Return a line that the model has along a direction."""
     error = np.nan if line.direction_error_deg is None else line.direction_error_deg
     angle, origin = _name_direction(line.direction_deg or 0.0, error)
-    row = fill_row(
-        LineRow,
-        line,
+    return LineRow(
+        frequency_hz=line.frequency_hz,
+        frequency_error_hz=line.frequency_error_hz,
         damping=_damping_text(line),
+        rms_nm=line.rms_nm,
         direction_deg=angle,
         direction_error_deg=error,
         origin=_origin_text(line, origin),
+        vibrations=(line.vibration(),),
     )
-    return LineOrigin(row=row, vibrations=(line.vibration(),))
 
 
 def _damping_text(line: IdentifiedLine) -> str:
@@ -116,7 +117,7 @@ def _describe(
     model: IdentifiedModel,
     series: FloatArray,
     stretches: Stretches,
-) -> LineOrigin:
+) -> LineRow:
     """Return a line of one or two axes."""
     axes = len(model.axes)
     parts = [part for _, part in group]
@@ -127,16 +128,14 @@ def _describe(
     if axes == 2:
         angle, error, origin = _origin(frequency, first.damping, model, series, stretches)
     each = np.eye(axes).tolist()
-    return LineOrigin(
-        row=LineRow(
-            frequency_hz=frequency,
-            frequency_error_hz=float(1 / np.sqrt(weights.sum())),
-            damping=_damping_text(first),
-            rms_nm=float(np.sqrt(sum(part.rms_nm**2 for part in parts))),
-            direction_deg=angle,
-            direction_error_deg=error,
-            origin=_origin_text(first, origin),
-        ),
+    return LineRow(
+        frequency_hz=frequency,
+        frequency_error_hz=float(1 / np.sqrt(weights.sum())),
+        damping=_damping_text(first),
+        rms_nm=float(np.sqrt(sum(part.rms_nm**2 for part in parts))),
+        direction_deg=angle,
+        direction_error_deg=error,
+        origin=_origin_text(first, origin),
         vibrations=tuple(part.vibration(tuple(each[i])) for i, part in group),
     )
 
@@ -212,11 +211,12 @@ class CostRow:
     running_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
     best_nm: float = nm_column("best design", help="Residual that it leaves in the best design")
     best_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
+    where: str = field(default="")  # along what a line shakes, to go on in a sentence
 
 
 def disturbance_costs(
     plant: TipTiltPlant,
-    lines: Sequence[LineOrigin],
+    lines: Sequence[LineRow],
     running: Controller | None,
     best: Controller | None,
     imaging: Imaging,
@@ -229,6 +229,7 @@ def disturbance_costs(
     tables = [_covariances(plant, lines, controller) for controller in (running, best)]
     names = next((list(table) for table in tables if table), [])
     losses = [_losses(table, imaging) for table in tables]
+    where = {line.name: line.where for line in lines}
     rows = [
         CostRow(
             part=name,
@@ -236,6 +237,7 @@ def disturbance_costs(
             running_strehl=losses[0].get(name, np.nan),
             best_nm=_rms(tables[1], name),
             best_strehl=losses[1].get(name, np.nan),
+            where=where.get(name, ""),
         )
         for name in names
     ]
@@ -244,7 +246,7 @@ def disturbance_costs(
 
 
 def _covariances(
-    plant: TipTiltPlant, lines: Sequence[LineOrigin], controller: Controller | None
+    plant: TipTiltPlant, lines: Sequence[LineRow], controller: Controller | None
 ) -> dict[str, FloatArray]:
     """Return the covariance (n, n) of the residual by part, and of all; none of no stable loop."""
     if controller is None:
