@@ -183,7 +183,13 @@ def _parse_columns(given: Sequence[str] | None) -> dict[str, list[str | int]] | 
 def identification_options(
     arguments: Namespace, record: LoopRecord | SpectrumRecord
 ) -> dict[str, Any]:
-    """Return the options of an identification that the command line gives."""
+    """Return the options of an identification that the command line gives.
+
+    Refuse facts of which no model can be written before it is identified.
+    """
+    obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
+    if obstruction is not None and record.diameter_m is None:
+        raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
     options: dict[str, Any] = {
         "announced": _expected_lines(arguments, record),
         "lowest_line_hz": arguments.lowest_line_hz,
@@ -292,8 +298,6 @@ def _model_text(
 ) -> bytes:
     """Return the text of a configuration for an identified model."""
     obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
-    if obstruction is not None and record.diameter_m is None:
-        raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,

@@ -199,3 +199,22 @@ def test_a_lost_frame_that_rounding_hides_is_refused():
     times = np.floor(np.arange(300) / 999 * 1e3 + 0.9) / 1e3
     with pytest.raises(ProblemError, match="cannot tell rounding from missing"):
         loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
+
+
+@pytest.mark.parametrize("times", [np.zeros(3000), np.floor(np.arange(3000) / RATE)])
+def test_stamps_that_tell_no_frame_apart_are_not_used_beside_a_rate(times):
+    kept = np.delete(np.arange(3001), [1700])
+    for counter in (None, kept):
+        seen = loop_record(
+            noise(3000), frame_rate_hz=RATE, times_s=times, frame_numbers=counter, unit="nm"
+        )
+        assert seen.frames == 3000 + (counter is not None)
+        assert "the times do not tell frames apart and were not used" in seen.health.notes
+    with pytest.raises(ProblemError, match="must rise"):
+        loop_record(noise(3000), times_s=np.zeros(3000), unit="nm")
+
+
+def test_whole_seconds_of_another_rate_are_refused():
+    times = np.floor(np.arange(30_000) / RATE)
+    with pytest.raises(ProblemError):
+        loop_record(noise(30_000), frame_rate_hz=1300, times_s=times, unit="nm")
