@@ -42,9 +42,9 @@ _BAND, _WIDEST_BAND = 0.06, 0.02  # of its frequency, and of the frame rate
 _SLOWEST_HZ, _FASTEST_HZ = 0.15, 6.0  # corners of the turbulence
 _CORNERS, _ORDERS = 5, (1, 2, 3)  # slopes of -2, -4, -6
 _BUMPS_HZ, _BUMPS, _BUMP_DAMPING = (1.5, 25.0), 8, 0.18
-_LINE_DAMPING = 0.004  # only the skirts of a line are compared, which do not show it
+_LINE_DAMPING = 0.004
 _SMALLEST = 1e-9  # of the measured power
-_FIRST_PASSES, _SETTLED = 20, 0.05
+_FIRST_PASSES, _SETTLED = 20, 0.01
 _LARGEST = 2.0  # step of the logarithm of an amplitude
 _PEAK, _SKIRT = 3.0, 1.25  # over the surroundings
 _REACH, _MOST_PEAKS = 40, 16  # frequencies on either side of a peak, peaks
@@ -156,7 +156,7 @@ def _segments(stretches: Sequence[tuple[int, int]], frame_rate_hz: float) -> Int
 def find_spectral_peaks(
     frequency_hz: FloatArray, power: FloatArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return the frequencies at peaks (f,), where the peaks are (l,), and their widths (l,)."""
+    """Return the frequencies at peaks (f,), where the peaks are and their widths [Hz], (l,)."""
     from scipy.ndimage import median_filter
     from scipy.signal import find_peaks
 
@@ -171,10 +171,9 @@ def find_spectral_peaks(
         stop = np.min(ends[ends > top], initial=high - 1)
         is_peak[max(start - 1, 0) : stop + 2] = True
     edges = np.flatnonzero(np.diff(np.r_[False, is_peak, False].astype(int))).reshape(-1, 2)
-    lines = np.array([frequency_hz[a + np.argmax(power[a:b])] for a, b in edges])
-    step = frequency_hz[1] - frequency_hz[0]
-    width = np.array([max(2.0, 0.3 * (b - a)) * step for a, b in edges])
-    return is_peak, lines, width / lines
+    tops = np.array([a + np.argmax(power[a:b]) for a, b in edges], dtype=np.intp)
+    width = np.maximum(2.0, 0.3 * (edges[:, 1] - edges[:, 0]))
+    return is_peak, frequency_hz[tops], width * (frequency_hz[1] - frequency_hz[0])
 
 
 def _bands(frequency_hz: FloatArray, frame_rate_hz: float, step: float) -> IntArray:
@@ -184,10 +183,8 @@ def _bands(frequency_hz: FloatArray, frame_rate_hz: float, step: float) -> IntAr
     return np.flatnonzero(np.diff(band, prepend=-np.inf) > 0)
 
 
-def _background_shapes(
-    square: FloatArray, lowest_hz: float, known: Sequence[FloatArray]
-) -> FloatArray:
-    """Return the shapes of noise, turbulence and wide resonances over the bands, (k, b).
+def _shapes(square: FloatArray, lowest_hz: float, known: Sequence[FloatArray]) -> FloatArray:
+    """Return the shapes of noise, turbulence, wide and known resonances over the bands, (k, b).
 
     Nothing but noise and the skirts of slower parts has a place at high frequencies: there the
     corrections of a wrong guess show.
@@ -208,9 +205,9 @@ def resonance(square: FloatArray, centre_hz: FloatArray | float, damping: float)
 
 
 class CoarseAxis:
-    """One axis in bands and at peaks, and fits of shapes to it for guesses of its corrections.
+    """One axis in bands and at peaks, and fits of shapes to it for repairs of its corrections.
 
-    A fit varies the gain, the logarithms of the amplitudes and the places of the lines.
+    A fit varies the gain and the logarithms of the amplitudes of the shapes.
     """
 
     def __init__(
@@ -223,12 +220,12 @@ class CoarseAxis:
         frame_rate_hz: float,
         resonances: Sequence[tuple[float, float]] = (),
     ) -> None:
-        """Take the powers of an axis from (segments, f) and guesses (n, segments, f).
+        """Take the powers of an axis from (segments, f) and corrections (n, segments, f).
 
         ``resonances`` are known ones, by frequency [Hz] and damping ratio.
         """
         power = np.mean(abs(measured) ** 2, axis=0)
-        is_peak, lines, self.line_width = find_spectral_peaks(frequency_hz, power)
+        is_peak, lines, width = find_spectral_peaks(frequency_hz, power)
         step = float(frequency_hz[1] - frequency_hz[0])
         every = LoopPeriodogram(
             frequency_hz=frequency_hz,
@@ -245,26 +242,25 @@ class CoarseAxis:
         def warp(f: FloatArray) -> FloatArray:
             return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
 
-        # frequency squared, as that of a sampled process [Hz^2], (b,); shapes of at most 1, (k, b)
-        self.square = warp(self.bands.frequency_hz)
-        known = [
-            resonance(self.square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in resonances
-        ]
-        self.shapes = _background_shapes(self.square, frequency_hz[0], known)
-        self.lines = np.log(lines)
-        self.fixed = len(self.shapes)
-        self.amplitudes = self.fixed + lines.size
-        upper = np.triu_indices(self.fixed)
+        # frequency squared, as that of a sampled process [Hz^2], (b,)
+        square = warp(self.bands.frequency_hz)
+        # only the skirts of a line are compared, which do not show its damping; a line on either
+        # side of its peak stands for one between them
+        places = np.concatenate([lines - width, lines + width])
+        narrow = [*resonances, *((f, _LINE_DAMPING) for f in places if f > 0)]
+        known = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in narrow]
+        self.shapes = _shapes(square, frequency_hz[0], known)  # of at most 1, (k, b)
+        upper = np.triu_indices(len(self.shapes))
         self.pairs = (self.shapes[upper[0]] * self.shapes[upper[1]]).T
-        self.pair = np.zeros((self.fixed, self.fixed), dtype=np.intp)  # the place of each there
+        self.pair = np.zeros((len(self.shapes), len(self.shapes)), dtype=np.intp)  # their places
         self.pair[upper] = self.pair.T[upper] = np.arange(upper[0].size)
 
     def fit_profile(self, gains: FloatArray) -> CoarseFit:
-        """Fit the spectrum with a single guess at each of its gains (n,)."""
+        """Fit the spectrum with a single repair at each of its gains (n,)."""
         return self._minimise(gains, np.zeros(gains.size, dtype=np.intp), free=False)
 
     def fit_guesses(self, starts: FloatArray) -> CoarseFit:
-        """Fit spectrum and gain of each guess, from each of its starting gains (guesses, s)."""
+        """Fit spectrum and gain of each repair, from each of its starting gains (repairs, s)."""
         guesses, each = starts.shape
         fits = self._minimise(starts.ravel(), np.repeat(np.arange(guesses), each), free=True)
         best = np.argmin(fits[0].reshape(guesses, each), axis=1) + each * np.arange(guesses)
@@ -272,20 +268,24 @@ class CoarseAxis:
         return contrast, gain, misfit
 
     def _minimise(self, gain: FloatArray, guess: IntArray, *, free: bool) -> CoarseFit:
-        """Return the least contrast of each row, by damped scoring."""
+        """Return the least contrast of each row, its gain and its misfit, by damped scoring."""
         theta = self._begin(gain, guess)
         rows = np.arange(gain.size)
-        value, damping = self._contrast(theta, guess), np.full(gain.size, 1e-2)
+        value, damping = self._contrast(theta, guess)[0], np.full(gain.size, 1e-2)
         for _ in range(MOST_STEPS):
             gradient, information = self._derivatives(theta[rows], guess[rows], free=free)
             diagonal = np.einsum("rii->ri", information)
             more = damping[rows, None] * diagonal
             more += 1e-9 * np.max(diagonal, axis=1, keepdims=True)
-            more[:, 1 : 1 + self.amplitudes] += 1e-3
+            more[:, 1:] += 1e-3
             stiff = information + np.eye(theta.shape[1]) * more[:, :, None]
             step = -np.linalg.solve(stiff, gradient[:, :, None])[:, :, 0]
-            trial = self._limit(theta[rows], step)
-            new = self._contrast(trial, guess[rows])
+            trial = theta[rows] + step
+            trial[:, 0] = np.maximum(trial[:, 0], 0.2 * theta[rows, 0])
+            trial[:, 1:] = theta[rows, 1:] + np.clip(step[:, 1:], -_LARGEST, _LARGEST)
+            level = np.max(trial[:, 1:], axis=1, keepdims=True)
+            trial[:, 1:] = np.maximum(trial[:, 1:], level - 40)
+            new, _ = self._contrast(trial, guess[rows])
             better = new < value[rows]
             saved = np.where(better, value[rows] - new, np.inf)
             moved = rows[better]
@@ -294,117 +294,58 @@ class CoarseAxis:
             rows = rows[(saved > _SETTLED) & (damping[rows] < 1e4)]
             if not rows.size:
                 break
-        return value, theta[:, 0], self._misfit(theta, guess)
-
-    def _misfit(self, theta: FloatArray, guess: IntArray) -> FloatArray:
-        """Return the mean deviance of the bands of each row."""
-        gain, model, *_ = self._model(theta)
-        bands = self.bands
-        ratio = _power(bands.row(guess), gain) / model
-        return np.asarray(np.mean(2 * bands.count * (ratio - 1 - np.log(ratio)), axis=1))
+        _, ratio = self._contrast(theta, guess)
+        deviance = 2 * self.bands.count * (ratio - 1 - np.log(ratio))
+        return value, theta[:, 0], np.asarray(np.mean(deviance, axis=1))
 
     def _begin(self, gain: FloatArray, guess: IntArray) -> FloatArray:
         """Return starting values, with amplitudes by multiplicative updates."""
-        skirts, _ = self._skirts(self.lines[None])
-        shapes = np.vstack([self.shapes, skirts[0]])
+        shapes = self.shapes
         power, count = _power(self.bands.row(guess), gain), self.bands.count
-        level = np.median(power, axis=1)[:, None] / self.amplitudes
+        level = np.median(power, axis=1)[:, None] / len(shapes)
         a = level / np.mean(shapes, axis=1)
         for _ in range(_FIRST_PASSES):
             model = a @ shapes
             weight = count / model
             a *= np.sqrt(((weight * power / model) @ shapes.T) / (weight @ shapes.T))
             a = np.maximum(a, 1e-12 * np.max(a, axis=1, keepdims=True))
-        return np.column_stack([gain, np.log(a), np.tile(self.lines, (gain.size, 1))])
+        return np.column_stack([gain, np.log(a)])
 
-    def _skirts(self, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the shapes of lines (rows, l, b), and their log derivatives by their places."""
-        square = self.square
-        centre = np.exp(lines)[:, :, None]
-        skirt = 1e-3 * resonance(square, centre, _LINE_DAMPING)
-        shift = square - centre**2
-        stretch = 4 * _LINE_DAMPING**2 * centre**2 * square
-        return skirt, 4 - (2 * stretch - 4 * centre**2 * shift) / (shift**2 + stretch)
-
-    def _model(
-        self, theta: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return gains (rows,), models (rows, b), amplitudes, the parts of lines and their slopes.
-
-        The amplitudes are those of the shapes that all rows share, (rows, k); parts and slopes are
-        (rows, l, b).
-        """
-        a = np.exp(theta[:, 1 : 1 + self.amplitudes])
-        skirt, slope = self._skirts(theta[:, 1 + self.amplitudes :])
-        skirt *= a[:, self.fixed :, None]
-        model = a[:, : self.fixed] @ self.shapes + np.sum(skirt, axis=1)
-        return theta[:, 0], model, a[:, : self.fixed], skirt, slope
-
-    def _away(self, theta: FloatArray) -> FloatArray:
-        """Return how far lines are from their peaks, over their widths, (rows, l)."""
-        away = theta[:, 1 + self.amplitudes :] - self.lines
-        return np.asarray(away / self.line_width)
-
-    def _contrast(self, theta: FloatArray, guess: IntArray) -> FloatArray:
-        """Return the contrast of each row."""
-        gain, model, *_ = self._model(theta)
-        ratio = _power(self.bands.row(guess), gain) / model
-        at_peaks = np.log(_power(self.peaks.row(guess), gain)) + 1
-        return np.asarray(
-            (np.log(model) + ratio) @ self.bands.count
-            + at_peaks @ self.peaks.count
-            + 0.5 * np.sum(self._away(theta) ** 2, axis=1)
-        )
+    def _contrast(self, theta: FloatArray, guess: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return the contrast of each row, and the power of each band over the model's."""
+        model = np.exp(theta[:, 1:]) @ self.shapes
+        ratio = _power(self.bands.row(guess), theta[:, 0]) / model
+        at_peaks = np.log(_power(self.peaks.row(guess), theta[:, 0])) + 1
+        total = (np.log(model) + ratio) @ self.bands.count + at_peaks @ self.peaks.count
+        return np.asarray(total), ratio
 
     def _derivatives(
         self, theta: FloatArray, guess: IntArray, *, free: bool
     ) -> tuple[FloatArray, FloatArray]:
         """Return gradients (rows, p) and information (rows, p, p) of the contrast.
 
-        What the shapes that all rows share add is a product of two matrices.
+        The information of the shapes is a product of two matrices.
         """
-        gain, model, a, skirt, slope = self._model(theta)
+        gain, a = theta[:, 0], np.exp(theta[:, 1:])
+        model = a @ self.shapes
         bands, peaks = self.bands.row(guess), self.peaks.row(guess)
         by_gain = 2 * (bands.crossed + gain[:, None] * bands.corrected) / model
         at_peaks = 2 * (peaks.crossed + gain[:, None] * peaks.corrected) / _power(peaks, gain)
         count, excess = bands.count, bands.count * (1 - _power(bands, gain) / model)
-        share = skirt / model[:, None]
-        own = np.concatenate([share, share * slope], axis=1)  # of lines, by power and place
-        weighted = own * count
-        n, k = theta.shape[1], 1 + self.fixed
+        n = theta.shape[1]
         gradient, information = np.empty((len(theta), n)), np.empty((len(theta), n, n))
         gradient[:, 0] = by_gain @ count + at_peaks @ peaks.count
-        gradient[:, 1:k] = a * ((excess / model) @ self.shapes.T)
-        gradient[:, k:] = (own @ excess[:, :, None])[:, :, 0]
+        gradient[:, 1:] = a * ((excess / model) @ self.shapes.T)
         information[:, 0, 0] = (bands.corrected / model) @ (2 * count)
         information[:, 0, 0] += at_peaks**2 @ peaks.count
-        information[:, 0, 1:k] = -a * ((count * by_gain / model) @ self.shapes.T)
-        information[:, 0, k:] = -(weighted @ by_gain[:, :, None])[:, :, 0]
+        information[:, 0, 1:] = -a * ((count * by_gain / model) @ self.shapes.T)
         pairs = ((count / model**2) @ self.pairs)[:, self.pair]
-        information[:, 1:k, 1:k] = a[:, :, None] * pairs * a[:, None]
-        information[:, k:, 1:k] = ((weighted / model[:, None]) @ self.shapes.T) * a[:, None]
-        information[:, 1:k, k:] = information[:, k:, 1:k].transpose(0, 2, 1)
-        information[:, k:, k:] = weighted @ own.transpose(0, 2, 1)
-        information[:, 1:, 0] = information[:, 0, 1:]
+        information[:, 1:, 1:] = a[:, :, None] * pairs * a[:, None]
         if not free:
-            gradient[:, 0] = information[:, 0, 1:] = information[:, 1:, 0] = 0.0
+            gradient[:, 0] = information[:, 0, 1:] = 0.0
             information[:, 0, 0] = 1.0
-        places = range(1 + self.amplitudes, n)
-        gradient[:, places] += self._away(theta) / self.line_width
-        information[:, places, places] += 1 / self.line_width**2
+        information[:, 1:, 0] = information[:, 0, 1:]
         return gradient, information
-
-    def _limit(self, theta: FloatArray, step: FloatArray) -> FloatArray:
-        """Return the parameters after a step, each of bounded size, the gain still above 0."""
-        k = 1 + self.amplitudes
-        trial = theta + step
-        trial[:, 0] = np.maximum(trial[:, 0], 0.2 * theta[:, 0])
-        trial[:, 1:k] = theta[:, 1:k] + np.clip(step[:, 1:k], -_LARGEST, _LARGEST)
-        width = self.line_width
-        trial[:, k:] = theta[:, k:] + np.clip(step[:, k:], -width, width)
-        level = np.max(trial[:, 1:k], axis=1, keepdims=True)
-        trial[:, 1:k] = np.maximum(trial[:, 1:k], level - 40)
-        return trial
 
 
 def _power(data: LoopPeriodogram, gain: FloatArray) -> FloatArray:

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.records.faults import MAD, find_saturated
 from lbt_synth.linear import Controller
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     BoolArray,
     ComplexArray,
@@ -143,6 +144,28 @@ class ControlLaw:
     def adds_up(self) -> bool:
         """Whether it adds up measurements, as positions do and increments do not."""
         return bool(self.order > 0 and np.all(abs(self.poles[:, 0] - 1) < _ADDS_UP))
+
+    @property
+    def gain_text(self) -> str:
+        """The gains that are not zero by structure; one where all are the same."""
+        gains = np.diag(self.gain) if self.axes_kind == "diagonal" else self.gain.ravel()
+        texts = [f"{value:.4g}" for value in gains + 0.0]
+        return texts[0] if len(set(texts)) == 1 else ", ".join(texts)
+
+    @property
+    def name(self) -> str:
+        """The law in words, but for its lag."""
+        if self.kind == "none":
+            return "no law"
+        short = f"a {self.kind} of gain {self.gain_text}"
+        return short if self.order <= 1 else f"a law of order {self.order}"
+
+    @property
+    def lag_text(self) -> str:
+        """How late the commands follow, to go on in a sentence; empty where they are in time."""
+        when = "late" if self.lag_frames > 0 else "early"
+        frames = count_text(abs(self.lag_frames), "frame")
+        return f", {frames} {when}" if self.lag_frames else ""
 
     @property
     def axis_lags(self) -> IntArray:

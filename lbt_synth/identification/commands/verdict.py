@@ -58,6 +58,7 @@ AS_GIVEN = "as given"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
 _MOST_SHIFT_FRAMES = 3  # by which commands are tried earlier and later
+_ALIKE = 0.1  # nats within which repairs are as likely
 _CLEAR_FINER = 8.0  # nats that decide by the criterion of the fit
 _UNUSUAL = 10.0  # nats that a law asks for which no one would run
 _CONTRADICTED = 60.0  # nats by which a repair is likelier than all that a law allows
@@ -136,15 +137,21 @@ class CommandVerdict:
         )
 
     def require_accepted(self) -> None:
-        """Refuse a record that something else explains better; name the options that repair it."""
-        if not self.accepted:
-            advice = f" Repair it as the options {self.options} do." if self.options else ""
-            raise RecordError(
-                f"the commands do not reach the measurements as the record says: "
-                f"{self.explanation}.{advice}",
-                explanation=self.explanation,
-                options=self.options,
-            )
+        """Refuse a record that something else explains better.
+
+        The message says which law fits, and names all options that repair the record.
+        """
+        if self.accepted:
+            return
+        law = "" if self.law is None else f" ({self.law.name} fits them{self.law.lag_text})"
+        tried = f"{self.options}, or " if self.options else ""
+        raise RecordError(
+            f"the commands do not reach the measurements as given: {self.explanation}{law}.",
+            explanation=self.explanation,
+            options=self.options,
+            in_python=f"Repair them as the options {self.options} do." if self.options else "",
+            at_terminal=f"Try {tried}--accept-record to go on as it is.",
+        )
 
 
 def explain_commands(
@@ -311,7 +318,7 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice |
     compared = coarse.compare(repairs)
     contrast, gain, misfit = compared[0].sum(axis=0), compared[1], compared[2]
     score, surprising = _score(repairs, compared, record, law, lag)
-    best = int(np.argmin(score))
+    best = int(np.argmax(score <= np.min(score) + _ALIKE))  # the simplest comes first
     # what the law asks for, which the coarse spectrum may miss
     expected = np.flatnonzero(~surprising)
     if surprising[[0, best]].all() and expected.size:

@@ -27,7 +27,6 @@ from lbt_synth.identification.diagnosis.running_loop import (
     given_controller,
     given_design_facts,
     judge_channels,
-    law_facts,
     loop_facts,
     running_controller,
 )
@@ -51,7 +50,7 @@ from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fill_row
-from lbt_synth.storage.words import count_text, listing_text
+from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import require_instance
 
 NARROW = 0.3  # modulus margin
@@ -360,12 +359,7 @@ def _state_sentence(found: Diagnosis) -> str:
         return f"The delay of the record is doubtful: {delays[0].removeprefix('warning: ')}."
     law = "an open loop ran"
     if found.law is not None:
-        row = law_facts(found.law)
-        law = f"a law of order {row.order} ran"
-        if found.law.order <= 1:
-            law = f"a {row.law} of gain {row.gain} ran"
-        if row.lag_frames:
-            law += f", {count_text(row.lag_frames, 'frame')} late"
+        law = f"{found.law.name} ran{found.law.lag_text}"
     if found.model is None or found.loop is None:
         return f"The record shows no fault, and {law}."
     gain = f"at the sensor gain of {found.loop.sensor_gain}"

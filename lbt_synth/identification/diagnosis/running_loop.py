@@ -17,7 +17,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.prediction.comparison import PredictionRow
-from lbt_synth.identification.records.from_series import LEAST_QUARTER, TREND
+from lbt_synth.identification.records.from_series import TREND, end_scatters
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, loop_margins
@@ -41,17 +41,15 @@ _AGREES = 0.1  # of the residual that its own model promises
 
 def law_facts(law: ControlLaw) -> Facts:
     """Return a control law in words."""
-    gains, is_none = law.gain, law.kind == "none"
-    flat = np.diag(gains) if law.axes_kind == "diagonal" else gains.ravel()
-    gain = ", ".join(_distinct(f"{value:.4g}" for value in flat + 0.0))
+    is_none = law.kind == "none"
     leak = ", ".join(_distinct(f"{value:.5g}" for value in law.leak if np.isfinite(value)))
     none = "none: the commands do not follow from the measurements"
-    axes = "" if is_none or len(gains) == 1 else law.axes_kind
+    axes = "" if is_none or len(law.gain) == 1 else law.axes_kind
     unexplained = 0.0 if law.exact else law.residual
     return facts(
         law=fact(none if is_none else law.kind, "control law"),
         order=fact(law.order, "order"),
-        gain=fact("" if is_none else gain, "gain"),
+        gain=fact("" if is_none else law.gain_text, "gain"),
         axes=fact(axes, "axes"),
         leak=fact(leak, "pole nearest 1"),
         lag_frames=fact(law.lag_frames, "late", unit="frames"),
@@ -169,12 +167,11 @@ def _judge_series(
             if each.series == series and each.axis == axis and each.kind in _WORDS
         ]
         here = one[good] if good.any() else one
-        first, last = _quarters(good)
-        ends = [_step_rms(one, part) for part in (first, last)]
-        change = ends[1] / ends[0] if ends[0] > 0 else np.nan
-        drift = float(np.mean(one[last]) - np.mean(one[first])) if last.any() else np.nan
+        first, last = end_scatters(one, good)
+        change, quarter = last / first if first > 0 else np.nan, len(here) // 4
+        drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
         held = sum(each.fraction for each in found if each.kind in ("stuck", "held"))
-        words = [f"{_WORDS[each.kind]} ({_percent(each.fraction)})" for each in found]
+        words = [f"{_WORDS[each.kind]} ({100 * each.fraction:.2g} %)" for each in found]
         if np.ptp(here) == 0 or held > _DEAD:
             words = [DEAD]
         elif series == "measurements":
@@ -200,25 +197,10 @@ def _judge_series(
     return rows
 
 
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.2g} %"
-
-
 def _step_rms(series: FloatArray, good: BoolArray) -> float:
     """Return the rms difference of neighbouring good frames, nan without any."""
     pairs = good[1:] & good[:-1]
     return float(np.sqrt(np.mean(np.diff(series)[pairs] ** 2))) if pairs.any() else np.nan
-
-
-def _quarters(good: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Return the good frames of the first and of the last quarter, none if they are few."""
-    first, last = np.zeros((2, len(good)), dtype=np.bool_)
-    where = np.flatnonzero(good)
-    quarter = where.size // 4
-    if quarter >= LEAST_QUARTER:
-        first[where[:quarter]] = True
-        last[where[-quarter:]] = True
-    return first, last
 
 
 def given_controller(design: Design, model: IdentifiedModel) -> Controller:

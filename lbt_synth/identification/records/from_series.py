@@ -52,7 +52,7 @@ _LARGEST_NM = 1e100  # a larger number is none: its square would overflow
 _SMALLEST_NM = 1e-30  # squares of less are lost to rounding
 _OPEN_FRAMES = 20  # of zero or equal commands
 TREND = 2.0  # ratio of scatters
-LEAST_QUARTER = 64  # pairs of frames that show a trend
+_LEAST_QUARTER = 64  # pairs of frames that show a trend
 
 Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
 
@@ -547,18 +547,25 @@ def _longest(stretches: IntArray) -> IntArray:
     return stretches[stretches[:, 1] - stretches[:, 0] >= _OPEN_FRAMES]
 
 
-def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
+def _note_trends(series: FloatArray, good: BoolArray) -> Iterator[str]:
     """Note where the scatter from frame to frame changes between the ends of the record."""
-    pairs = np.flatnonzero(good[1:] & good[:-1])
-    quarter = pairs.size // 4
-    if quarter < LEAST_QUARTER:
-        return []
-    said, squares = [], np.diff(series, axis=0)[pairs] ** 2
-    ends = np.sqrt([squares[:quarter].mean(axis=0), squares[-quarter:].mean(axis=0)])
-    for axis, (first, last) in enumerate(ends.T):
+    for axis, column in enumerate(series.T):
+        first, last = end_scatters(column, good)
         if max(first, last) > TREND * min(first, last):
-            said.append(
+            yield (
                 f"axis {axis} is not stationary: the rms difference of two frames is "
                 f"{nm_text(first)} in the first quarter and {nm_text(last)} in the last"
             )
-    return said
+
+
+def end_scatters(series: FloatArray, good: BoolArray) -> tuple[float, float]:
+    """Return the rms difference of two good frames in the first quarter, and in the last.
+
+    nan where these are few.
+    """
+    steps = np.diff(series)[good[1:] & good[:-1]]
+    quarter = steps.size // 4
+    if quarter < _LEAST_QUARTER:
+        return float("nan"), float("nan")
+    first, last = (float(np.sqrt(np.mean(part**2))) for part in (steps[:quarter], steps[-quarter:]))
+    return first, last
