@@ -231,7 +231,7 @@ def _examine_loop(
         return found
     notes += model.notes
     running = running_controller(found.law, record.frame_rate_hz)
-    lines = line_origins(model, record.pseudo_open_loop(model.sensor_gains), record.stretches())
+    lines = line_origins(model)
     found = replace(found, model=model, loop=loop_facts(model, running), lines=lines)
     controllers = {name: given_controller(design, model) for name, design in given.items()}
     compared = _attempt(
@@ -312,7 +312,7 @@ def _compare(
     }
     best = min(left, key=lambda name: left[name])
     found = replace(found, comparison=table, best=best, best_design=designs[best])
-    return found, half, line_origins(half, series, fit)
+    return found, half, line_origins(half)
 
 
 def _stable_designs(plant: TipTiltPlant, notes: list[str]) -> dict[str, Design]:
