@@ -69,7 +69,8 @@ def line_origins(model: IdentifiedModel) -> tuple[LineRow, ...]:
 
 def _are_twins(one: IdentifiedLine, other: IdentifiedLine, model: IdentifiedModel) -> bool:
     """Whether lines are those of two axes, and of one frequency."""
-    if np.count_nonzero([one.direction, other.direction]) > 2 or one.direction == other.direction:
+    along = [line.direction or () for line in (one, other)]
+    if along[0] == along[1] or any(np.count_nonzero(each) != 1 for each in along):
         return False
     error = float(np.hypot(one.frequency_error_hz, other.frequency_error_hz))
     width = max(one.damping * one.frequency_hz, other.damping * other.frequency_hz)
