@@ -104,7 +104,7 @@ class ControlLaw:
     residual: float  # unexplained part of the variance of the increments of u
     # (axes,); part that past commands leave and measurements explain: 1 of a deterministic law
     axis_coherence: FloatArray
-    odd_frames: int  # frames left out because they do not follow the law of the others
+    odd_frames: int = 0  # frames left out because they do not follow the law of the others
 
     @property
     def order(self) -> int:
@@ -483,11 +483,7 @@ def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
     coherence, residual = np.zeros(axes), 1.0
     if shape is not None:
         coherence, residual = regression.coherence(shape), regression.residual(shape)
-    rest: dict[str, Any] = {
-        "residual": residual,
-        "axis_coherence": read_only(coherence),
-        "odd_frames": 0,
-    }
+    rest: dict[str, Any] = {"residual": residual, "axis_coherence": read_only(coherence)}
     if shape is None or np.max(coherence) < _LEAST_COHERENCE:
         return ControlLaw(
             kind="none",
@@ -545,20 +541,18 @@ def _kind(order: int, poles: ComplexArray, past_error: FloatArray) -> LawKind:
     return "higher order"
 
 
-def classify_matrix(
-    values: ArrayLike, errors: ArrayLike = 0.0, *, tolerance: float = _TOLERANCE
-) -> tuple[AxisKind, tuple[int, ...]]:
+def classify_matrix(values: ArrayLike, errors: ArrayLike = 0.0) -> tuple[AxisKind, tuple[int, ...]]:
     """Return what a matrix (n, n) of one or two axes does, the first kind that fits, and signs.
 
-    Elements within four standard errors of zero, or below a part of the largest one, the tolerance,
-    count as zero. Signs are those on the diagonal, of a swapped matrix on the other one, of each
-    row; 0 of any other.
+    Elements within four standard errors of zero, or below 5 % of the largest one, count as zero.
+    Signs are those on the diagonal, of a swapped matrix on the other one, of each row; 0 of any
+    other.
     """
     g = square(values, "values")
-    part = number(tolerance, "tolerance", at_least=0)
     doubt = _SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
-    least = np.where(np.isfinite(doubt), doubt, np.inf)
-    g = np.where(np.abs(g) <= np.maximum(least, part * np.max(np.abs(g), initial=0.0)), 0.0, g)
+    small = _TOLERANCE * np.max(np.abs(g), initial=0.0)
+    least = np.where(np.isfinite(doubt), np.maximum(doubt, small), np.inf)
+    g = np.where(np.abs(g) <= least, 0.0, g)
     on, off = np.diag(g), (g - np.diag(np.diag(g))).sum(axis=1)
     kind: AxisKind = "general"
     if not g.any():

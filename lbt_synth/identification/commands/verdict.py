@@ -212,6 +212,11 @@ def explain_commands(
     if np.any(scale != 1):
         words.append(wrong_scale(scale, gain))
     words = words or [steps] * bool(steps)
+    slow = (
+        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
+        "real-time computer takes that long, the total delay of a new design is "
+        f"{delay + lag:g} frames"
+    )
     shown = gain / scale
     hidden = (shown <= plausible[0] / _NOT_SHOWN) | (shown >= plausible[1] * _NOT_SHOWN)
     return CommandVerdict(
@@ -222,7 +227,7 @@ def explain_commands(
         nats=max(nats, 0.0),
         gain=frozen_copy(np.where(hidden, np.nan, shown)),
         law=law if not early else sure,
-        notes=() if words else _note_lag(delay, lag),
+        notes=(slow,) if lag and not words else (),
     )
 
 
@@ -267,17 +272,6 @@ def _explain_by_law(
         return refuse(explanation=f"by their law {words}", repair=repair)
     note = "the commands were not tested: no stretch of usable frames is long enough"
     return refuse(explanation=AS_GIVEN, accepted=True, notes=(note,))
-
-
-def _note_lag(delay_frames: float, lag: int) -> tuple[str, ...]:
-    """Return what to look at in an accepted record whose law has a lag."""
-    if lag <= 0:
-        return ()
-    return (
-        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If "
-        "the real-time computer takes that long, the total delay of a new design is "
-        f"{delay_frames + lag:g} frames",
-    )
 
 
 def list_repairs(
