@@ -26,7 +26,7 @@ _ALIKE = 0.2  # of the largest tap, between laws that are one
 _RELATED = 30.0  # nats by which the commands of an axis must be likelier than none
 _FUZZ = 1e-6  # of the range of values, within which two are the same
 STEPPED = 1e-6  # of the variance of increments, in rounding that may move a gain
-_DROWNED = 1.15  # factor by which rounding makes a gain too small to be used
+_DROWNED = 1.2  # factor by which rounding makes a gain too small to be used
 _LEAST_SEGMENTS = 4
 _BANDS = 20
 

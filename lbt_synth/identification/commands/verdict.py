@@ -212,11 +212,6 @@ def explain_commands(
     if np.any(scale != 1):
         words.append(wrong_scale(scale, gain))
     words = words or [steps] * bool(steps)
-    slow = (
-        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
-        "real-time computer takes that long, the total delay of a new design is "
-        f"{delay + lag:g} frames"
-    )
     shown = gain / scale
     hidden = (shown <= plausible[0] / _NOT_SHOWN) | (shown >= plausible[1] * _NOT_SHOWN)
     return CommandVerdict(
@@ -227,8 +222,18 @@ def explain_commands(
         nats=max(nats, 0.0),
         gain=frozen_copy(np.where(hidden, np.nan, shown)),
         law=law if not early else sure,
-        notes=(slow,) if lag and not words else (),
+        notes=() if words else _note_lag(delay, lag),
     )
+
+
+def _note_lag(delay_frames: float, lag: int) -> tuple[str, ...]:
+    """Return what to look at in an accepted record whose law has a lag."""
+    words = (
+        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
+        "real-time computer takes that long, the total delay of a new design is "
+        f"{delay_frames + lag:g} frames"
+    )
+    return (words,) if lag else ()
 
 
 def record_law(record: LoopRecord) -> ControlLaw | None:
