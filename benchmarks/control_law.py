@@ -108,7 +108,7 @@ def main(loops: int) -> None:
             start = time.perf_counter()
             law = fit_control_law(y, commands)
             times[name].append(time.perf_counter() - start)
-            found = (law.kind, law.lag_frames, law.axis_matrix.kind, law.axis_matrix.signs)
+            found = (law.kind, law.lag_frames, law.axes_kind, law.signs)
             right[name] += found[: len(EXPECTED[name])] == EXPECTED[name]
     print("| commands | law as expected | time, median [s] |\n|---|---|---|")
     for name in EXPECTED:

@@ -104,10 +104,8 @@ class RecordError(ProblemError):
         Options of the command line that repair it; empty if nothing does.
     """
 
-    def __init__(self, message: str, *, explanation: str, options: str = "") -> None:
-        super().__init__(message)
-        self.explanation = explanation
-        self.options = options
+    explanation: str = ""
+    options: str = ""
 
 
 class ConfigError(ProblemError):

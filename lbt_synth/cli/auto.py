@@ -25,10 +25,7 @@ def run(arguments: Namespace) -> Report:
     )
     choose_unit(arguments, record.diameter_m)
     imaging = loop_records.record_imaging(arguments, record)
-    with (
-        count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count,
-        loop_records.explain_refusals(arguments),
-    ):
+    with count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count:
         found = design_from_record(
             record,
             method=arguments.method,

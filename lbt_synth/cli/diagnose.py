@@ -15,7 +15,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.diagnosis.diagnosis import diagnosis_verdict
-from lbt_synth.identification.diagnosis.running_loop import command_row, live_axes
+from lbt_synth.identification.diagnosis.running_loop import live_axes
 from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.rows import json_record
@@ -72,10 +72,10 @@ def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:
         "doubt": found.doubt or None,
         "record": loop_records.record_data(record),
         "channels": [json_record(row) for row in found.channels],
-        "commands": None if found.commands is None else json_record(command_row(found.commands)),
+        "commands": None if found.commands is None else json_record(found.commands.facts()),
         "control_law": None if found.law is None else _law_data(found.law),
         "loop": None if found.loop is None else json_record(found.loop),
-        "lines": [json_record(line.row) for line in found.lines],
+        "lines": [json_record(line) for line in found.lines],
         "costs": [json_record(row) for row in found.costs],
         "residuals": [json_record(row) for row in found.residuals],
         "best": found.best or None,

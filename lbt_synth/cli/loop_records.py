@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ from lbt_synth.cli.argument_kinds import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import config_text
-from lbt_synth.errors import ProblemError, RecordError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
     IdentifiedAxis,
@@ -33,18 +32,15 @@ from lbt_synth.identification.accelerometers.readings import (
     load_readings,
 )
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
-from lbt_synth.identification.commands.verdict import (
-    CommandRepair,
-    explain_commands,
-    repair_commands,
-)
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
+from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import axis_names, model_tables
-from lbt_synth.identification.records.faults import HEADINGS
 from lbt_synth.identification.records.record import LEAST_SECONDS
 from lbt_synth.loop import Imaging
 from lbt_synth.report.draw import require_figure_name, save_figure
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import number
 
@@ -117,30 +113,13 @@ def is_scale_known(arguments: Namespace) -> bool:
     return arguments.command_scale is not None or arguments.command_matrix is not None
 
 
-@contextmanager
-def explain_refusals(arguments: Namespace) -> Iterator[None]:
-    """Refuse a record in the words of the command line, with the options that repair it."""
-    try:
-        yield
-    except RecordError as error:
-        advice = f"{error.options}, or " if error.options else ""
-        raise RecordError(
-            f"the commands of {arguments.file} do not reach its measurements as given: "
-            f"{error.explanation}. Try {advice}--accept-record to go on as it is.",
-            explanation=error.explanation,
-            options=error.options,
-        ) from error
-
-
 def judge_record(arguments: Namespace, record: LoopRecord) -> tuple[str, ...]:
     """Refuse a record whose commands do not reach its measurements; return notes on others."""
     if record.commands is None:
         return ()
-    gains = arguments.sensor_gain
-    with explain_refusals(arguments):
-        verdict = explain_commands(record, sensor_gain=gains)
-        if not arguments.accept_record:
-            verdict.require_accepted()
+    verdict = explain_commands(record, sensor_gain=arguments.sensor_gain)
+    if not arguments.accept_record:
+        verdict.require_accepted()
     return (*verdict.notes, *(f"warning: it is assumed that {word}" for word in verdict.overruled))
 
 
@@ -191,7 +170,13 @@ def _parse_columns(given: Sequence[str] | None) -> dict[str, list[str | int]] | 
 def identification_options(
     arguments: Namespace, record: LoopRecord | SpectrumRecord
 ) -> dict[str, Any]:
-    """Return the options of an identification that the command line gives."""
+    """Return the options of an identification that the command line gives.
+
+    Refuse facts of which no model can be written before it is identified.
+    """
+    obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
+    if obstruction is not None and record.diameter_m is None:
+        raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
     options: dict[str, Any] = {
         "announced": _expected_lines(arguments, record),
         "lowest_line_hz": arguments.lowest_line_hz,
@@ -303,8 +288,6 @@ def _model_text(
 ) -> bytes:
     """Return the text of a configuration for an identified model."""
     obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
-    if obstruction is not None and record.diameter_m is None:
-        raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
@@ -340,16 +323,13 @@ def _add_spectra(report: Report, record: SpectrumRecord) -> None:
 
 
 def _add_series(report: Report, record: LoopRecord) -> None:
-    health, names = record.health, axis_names(record.axes)
+    health = record.health
     report.data["record"] = record_data(record)
     axes = count_text(record.axes, "axis", "axes")
     text = f"{record.duration_s:.4g} s, {_loop_kind(record)}, {axes}"
-    rows = [
-        (fault, series, "both" if axis is None else names[axis], *rest)
-        for fault, series, axis, *rest in health.rows()
-    ]
-    if rows:
-        report.add_table(f"Record: {text}: {health.summary()}", HEADINGS, rows)
+    if health.findings:
+        caption = f"Record: {text}: {health.summary()}"
+        report.tables.append(row_table(caption, health.findings))
     else:
         report.notes.append(f"record: {text}; {health.summary()}")
     report.notes += [f"note: {note}" for note in health.notes]

@@ -1,10 +1,8 @@
 from .accelerometers.transfers import accelerometer_transfers as accelerometer_transfers
 from .auto import MethodChoice as MethodChoice
 from .auto import design_from_record as design_from_record
-from .commands.control_law import AxisMatrix as AxisMatrix
 from .commands.control_law import fit_control_law as fit_control_law
-from .commands.control_law import record_control_law as record_control_law
-from .commands.verdict import CommandRepair as CommandRepair
+from .commands.repair import CommandRepair as CommandRepair
 from .diagnosis.diagnosis import Diagnosis as Diagnosis
 from .diagnosis.diagnosis import diagnose as diagnose
 from .fit.identified_model import IdentifiedAxis as IdentifiedAxis

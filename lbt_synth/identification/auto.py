@@ -27,7 +27,8 @@ from lbt_synth.identification.likeliest_gain import (
     design_for_gains,
     identify_likeliest,
     identify_with_gains,
-    is_stable_at_gains,
+    possible_gains,
+    unstable_gains,
 )
 from lbt_synth.identification.prediction.comparison import (
     PredictionRow,
@@ -196,7 +197,9 @@ def design_from_record(
             half,
             identify_past=fit_model,
             design=design,
-            is_safe=lambda made: allowed is None or is_stable_at_gains(made, allowed, half),
+            is_safe=lambda made: (
+                allowed is None or unstable_gains(made, possible_gains(allowed, half)) is None
+            ),
         )
         method = found.method
     step(1)
@@ -204,7 +207,7 @@ def design_from_record(
     held_out = _test_on_unseen(record, half, {name: design(method, half)}, imaging, taps)
     step(1)
     whole, allowed = identify_with_gains(record, start=half, **options)
-    safe = design_for_gains(
+    model, made, careful = design_for_gains(
         fit_model,
         partial(design, method),
         _design_robustly,
@@ -215,18 +218,17 @@ def design_from_record(
     step(1)
     row = held_out[name]
     assert row.model_axis_nm is not None
-    model, made = safe.model, safe.design
     loop = close_loop(model.hardware, made.controller)
     drifts = note_drift(record, loop, row.model_axis_nm)
     return RecordedDesign(
         model=model,
-        design=replace(made, assumptions=(*assumptions, *safe.assumptions)),
+        design=replace(made, assumptions=(*assumptions, *made.assumptions)),
         half_model=half,
         held_out=held_out,
         name=name,
         notes=(
             *notes,
-            *safe.notes,
+            *careful,
             *_compare_gains(model, half),
             *drifts,
             *_note_short(usable, model, row),

@@ -1,15 +1,10 @@
-"""The model of a record at the likeliest sensor gain, and the gains that record and model allow.
-
-The sensor gains that a record allows, and the designs that are stable at all of them.
-
-A design that is stable at all sensor gains that a record and its model allow.
-"""
+"""The sensor gains that a record allows, its likeliest model, and a design that all suit."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -17,17 +12,17 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
-from lbt_synth.identification.commands.control_law import record_control_law
-from lbt_synth.identification.commands.doubts import STEPPED, gain_dilution, rounding_share
-from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
-from lbt_synth.identification.commands.plausibility import could_have_run
+from lbt_synth.identification.commands.coarse_spectrum import CoarseRecord, dispersion
+from lbt_synth.identification.commands.doubts import STEPPED, command_steps, gain_dilution
+from lbt_synth.identification.commands.repair import CommandRepair
+from lbt_synth.identification.commands.verdict import could_have_run, record_law
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS, Search
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.validation import BoolArray, FloatArray
+from lbt_synth.validation import FloatArray
 
 _OUTSIDE = 1.3  # factor beyond an interval of gains
 _LEAST, _MOST = POSSIBLE_GAINS
@@ -57,15 +52,20 @@ def identify_with_gains(
     if record.commands is None or options.get("sensor_gain") is not None:
         return model, None
     allowed = allowed_gains(record, model)
-    if not (agrees(model, allowed) or _is_plausible(model)):
-        allowed = _with_plausible_gains(allowed)
+    if agrees(model, allowed):
+        return model, allowed
+    low, high = PLAUSIBLE_GAINS
+    if not _is_plausible(model):  # intervals without a plausible gain are widened to these
+        odd = (allowed[:, :1] > high) | (allowed[:, 1:] < low)
+        wider = [np.minimum(allowed[:, 0], low), np.maximum(allowed[:, 1], high)]
+        allowed = np.where(odd, np.column_stack(wider), allowed)
     if agrees(model, allowed):
         return model, allowed
     best, excluded = _compare(record, model, allowed, options)
-    stepped = np.max(rounding_share(record)) > STEPPED
-    excluded = excluded and not stepped and _is_plausible(best)
-    own = np.repeat(np.array(best.sensor_gains)[:, None], 2, axis=1)
-    return best, own if excluded else allowed
+    stepped = np.max(command_steps(record)[1]) > STEPPED
+    if excluded and not stepped and _is_plausible(best):
+        allowed = np.repeat(np.array(best.sensor_gains)[:, None], 2, axis=1)
+    return best, allowed
 
 
 def identify_likeliest(
@@ -89,16 +89,7 @@ def agrees(model: IdentifiedModel, allowed: FloatArray) -> bool:
     """
     gains = np.array(model.sensor_gains)
     far = [1.0 if axis.sensor_gain_error is None else _OUTSIDE for axis in model.axes]
-    near = (gains >= allowed[:, 0] / far) & (gains <= allowed[:, 1] * far)
-    return bool(near.all())
-
-
-def _with_plausible_gains(allowed: FloatArray) -> FloatArray:
-    """Return intervals of gains (axes, 2), widened to the plausible ones where they have none."""
-    low, high = PLAUSIBLE_GAINS
-    odd = (allowed[:, :1] > high) | (allowed[:, 1:] < low)
-    wider = np.column_stack([np.minimum(allowed[:, 0], low), np.maximum(allowed[:, 1], high)])
-    return np.where(odd, wider, allowed)
+    return bool(np.all((gains >= allowed[:, 0] / far) & (gains <= allowed[:, 1] * far)))
 
 
 def _compare(
@@ -114,38 +105,33 @@ def _compare(
         return model, False
     begun = min(held, key=_criterion)
     best = min(model, identify(record, **options | {"start": begun}), key=_criterion)
-    if why := _distrust(best, allowed):
+    agreed, why = agrees(best, allowed), ""
+    if not _are_within(best, POSSIBLE_GAINS):
+        why = (
+            f"the fit asks for a sensor gain of {_words(best)}, which no sensor has (the "
+            "disturbance has something that the model leaves out)"
+        )
+    elif not agreed and not _are_found(best):
+        why = "the fit does not find the sensor gain"
+    if why:
         taken = f"{_words(begun)} was taken, from the middle of what the record allows"
         each = zip(begun.axes, best.axes, strict=True)
         axes = tuple(replace(axis, likely_gains=free.likely_gains) for axis, free in each)
         notes = (*begun.notes, f"warning: {why}: {taken}")
         return replace(begun, axes=axes, notes=notes), False
-    excluded = _criterion(begun) > _criterion(best) + _price(best)
-    return best, excluded and not agrees(best, allowed)
+    return best, _criterion(begun) > _criterion(best) + _price(best) and not agreed
 
 
 def _are_found(model: IdentifiedModel) -> bool:
     return all(axis.sensor_gain_error is not None for axis in model.axes)
 
 
-def _is_plausible(model: IdentifiedModel) -> bool:
-    return _are_found(model) and _are_within(model, PLAUSIBLE_GAINS)
-
-
 def _are_within(model: IdentifiedModel, gains: tuple[float, float]) -> bool:
     return all(gains[0] <= gain <= gains[1] for gain in model.sensor_gains)
 
 
-def _distrust(model: IdentifiedModel, allowed: FloatArray) -> str | None:
-    """Return why the gains of a fit are not used, in words."""
-    if not _are_within(model, POSSIBLE_GAINS):
-        return (
-            f"the fit asks for a sensor gain of {_words(model)}, which no sensor has (the "
-            "disturbance has something that the model leaves out)"
-        )
-    if not agrees(model, allowed) and not _are_found(model):
-        return "the fit does not find the sensor gain"
-    return None
+def _is_plausible(model: IdentifiedModel) -> bool:
+    return _are_found(model) and _are_within(model, PLAUSIBLE_GAINS)
 
 
 def _words(model: IdentifiedModel) -> str:
@@ -204,45 +190,37 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel | None = None) -> F
     True
     """
     everything = np.tile([_LEAST, _MOST], (record.axes, 1))
-    coarse = CoarseRecord(record, None if model is None else _resonances(model))
+    known = None
+    if model is not None:
+        to_hz = model.frame_rate_hz / (2 * np.pi)
+        each = (axis.fitted_model.spectrum.components for axis in model.axes)
+        known = [
+            [(c.frequency * to_hz, c.damping_ratio) for c in components] for components in each
+        ]
+    coarse = CoarseRecord(record, known)
     if not coarse.stretches:
         return everything
-    given = Guess(kind="as given")
-    best = coarse.compare([given])
+    given = CommandRepair()
+    contrast, gains, (misfit,) = coarse.compare([given])
     far = np.geomspace(_LEAST, _MOST, _FAR_STEPS)
-    grid = np.array([[*far, *(gain * _NEAR)] for gain in best.gain[:, 0]])
-    excess = coarse.profile(given, grid) - best.axis_contrast
-    allowed = excess < _FAR * best.dispersion(0)
+    grid = np.array([[*far, *(gain * _NEAR)] for gain in gains[:, 0]])
+    excess = coarse.profile(given, grid) - contrast
+    allowed = excess < _FAR * dispersion(misfit)
     allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
     low, high = np.array(ends, dtype=np.float64).T
-    high = high * gain_dilution(coarse) ** 2  # in steps, a gain looks smaller
+    high = high * gain_dilution(coarse)[0] ** 2  # in steps, a gain looks smaller
     intervals: FloatArray = np.clip(np.column_stack([low, high]), _LEAST, _MOST)
-    running = far[_has_run(record, far)]
+    law = record_law(record)
+    if law is None or law.kind == "none" or law.lag_frames < 0:
+        return intervals
+    one = np.ones((1, record.axes))
+    running = far[[could_have_run(given, gain * one, record, law) for gain in far]]
     if not running.size:
         return intervals
+    apart = (intervals[:, :1] > running[-1]) | (intervals[:, 1:] <= running[0])
     inside = np.clip(intervals, running[0], running[-1])
-    apart = (intervals[:, 0] > running[-1]) | (intervals[:, 1] <= running[0])
-    return np.where(apart[:, None], [running[0], running[-1]], inside)
-
-
-def _resonances(model: IdentifiedModel) -> list[list[tuple[float, float]]]:
-    """Return frequency [Hz] and damping ratio of the components of each axis."""
-    to_hz = model.frame_rate_hz / (2 * np.pi)
-    each = (axis.fitted_model.spectrum.components for axis in model.axes)
-    return [[(c.frequency * to_hz, c.damping_ratio) for c in components] for components in each]
-
-
-def _has_run(record: LoopRecord, gains: FloatArray) -> BoolArray:
-    """Return at which gains (n,) the recorded law is stable; at all where there is no law."""
-    try:
-        law = record_control_law(record)
-    except ProblemError:
-        return np.ones(gains.size, dtype=np.bool_)
-    if law.kind == "none" or law.lag_frames < 0:
-        return np.ones(gains.size, dtype=np.bool_)
-    given, one = Guess(kind="as given"), np.ones((1, record.axes))
-    return np.array([could_have_run(given, gain * one, record, law) for gain in gains])
+    return np.where(apart, [running[0], running[-1]], inside)
 
 
 def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
@@ -264,16 +242,6 @@ def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
         if not low < factor < high:
             return np.asarray(factor * own)
     return None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SafeDesign:
-    """A design that is stable at all possible gains, its model, and what is to be said of it."""
-
-    model: IdentifiedModel
-    design: Design
-    assumptions: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
 
 
 def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
@@ -300,11 +268,6 @@ def possible_gains(allowed: FloatArray, *models: IdentifiedModel) -> FloatArray:
     return np.column_stack([np.min(found, axis=0), np.max(found, axis=0)])
 
 
-def is_stable_at_gains(design: Design, allowed: FloatArray, model: IdentifiedModel) -> bool:
-    """Return whether a design is stable at all sensor gains that record and model allow."""
-    return unstable_gains(design, possible_gains(allowed, model)) is None
-
-
 def design_for_gains(
     fit_model: Callable[..., IdentifiedModel],
     design: Callable[[IdentifiedModel], Design],
@@ -313,9 +276,10 @@ def design_for_gains(
     allowed: FloatArray | None,
     *,
     command_scale_known: bool,
-) -> SafeDesign:
+) -> tuple[IdentifiedModel, Design, tuple[str, ...]]:
     """Return a design that is stable at all possible gains of two models, for the first of them.
 
+    It comes with its model and with notes; its first assumption says which gains these are.
     Commands that were recorded at half their size look like twice the sensor gain, and no record
     can tell; so half of the gains are possible, unless the scale of the commands is known. Where
     the axes have different gains, the commands of either may have another size than was recorded,
@@ -324,63 +288,49 @@ def design_for_gains(
     model, _ = models
     made = design(model)
     if allowed is None:
-        return SafeDesign(model=model, design=made)
-    intervals = possible_gains(allowed, *models)
+        return model, made, ()
+    known = intervals = possible_gains(allowed, *models)
+    uneven = max(model.sensor_gains) > _UNEVEN * min(model.sensor_gains)
     assumed = (
-        f"the sensor gain lies within {_in_words(intervals)}, as the record and its model allow; "
+        f"the sensor gain lies within {_in_words(known)}, as the record and its model allow; "
         "the loop is stable at all of these"
     )
-    known = intervals
     if command_scale_known:
         assumed += ". The commands were recorded at the size that was applied, as was stated"
     else:
         intervals = known * [_HALF, 1.0]
         assumed += " and at half of them, should the commands be recorded at half their size"
-        if _are_uneven(model):
+        if uneven:
             low = np.minimum(intervals[:, 0], known.min())
             intervals = np.column_stack([low, np.full(len(low), known.max())])
             assumed += ", and each axis at those of both, because they differ"
-    bad = unstable_gains(made, intervals)
-    if bad is None:
-        return SafeDesign(model=model, design=made, assumptions=(assumed,))
-    used, careful = _design_carefully(fit_model, design, model, intervals)
-    if careful is None:
-        careful = _robust(model, bad, intervals, design_robustly, command_scale_known)
-    note = (
-        f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
-        f"{nm_text(_residual_nm(careful, model))} in the model; without that it would leave "
-        f"{nm_text(_residual_nm(made, model))}"
-    )
-    if not command_scale_known and unstable_gains(made, known) is None:
-        note += " (--command-scale 1: the commands were recorded at the size that was applied)"
-    return SafeDesign(model=used, design=careful, assumptions=(assumed,), notes=(note,))
+    used, safe, notes = model, made, list[str]()
+    if (bad := unstable_gains(made, intervals)) is not None:
+        low, high = float(np.min(intervals)), float(np.max(intervals))
+        own = float(np.mean(model.sensor_gains))
+        tried = [*(own * part for part in _CAREFUL), high / _WIDE, float(np.sqrt(low * high))]
+        for gain in [max(model.sensor_gains)] * uneven + tried:
+            used = fit_model(start=model, sensor_gain=gain)
+            safe = design(used)
+            if unstable_gains(safe, intervals) is None:
+                break
+        else:
+            used, safe = model, _robust(model, bad, intervals, design_robustly, command_scale_known)
+        note = (
+            f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
+            f"{_residual(safe, model)} in the model; without that it would leave "
+            f"{_residual(made, model)}"
+        )
+        if not command_scale_known and unstable_gains(made, known) is None:
+            note += " (--command-scale 1: the commands were recorded at the size that was applied)"
+        notes.append(note)
+    return used, replace(safe, assumptions=(assumed, *safe.assumptions)), tuple(notes)
 
 
-def _design_carefully(
-    fit_model: Callable[..., IdentifiedModel],
-    design: Callable[[IdentifiedModel], Design],
-    model: IdentifiedModel,
-    intervals: FloatArray,
-) -> tuple[IdentifiedModel, Design | None]:
-    """Return the first design for other gains that is stable within intervals, and its model."""
-    low, high = float(np.min(intervals)), float(np.max(intervals))
-    own = float(np.mean(model.sensor_gains))
-    middle = float(np.sqrt(low * high))
-    gains = [*(own * part for part in _CAREFUL), high / _WIDE, middle]
-    if _are_uneven(model):
-        gains.insert(0, max(model.sensor_gains))
-    for gain in gains:
-        fitted = fit_model(start=model, sensor_gain=gain)
-        made = design(fitted)
-        if unstable_gains(made, intervals) is None:
-            return fitted, made
-    return model, None
-
-
-def _residual_nm(design: Design, model: IdentifiedModel) -> float:
-    """Return what a design leaves in a model; infinite where its loop is unstable."""
+def _residual(design: Design, model: IdentifiedModel) -> str:
+    """Say what a design leaves in a model; infinite where its loop is unstable."""
     loop = close_loop(model.hardware, design.controller)
-    return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else np.inf
+    return nm_text(residual_budget(loop, model.truth()).rms_nm if loop.is_stable else np.inf)
 
 
 def _robust(
@@ -392,12 +342,10 @@ def _robust(
 ) -> Design:
     """Return a design by robust synthesis, or refuse with the gains that are bad for another."""
     factors = intervals / np.array(model.sensor_gains)[:, None]
-    try:
-        found = design_robustly(model, (float(np.min(factors)), float(np.max(factors))))
-        if unstable_gains(found, intervals) is None:
-            return found
-    except (SynthesisError, ProblemError):  # a plant without lines has no such design
-        pass  # the refusal says what the record lacks
+    with suppress(SynthesisError, ProblemError):  # a plant without lines has no such design
+        made = design_robustly(model, (float(np.min(factors)), float(np.max(factors))))
+        if unstable_gains(made, intervals) is None:
+            return made
     gain = ", ".join(f"{value:.3g}" for value in bad)
     advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
     raise CertificateError(
@@ -405,11 +353,6 @@ def _robust(
         f"{_in_words(intervals)}. Record with a higher loop gain, look for jumps in the record, "
         f"give the sensor gain{advice}."
     )
-
-
-def _are_uneven(model: IdentifiedModel) -> bool:
-    """Return whether the axes have gains that one sensor hardly has."""
-    return max(model.sensor_gains) > _UNEVEN * min(model.sensor_gains)
 
 
 def _in_words(intervals: FloatArray) -> str:

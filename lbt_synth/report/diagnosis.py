@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.diagnosis import NARROW, diagnosis_verdict
-from lbt_synth.identification.diagnosis.running_loop import AXES, command_row, law_row
-from lbt_synth.identification.records.faults import HEADINGS
+from lbt_synth.identification.diagnosis.running_loop import law_facts
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
@@ -28,7 +27,7 @@ from lbt_synth.report.page.html import (
     source_section,
     time_text,
 )
-from lbt_synth.storage.rows import cell_text, fact_table, row_table
+from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 
@@ -86,27 +85,24 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
     if health.jitter_frames is not None:
         text += f", clock jitter {health.jitter_frames:.2g} frames rms"
     channels = [row_table(f"Record: {text}. {health.summary()}", found.channels)]
-    faults = tuple(
-        tuple(map(cell_text, (kind, series, "-" if axis is None else AXES[axis], *rest)))
-        for kind, series, axis, *rest in health.rows()
-        if kind != NOT_KNOWN  # a consequence of other faults, and of the beginning
-    )
-    if faults:
-        channels.append(Table(caption="Faults", headings=HEADINGS, rows=faults, words=(1, 2, 6)))
+    # what a correction lacks is a consequence of other faults, and of the beginning
+    if faults := [each for each in health.findings if each.kind != NOT_KNOWN]:
+        channels.append(row_table("Faults", faults))
     commands, law = found.commands, found.law
     loop = {
-        "How the commands reach the measurements": commands and [command_row(commands)],
-        "Control law in use, from y to u": law and [law_row(law)],
+        "How the commands reach the measurements": commands and [commands.facts()],
+        "Control law in use, from y to u": law and [law_facts(law)],
         "Loop": found.loop and [found.loop],
     }
     best = f" (best design: {found.best})" if found.best else ""
+    half = "whole record" if found.comparison is None else "first half"
     unseen = "Residual on the second half of the record, by models of the first"
     residuals = {
-        f"What each part leaves by the model of the whole record{best}": found.costs,
+        f"What each part leaves by the model of the {half}{best}": found.costs,
         f"{unseen}; {found.imaging.label}": found.residuals,
     }
     given = found.given
-    lines = {"Vibrations, and where they come from": [line.row for line in found.lines]}
+    lines = {"Vibrations, and where they come from": found.lines}
     return {
         "record": channels,
         "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],

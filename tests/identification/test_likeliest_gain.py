@@ -220,14 +220,16 @@ def fail(model, gains):
 def test_gains_that_the_fit_shows_keep_the_design(fit_model, half, models):
     gain, error = half.axes[0].sensor_gain, half.axes[0].sensor_gain_error
     allowed = np.array([[0.6, 1.2]])
-    safe = design_for_gains(fit_model, kalman, fail, models, allowed, command_scale_known=True)
-    assert safe.design.method == "kalman"
-    assert safe.model.axes[0].sensor_gain == pytest.approx(gain, abs=error)
-    (text,) = safe.assumptions
+    model, design, notes = design_for_gains(
+        fit_model, kalman, fail, models, allowed, command_scale_known=True
+    )
+    assert design.method == "kalman"
+    assert model.axes[0].sensor_gain == pytest.approx(gain, abs=error)
+    (text,) = design.assumptions
     assert "the loop is stable at all of these" in text
     assert "at the size that was applied, as was stated" in text
-    assert safe.notes == ()
-    free = design_for_gains(fit_model, kalman, fail, models, None, command_scale_known=False)
+    assert notes == ()
+    _, free, _ = design_for_gains(fit_model, kalman, fail, models, None, command_scale_known=False)
     assert free.assumptions == ()
 
 
@@ -238,20 +240,19 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain():
     first = fit_model()
     models, allowed = (fit_model(start=first), first), np.array([[0.8, 1.0]])
     made = partial(design_for_gains, fit_model, hinf, models=models, allowed=allowed)
-    best = made(design_robustly=fail, command_scale_known=True)
+    _, best, notes = made(design_robustly=fail, command_scale_known=True)
     halves = possible_gains(np.array([[0.8, 1.0]]), first) * [0.5, 1.0]
-    assert best.design.method == "hinf"
-    assert best.notes == ()
-    assert unstable_gains(best.design, halves) is not None
-    safe = made(design_robustly=robust, command_scale_known=False)
-    assert unstable_gains(safe.design, halves) is None
+    assert best.method == "hinf"
+    assert notes == ()
+    assert unstable_gains(best, halves) is not None
+    _, safe, (note,) = made(design_robustly=robust, command_scale_known=False)
+    assert unstable_gains(safe, halves) is None
     assert "at half of them" in safe.assumptions[0]
-    (note,) = safe.notes
     assert "--command-scale 1" in note
     with pytest.raises(lbt.errors.CertificateError, match="or say --command-scale 1"):
         design_for_gains(
             lambda **_: first,
-            lambda _: best.design,
+            lambda _: best,
             fail,
             (first, first),
             np.array([[0.8, 1.0]]),
@@ -306,7 +307,7 @@ def test_gains_that_are_too_far_apart_take_robust_synthesis_or_no_design(fit_mod
     wide = np.array([[0.02, 0.4]])  # the fit is outside: both count
     with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):
         design_for_gains(fit_model, hinf, fail, models, wide, command_scale_known=True)
-    safe = design_for_gains(fit_model, hinf, robust, models, wide, command_scale_known=True)
-    assert safe.design.method == gain_robust_method()
-    assert unstable_gains(safe.design, possible_gains(wide, half)) is None
+    _, safe, _ = design_for_gains(fit_model, hinf, robust, models, wide, command_scale_known=True)
+    assert safe.method == gain_robust_method()
+    assert unstable_gains(safe, possible_gains(wide, half)) is None
     assert "lies within 0.02 to 0.9" in safe.assumptions[0]

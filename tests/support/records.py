@@ -39,3 +39,11 @@ def kinds(seen, *, spoils=True):
 
 def noise(frames, seed=0):
     return np.random.default_rng(seed).standard_normal(frames)
+
+
+def findings(record):
+    """What was found in a record: kind, series, axis, frames, the first of them, whether spoilt."""
+    return [
+        (each.kind, each.series, each.axis, each.count, each.first_frame, each.spoils)
+        for each in record.health.findings
+    ]

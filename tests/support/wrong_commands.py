@@ -7,7 +7,7 @@ from support.control_laws import ordinary_loop
 from support.recorded_loops import RATE
 
 import lbt_synth as lbt
-from lbt_synth.identification.commands.verdict import CommandRepair
+from lbt_synth.identification.commands.repair import CommandRepair
 
 TURN = np.deg2rad(30)
 ROTATION = np.array([[np.cos(TURN), -np.sin(TURN)], [np.sin(TURN), np.cos(TURN)]])

@@ -1,29 +1,26 @@
-"""The control law of a record: how its commands follow from its measurements.
+"""The control law of a record: how its commands follow from its measurements, by least squares.
 
-What a matrix between two pairs of axes does: signs, exchanged axes, or a mixture.
+A law of order p computes, for each axis i and lags l from the first to the last one::
+
+    u_i(k) = sum_j a_ij u_i(k-j) + sum_l B_il y(k-l),   j = 1..p
+
+It is fitted to the increments u(k) - u(k-1): commands are large and smooth, and what tells the
+laws apart is in their increments.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from itertools import product
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.commands.law_search import (
-    LAGS,
-    SHORT_ORDER,
-    LawCoefficients,
-    LawShape,
-    LoopSeries,
-    Regression,
-    prepare_series,
-    simplest_law,
-    simplest_short_law,
-)
-from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.records.faults import MAD, find_saturated
+from lbt_synth.linear import Controller
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     BoolArray,
     ComplexArray,
@@ -43,24 +40,42 @@ LawKind: TypeAlias = Literal[
     "higher order",
     "none",
 ]
+AxisKind: TypeAlias = Literal["diagonal", "swapped", "general", "zero"]
+_LAGS = range(-4, 5)  # frames by which the first measurement may be late
 _LEAST_ROWS = 400
 _EXACT = 1e-6  # part of the increments' variance, below which a law is exact
-_LONG_ORDER = 32
+_SURE = 0.05  # most that a law leaves unexplained whose lag counts
+FOLLOWED = 0.5  # coherence of an axis whose law counts
+_SHORT_ORDER, _LONG_ORDER = 3, 32
 _SHORT_ROWS, _LONG_ROWS = 60_000, 16_000
 _ROWS_PER_VALUE = 8
 _LEAST_COHERENCE = 0.1
 _PASSES = 3
+_ADDS_UP = 0.2  # distance from 1 of the pole of a law that adds up
 _NEAR_ONE = 0.1  # distance of both poles of a double integrator
 _LEAKY = 0.5  # least pole of a leaky one
 _PURE = 1e-6
 _ROUNDING = 1e-12
 _AS_GOOD = 0.9
 _NEARLY = 2.0  # times the residual of a law that knows the future, which one that does not may have
-_SURE = 0.05  # most that a law leaves unexplained whose lag counts
-FOLLOWED = 0.5  # coherence of an axis whose law counts
-AxisKind: TypeAlias = Literal["diagonal", "swapped", "general", "zero"]
 _SIGMAS = 4.0  # standard errors within which a weight is zero
 _TOLERANCE = 0.05  # of the largest element
+_CUTOFF = 1e-11  # of the largest singular value
+_BLOCK = 2048  # rows of a triangular factor
+_ALIKE = 3.0  # over the residual of the richest law, within which a simple one explains as much
+_FLOOR = 1e-10  # part of the increments' variance that rounding may leave
+_SAME = 1.05  # times the residual, within which a tap is idle
+_SPARE = 0.2  # of what the richest law explains, that a simple one may leave
+_JUMP = 30.0  # median deviations
+_MOST_JUMPS = 0.02  # of the frames
+_ODD = 8.0  # deviations of a frame that follows another law
+_ODD_FLOOR = 1e-3  # of the increments
+_MOST_ODD = 0.1  # of the frames
+
+# measurements and commands (frames, axes), and the frames (frames,) that are measured, that are
+# commanded, and whose command is a result of the law
+_Series: TypeAlias = tuple[FloatArray, FloatArray, BoolArray, BoolArray, BoolArray]
+_Shape: TypeAlias = tuple[int, range]  # order of a law, and the lags of its measurements
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,17 +96,33 @@ class ControlLaw:
     lag_frames: int
     gain: FloatArray  # (axes, axes); zeros where there is no law
     gain_error: FloatArray  # (axes, axes), standard errors
-    axis_matrix: AxisMatrix  # signs and structure of the gain
-    leak: FloatArray  # (axes,), pole nearest 1; nan without memory
-    poles: ComplexArray  # (axes, order)
-    order: int  # past commands of an axis that the law uses
+    axes_kind: AxisKind  # structure of the gain, as classify_matrix says
+    signs: tuple[int, ...]  # of each axis; 0 where the structure has none
+    poles: ComplexArray  # (axes, order), the one nearest 1 first
     past: FloatArray  # (axes, order), weights of past commands
     taps: FloatArray  # (axes, lags, axes), weights of measurements
     residual: float  # unexplained part of the variance of the increments of u
-    # 1 of a deterministic law, 0 of the commands of another night; mean of the axes
-    coherence: float
-    axis_coherence: FloatArray  # (axes,); part that past commands leave and measurements explain
-    odd_frames: int  # frames left out because they do not follow the law of the others
+    # (axes,); part that past commands leave and measurements explain: 1 of a deterministic law
+    axis_coherence: FloatArray
+    odd_frames: int = 0  # frames left out because they do not follow the law of the others
+
+    @property
+    def order(self) -> int:
+        """Past commands of an axis that the law uses."""
+        return int(self.past.shape[1])
+
+    @property
+    def coherence(self) -> float:
+        """Mean coherence of the axes: 0 of the commands of another night."""
+        return float(np.mean(self.axis_coherence))
+
+    @property
+    def leak(self) -> FloatArray:
+        """Pole nearest 1 of each axis, its size where it is complex, (axes,); nan of none."""
+        if not self.order:
+            return np.full(len(self.past), np.nan)
+        nearest = self.poles[:, 0]
+        return np.where(abs(nearest.imag) > 0, abs(nearest), nearest.real)
 
     @property
     def exact(self) -> bool:
@@ -106,8 +137,35 @@ class ControlLaw:
     @property
     def is_ordinary(self) -> bool:
         """Whether it is sure, without a lag, and each axis follows its own measurements."""
-        own = self.axis_matrix.kind == "diagonal" and min(self.axis_matrix.signs) > 0
+        own = self.axes_kind == "diagonal" and min(self.signs) > 0
         return self.is_sure and self.lag_frames == 0 and own
+
+    @property
+    def adds_up(self) -> bool:
+        """Whether it adds up measurements, as positions do and increments do not."""
+        return bool(self.order > 0 and np.all(abs(self.poles[:, 0] - 1) < _ADDS_UP))
+
+    @property
+    def gain_text(self) -> str:
+        """The gains that are not zero by structure; one where all are the same."""
+        gains = np.diag(self.gain) if self.axes_kind == "diagonal" else self.gain.ravel()
+        texts = [f"{value:.4g}" for value in gains + 0.0]
+        return texts[0] if len(set(texts)) == 1 else ", ".join(texts)
+
+    @property
+    def name(self) -> str:
+        """The law in words, but for its lag."""
+        if self.kind == "none":
+            return "no law"
+        short = f"a {self.kind} of gain {self.gain_text}"
+        return short if self.order <= 1 else f"a law of order {self.order}"
+
+    @property
+    def lag_text(self) -> str:
+        """How late the commands follow, to go on in a sentence; empty where they are in time."""
+        when = "late" if self.lag_frames > 0 else "early"
+        frames = count_text(abs(self.lag_frames), "frame")
+        return f", {frames} {when}" if self.lag_frames else ""
 
     @property
     def axis_lags(self) -> IntArray:
@@ -117,45 +175,12 @@ class ControlLaw:
         return np.asarray(self.lag_frames + np.argmax(counts, axis=1))
 
 
-def record_control_law(record: LoopRecord) -> ControlLaw:
-    """Return the control law of a closed-loop record.
-
-    Parameters
-    ----------
-    record : LoopRecord
-        The record; its delay does not matter.
-
-    Returns
-    -------
-    ControlLaw
-        The law.
-
-    Raises
-    ------
-    ProblemError
-        If the record has no commands, or too few good frames.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> y = np.random.default_rng(1).standard_normal((2000, 1))
-    >>> u = -0.4 * np.cumsum(y, axis=0)
-    >>> record = lbt.identification.loop_record(y, u, frame_rate_hz=1000, unit="nm")
-    >>> law = lbt.identification.record_control_law(record)
-    >>> law.kind, law.lag_frames, law.gain.round(6).tolist()
-    ('pure integrator', 0, [[-0.4]])
-    """
-    if record.commands is None:
-        raise ProblemError(
-            "the control law needs commands; the record is of an open loop. Give the commands."
-        )
-    measured = record.usable if record.measured is None else record.measured
-    return _find_law(record.measurements, record.commands, measured, record.commanded)
-
-
 def fit_control_law(
-    measurements: ArrayLike, commands: ArrayLike, *, usable: ArrayLike | None = None
+    measurements: ArrayLike,
+    commands: ArrayLike,
+    *,
+    usable: ArrayLike | None = None,
+    commanded: ArrayLike | None = None,
 ) -> ControlLaw:
     """Return the law with the least order that explains commands by measurements.
 
@@ -168,6 +193,8 @@ def fit_control_law(
         Measurements y(k) and commands u(k) of one or two axes, in the same unit.
     usable : (frames,) bool array_like, optional
         Frames whose values are good; all by default.
+    commanded : (frames,) bool array_like, optional
+        Frames whose commands are good, where ``usable`` is only of the measurements.
 
     Returns
     -------
@@ -185,56 +212,91 @@ def fit_control_law(
     >>> y = np.random.default_rng(1).standard_normal((2000, 2))
     >>> u = 0.3 * np.cumsum(y[:, ::-1], axis=0)  # axes swapped
     >>> law = fit_control_law(y, u)
-    >>> law.kind, law.axis_matrix.kind, law.gain.round(6).tolist()
-    ('pure integrator', 'swapped', [[0.0, 0.3], [0.3, 0.0]])
+    >>> law.kind, law.lag_frames, law.axes_kind, law.gain.round(6).tolist()
+    ('pure integrator', 0, 'swapped', [[0.0, 0.3], [0.3, 0.0]])
     """
     y = matrix(measurements, "measurements")
     why = f"to match measurements {y.shape}"
     u = matrix(commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
     good = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
-    if good.dtype != np.bool_ or good.shape != (len(y),):
-        raise DimensionError(
-            f"usable must be {len(y)} truth values, one per frame; got {good.dtype} {good.shape}."
-        )
-    return _find_law(y, u, good, good)
-
-
-def _find_law(
-    y: FloatArray, u: FloatArray, measured: BoolArray, commanded: BoolArray | None
-) -> ControlLaw:
-    """Fit the law, and again without the frames that do not follow it."""
-    series = prepare_series(y, u, measured, commanded)
+    moved = good if commanded is None else np.array(commanded)
+    for flags in (good, moved):
+        if flags.dtype != np.bool_ or flags.shape != (len(y),):
+            raise DimensionError(
+                f"usable must be {len(y)} truth values, one per frame; got {flags.dtype} "
+                f"{flags.shape}."
+            )
+    free = moved.copy()
+    for column in u.T:
+        free &= ~find_saturated(column, free)
+    series = y, u, good, free, ~_jumps(u)
     for _ in range(_PASSES):
         law = _search(series)
-        lags = range(law.lag_frames, law.lag_frames + law.taps.shape[1])
-        odd = series.odd_frames(law.past, law.taps, lags)
+        odd = _odd_frames(series, law)
         if not odd.any() or law.kind == "none":
             break
-        series = replace(series, followed=series.followed & ~odd)
-    return replace(law, odd_frames=int(np.sum(~series.followed)))
+        series = *series[:4], series[4] & ~odd
+    return replace(law, odd_frames=int(np.sum(~series[4])))
 
 
-def _search(series: LoopSeries) -> ControlLaw:
+def _jumps(u: FloatArray) -> BoolArray:
+    """Return the frames whose commands jump, as at a reset, if they are few, (frames,)."""
+    size = np.abs(np.diff(u, axis=0, prepend=u[:1]))
+    jumps = np.any(size > _JUMP * np.median(size, axis=0) + 1e-300, axis=1)
+    return jumps if np.mean(jumps) < _MOST_JUMPS else np.zeros(len(u), dtype=np.bool_)
+
+
+def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:
+    """Return the frames that are far from a law, if they are few, (frames,)."""
+    y, u, *_ = series
+    lags = range(law.lag_frames, law.lag_frames + law.taps.shape[1])
+    rows = _rows(series, law.order, lags)
+    left = u[rows].copy()
+    for j in range(law.order):
+        left -= law.past[:, j] * u[rows - 1 - j]
+    for index, lag in enumerate(lags):
+        left -= y[rows - lag] @ law.taps[:, index].T
+    left = np.abs(left - np.median(left, axis=0))
+    floor = _ODD_FLOOR * np.std(u[rows] - u[rows - 1], axis=0)
+    beyond = np.any(left > np.maximum(_ODD * MAD * np.median(left, axis=0), floor), axis=1)
+    odd = np.zeros(len(u), dtype=np.bool_)
+    if np.mean(beyond) < _MOST_ODD:
+        odd[rows[beyond]] = True
+    return odd
+
+
+def _rows(series: _Series, order: int, lags: range) -> IntArray:
+    """Return the frames k at which all values of a law are good."""
+    _, u, measured, commanded, followed = series
+    start, stop = max(order, 1, lags[-1]), min(len(u), len(u) + lags[0])
+    if stop <= start:
+        return np.zeros(0, dtype=np.int64)
+    good = followed[start:stop].copy()
+    for lag in range(max(order, 1) + 1):
+        good &= commanded[start - lag : stop - lag]
+    for lag in lags:
+        good &= measured[start - lag : stop - lag]
+    return start + np.flatnonzero(good)
+
+
+def _search(series: _Series) -> ControlLaw:
     """Return the shortest law that explains as much as a long one."""
-    regression = _regression(series, SHORT_ORDER, _SHORT_ROWS)
+    regression = _regression(series, _SHORT_ORDER, _SHORT_ROWS)
     if not regression.moving:
-        return _no_law(regression)
-    found = simplest_short_law(regression)
-    if found is None or regression.residual(found) > _EXACT:
+        return _describe(regression, None)
+    shape = _simplest_shape(regression, only_short=True)
+    if shape is None or regression.residual(shape) > _EXACT:
         regression = _regression(series, _LONG_ORDER, _LONG_ROWS)
-        if found is None or regression.residual(found) > regression.most_residual():
-            found = simplest_law(regression)
-    law = _describe(regression, found)
-    return _least_anticipating(regression, law) if law.lag_frames < 0 and not law.exact else law
-
-
-def _least_anticipating(regression: Regression, law: ControlLaw) -> ControlLaw:
-    """Return the law that knows least of the future among those nearly as good as one that does.
-
-    The sensor's answer to commands may explain more: it comes later, with the other sign.
-    """
+        if shape is None or regression.residual(shape) > regression.most_residual():
+            shape = _simplest_shape(regression)
+    law = _describe(regression, shape)
+    if law.lag_frames >= 0 or law.exact:
+        return law
+    # among laws nearly as good the one that knows least of the future: the sensor's answer to
+    # commands may explain more, later and with the other sign
     for first in range(0, law.lag_frames, -1):
-        later = _describe(regression, simplest_law(regression, range(first, LAGS.stop)))
+        shape = _simplest_shape(regression, range(first, _LAGS.stop))
+        later = _describe(regression, shape)
         if later.kind != "none" and later.residual < _NEARLY * law.residual:
             return later
         if first == 0 and not law.is_sure:
@@ -244,46 +306,217 @@ def _least_anticipating(regression: Regression, law: ControlLaw) -> ControlLaw:
     return law
 
 
-def _regression(series: LoopSeries, order: int, most_rows: int) -> Regression:
+def _regression(series: _Series, order: int, most_rows: int) -> _Regression:
     """Return the regression of laws of an order, or of the most that the frames allow."""
+    y, u, *_ = series
     while True:
-        lags = range(LAGS[0], LAGS[-1] + order + 1)
-        rows = series.rows(order, lags).size
-        if rows >= max(_LEAST_ROWS, _ROWS_PER_VALUE * (order + series.axes * len(lags))):
-            return Regression(series, order, lags, most_rows)
+        lags = range(_LAGS[0], _LAGS[-1] + order + 1)
+        rows = _rows(series, order, lags)
+        if rows.size >= max(_LEAST_ROWS, _ROWS_PER_VALUE * (order + u.shape[1] * len(lags))):
+            return _Regression(y, u, rows, order, lags, most_rows)
         if order <= 1:
             raise ProblemError(
                 f"the control law needs {_LEAST_ROWS} frames whose neighbours are good; got "
-                f"{rows} of {len(series.commands)}. Give a longer record, or one with fewer holes."
+                f"{rows.size} of {len(u)}. Give a longer record, or one with fewer holes."
             )
         order //= 2
 
 
-def _describe(regression: Regression, shape: LawShape) -> ControlLaw:
-    """Return the law of a shape, in words."""
-    found = regression.coefficients(shape)
-    unexplained = regression.residual(shape)
-    coherence = regression.coherence(shape)
-    if np.max(coherence) < _LEAST_COHERENCE:
-        return _no_law(regression, residual=unexplained, coherence=coherence)
-    poles = _poles(found.past)
-    kind = _kind(shape, found, poles)
-    gain, error = _gain(found, poles[:, 2 if kind == "double integrator" else 1 :])
+class _Regression:
+    """Triangular factor of the increments and of all that may explain them."""
+
+    def __init__(
+        self, y: FloatArray, u: FloatArray, rows: IntArray, order: int, lags: range, most_rows: int
+    ) -> None:
+        """Factorise ``most_rows`` frames at most, evenly spread."""
+        if rows.size > most_rows:
+            rows = rows[np.linspace(0, rows.size - 1, most_rows).astype(np.int64)]
+        self.order, self.lags, self.axes, self.rows = order, lags, u.shape[1], rows.size
+        increments = np.diff(u, axis=0, prepend=u[:1])
+        parts = [increments[rows], u[rows - 1]]
+        parts += [increments[rows - lag] for lag in range(1, order)]
+        parts += [y[rows - lag] for lag in lags]
+        table = np.concatenate(parts, axis=1)
+        table -= table.mean(axis=0)
+        self.scale = np.maximum(np.sqrt(np.mean(table**2, axis=0)), 1e-300)
+        self.factor = _triangular_factor(table / self.scale)
+        self.moving = [i for i in range(self.axes) if self.scale[i] ** 2 > 1e-30]
+
+    def columns(self, axis: int, shape: _Shape) -> list[int]:
+        """Return the columns of past commands and measurements that a law uses."""
+        order, lags = shape
+        first = self.axes * (1 + self.order + lags[0] - self.lags[0])
+        past = [axis + self.axes * (1 + lag) for lag in range(order)]
+        return past + list(range(first, first + self.axes * len(lags)))
+
+    def solve(self, axis: int, chosen: list[int], order: int) -> tuple[FloatArray, float]:
+        """Return the weights of some columns, and what they leave of the increments' variance.
+
+        A law without memory gives the command in place of its increment.
+        """
+        target = self.factor[:, axis]
+        if not order:
+            past = axis + self.axes
+            target = target + self.factor[:, past] * self.scale[past] / self.scale[axis]
+        table = self.factor[:, chosen]
+        weights = np.linalg.lstsq(table, target, rcond=_CUTOFF)[0]
+        left = target - table @ weights
+        return weights * self.scale[axis] / self.scale[chosen], float(left @ left) / self.rows
+
+    def residuals(self, shape: _Shape) -> list[float]:
+        """Return the part of the increments' variance that a law leaves of each moving axis."""
+        return [self.solve(i, self.columns(i, shape), shape[0])[1] for i in self.moving]
+
+    def residual(self, shape: _Shape) -> float:
+        """Return the mean of that over the axes."""
+        return float(np.mean(self.residuals(shape)))
+
+    def coherence(self, shape: _Shape) -> FloatArray:
+        """Return the part of what past commands leave that a law explains, of each axis (axes,).
+
+        Corrected for the number of coefficients; zero where commands do not move.
+        """
+        out = np.zeros(self.axes)
+        used = shape[0] + self.axes * len(shape[1])
+        for axis, after in zip(self.moving, self.residuals(shape), strict=True):
+            past = self.columns(axis, (self.order, self.lags))[: self.order]
+            _, before = self.solve(axis, past, self.order)
+            if before > 0:
+                ratio = after / before * (self.rows - self.order) / (self.rows - used)
+                out[axis] = max(0.0, 1 - float(ratio))
+        return out
+
+    def most_residual(self, lags: range = _LAGS) -> float:
+        """Return what a simple law may leave, to explain as much as the richest one."""
+        richest = self.residual((self.order, range(lags[0], self.lags.stop)))
+        return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _FLOOR
+
+    def coefficients(self, shape: _Shape) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the weights of past commands (axes, order) and measurements (axes, lags, axes).
+
+        Then the errors of the sums of both over their lags, (axes,) and (axes, axes).
+        """
+        order, lags = shape
+        past, past_error = np.zeros((self.axes, order)), np.zeros(self.axes)
+        taps = np.zeros((self.axes, len(lags), self.axes))
+        sum_error = np.zeros((self.axes, self.axes))
+        for axis in self.moving:
+            chosen = self.columns(axis, shape)
+            weights, left = self.solve(axis, chosen, order)
+            taps[axis] = weights[order:].reshape(len(lags), self.axes)
+            inverse = np.linalg.pinv(self.factor[:, chosen], rcond=_CUTOFF)
+            scale = self.scale[axis] / self.scale[chosen]
+            spare = max(self.rows - len(chosen), 1)
+            half = scale[:, None] * inverse * np.sqrt(left * self.rows / spare)
+            sums = half[order:].reshape(len(lags), self.axes, -1).sum(axis=0)
+            sum_error[axis] = np.linalg.norm(sums, axis=1)
+            if order:
+                steps = np.append(weights[1:order], 0.0)  # of the increments before
+                past[axis] = np.diff(steps, prepend=0.0)
+                past[axis, 0] += 1 + weights[0]
+                past_error[axis] = float(np.linalg.norm(half[0]))
+        return past, taps, past_error, sum_error
+
+
+def _triangular_factor(table: FloatArray) -> FloatArray:
+    """Return R of the QR factorisation of a tall table, block by block."""
+    whole = len(table) // _BLOCK * _BLOCK
+    parts = [table[whole:]]
+    if whole and table.shape[1] < _BLOCK:
+        blocks = np.asarray(np.linalg.qr(table[:whole].reshape(-1, _BLOCK, table.shape[1]), "r"))
+        parts.append(blocks.reshape(-1, table.shape[1]))
+    elif whole:
+        parts.append(table[:whole])
+    return np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
+
+
+def _simplest_shape(
+    regression: _Regression, lags: range = _LAGS, *, only_short: bool = False
+) -> _Shape | None:
+    """Return the shortest law that explains as much as the richest one.
+
+    Of up to three states each order and number of taps is tried, beyond them orders that double.
+    None if only a short law is asked for, and none explains as much.
+    """
+    most = regression.most_residual(lags)
+    tried = [
+        (order, more)
+        for order, more in product(range(_SHORT_ORDER + 1), repeat=2)
+        if order - 1 <= more <= order
+    ]
+    order = _SHORT_ORDER
+    while order < regression.order and not only_short:
+        order = min(2 * order, regression.order)
+        tried.append((order, order))
+    left, shape = 1.0, (regression.order, range(regression.order + 1))
+    for order, more in tried:
+        shapes = [(order, range(lag, lag + more + 1)) for lag in lags]
+        residuals = [regression.residual(each) for each in shapes]
+        left, shape = min(residuals), shapes[int(np.argmin(residuals))]
+        if left <= most:
+            break
+    else:
+        return None if only_short else _without_idle_taps(regression, left, shape)
+    shape = _without_idle_taps(regression, left, shape)
+    for order in range(1 + max(_SHORT_ORDER, shape[0] // 2), shape[0]):
+        first, stop = shape[1].start, min(shape[1].start + order + 1, shape[1].stop)
+        if regression.residual((order, range(first, stop))) <= most:
+            return order, range(first, stop)
+    return shape
+
+
+def _without_idle_taps(regression: _Regression, left: float, shape: _Shape) -> _Shape:
+    """Return the law without the first and last taps that explain nothing."""
+    most = _SAME * left + _FLOOR
+    for early, late in ((1, 0), (0, -1)):
+        while len(shape[1]) > 1:
+            shorter = shape[0], range(shape[1].start + early, shape[1].stop + late)
+            if regression.residual(shorter) > most:
+                break
+            shape = shorter
+    return shape
+
+
+def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
+    """Return the law of a shape, in words; that of commands that do not move for none."""
+    axes = regression.axes
+    coherence, residual = np.zeros(axes), 1.0
+    if shape is not None:
+        coherence, residual = regression.coherence(shape), regression.residual(shape)
+    rest: dict[str, Any] = {"residual": residual, "axis_coherence": read_only(coherence)}
+    if shape is None or np.max(coherence) < _LEAST_COHERENCE:
+        return ControlLaw(
+            kind="none",
+            lag_frames=0,
+            gain=read_only(np.zeros((axes, axes))),
+            gain_error=read_only(np.zeros((axes, axes))),
+            axes_kind="zero",
+            signs=(0,) * axes,
+            poles=read_only(np.zeros((axes, 0), dtype=np.complex128)),
+            past=read_only(np.zeros((axes, 0))),
+            taps=read_only(np.zeros((axes, 1, axes))),
+            **rest,
+        )
+    past, taps, past_error, sum_error = regression.coefficients(shape)
+    poles = _poles(past)
+    kind = _kind(shape[0], poles, past_error)
+    # at low frequencies, but for the poles at 1
+    others = poles[:, 2 if kind == "double integrator" else 1 :]
+    scale = np.prod(abs(1 - others), axis=1)[:, None]
+    gain, error = np.sum(taps, axis=1) / scale, sum_error / scale
+    gain[abs(gain) < _ROUNDING * np.max(abs(gain))] = 0.0
+    axes_kind, signs = classify_matrix(gain, error)
     return ControlLaw(
         kind=kind,
-        lag_frames=shape.first,
+        lag_frames=shape[1].start,
         gain=read_only(gain),
         gain_error=read_only(error),
-        axis_matrix=classify_matrix(gain, error),
-        leak=read_only(_leak(poles)),
+        axes_kind=axes_kind,
+        signs=signs,
         poles=read_only(poles),
-        order=shape.order,
-        past=read_only(found.past),
-        taps=read_only(found.taps),
-        residual=unexplained,
-        coherence=float(np.mean(coherence)),
-        axis_coherence=read_only(coherence),
-        odd_frames=0,
+        past=read_only(past),
+        taps=read_only(taps),
+        **rest,
     )
 
 
@@ -294,103 +527,71 @@ def _poles(past: FloatArray) -> ComplexArray:
     return np.array([row[np.argsort(abs(row - 1), kind="stable")] for row in padded])
 
 
-def _leak(poles: ComplexArray) -> FloatArray:
-    """Return the pole nearest 1 of each axis, its size where it is complex, (axes,)."""
-    if not poles.shape[1]:
-        return np.full(len(poles), np.nan)
-    nearest = poles[:, 0]
-    return np.where(abs(nearest.imag) > 0, abs(nearest), nearest.real)
-
-
-def _gain(found: LawCoefficients, others: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Return the gain at low frequencies but for the poles at 1, and its errors."""
-    axes, lags, _ = found.taps.shape
-    scale = np.prod(abs(1 - others), axis=1)[:, None]
-    variance = np.einsum("iljmj->ij", found.taps_covariance.reshape(axes, lags, axes, lags, axes))
-    gain = np.sum(found.taps, axis=1) / scale
-    gain[abs(gain) < _ROUNDING * np.max(abs(gain))] = 0.0
-    return gain, np.sqrt(np.maximum(variance, 0)) / scale
-
-
-def _kind(shape: LawShape, found: LawCoefficients, poles: ComplexArray) -> LawKind:
+def _kind(order: int, poles: ComplexArray, past_error: FloatArray) -> LawKind:
     """Return the word for a law."""
-    if shape.order == 0:
+    if order == 0:
         return "proportional"
     distance = abs(poles - 1)
-    if shape.order == 1 and np.all(distance <= np.maximum(_PURE, 4 * found.past_error)[:, None]):
+    if order == 1 and np.all(distance <= np.maximum(_PURE, 4 * past_error)[:, None]):
         return "pure integrator"
-    if shape.order == 1 and np.all(poles.real > _LEAKY):
+    if order == 1 and np.all(poles.real > _LEAKY):
         return "leaky integrator"
-    if shape.order == 2 and np.all(distance < _NEAR_ONE):
+    if order == 2 and np.all(distance < _NEAR_ONE):
         return "double integrator"
     return "higher order"
 
 
-def _no_law(
-    regression: Regression, *, residual: float = 1.0, coherence: FloatArray | None = None
-) -> ControlLaw:
-    """Return the law of commands that do not follow from the measurements, or do not move."""
-    axes = regression.axes
-    known = np.zeros(axes) if coherence is None else coherence
-    zeros = np.zeros((axes, axes))
-    return ControlLaw(
-        kind="none",
-        lag_frames=0,
-        gain=read_only(zeros),
-        gain_error=read_only(zeros.copy()),
-        axis_matrix=classify_matrix(zeros),
-        leak=read_only(np.full(axes, np.nan)),
-        poles=read_only(np.zeros((axes, 0), dtype=np.complex128)),
-        order=0,
-        past=read_only(np.zeros((axes, 0))),
-        taps=read_only(np.zeros((axes, 1, axes))),
-        residual=residual,
-        coherence=float(np.mean(known)),
-        axis_coherence=read_only(known),
-        odd_frames=0,
-    )
+def classify_matrix(values: ArrayLike, errors: ArrayLike = 0.0) -> tuple[AxisKind, tuple[int, ...]]:
+    """Return what a matrix (n, n) of one or two axes does, the first kind that fits, and signs.
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AxisMatrix:
-    """Structure of a matrix between axes.
-
-    Attributes
-    ----------
-    kind : str
-        "diagonal"; "swapped" (only the other diagonal is not zero); "general" (a rotation, for
-        example); "zero" (nothing differs from 0).
-    signs : (axes,) tuple of int
-        Signs of the elements on the diagonal, of a swapped matrix on the other one, of each row;
-        0 of any other.
-    """
-
-    kind: AxisKind
-    signs: tuple[int, ...]
-
-
-def classify_matrix(
-    values: ArrayLike, errors: ArrayLike = 0.0, *, tolerance: float = _TOLERANCE
-) -> AxisMatrix:
-    """Return what a matrix (n, n) of one or two axes does: the first kind that fits.
-
-    Elements within four standard errors of zero, or below a part of the largest one, the tolerance,
-    count as zero.
+    Elements within four standard errors of zero, or below 5 % of the largest one, count as zero.
+    Signs are those on the diagonal, of a swapped matrix on the other one, of each row; 0 of any
+    other.
     """
     g = square(values, "values")
-    part = number(tolerance, "tolerance", at_least=0)
     doubt = _SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
-    least = np.where(np.isfinite(doubt), doubt, np.inf)
-    g = np.where(np.abs(g) <= np.maximum(least, part * np.max(np.abs(g), initial=0.0)), 0.0, g)
+    small = _TOLERANCE * np.max(np.abs(g), initial=0.0)
+    least = np.where(np.isfinite(doubt), np.maximum(doubt, small), np.inf)
+    g = np.where(np.abs(g) <= least, 0.0, g)
     on, off = np.diag(g), (g - np.diag(np.diag(g))).sum(axis=1)
+    kind: AxisKind = "general"
     if not g.any():
-        return AxisMatrix(kind="zero", signs=(0,) * len(g))
-    if not off.any():
-        return AxisMatrix(kind="diagonal", signs=_signs(on))
-    if not on.any():
-        return AxisMatrix(kind="swapped", signs=_signs(off))
-    return AxisMatrix(kind="general", signs=(0,) * len(g))
+        kind = "zero"
+    elif not off.any() or not on.any():
+        kind = "diagonal" if on.any() else "swapped"
+        return kind, tuple(int(sign) for sign in np.sign(on if on.any() else off))
+    return kind, (0,) * len(g)
 
 
-def _signs(values: FloatArray) -> tuple[int, ...]:
-    return tuple(int(sign) for sign in np.sign(values))
+def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
+    """Return a control law as a controller, whose state holds past commands and measurements.
+
+    ProblemError refuses the absence of a law, and one that knows measurements of the future.
+    """
+    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    if law.kind == "none" or law.lag_frames < 0:
+        why = (
+            "the commands do not follow from the measurements"
+            if law.kind == "none"
+            else f"its commands know measurements of {-law.lag_frames} frames later"
+        )
+        raise ProblemError(f"a controller needs a law that can run; got one where {why}.")
+    axes, lags = len(law.gain), law.taps.shape[1]
+    one, last = np.eye(axes), law.lag_frames + lags - 1
+    slots = max(law.order, 1)  # of u(k-1), u(k-2), ...; then last of y(k-1), y(k-2), ...
+    # each slot moves to the next one of its kind
+    shift = np.eye(slots + last, k=-1)
+    shift[slots : slots + 1] = 0.0
+    A = np.asarray(np.kron(shift, one), dtype=np.float64)
+    B = np.zeros((len(A), axes))
+    for j in range(law.order):
+        A[:axes, axes * j : axes * (j + 1)] = np.diag(law.past[:, j])
+    for lag in range(law.lag_frames, last + 1):
+        if lag:
+            column = axes * (slots + lag - 1)
+            A[:axes, column : column + axes] += law.taps[:, lag - law.lag_frames]
+        else:
+            B[:axes] += law.taps[:, 0]
+    if last:
+        B[axes * slots : axes * (slots + 1)] = one
+    return Controller(A=A, B=B, C=np.eye(axes, len(A)), D=np.zeros((axes, axes)), dt_s=1 / rate)

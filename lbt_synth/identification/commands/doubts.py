@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification.commands.coarse_spectrum import CLEAR, CoarseRecord, dispersion
 from lbt_synth.identification.commands.control_law import FOLLOWED, ControlLaw, fit_control_law
-from lbt_synth.identification.commands.guesses import CoarseRecord, Guess
-from lbt_synth.identification.commands.plausibility import CLEAR, SHORT_LAW, could_have_run
-from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
+from lbt_synth.identification.commands.repair import CommandRepair
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, segment_transforms
 from lbt_synth.identification.records.faults import equal_runs, mark, runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.loop_hardware import past_corrections
@@ -21,19 +21,18 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray, read_only
 
 _SAME_ROWS = 0.05  # sine of the angle between the rows of a gain that are one
 _NO_STEADY_GAIN = 1e-3  # of the size of the taps, in their sum
-_PARTS_OF_GAIN, _TRIED = np.array([1.0, 0.3, 0.1]), np.geomspace(1.0, 1e-6, 19)
 _PARTS = 8  # of a record whose series may slip
 _ALIKE = 0.2  # of the largest tap, between laws that are one
 _RELATED = 30.0  # nats by which the commands of an axis must be likelier than none
 _FUZZ = 1e-6  # of the range of values, within which two are the same
 STEPPED = 1e-6  # of the variance of increments, in rounding that may move a gain
-_DROWNED = 1.15  # factor by which rounding makes a gain too small to be used
+_DROWNED = 1.2  # factor by which rounding makes a gain too small to be used
 _LEAST_SEGMENTS = 4
 _BANDS = 20
 
 
-def doubt_law(law: ControlLaw) -> str | None:
-    """Return what is wrong with the axes of a sure law, in words; None if nothing is."""
+def doubt_law(law: ControlLaw) -> str:
+    """Return what is wrong with the axes of a sure law, in words; empty if nothing is."""
     followed = law.axis_coherence > FOLLOWED
     lags = law.axis_lags
     if np.any(followed) and np.ptp(lags[followed]):  # no real-time computer does that
@@ -47,7 +46,7 @@ def doubt_law(law: ControlLaw) -> str | None:
         rows = law.gain / size
         if abs(np.linalg.det(rows)) < _SAME_ROWS:
             return "those of both axes follow the same measurements: one axis was recorded twice"
-    return None
+    return ""
 
 
 def _axes_apart(lags: IntArray) -> str:
@@ -60,23 +59,7 @@ def _axes_apart(lags: IntArray) -> str:
     )
 
 
-def doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray) -> str | None:
-    """Return that no loop has run with the law of these commands at any gain, in words.
-
-    ``gains`` (axes,) are the likeliest ones.
-    """
-    if law is None or not law.exact or law.order > SHORT_LAW:
-        return None
-    tried = np.vstack([gains * _PARTS_OF_GAIN[:, None], _TRIED[:, None] * np.ones(record.axes)])
-    if could_have_run(Guess(kind="as given"), tried, record, law):
-        return None
-    return (
-        "a loop with the law that they follow is unstable at any sensor gain. Check what the "
-        "series are"
-    )
-
-
-def doubt_parts(record: LoopRecord) -> str | None:
+def doubt_parts(record: LoopRecord) -> str:
     """Return that parts of a record have one law at different lags, in words."""
     assert record.commands is not None
     laws = []
@@ -93,24 +76,22 @@ def doubt_parts(record: LoopRecord) -> str | None:
                 f"parts of them follow their measurements at different lags, {one.lag_frames} and "
                 f"{other.lag_frames} frames, as if frames of one series were lost. Cut the record"
             )
-    return None
+    return ""
 
 
-def doubt_axes(coarse: CoarseRecord, law: ControlLaw) -> str | None:
+def doubt_axes(coarse: CoarseRecord, law: ControlLaw) -> str:
     """Return which axis has commands that follow no law and do not reach it, in words.
 
     Commands that stand still are of an open loop.
     """
     alone = (law.axis_coherence < FOLLOWED) & moving_axes(coarse.record)
     if law.kind == "none" or not np.any(alone):
-        return None
-    given = Guess(kind="as given")
-    best = coarse.compare([given])
-    nothing = coarse.profile(given, np.zeros((alone.size, 1)))
-    saved = (nothing - best.axis_contrast)[:, 0]
-    unrelated = np.flatnonzero(alone & (saved < _RELATED * best.dispersion(0)))
+        return ""
+    contrast, _, (misfit,) = coarse.compare([CommandRepair()])
+    saved = coarse.unrelated() - contrast[:, 0]
+    unrelated = np.flatnonzero(alone & (saved < _RELATED * dispersion(misfit)))
     if not unrelated.size:
-        return None
+        return ""
     return f"those of axis {unrelated[0]} have nothing to do with its measurements"
 
 
@@ -121,15 +102,29 @@ def moving_axes(record: LoopRecord) -> BoolArray:
     return np.asarray(np.ptp(used, axis=0) > 0) if used.size else np.ones(record.axes, dtype=bool)
 
 
-def rounding_share(record: LoopRecord) -> FloatArray:
-    """Return which part of the increments' variance is rounding to steps, (axes,)."""
+def gain_dilution(coarse: CoarseRecord) -> tuple[FloatArray, FloatArray]:
+    """Return by how much the steps of commands make sensor gains too small, and steps (axes,) [nm].
+
+    What rounding takes from a gain, as much rounding again takes once more (J. R. Cook, L. A.
+    Stefanski, J. Am. Stat. Assoc. 89, 1314 (1994), doi:10.2307/2290994).
+    """
+    record = coarse.record
+    steps, share = command_steps(record)
+    matters = share > STEPPED
+    if not np.any(matters):
+        return np.ones(record.axes), steps
     assert record.commands is not None
-    changes = np.var(np.diff(record.commands, axis=0), axis=0)
-    return np.asarray(_steps(record) ** 2 / 12 / np.maximum(changes, np.finfo(float).tiny))
+    rounding = np.random.default_rng(0).uniform(-0.5, 0.5, record.commands.shape) * steps
+    worse = CoarseRecord(replace(record, commands=read_only(record.commands + rounding)))
+    own, moved = (each.compare([CommandRepair()])[1][:, 0] for each in (coarse, worse))
+    return np.where(matters, np.maximum(own / moved, 1.0), 1.0), steps
 
 
-def _steps(record: LoopRecord) -> FloatArray:
-    """Return the step of which the commands of each axis are multiples, (axes,); 0 if none."""
+def command_steps(record: LoopRecord) -> tuple[FloatArray, FloatArray]:
+    """Return the step of which commands are multiples, 0 if none, and the part that rounding has.
+
+    Of each axis (axes,); the part is that of the variance of the increments.
+    """
     assert record.commands is not None
     steps = np.zeros(record.axes)
     for axis, column in enumerate(record.commands[record.usable].T):
@@ -140,36 +135,19 @@ def _steps(record: LoopRecord) -> FloatArray:
             away = (values - values[0]) / np.min(gaps)
             whole = np.max(np.abs(away - np.round(away))) < 0.1
             steps[axis] = np.min(gaps) if whole else 0.0
-    return steps
+    changes = np.var(np.diff(record.commands, axis=0), axis=0)
+    return steps, np.asarray(steps**2 / 12 / np.maximum(changes, np.finfo(float).tiny))
 
 
-def gain_dilution(coarse: CoarseRecord) -> FloatArray:
-    """Return by how much sensor gains are too small for the steps of commands, (axes,), about.
-
-    What rounding takes from a gain, as much rounding again takes once more (J. R. Cook, L. A.
-    Stefanski, J. Am. Stat. Assoc. 89, 1314 (1994), doi:10.2307/2290994).
-    """
-    record = coarse.record
-    matters = rounding_share(record) > STEPPED
-    if not np.any(matters):
-        return np.ones(record.axes)
-    assert record.commands is not None
-    rounding = np.random.default_rng(0).uniform(-0.5, 0.5, record.commands.shape) * _steps(record)
-    worse = CoarseRecord(replace(record, commands=read_only(record.commands + rounding)))
-    given = [Guess(kind="as given")]
-    own, moved = (each.compare(given).gain[:, 0] for each in (coarse, worse))
-    return np.where(matters, np.maximum(own / moved, 1.0), 1.0)
-
-
-def doubt_steps(coarse: CoarseRecord) -> str | None:
+def doubt_steps(coarse: CoarseRecord) -> str:
     """Return that a sensor gain drowns in the steps of the recorded commands, in words."""
-    dilution = gain_dilution(coarse)
+    dilution, steps = gain_dilution(coarse)
     worst = int(np.argmax(dilution))
     if dilution[worst] < _DROWNED:
-        return None
+        return ""
     return (
-        f"those of axis {worst} are recorded in steps of {_steps(coarse.record)[worst]:.3g} nm, in "
-        "which the sensor gain drowns. Record more digits, or give the sensor gain"
+        f"those of axis {worst} are recorded in steps of {steps[worst]:.3g} nm, in which the "
+        "sensor gain drowns. Record more digits, or give the sensor gain"
     )
 
 
@@ -188,12 +166,20 @@ def held_while_moving(record: LoopRecord) -> str:
     moving = CoarseRecord(replace(record, usable=record.usable & ~np.any(still, axis=0)))
     if not moving.stretches:
         return ""
-    gains = moving.compare([Guess(kind="as given")]).gain[:, 0]
-    opened = record.measurements + gains * corrections
-    nats = sum(
-        _excess(*axis)
-        for axis in zip(record.measurements.T, opened.T, still, still ^ record.usable, strict=True)
-    )
+    gains = moving.compare([CommandRepair()])[1][:, 0]
+    nats = 0.0
+    for i, y in enumerate(record.measurements.T):
+        both = np.column_stack([y, y + gains[i] * corrections[:, i]])
+        held, free = _whole_segments(still[i]), _whole_segments(still[i] ^ record.usable)
+        if min(len(held), len(free)) < _LEAST_SEGMENTS:
+            continue
+        seen = _spectra(both[:, :1], held, record.frame_rate_hz)[0]
+        if np.all(seen > 0):  # otherwise nothing is measured there
+            closed, opened = (
+                len(held) * np.sum(np.log(S) + seen / S)
+                for S in _spectra(both, free, record.frame_rate_hz)
+            )
+            nats += opened - closed
     if nats < CLEAR:
         return ""
     share = 100 * float(np.max(np.mean(still, axis=1)))
@@ -209,22 +195,7 @@ def _still(correction: FloatArray, usable: BoolArray) -> BoolArray:
     return mark(each[each[:, 1] - each[:, 0] >= SHORTEST_SEGMENT], len(correction))
 
 
-def _excess(closed: FloatArray, opened: FloatArray, still: BoolArray, moving: BoolArray) -> float:
-    """Return by how many nats the closed loop explains the measurements of held frames better."""
-    held, free = _segments(still), _segments(moving)
-    if min(len(held), len(free)) < _LEAST_SEGMENTS:
-        return 0.0
-    seen = _spectrum(closed[held])
-    if not np.all(seen > 0):  # nothing is measured there
-        return 0.0
-    own, other = (
-        len(held) * np.sum(np.log(S) + seen / S)
-        for S in (_spectrum(closed[free]), _spectrum(opened[free]))
-    )
-    return float(other - own)
-
-
-def _segments(frames: BoolArray) -> IntArray:
+def _whole_segments(frames: BoolArray) -> IntArray:
     """Return the frames of each whole segment of stretches, (segments, frames)."""
     starts = [
         first
@@ -234,10 +205,9 @@ def _segments(frames: BoolArray) -> IntArray:
     return np.array(starts, dtype=np.int64)[:, None] + np.arange(SHORTEST_SEGMENT)
 
 
-def _spectrum(segments: FloatArray) -> FloatArray:
-    """Return the mean power in each of some bands, but for the mean, (bands,)."""
-    window = np.hanning(SHORTEST_SEGMENT + 1)[:-1]
-    transforms = np.fft.rfft((segments - segments.mean(axis=1, keepdims=True)) * window)
-    power = np.mean(np.abs(transforms[:, 2:]) ** 2, axis=0)
-    edges = np.unique(np.geomspace(1, power.size, _BANDS).astype(np.int64)) - 1
-    return np.asarray(np.add.reduceat(power, edges) / np.diff(edges, append=power.size))
+def _spectra(series: FloatArray, segments: IntArray, rate_hz: float) -> FloatArray:
+    """Return the mean power of each series (frames, n) in some bands, (n, bands)."""
+    transforms = segment_transforms(series, segments, rate_hz, levelled=True)[1]
+    power = np.mean(np.abs(transforms) ** 2, axis=1)
+    edges = np.unique(np.geomspace(1, power.shape[1], _BANDS).astype(np.int64)) - 1
+    return np.asarray(np.add.reduceat(power, edges, axis=1) / np.diff(edges, append=power.shape[1]))

@@ -1,60 +1,68 @@
 """The verdict on the commands of a record: whether they reach its measurements as given.
 
-The factor of commands whose sensor gains are implausible, by the coarse model and by the fit.
-
-What turns the commands of a record into those that its mirror followed.
+The control law says which repairs make it one that somebody runs, and the likelihood of the
+repaired commands decides: first by the coarse spectrum, where that is not enough by the model of
+the fit. The law alone decides on records that are too short for a spectrum.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 
-from lbt_synth.errors import ProblemError, RecordError
-from lbt_synth.identification.commands.control_law import ControlLaw, record_control_law
+from lbt_synth.errors import NumericalError, ProblemError, RecordError
+from lbt_synth.identification.commands.coarse_spectrum import (
+    CLEAR,
+    SEGMENT_S,
+    CoarseFit,
+    CoarseRecord,
+    dispersion,
+)
+from lbt_synth.identification.commands.control_law import (
+    ControlLaw,
+    classify_matrix,
+    fit_control_law,
+    law_controller,
+)
 from lbt_synth.identification.commands.doubts import (
     doubt_axes,
     doubt_law,
     doubt_parts,
-    doubt_running,
     doubt_steps,
     held_while_moving,
     moving_axes,
 )
-from lbt_synth.identification.commands.guesses import (
-    MOST_SHIFT_FRAMES,
-    CoarseRecord,
-    Guess,
-    list_guesses,
+from lbt_synth.identification.commands.repair import (
+    CommandRepair,
+    axes_repair,
+    repair_commands,
 )
-from lbt_synth.identification.commands.plausibility import (
-    CLEAR,
-    could_have_run,
-    finer_saving,
-    finer_saving_of_gain,
-    fit_gains,
-    score_guesses,
-)
-from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS
+from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
+from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components, try_other_gains
+from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.linear import Controller
+from lbt_synth.loop import close_loop
+from lbt_synth.models import LoopHardware
+from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import (
-    BoolArray,
-    FloatArray,
-    frozen_copy,
-    integer,
-    number,
-    read_only,
-    real_array,
-    require_instance,
-    set_fields,
-)
+from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_instance
 
 AS_GIVEN = "as given"
-_CLEAR_FINER = 8.0  # the same by the criterion of the fit
+_FIND = "find the commands that belong to these measurements"
+_GIVEN = CommandRepair()
+_MOST_SHIFT_FRAMES = 3  # by which commands are tried earlier and later
+_ALIKE = 0.1  # nats within which repairs are as likely
+_CLEAR_FINER = 8.0  # nats that decide by the criterion of the fit
+_UNUSUAL = 10.0  # nats that a law asks for which no one would run
+_CONTRADICTED = 60.0  # nats by which a repair is likelier than all that a law allows
+_GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
 _RELATED = 60.0  # nats by which commands without a law must be likelier than none
 _ABSURD = 3e4  # scale of commands without a law that are rather of another night
 _NO_UNIT = 1e12  # scale that no two units of a length or an angle have
@@ -67,8 +75,15 @@ _USUAL_GAIN = 0.7
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
 _APART = 1.6  # between gains of two axes that have scales of their own
 _INSIDE = 8  # gains that are tried of the plausible ones
-_SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
-_MOST_SHIFT = 100
+_HIDDEN = 1e-7  # distance of poles at two gains that are the same
+_STABLE = 1 - 1e-9  # spectral radius below which a loop has run
+_SHORT_LAW = 3  # order of a law that does not couple axes, and whose loop can be judged
+_TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
+_ALL_GAINS = np.geomspace(1.0, 1e-6, 19)[:, None]  # the same for a loop that may be of no sensor
+_NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
+_NEAR = 0.4  # such a distance that a coarse gain may have
+_LIKE = 3.0  # factor between a coarse gain and the fitted one of the same record
+_LINES = 10  # at most, of the search for lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,7 +92,7 @@ class CommandVerdict:
 
     explanation: str  # the best one, in words; "as given" if that is what was given
     accepted: bool  # whether a model may be fitted
-    repair: CommandRepair | None = None  # None where nothing is wrong or nothing helps
+    repair: CommandRepair = _GIVEN  # without options where nothing is wrong or nothing helps
     delay_frames: float | None = None  # delay that fits, where another was given
     # log-likelihood above that of the record as given; 0 where the law alone decides
     nats: float = 0.0
@@ -88,29 +103,55 @@ class CommandVerdict:
     @property
     def options(self) -> str:
         """The options of the command line that repair the record; empty if there are none."""
-        words = "" if self.repair is None else self.repair.options
-        if self.delay_frames is not None:
-            words += f" --delay-frames {self.delay_frames:g}"
-        return words.strip()
+        delay = "" if self.delay_frames is None else f"--delay-frames {self.delay_frames:g}"
+        return f"{self.repair.options} {delay}".strip()
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong with the commands, without advice; empty if nothing is."""
+        return "" if self.accepted else self.explanation.partition(". ")[0]
+
+    @property
+    def advice(self) -> str:
+        """What to do about it; empty if nothing is wrong."""
+        if self.accepted:
+            return ""
+        if self.options:
+            return f"read the record with {self.options}"
+        advice = self.explanation.partition(". ")[2]
+        return advice[:1].lower() + advice[1:] or _FIND
 
     @property
     def overruled(self) -> tuple[str, ...]:
         """What a design assumes that is made although the record is refused."""
         if self.accepted:
             return ()
-        what = self.explanation.partition(". ")[0]  # without advice
-        return (f"the record is right, although its commands look as if {what}",)
+        return (f"the record is right, although its commands look as if {self.doubt}",)
+
+    def facts(self) -> Facts:
+        """Return the verdict as a row of a table."""
+        return facts(
+            explanation=fact(self.explanation, "the commands"),
+            nats=fact(self.nats, "evidence", format=".0f"),
+            repair=fact(self.options, "repair"),
+        )
 
     def require_accepted(self) -> None:
-        """Refuse a record that something else explains better; name the options that repair it."""
-        if not self.accepted:
-            advice = f" Repair it as the options {self.options} do." if self.options else ""
-            raise RecordError(
-                f"the commands do not reach the measurements as the record says: "
-                f"{self.explanation}.{advice}",
-                explanation=self.explanation,
-                options=self.options,
-            )
+        """Refuse a record that something else explains better.
+
+        The message says which law fits, and names all options that repair the record.
+        """
+        if self.accepted:
+            return
+        law = "" if self.law is None else f" ({self.law.name} fits them{self.law.lag_text})"
+        tried = f"{self.options}, or " if self.options else ""
+        raise RecordError(
+            f"the commands do not reach the measurements as given: {self.explanation}{law}.",
+            explanation=self.explanation,
+            options=self.options,
+            in_python=f"Repair them as the options {self.options} do." if self.options else "",
+            at_terminal=f"Try {tried}--accept-record to go on as it is.",
+        )
 
 
 def explain_commands(
@@ -130,73 +171,80 @@ def explain_commands(
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     known = None if sensor_gain is None else record.known_gains(sensor_gain)
-    plausible = _plausible(known)
-    law, nothing = _find_law(record), np.full(record.axes, np.nan)
-    moves = moving_axes(record)
+    law, moves = record_law(record), moving_axes(record)
     if moves.any() and not moves.all():
         return _explain_moving(record, moves, law, known)
-    refuse = partial(CommandVerdict, accepted=False, gain=nothing, law=law)
-    if doubt := _doubt_series(record, law):
+    refuse = partial(CommandVerdict, accepted=False, gain=np.full(record.axes, np.nan), law=law)
+    sure = law if law is not None and law.is_sure else None
+    doubt = held_while_moving(record) or (doubt_parts(record) if sure is None else doubt_law(sure))
+    if doubt:
         return refuse(explanation=doubt)
-    lag = law.lag_frames if law is not None and law.is_sure else 0
-    early = max(-lag, 0)
+    late = 0 if sure is None else sure.lag_frames
+    early, lag = max(-late, 0), max(late, 0)
     if early:  # corrections that follow from the future have no likelihood: they are moved first
-        assert law is not None
         record = repair_commands(record, CommandRepair(shift_frames=early))
-        law = replace(law, lag_frames=0)
+        law = None if sure is None else replace(sure, lag_frames=0)
     coarse = CoarseRecord(record)
     if not coarse.stretches:
-        note = "the commands were not tested: no stretch of usable frames is long enough"
-        return CommandVerdict(
-            explanation=AS_GIVEN, accepted=True, gain=nothing, law=law, notes=(note,)
-        )
-    steps = doubt_steps(coarse) if sensor_gain is None else None
-    if law is not None and (doubt := _doubt_commands(coarse, law, steps)):
-        return refuse(explanation=doubt)
-    found = _find_best(coarse, law, max(lag, 0))
-    one = np.ones(record.axes)
-    scale = one if found is None else found.scale(coarse, law, plausible)
-    no_law = law is None or law.kind == "none"
-    absurd = _ABSURD if no_law else _NO_UNIT
-    if found is None or np.max(np.abs(np.log(scale))) > np.log(absurd):
+        return _explain_by_law(refuse, law, early)
+    steps = "" if known is not None else doubt_steps(coarse)
+    if law is not None and (doubt := doubt_axes(coarse, law) or (steps if law.is_ordinary else "")):
+        return refuse(explanation=steps or doubt)
+    plausible = PLAUSIBLE_GAINS
+    if known is not None:
+        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
+    best = _choose(coarse, law, lag)
+    scale = np.ones(record.axes) if best is None else _scale(coarse, law, best, plausible)
+    absurd = _ABSURD if law is None or law.kind == "none" else _NO_UNIT
+    if best is None or np.max(np.abs(np.log(scale))) > np.log(absurd):
         return refuse(
             explanation="they have nothing to do with the measurements, as if of another night",
             gain=np.zeros(record.axes),
         )
-    if found.guess.kind == "as given" and (doubt := doubt_running(record, law, found.gain)):
+    repair, gain, nats, *_ = best
+    if repair == _GIVEN and law is not None and (doubt := _doubt_running(record, law, gain)):
         return refuse(explanation=doubt)
-    late = f"{count_text(early, 'frame')} early, before their measurements"
-    words = [f"they are recorded {late}"] if early else []
-    repair, other_delay, why = repair_guess(found.guess, delay, max(lag, 0))
-    words += why
+    off = repair.shift_frames and repair.shift_frames + lag
+    repair = replace(repair, shift_frames=early or (-lag if repair.shift_frames else 0))
+    words = repair.words()
+    if off:
+        words.append(f"the total delay is {delay + off:g} frames, not {delay:g}")
     if np.any(scale != 1):
-        words.append(wrong_scale(scale, found.gain))
-    if steps and not words:
-        words.append(steps)
-    repair = replace(repair, shift_frames=repair.shift_frames or early, scale=tuple(scale))
+        words.append(wrong_scale(scale, gain))
+    words = words or [steps] * bool(steps)
+    shown = gain / scale
+    hidden = (shown <= plausible[0] / _NOT_SHOWN) | (shown >= plausible[1] * _NOT_SHOWN)
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
         accepted=not words,
-        repair=repair if repair.options else None,
-        delay_frames=other_delay,
-        nats=max(found.nats, 0.0),
-        gain=_shown_gain(found.gain / scale, plausible),
-        law=law,
+        repair=replace(repair, scale=tuple(scale)),
+        delay_frames=delay + off if off else None,
+        nats=max(nats, 0.0),
+        gain=frozen_copy(np.where(hidden, np.nan, shown)),
+        law=law if not early else sure,
         notes=() if words else _note_lag(delay, lag),
     )
 
 
-def _plausible(known: FloatArray | None) -> tuple[float, float]:
-    """Return the least and the largest gain that a sensor may have."""
-    if known is None:
-        return PLAUSIBLE_GAINS
-    return float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
+def _note_lag(delay_frames: float, lag: int) -> tuple[str, ...]:
+    """Return what to look at in an accepted record whose law has a lag."""
+    words = (
+        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
+        "real-time computer takes that long, the total delay of a new design is "
+        f"{delay_frames + lag:g} frames"
+    )
+    return (words,) if lag else ()
 
 
-def _shown_gain(gain: FloatArray, plausible: tuple[float, float]) -> FloatArray:
-    """Return gains, nan where the coarse spectrum shows none."""
-    low, high = plausible[0] / _NOT_SHOWN, plausible[1] * _NOT_SHOWN
-    return frozen_copy(np.where((gain > low) & (gain < high), gain, np.nan))
+def record_law(record: LoopRecord) -> ControlLaw | None:
+    """Return the control law of a closed-loop record; None where the frames are too few."""
+    assert record.commands is not None
+    measured = record.usable if record.measured is None else record.measured
+    with suppress(ProblemError):
+        return fit_control_law(
+            record.measurements, record.commands, usable=measured, commanded=record.commanded
+        )
+    return None
 
 
 def _explain_moving(
@@ -207,152 +255,280 @@ def _explain_moving(
     one = replace(
         record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
     )
-    found = explain_commands(one, sensor_gain=None if known is None else known[moves].tolist())
+    verdict = explain_commands(one, sensor_gain=None if known is None else known[moves].tolist())
     gain = np.full(record.axes, np.nan)
-    gain[moves] = found.gain
+    gain[moves] = verdict.gain
     note = f"the commands of axis {int(np.argmin(moves))} stand still: its loop was open"
-    return replace(found, gain=frozen_copy(gain), law=law, notes=(*found.notes, note))
+    return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
 
 
-def _doubt_series(record: LoopRecord, law: ControlLaw | None) -> str | None:
-    """Return what is wrong with the series of a record whatever the sensor sees, in words."""
-    if held := held_while_moving(record):
-        return held
-    return doubt_law(law) if law is not None and law.is_sure else doubt_parts(record)
+def _explain_by_law(
+    refuse: Callable[..., CommandVerdict], law: ControlLaw | None, early: int
+) -> CommandVerdict:
+    """Return the verdict on commands whose likelihood no stretch is long enough to tell."""
+    repair = CommandRepair(shift_frames=early)
+    if law is not None and law.exact:
+        swapped = law.axes_kind == "swapped"
+        signs = law.signs[::-1] if swapped else law.signs
+        repair = axes_repair(swapped, tuple(sign or 1 for sign in signs))
+        repair = replace(repair, shift_frames=early, increments=law.order == 0)
+    if repair.options:
+        words = " and ".join(repair.words())
+        return refuse(explanation=f"by their law {words}", repair=repair)
+    note = "the commands were not tested: no stretch of usable frames is long enough"
+    return refuse(explanation=AS_GIVEN, accepted=True, notes=(note,))
 
 
-def _doubt_commands(coarse: CoarseRecord, law: ControlLaw, steps: str | None) -> str | None:
-    """Return why commands do not show the sensor gain, in words; ``steps`` say so of theirs."""
-    if doubt := doubt_axes(coarse, law):
-        return steps or doubt
-    return steps if law.is_ordinary else None
+def list_repairs(
+    axes: int, delay_frames: float, law: ControlLaw | None = None, lag: int = 0
+) -> list[CommandRepair]:
+    """Return what the commands of a record may need, the first nothing.
+
+    The law may ask for a matrix, and for a long shift. A shift moves corrections to frames that
+    still follow from the past of the measurements; it stands for another delay, too.
+    """
+    signs = list(product((1, -1), repeat=axes))
+    out = [axes_repair(bool(swapped), each) for swapped in range(axes) for each in signs]
+    near = range(-_MOST_SHIFT_FRAMES, _MOST_SHIFT_FRAMES + 1)
+    shifts = [k for k in near if k and k >= 1 - lag - delay_frames]
+    shifts += [-lag] if lag > _MOST_SHIFT_FRAMES else []
+    out += [CommandRepair(shift_frames=k) for k in shifts]
+    out.append(CommandRepair(increments=True))
+    general = law is not None and law.is_sure and law.axes_kind == "general"
+    if law is not None and general and np.linalg.cond(law.gain) < _WORST_CONDITION:
+        # what undoes the gain of the law: a turn, and all of it
+        one, _, other = np.linalg.svd(law.gain)
+        inverse = np.linalg.inv(law.gain)
+        for whole in ((one @ other).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))):
+            out.append(CommandRepair(matrix=tuple(whole.ravel().tolist())))
+    return out
 
 
-def _find_law(record: LoopRecord) -> ControlLaw | None:
-    """Return the control law; None where the frames are too few."""
-    try:
-        return record_control_law(record)
-    except ProblemError:
-        return None
+# a repair, the sensor gains (axes,) with it, the nats by which it is likelier than the record as
+# given, its contrast, and the nats that decide about it
+_Choice: TypeAlias = tuple[CommandRepair, FloatArray, float, float, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Best:
-    """The best explanation of a record, and what decides about it."""
-
-    guess: Guess
-    nats: float  # over the record as given
-    contrast: float
-    gain: FloatArray  # (axes,)
-    clear: float  # nats that decide
-
-    def scale(
-        self, coarse: CoarseRecord, law: ControlLaw | None, plausible: tuple[float, float]
-    ) -> FloatArray:
-        """Return the factors of commands that make implausible gains plausible ones."""
-        decides = {"contrast": self.contrast, "clear": self.clear}
-        return find_scale(coarse, law, self.guess, self.gain, plausible=plausible, **decides)
-
-
-def _find_best(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Best | None:
-    """Return the best explanation; None where commands do not reach the measurements."""
+def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice | None:
+    """Return the best repair; None where commands do not reach the measurements."""
     record = coarse.record
-    guesses = list_guesses(record, earliest_frames=1.0 - lag)
-    if lag > MOST_SHIFT_FRAMES:
-        guesses.append(Guess(kind="shift", shift_frames=-lag))
-    if law is not None and law.is_sure and law.axis_matrix.kind == "general":
-        guesses += [Guess(kind="matrix", matrix=each) for each in _unmix_axes(law.gain)]
-    compared = coarse.compare(guesses)
-    score, surprising = score_guesses(compared, record, law, lag)
-    best = int(np.argmin(score))
+    assert record.delay_frames is not None
+    repairs = list_repairs(record.axes, record.delay_frames, law, lag)
+    compared = coarse.compare(repairs)
+    contrast, gain, misfit = compared[0].sum(axis=0), compared[1], compared[2]
+    score, surprising = _score(repairs, compared, record, law, lag)
+    best = int(np.argmax(score <= np.min(score) + _ALIKE))  # the simplest comes first
     # what the law asks for, which the coarse spectrum may miss
     expected = np.flatnonzero(~surprising)
     if surprising[[0, best]].all() and expected.size:
         other = int(expected[np.argmin(score[expected])])
-        if finer_saving(coarse, guesses[other], _CLEAR_FINER) >= _CLEAR_FINER:
+        if _finer_saving(coarse, repairs[other]) >= _CLEAR_FINER:
             best, score[0] = other, np.inf
-    clear = CLEAR * compared.dispersion(best)
-    no_law = law is None or law.kind == "none"
-    saved = coarse.unrelated() - np.min(compared.contrast) if no_law else np.inf
-    if saved < _RELATED * compared.dispersion(best):
-        return None
-    nats = float(compared.contrast[0] - compared.contrast[best])
+    clear = CLEAR * dispersion(misfit[best])
+    if law is None or law.kind == "none":
+        saved = np.sum(coarse.unrelated()) - np.min(contrast)
+        if saved < _RELATED * dispersion(misfit[best]):
+            return None
+    nats = float(contrast[0] - contrast[best])
     if surprising[0] and not surprising[best]:  # the law asks for it
         shown = nats >= clear / 2 or np.isinf(score[0])
     else:
-        finer = finer_saving(coarse, guesses[best], _CLEAR_FINER) if nats >= clear else 0.0
-        shown = finer >= _CLEAR_FINER
+        shown = nats >= clear and _finer_saving(coarse, repairs[best]) >= _CLEAR_FINER
     if not shown:
         best, nats = 0, 0.0
-    return _Best(
-        guess=guesses[best],
-        nats=nats,
-        contrast=float(compared.contrast[best]),
-        gain=compared.gain[:, best],
-        clear=clear,
+    return repairs[best], gain[:, best], nats, float(contrast[best]), clear
+
+
+def _score(
+    repairs: Sequence[CommandRepair],
+    compared: CoarseFit,
+    record: LoopRecord,
+    law: ControlLaw | None,
+    lag: int,
+) -> tuple[FloatArray, BoolArray]:
+    """Return the contrast of repairs with what their laws cost, and which laws are surprising.
+
+    A loop that would have been unstable has not run. A law that is not exact overrules no clear
+    likelihood.
+    """
+    axis_contrast, gain, misfit = compared
+    contrast = axis_contrast.sum(axis=0)
+    unusual = np.array([_is_unusual(repair, law, lag) for repair in repairs])
+    possible = _possible_repairs(repairs, gain, record, law)
+    surprising = unusual | ~possible
+    best = int(np.argmin(contrast))
+    if law is not None and not law.exact and surprising[best]:
+        expected = contrast[:1] if surprising.all() else contrast[~surprising]
+        if np.min(expected) - contrast[best] > _CONTRADICTED * dispersion(misfit[best]):
+            return _score(repairs, compared, record, None, 0)  # it did not compute the commands
+    assert record.delay_frames is not None
+    delays = [record.delay_frames + repair.shift_frames for repair in repairs]
+    odd = [bool(each.matrix) or delay % 1 > 0 for each, delay in zip(repairs, delays, strict=True)]
+    score = contrast + _UNUSUAL * unusual + _GENERAL * np.array([False, *odd[1:]])
+    score[~possible] = np.inf
+    if surprising[0] and not surprising.all():  # the law says what is wrong
+        score[1:][surprising[1:]] = np.inf
+        away = abs(np.log(gain / np.clip(gain, *PLAUSIBLE_GAINS))).max(axis=0)
+        memoryless = law is not None and law.order == 0  # it would hold nothing
+        if np.min(away[~surprising]) < (_NEAR if memoryless else _NEARER * away[0]):
+            score[0] = np.inf  # and so does the sensor
+    return score, surprising
+
+
+def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool:
+    """Return whether a repair makes the control law one that no one would run."""
+    shift = repair.shift_frames
+    if law is None or law.kind == "none":
+        return shift != 0
+    if shift:
+        return shift != -lag or lag == 0
+    if (repair == _GIVEN and lag) or repair.increments == law.adds_up:
+        return True
+    kind, signs = classify_matrix(repair.turn(len(law.gain)) @ law.gain)
+    if kind == "swapped" or min(signs) < 0:
+        return True
+    # a long law may couple the axes, as a filter of lines along diagonals does
+    return kind != "diagonal" and law.order <= _SHORT_LAW
+
+
+def _possible_repairs(
+    repairs: Sequence[CommandRepair],
+    gains: FloatArray,
+    record: LoopRecord,
+    law: ControlLaw | None,
+) -> BoolArray:
+    """Return which repairs make loops that have run; all where no law tells."""
+    every = np.ones(len(repairs), dtype=np.bool_)
+    if law is None or not law.is_sure:
+        return every
+    tried = _TRIED * np.ones(record.axes)
+    possible = np.array(
+        [
+            could_have_run(repair, np.vstack([gain, 0.3 * gain, *tried]), record, law)
+            for repair, gain in zip(repairs, gains.T, strict=True)
+        ]
     )
+    return possible if possible.any() else every
 
 
-def _unmix_axes(gain: FloatArray) -> list[FloatArray]:
-    """Return matrices of commands that undo a law's gain: a turn, and all of it."""
-    if np.linalg.cond(gain) > _WORST_CONDITION:
-        return []
-    one, _, other = np.linalg.svd(gain)
-    inverse = np.linalg.inv(gain)
-    return [(one @ other).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))]
+def could_have_run(
+    repair: CommandRepair, gains: FloatArray, record: LoopRecord, law: ControlLaw
+) -> bool:
+    """Return whether the recorded law would have been stable at any gains (n, axes)."""
+    if repair.increments:
+        return True  # another law computes the positions
+    assert record.delay_frames is not None
+    controller = law_controller(law, record.frame_rate_hz)
+    path = LoopHardware(
+        frame_rate_hz=record.frame_rate_hz,
+        delay_frames=max(record.delay_frames + repair.shift_frames, 1.0),
+        modes=record.axes,
+        influence_matrix=repair.turn(record.axes),
+        mirror=record.mirror,
+    )
+    each = (replace(path, sensor_matrix=np.diag(gain)) for gain in gains)
+    return any(_moving_radius(loop, controller) < _STABLE for loop in each)
 
 
-def repair_guess(
-    guess: Guess, delay_frames: float, lag: int
-) -> tuple[CommandRepair, float | None, list[str]]:
-    """Return the repair that a guess asks for, the delay if it is another, and the words."""
-    if guess.matrix is not None:
-        repair, why = _repair_matrix(guess.matrix)
-        return repair, None, [why]
-    if guess.kind == "increments":
-        return CommandRepair(increments=True), None, ["they are increments, not positions"]
-    if guess.shift_frames == 0:
-        return CommandRepair(), None, []
-    words = []
-    if lag:
-        words = [f"they are recorded {count_text(lag, 'frame')} late"]
-    total = delay_frames + guess.shift_frames + lag
-    other = total if total != delay_frames else None
-    if other is not None:
-        words.append(f"the total delay is {other:g} frames, not {delay_frames:g}")
-    return CommandRepair(shift_frames=-lag), other, words
+def _moving_radius(path: LoopHardware, controller: Controller) -> float:
+    """Return the largest modulus of the poles of a loop that depend on its sensor gain.
+
+    A law that was found from series has poles and zeros that cancel, outside of the circle too.
+    Infinite where the gain is so small that nothing depends on it: that loop was open.
+    """
+    weaker = replace(path, sensor_matrix=0.8 * path.sensor)
+    poles, others = (
+        np.linalg.eigvals(close_loop(each, controller).system.A) for each in (path, weaker)
+    )
+    moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
+    return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
 
 
-def _repair_matrix(matrix: FloatArray) -> tuple[CommandRepair, str]:
-    """Return the repair of a matrix from commands to axes of the measurements, and its words."""
-    if len(matrix) == 1:
-        return CommandRepair(sign=(-1,)), "they have the opposite sign"
-    if not np.isin(np.abs(matrix), (0, 1)).all():
-        values = tuple(float(f"{value:.6g}") for value in matrix.ravel())
-        rows = ", ".join(f"{value:.4g}" for value in values)
-        why = f"between them and the axes of the measurements lies a matrix ({rows})"
-        return CommandRepair(matrix=values), why
-    swapped = bool(matrix[0, 0] == 0)
-    one, other = matrix[:, ::-1].diagonal() if swapped else matrix.diagonal()
-    signs = int(one), int(other)
-    words = ["those of the two axes are exchanged"] if swapped else []
-    if signs == (-1, -1):
-        words.append("they have the opposite sign")
-    elif min(signs) < 0:
-        words.append(f"axis {signs.index(-1)} has the opposite sign")
-    sign = () if signs == (1, 1) else (-1,) if signs == (-1, -1) else signs
-    return CommandRepair(swap_axes=swapped, sign=sign), " and ".join(words)
+def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray) -> str:
+    """Return that no loop has run with the law of these commands at any gain, in words.
 
-
-def _note_lag(delay_frames: float, lag: int) -> tuple[str, ...]:
-    """Return what to look at in an accepted record whose law has a lag."""
-    if lag <= 0:
-        return ()
+    ``gains`` (axes,) are the likeliest ones.
+    """
+    if law is None or not law.exact or law.order > _SHORT_LAW:
+        return ""
+    tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ALL_GAINS * np.ones(record.axes))])
+    if could_have_run(_GIVEN, tried, record, law):
+        return ""
     return (
-        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If "
-        "the real-time computer takes that long, the total delay of a new design is "
-        f"{delay_frames + lag:g} frames",
+        "a loop with the law that they follow is unstable at any sensor gain. Check what the "
+        "series are"
     )
+
+
+def _fit(
+    coarse: CoarseRecord,
+    repair: CommandRepair,
+    gain: float | None = None,
+    *,
+    other_gains: bool = False,
+    begin_at: FloatArray | None = None,
+) -> tuple[float, FloatArray]:
+    """Return the criterion of the fit over all axes, and the gains (axes,), nan where one failed.
+
+    Any gain is looked for from several, or from one for each axis (axes,) where they are given.
+    The model has the lines and the wide resonances that it needs, of which the coarse spectrum has
+    few.
+    """
+    record = coarse.record
+    length = int(SEGMENT_S * record.frame_rate_hz)
+    pieces = [
+        (start, min(start + length, b))
+        for a, b in coarse.stretches
+        for start in range(a, max(b - length, a) + 1, length)
+    ]
+    total, gains = 0.0, np.full(record.axes, np.nan)
+    series = zip(record.measurements.T, coarse.corrections(repair).T, strict=True)
+    for i, (y, c) in enumerate(series):
+        data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
+        search = Search(data=data, gain=gain, most_lines=_LINES)
+        if begin_at is not None:
+            search = replace(search, starting_gains=(float(begin_at[i]),))
+        try:
+            model = find_components(search, None, rounds=FEW_ROUNDS)
+            if other_gains:
+                model, _ = try_other_gains(search, model)
+        except NumericalError:
+            total = np.inf
+        else:
+            total, gains[i] = total + cost(search, model), model.spectrum.gain
+    return total, gains
+
+
+def _finer_saving(coarse: CoarseRecord, repair: CommandRepair) -> float:
+    """Return how much likelier a repair is than the record as given, by the model of the fit.
+
+    Before a saving is clear, the record as given is fitted from other gains as well.
+    """
+    other, _ = _fit(coarse, repair)
+    saving = _fit(coarse, _GIVEN)[0] - other
+    return saving if saving < _CLEAR_FINER else _fit(coarse, _GIVEN, other_gains=True)[0] - other
+
+
+def saving_of_gain(
+    coarse: CoarseRecord, repair: CommandRepair, plausible: tuple[float, float]
+) -> float:
+    """Return how much likelier any gain is than plausible ones, by the model of the fit."""
+    low, high = plausible
+    free, gains = _fit(coarse, repair)
+    if np.all((gains >= low) & (gains <= high)):
+        return 0.0
+    return min(_fit(coarse, repair, gain)[0] for gain in (low, _usual_gain(plausible), high)) - free
+
+
+def fit_gains(coarse: CoarseRecord, repair: CommandRepair, gains: FloatArray) -> FloatArray:
+    """Return the gains (axes,) of a repair by the model of the fit; the coarse ones where it fails.
+
+    Wide resonances that the coarse spectrum lacks move its gains.
+    """
+    if not np.all((gains > GAINS["above"]) & (gains < GAINS["below"])):
+        return gains
+    _, fitted = _fit(coarse, repair, begin_at=gains)
+    return np.where(np.abs(np.log(fitted / gains)) < np.log(_LIKE), fitted, gains)
 
 
 def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
@@ -365,45 +541,32 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
     return CommandVerdict(
         explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
         accepted=accepted,
-        repair=None if accepted else CommandRepair(scale=tuple(scale)),
+        repair=CommandRepair(scale=tuple(scale)),
         gain=frozen_copy(gains / scale),
         law=None,
     )
 
 
-def find_scale(
-    coarse: CoarseRecord,
-    law: ControlLaw | None,
-    guess: Guess,
-    found: FloatArray,
-    *,
-    contrast: float,
-    clear: float,
-    plausible: tuple[float, float],
+def _scale(
+    coarse: CoarseRecord, law: ControlLaw | None, best: _Choice, plausible: tuple[float, float]
 ) -> FloatArray:
-    """Return the factors (axes,) of commands that make implausible gains plausible ones.
-
-    ``found`` are the gains (axes,) of a guess, ``contrast`` is its contrast there, and ``clear``
-    what decides.
-    """
+    """Return the factors (axes,) of commands that make implausible gains plausible ones."""
+    repair, found, _, contrast, clear = best
     low, high = plausible
-    bounded, nothing = np.clip(found, low, high), np.ones(found.size)
-    if np.all(bounded == found):
-        return nothing
-    inside = np.geomspace(low, high, _INSIDE)
-    near = coarse.profile(guess, np.tile(inside, (found.size, 1)))
+    one, inside = np.ones(found.size), np.geomspace(low, high, _INSIDE)
+    if np.all((found >= low) & (found <= high)):
+        return one
+    near = coarse.profile(repair, np.tile(inside, (found.size, 1)))
     if np.sum(np.min(near, axis=1)) - contrast < clear:
-        return nothing
-    gains = fit_gains(coarse, guess, found)
-    scale, usual = likely_factors(gains, plausible), _usual_gain(plausible)
-    gain = float(np.exp(np.mean(np.log(gains))))
+        return one
+    gains = fit_gains(coarse, repair, found)
+    scale = likely_factors(gains, plausible)
     if law is not None and law.is_sure:
-        if not could_have_run(guess, inside[:, None] * nothing, coarse.record, law):
+        if not could_have_run(repair, inside[:, None] * one, coarse.record, law):
             return scale
-        if gain < low:  # commands that are too large come from a law that is too strong
-            return nothing
-    shown = finer_saving_of_gain(coarse, guess, plausible, usual) >= clear
-    return scale if shown else nothing
+        if np.mean(np.log(gains)) < np.log(low):
+            return one  # commands that are too large come from a law that is too strong
+    return scale if saving_of_gain(coarse, repair, plausible) >= clear else one
 
 
 def _usual_gain(plausible: tuple[float, float]) -> float:
@@ -414,22 +577,18 @@ def _usual_gain(plausible: tuple[float, float]) -> float:
 def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
     """Return the likeliest factor of the commands of each axis with these gains, (axes,)."""
     low, high = plausible
-    if np.max(gains) < _APART * np.min(gains):
-        together = float(np.exp(np.mean(np.log(gains))))
-        return np.full(gains.size, _likely_factor(together, plausible))
-    each = [1.0 if low <= gain <= high else _likely_factor(gain, plausible) for gain in gains]
-    return np.array(each)
-
-
-def _likely_factor(gain: float, plausible: tuple[float, float]) -> float:
-    """Return the likeliest factor of commands with a gain."""
-    low, high = plausible
     usual = _usual_gain(plausible)
-    fits = [f for f in _FACTORS if low <= gain / f <= high]
-    fits = fits or [f for f in _FACTORS if low / _COARSE <= gain / f <= _COARSE * high]
-    if fits:
-        return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
-    return float(f"{gain / usual:.2g}")
+
+    def factor(gain: float) -> float:
+        fits = [f for f in _FACTORS if low <= gain / f <= high]
+        fits = fits or [f for f in _FACTORS if low / _COARSE <= gain / f <= _COARSE * high]
+        if fits:
+            return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
+        return float(f"{gain / usual:.2g}")
+
+    if np.max(gains) < _APART * np.min(gains):
+        return np.full(gains.size, factor(float(np.exp(np.mean(np.log(gains))))))
+    return np.array([1.0 if low <= gain <= high else factor(gain) for gain in gains.tolist()])
 
 
 def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
@@ -446,127 +605,3 @@ def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
         )
     gains = ", ".join(f"{value:.3g}" for value in gain)
     return f"{words} (with them the sensor has a gain of {gains})"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CommandRepair:
-    """A correction of recorded commands, in the order of the fields.
-
-    Parameters
-    ----------
-    increments : bool, optional
-        The record has increments: they are added up.
-    shift_frames : int, optional
-        Frames by which the commands move to later frames; negative to earlier ones.
-    swap_axes : bool, optional
-        The commands of the two axes change places.
-    sign : tuple of int, optional
-        1 or -1 for each axis, or for both.
-    matrix : tuple of float, optional
-        Matrix from commands to the axes of the measurements, in rows.
-    scale : float or sequence of float, optional
-        Factor of the commands of both axes, or of each: from volts or counts to the unit of the
-        measurements, for example.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.identification.CommandRepair(sign=(-1,), scale=0.001).options
-    '--command-sign -1 --command-scale 0.001'
-    """
-
-    increments: bool = False
-    shift_frames: int = 0
-    swap_axes: bool = False
-    sign: tuple[int, ...] = ()
-    matrix: tuple[float, ...] = ()
-    scale: float | tuple[float, ...] = 1.0
-
-    def __post_init__(self) -> None:
-        given = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
-        scales = tuple(number(scale, "command_scale", above=0) for scale in given)
-        set_fields(self, scale=scales[0] if len(set(scales)) == 1 else scales)
-        shift = integer(self.shift_frames, "command_shift_frames", at_least=-_MOST_SHIFT)
-        number(shift, "command_shift_frames", at_most=_MOST_SHIFT)
-        if any(sign not in (-1, 1) for sign in self.sign):
-            raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
-        real_array(self.matrix, "command_matrix")
-
-    @property
-    def options(self) -> str:
-        """The options of the command line that do the same."""
-
-        def values(each: tuple[float, ...]) -> str:
-            return " ".join(f"{value:g}" for value in each)
-
-        words = [
-            "--command-increments" if self.increments else "",
-            f"--command-shift-frames {self.shift_frames}" if self.shift_frames else "",
-            "--swap-axes" if self.swap_axes else "",
-            f"--command-sign {values(self.sign)}" if self.sign else "",
-            f"--command-matrix {values(self.matrix)}" if self.matrix else "",
-            f"--command-scale {values(self._scales)}" if self.scale != 1 else "",
-        ]
-        return " ".join(filter(None, words))
-
-    @property
-    def _scales(self) -> tuple[float, ...]:
-        return self.scale if isinstance(self.scale, tuple) else (self.scale,)
-
-    def turn(self, axes: int) -> FloatArray:
-        """Return the matrix that swap, sign, matrix and scale are together."""
-        if axes != 2 and self.swap_axes:
-            raise ProblemError(
-                "swapped commands need two axes; the record has one. Leave "
-                f"{self.options} out, or choose two columns."
-            )
-        if len(self._scales) not in (1, axes):
-            raise ProblemError(
-                f"command_scale must be one factor, or {axes}; got {list(self._scales)}."
-            )
-        out = np.diag(np.broadcast_to(np.array(self._scales), axes))
-        if self.matrix:
-            if len(self.matrix) != axes**2:
-                raise ProblemError(
-                    f"command_matrix must have {axes**2} numbers for {axes} axes, row after row; "
-                    f"got {len(self.matrix)}."
-                )
-            out = out @ np.reshape(self.matrix, (axes, axes))
-        if self.sign:
-            if len(self.sign) not in (1, axes):
-                raise ProblemError(
-                    f"command_sign must be one sign, or {axes}; got {list(self.sign)}."
-                )
-            out = out @ np.diag(np.broadcast_to(np.array(self.sign, dtype=float), axes))
-        return out @ _SWAP if self.swap_axes else out
-
-
-def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
-    """Return a closed-loop record with the commands that the mirror followed.
-
-    The usable frames are those of the new commands. ProblemError refuses a record
-    without commands, and a repair that does not fit its axes.
-    """
-    if record.commands is None:
-        raise ProblemError("the record is of an open loop: it has no commands to repair.")
-    commands = np.array(record.commands)
-    good = np.ones(record.frames, dtype=np.bool_)
-    if record.commanded is not None:
-        good = np.array(record.commanded)
-    if repair.increments:
-        commands = np.cumsum(commands, axis=0)
-        good &= np.logical_and.accumulate(good)
-    if repair.shift_frames:
-        commands = np.roll(commands, repair.shift_frames, axis=0)
-        good = np.roll(good, repair.shift_frames)
-        late = repair.shift_frames > 0
-        unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
-        commands[unknown], good[unknown] = 0.0, False
-    commands = commands @ repair.turn(record.axes).T
-    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
-    return repaired if record.delay_frames is None else repaired.with_delay(record.delay_frames)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,23 +17,17 @@ from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
 from lbt_synth.identification.diagnosis.line_origins import (
     CostRow,
-    LineOrigin,
     LineRow,
     disturbance_costs,
     line_origins,
 )
 from lbt_synth.identification.diagnosis.running_loop import (
-    AXES,
     ChannelRow,
-    GivenDesignRow,
-    LoopRow,
     design_differences,
-    doubt_commands,
     given_controller,
-    given_design_row,
+    given_design_facts,
     judge_channels,
-    law_row,
-    loop_row,
+    loop_facts,
     running_controller,
 )
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
@@ -55,7 +48,8 @@ from lbt_synth.methods.registry import all_methods, reference_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.words import count_text, listing_text
+from lbt_synth.storage.rows import Facts
+from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import require_instance
 
 NARROW = 0.3  # modulus margin
@@ -81,32 +75,27 @@ class Diagnosis:
         The camera of Strehl ratios.
     commands : CommandVerdict or None
         How the commands reach the measurements; None of an open loop.
-    doubt : str
-        What is wrong with the commands; empty if nothing is.
-    repair : str
-        What to do about that.
     channels : tuple of ChannelRow
         Measurements and commands, one by one.
-    law : ControlLaw or None
-        The law that computed the commands; None of an open loop.
     model : IdentifiedModel or None
         The model of the whole record, and why there is none in ``notes``.
-    loop : LoopRow or None
+    loop : Facts or None
         The loop that ran, by law and model.
-    lines : tuple of LineOrigin
+    lines : tuple of LineRow
         Vibrations, and where they come from.
-    costs : tuple of CostRow
-        What each part of the disturbance costs, the most costly first; the last row is all.
     comparison : PredictionTable or None
         Residuals on the second half of the record, by models of the first.
     best : str
         Row of the comparison that leaves least, of the designs.
     best_design : Design or None
-        The same design, for the model of the whole record.
+        The same design, for the model of the first half.
+    costs : tuple of CostRow
+        What each part of the disturbance costs by the model of the first half (of the whole record
+        where there is no comparison), the most costly first; the last row is all.
     limit_nm : float
-        Residual below which no linear controller comes, by the model of the whole record [nm rms];
-        nan where it is not known.
-    given : GivenDesignRow or None
+        Residual below which no linear controller comes, by the same model [nm rms]; nan where it is
+        not known.
+    given : Facts or None
         A given design on this record.
     notes : tuple of str
         What could not be said and why, and what else should be known.
@@ -115,20 +104,27 @@ class Diagnosis:
     record: LoopRecord
     imaging: Imaging
     commands: CommandVerdict | None = None
-    doubt: str = ""
-    repair: str = ""
     channels: tuple[ChannelRow, ...] = ()
-    law: ControlLaw | None = None
     model: IdentifiedModel | None = None
-    loop: LoopRow | None = None
-    lines: tuple[LineOrigin, ...] = ()
-    costs: tuple[CostRow, ...] = ()
+    loop: Facts | None = None
+    lines: tuple[LineRow, ...] = ()
     comparison: PredictionTable | None = None
     best: str = ""
     best_design: Design | None = None
+    costs: tuple[CostRow, ...] = ()
     limit_nm: float = float("nan")
-    given: GivenDesignRow | None = None
+    given: Facts | None = None
     notes: tuple[str, ...] = ()
+
+    @property
+    def law(self) -> ControlLaw | None:
+        """The law that computed the commands; None of an open loop, or of too few frames."""
+        return None if self.commands is None else self.commands.law
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong with the commands; empty if nothing is."""
+        return "" if self.commands is None else self.commands.doubt
 
     @property
     def residuals(self) -> tuple[PredictionRow, ...]:
@@ -201,17 +197,11 @@ def diagnose(
     if record.commands is not None:
         commands = explain_commands(record, sensor_gain=options.get("sensor_gain"))
         notes += commands.notes
-    law = None if commands is None else commands.law
-    doubt, repair = doubt_commands(commands)
-    camera = Imaging() if imaging is None else imaging
     found = Diagnosis(
         record=record,
-        imaging=camera,
+        imaging=Imaging() if imaging is None else imaging,
         commands=commands,
-        doubt=doubt,
-        repair=repair,
         channels=judge_channels(record if whole is None else whole),
-        law=law,
     )
     step(1)
     if whole is not None and whole.axes > record.axes:
@@ -230,51 +220,40 @@ def _examine_loop(
     notes: list[str],
     step: Callable[[int], object],
 ) -> Diagnosis:
-    """Add what a model of the record tells."""
-    record, law = found.record, found.law
+    """Add what models of the record tell: of all of it, and of its first half on the second."""
+    record = found.record
     model = _attempt(lambda: _identify(record, options), "model", notes)
     step(1)
     if model is None:
         return found
     notes += model.notes
-    running = running_controller(law, record.frame_rate_hz)
-    series = record.pseudo_open_loop(model.sensor_gains)
-    lines = line_origins(model, series, record.stretches())
-    given_controllers = {name: given_controller(one, model) for name, one in given.items()}
+    running = running_controller(found.law, record.frame_rate_hz)
+    lines = line_origins(model)
+    found = replace(found, model=model, loop=loop_facts(model, running), lines=lines)
+    controllers = {name: given_controller(design, model) for name, design in given.items()}
     compared = _attempt(
-        lambda: _compare(found, model, running, given_controllers, options, notes, step),
+        lambda: _compare(found, running, controllers, options, notes, step),
         "comparison on unseen data",
         notes,
     )
-    comparison, best = compared if compared is not None else (None, "")
-    build = _candidate_designs(model).get(best)
-    best_design = None if build is None else _attempt(build, best, notes)
+    if compared is not None:
+        found, model, lines = compared
+    design, plant = found.best_design, model.plant()
     costs = _attempt(
         lambda: disturbance_costs(
-            model.plant(),
-            lines,
-            running,
-            None if best_design is None else best_design.controller,
-            found.imaging,
+            plant, lines, running, None if design is None else design.controller, found.imaging
         ),
         "costs",
         notes,
     )
-    found = replace(
-        found,
-        model=model,
-        loop=loop_row(model, running),
-        lines=lines,
-        costs=costs or (),
-        comparison=comparison,
-        best=best,
-        best_design=best_design,
-        limit_nm=limit_or_nan(lambda: least_model_residual(model.plant(), frame_means=True)),
-    )
+    limit_nm = limit_or_nan(lambda: least_model_residual(plant, frame_means=True))
     step(1)
+    found = replace(found, costs=costs or (), limit_nm=limit_nm)
     for name, design in given.items():
-        notes += design_differences(design, model)
-        found = replace(found, given=given_design_row(name, design, model, found.row(name)))
+        assert found.model is not None
+        notes += design_differences(design, found.model)
+        facts = given_design_facts(name, design, found.model, found.row(name))
+        found = replace(found, given=facts)
     return found
 
 
@@ -285,34 +264,31 @@ def _identify(record: LoopRecord, options: dict[str, Any]) -> IdentifiedModel:
 
 def _compare(
     found: Diagnosis,
-    model: IdentifiedModel,
     running: Controller | None,
     given: Mapping[str, Controller],
     options: dict[str, Any],
     notes: list[str],
     step: Callable[[int], object],
-) -> tuple[PredictionTable, str]:
-    """Return residuals on the second half, by models of the first, and the best design there."""
+) -> tuple[Diagnosis, IdentifiedModel, tuple[LineRow, ...]]:
+    """Add residuals on the second half and the best design there, by a model of the first half.
+
+    Return it, the model and its lines.
+    """
     record = found.record
     fit, test = split_halves(record.stretches(), record.frames)
-    half = identify(record, stretches=fit, start=model, **options)
+    half = identify(record, stretches=fit, start=found.model, **options)
     step(1)
-    plant = half.plant()
-    series = record.pseudo_open_loop(half.sensor_gains)
-    builders = _candidate_designs(half)
-    builders.pop(INTEGRATOR)  # the comparison has it
-    designs, missing = _stable_designs(builders, plant)
-    notes += missing
+    plant, series = half.plant(), record.pseudo_open_loop(half.sensor_gains)
+    designs = _stable_designs(plant, notes)
     stable = {}
     for name, controller in given.items():
         if close_loop(plant.hardware, controller).is_stable:
             stable[name] = controller
         else:
             notes.append(f"{name} is unstable in the loop of this record")
-    ran = running
-    if ran is not None and not close_loop(plant.hardware, ran).is_stable:
+    if running is not None and not close_loop(plant.hardware, running).is_stable:
         notes.append("the law of the commands is unstable at the sensor gain of the model")
-        ran = None
+        running = None
     table = prediction_against_data(
         plant,
         series,
@@ -320,47 +296,37 @@ def _compare(
         fit=fit,
         test=test,
         measurements=None if record.commands is None else record.measurements,
-        running=ran,
+        running=running,
         noise_error_nm=[axis.noise_error_nm for axis in half.axes],
         imaging=found.imaging,
     )
     notes += table.notes
+    designs[INTEGRATOR] = model_integrator(plant)  # the comparison has it
     left = {
         entry.name: entry.replayed.total_nm2
         for entry in table.entries
-        if entry.replayed is not None and entry.name in (INTEGRATOR, *designs)
+        if entry.replayed is not None and entry.name in designs
     }
-    return table, min(left, key=lambda name: left[name])
+    best = min(left, key=lambda name: left[name])
+    found = replace(found, comparison=table, best=best, best_design=designs[best])
+    return found, half, line_origins(half)
 
 
-def _candidate_designs(model: IdentifiedModel) -> dict[str, Callable[[], Design]]:
-    """Return what builds each candidate for a model, by the name of its row."""
-    plant = model.plant()
-    inputs = PlantInputs(plant=plant)
+def _stable_designs(plant: TipTiltPlant, notes: list[str]) -> dict[str, Design]:
+    """Return the designs that hold a plant's loop by their titles; note why others are missing."""
+    inputs, designs = PlantInputs(plant=plant), {}
     with_bands = [each for each in all_methods().values() if each.plant_section is not None]
-    builders: dict[str, Callable[[], Design]] = {
-        method.title: partial(design_request(method.name, {}).build, inputs)
-        for method in (*reference_methods(estimators_only=True), *with_bands)
-    }
-    return builders | {INTEGRATOR: partial(model_integrator, plant)}
-
-
-def _stable_designs(
-    builders: Mapping[str, Callable[[], Design]], plant: TipTiltPlant
-) -> tuple[dict[str, Design], list[str]]:
-    """Return the designs that can be built and hold a plant's loop, and why others are missing."""
-    found, notes = {}, []
-    for name, build in builders.items():
+    for method in (*reference_methods(estimators_only=True), *with_bands):
         try:
-            design = build()
+            design = design_request(method.name, {}).build(inputs)
         except LbtSynthError as error:
-            notes.append(f"no {name}: {error}")
+            notes.append(f"no {method.title}: {error}")
             continue
         if close_loop(plant.hardware, design.controller).is_stable:
-            found[name] = design
+            designs[method.title] = design
         else:
-            notes.append(f"no {name}: its loop is not stable at the identified sensor gain")
-    return found, notes
+            notes.append(f"no {method.title}: its loop is not stable at the identified sensor gain")
+    return designs
 
 
 def _attempt(compute: Callable[[], Any], what: str, notes: list[str]) -> Any:
@@ -390,12 +356,7 @@ def _state_sentence(found: Diagnosis) -> str:
         return f"The delay of the record is doubtful: {delays[0].removeprefix('warning: ')}."
     law = "an open loop ran"
     if found.law is not None:
-        row = law_row(found.law)
-        law = f"a law of order {row.order} ran"
-        if found.law.order <= 1:
-            law = f"a {row.law} of gain {row.gain} ran"
-        if row.lag_frames:
-            law += f", {count_text(row.lag_frames, 'frame')} late"
+        law = f"{found.law.name} ran{found.law.lag_text}"
     if found.model is None or found.loop is None:
         return f"The record shows no fault, and {law}."
     gain = f"at the sensor gain of {found.loop.sensor_gain}"
@@ -424,14 +385,12 @@ def _residual_sentence(found: Diagnosis) -> str:
         return "Nothing can be said of its residual."
     total = found.costs[-1]
     by_running = np.isfinite(total.running_nm)
-    of = [(row.part, row.running_nm if by_running else row.best_nm) for row in parts]
     whole = total.running_nm if by_running else total.best_nm
-    where = {line.name: _direction_text(line.row) for line in found.lines}
-    named = [
-        f"{nm_text(nm)} of the {part}{where.get(part, '')}"
-        for part, nm in of[:_PARTS]
-        if nm**2 >= _LEAST_PART * whole**2
-    ]
+    named = []
+    for row in parts[:_PARTS]:
+        nm = row.running_nm if by_running else row.best_nm
+        if nm**2 >= _LEAST_PART * whole**2:
+            named.append(f"{nm_text(nm)} of the {row.part}{row.where}")
     if not by_running:
         return f"By the model the {found.best} would leave {nm_text(whole)}: {listing_text(named)}."
     measured = doubt = ""
@@ -444,20 +403,13 @@ def _residual_sentence(found: Diagnosis) -> str:
     return f"{measured or 'By the model it leaves '}{nm_text(whole)}{doubt}: {listing_text(named)}."
 
 
-def _direction_text(row: LineRow) -> str:
-    """Say along what a line shakes."""
-    if row.origin in AXES:
-        return f" in {row.origin}"
-    return "" if np.isnan(row.direction_deg) else f" along {row.direction_deg:.0f} deg"
-
-
 def _advice_sentence(found: Diagnosis) -> str:
     """Say what to change first."""
     bad = next((row for row in found.channels if row.serious), None)
     if bad is not None:
         return f"First look at the {bad.channel}, which is {bad.state}."
-    if found.doubt:
-        return f"First {found.repair}."
+    if found.doubt and found.commands is not None:
+        return f"First {found.commands.advice}."
     if any(note.startswith(_DELAY_WARNING) for note in found.notes):
         return "First check the delay, on which sensor gain and designs depend."
     ran, best, slow = found.row(RAN), found.row(found.best), found.row(INTEGRATOR)

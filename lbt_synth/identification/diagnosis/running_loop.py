@@ -14,22 +14,20 @@ import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.commands.plausibility import law_controller
-from lbt_synth.identification.commands.verdict import CommandVerdict
+from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.prediction.comparison import PredictionRow
-from lbt_synth.identification.records.from_series import LEAST_QUARTER, TREND
+from lbt_synth.identification.records.from_series import TREND, end_scatters
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.loop.stable_range import stable_sensor_gains
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
+from lbt_synth.storage.rows import Facts, column, fact, facts, nm_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray
 
-_FIND = "find the commands that belong to these measurements"
+_STABLE_GAINS = "stable sensor gains"
 AXES = ("tip", "tilt")
 _DEAD = 0.5  # of the frames, on one value
 _NOISIER = 3.0  # times the other axis
@@ -41,66 +39,22 @@ _SAME_RATE = 1e-3
 _AGREES = 0.1  # of the residual that its own model promises
 
 
-@table_row
-class LawRow:
-    """The control law of a record, in words."""
-
-    law: str = column("control law", help="Kind of the law")
-    order: int = column("order", help="Past commands that it uses")
-    gain: str = column("gain", help="Command per measurement, at low frequencies")
-    axes: str = column("axes", help="Which axes move which")
-    leak: str = column("pole nearest 1", help="Leak: 1 is a pure integrator")
-    lag_frames: int = column(
-        "late", unit="frames", help="Lag of the first measurement, 0 if nothing is late"
-    )
-    residual: float = percent_column(
-        "unexplained",
-        format=".2g",
-        help="Part of the variance of the commands' increments that it leaves unexplained",
-    )
-    coherence: float = column(
-        help="Part of what past commands leave of the increments that follows from measurements"
-    )
-
-
-@table_row
-class LoopRow:
-    """The loop that ran, by its law and the model."""
-
-    delay_frames: float = column("delay", unit="frames", help="Total delay, as given")
-    sensor_gain: str = column("sensor gain", help="Sensor gain of each axis, with its error")
-    sensor_gain_note: str = column(help="Where the sensor gain is from")
-    spectral_radius: float = column("spectral radius", format=".5f", help="1 and more is unstable")
-    stable_gains: str = column("stable sensor gains", help="Real sensor gains that are stable")
-    modulus: float = column("modulus margin", format=".3f", help="Distance from instability")
-    crossover_hz: float = column("crossover", unit="Hz", format=".3g", help="Highest crossover")
-
-
-def law_row(law: ControlLaw) -> LawRow:
+def law_facts(law: ControlLaw) -> Facts:
     """Return a control law in words."""
-    if law.kind == "none":
-        return LawRow(
-            law="none: the commands do not follow from the measurements",
-            order=0,
-            gain="",
-            axes="",
-            leak="",
-            lag_frames=0,
-            residual=law.residual,
-            coherence=law.coherence,
-        )
-    matrix = law.axis_matrix
-    gains = law.gain
-    flat = np.diag(gains) if matrix.kind == "diagonal" else gains.ravel()
-    return LawRow(
-        law=law.kind,
-        order=law.order,
-        gain=", ".join(_distinct(f"{value:.4g}" for value in flat + 0.0)),
-        axes="" if len(gains) == 1 else matrix.kind,
-        leak=", ".join(_distinct(f"{value:.5g}" for value in law.leak if np.isfinite(value))),
-        lag_frames=law.lag_frames,
-        residual=0.0 if law.exact else law.residual,
-        coherence=law.coherence,
+    is_none = law.kind == "none"
+    leak = ", ".join(_distinct(f"{value:.5g}" for value in law.leak if np.isfinite(value)))
+    none = "none: the commands do not follow from the measurements"
+    axes = "" if is_none or len(law.gain) == 1 else law.axes_kind
+    unexplained = 0.0 if law.exact else law.residual
+    return facts(
+        law=fact(none if is_none else law.kind, "control law"),
+        order=fact(law.order, "order"),
+        gain=fact("" if is_none else law.gain_text, "gain"),
+        axes=fact(axes, "axes"),
+        leak=fact(leak, "pole nearest 1"),
+        lag_frames=fact(law.lag_frames, "late", unit="frames"),
+        residual=fact(unexplained, "unexplained", unit="%", scale=100, format=".2g"),
+        coherence=fact(law.coherence),
     )
 
 
@@ -117,8 +71,8 @@ def running_controller(law: ControlLaw | None, frame_rate_hz: float) -> Controll
     return law_controller(law, frame_rate_hz)
 
 
-def loop_row(model: IdentifiedModel, running: Controller | None) -> LoopRow:
-    """Return the loop that ran, with what is known of its stability."""
+def loop_facts(model: IdentifiedModel, running: Controller | None) -> Facts:
+    """Return the loop that ran, by its law and the model, with what is known of its stability."""
     gains = [
         f"{axis.sensor_gain:.3f}"
         + ("" if axis.sensor_gain_error is None else f" +- {axis.sensor_gain_error:.3f}")
@@ -133,66 +87,25 @@ def loop_row(model: IdentifiedModel, running: Controller | None) -> LoopRow:
         if loop.is_stable:
             margins = loop_margins(loop)
             modulus, crossover = margins.modulus, margins.crossover_hz
-            nominal = float(np.mean(model.sensor_gains))
-            low, high = margins.gain_low * nominal, margins.gain_high * nominal
-            stable = f"{low:.3g} to {high:.3g}"
-        else:
-            stable = "unstable at this one"
-    return LoopRow(
-        delay_frames=model.delay_frames,
-        sensor_gain=", ".join(_distinct(gains)),
-        sensor_gain_note=", ".join(_distinct(notes)),
-        spectral_radius=radius,
-        stable_gains=stable,
-        modulus=modulus,
-        crossover_hz=crossover,
+        stable = _stable_gains(model, running)
+    return facts(
+        delay_frames=fact(model.delay_frames, "delay", unit="frames"),
+        sensor_gain=fact(", ".join(_distinct(gains)), "sensor gain"),
+        sensor_gain_note=fact(", ".join(_distinct(notes))),
+        spectral_radius=fact(radius, "spectral radius", format=".5f"),
+        stable_gains=fact(stable or "unstable at this one" * (running is not None), _STABLE_GAINS),
+        modulus=fact(modulus, "modulus margin", format=".3f"),
+        crossover_hz=fact(crossover, "crossover", unit="Hz", format=".3g"),
     )
 
 
-@table_row
-class CommandRow:
-    """How the commands of a record reach its measurements."""
-
-    explanation: str = column("the commands", help="What explains the record best")
-    nats: float = column(
-        "evidence", format=".0f", help="Log-likelihood over that of the record as given"
-    )
-    repair: str = column("repair", help="Options that repair the record")
-
-
-def command_row(verdict: CommandVerdict) -> CommandRow:
-    """Return the verdict on the commands as a row."""
-    return CommandRow(
-        explanation=verdict.explanation,
-        nats=verdict.nats,
-        repair=verdict.options,
-    )
-
-
-def doubt_commands(verdict: CommandVerdict | None) -> tuple[str, str]:
-    """Say what is wrong with the commands, and what to do; empty if nothing is."""
-    if verdict is None:
-        return "", ""
-    if not verdict.accepted:
-        if verdict.options:
-            return verdict.explanation, f"read the record with {verdict.options}"
-        what, _, advice = verdict.explanation.partition(". ")
-        return what, advice[:1].lower() + advice[1:] or _FIND
-    return ("", "") if verdict.law is None else _doubt_law(verdict.law)
-
-
-def _doubt_law(law: ControlLaw) -> tuple[str, str]:
-    """Say what is wrong by the law alone, for records too short for anything else."""
-    matrix = law.axis_matrix
-    if not law.exact:
-        return "", ""
-    if matrix.kind == "diagonal" and min(matrix.signs) < 0:
-        return "by their law they have the opposite sign", "turn their sign"
-    if matrix.kind == "swapped":
-        return "by their law those of the two axes are exchanged", "exchange them"
-    if law.kind == "proportional":
-        return "by their law they are increments, not positions", "add them up"
-    return "", ""
+def _stable_gains(model: IdentifiedModel, controller: Controller) -> str:
+    """Return the real sensor gains at which the loop is stable, empty if not at the model's."""
+    if not close_loop(model.hardware, controller).is_stable:
+        return ""
+    nominal = float(np.mean(model.sensor_gains))
+    low, high = stable_sensor_gains(model.hardware, controller)
+    return f"{low * nominal:.3g} to {high * nominal:.3g}"
 
 
 @table_row
@@ -254,12 +167,11 @@ def _judge_series(
             if each.series == series and each.axis == axis and each.kind in _WORDS
         ]
         here = one[good] if good.any() else one
-        first, last = _quarters(good)
-        ends = [_step_rms(one, part) for part in (first, last)]
-        change = ends[1] / ends[0] if ends[0] > 0 else np.nan
-        drift = float(np.mean(one[last]) - np.mean(one[first])) if last.any() else np.nan
+        first, last = end_scatters(one, good)
+        change, quarter = last / first if first > 0 else np.nan, len(here) // 4
+        drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
         held = sum(each.fraction for each in found if each.kind in ("stuck", "held"))
-        words = [f"{_WORDS[each.kind]} ({_percent(each.fraction)})" for each in found]
+        words = [f"{_WORDS[each.kind]} ({100 * each.fraction:.2g} %)" for each in found]
         if np.ptp(here) == 0 or held > _DEAD:
             words = [DEAD]
         elif series == "measurements":
@@ -285,48 +197,10 @@ def _judge_series(
     return rows
 
 
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.2g} %"
-
-
 def _step_rms(series: FloatArray, good: BoolArray) -> float:
     """Return the rms difference of neighbouring good frames, nan without any."""
     pairs = good[1:] & good[:-1]
     return float(np.sqrt(np.mean(np.diff(series)[pairs] ** 2))) if pairs.any() else np.nan
-
-
-def _quarters(good: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Return the good frames of the first and of the last quarter, none if they are few."""
-    first, last = np.zeros((2, len(good)), dtype=np.bool_)
-    where = np.flatnonzero(good)
-    quarter = where.size // 4
-    if quarter >= LEAST_QUARTER:
-        first[where[:quarter]] = True
-        last[where[-quarter:]] = True
-    return first, last
-
-
-@table_row
-class GivenDesignRow:
-    """A given design on the record."""
-
-    design: str = column("design", help="Its name")
-    method: str = column("method", help="Method of synthesis")
-    stable: bool = column("stable", help="Whether its loop is stable at the identified gain")
-    spectral_radius: float = column("spectral radius", format=".5f", help="1 and more is unstable")
-    stable_gains: str = column("stable sensor gains", help="Real sensor gains that are stable")
-    sensor_gain: str = column("identified sensor gain", help="That of the record")
-    replayed_nm: float = column(
-        "residual on the record", unit="nm", format=".2f", help="On frames of no fit"
-    )
-    replayed_error_nm: float = column("+-", unit="nm", format=".2f", help="Its standard error")
-    own_model_nm: float = column(
-        "promised by its own model", unit="nm", format=".2f", help="For which it was designed"
-    )
-    model_nm: float = column(
-        "by the record's model", unit="nm", format=".2f", help="Identified from the record"
-    )
-    agreement: str = column("agrees with its model", help="Whether the record does")
 
 
 def given_controller(design: Design, model: IdentifiedModel) -> Controller:
@@ -347,33 +221,37 @@ def given_controller(design: Design, model: IdentifiedModel) -> Controller:
     return replace(design.controller, dt_s=path.dt_s)
 
 
-def given_design_row(
+def given_design_facts(
     name: str,
     design: Design,
     model: IdentifiedModel,
     replayed: PredictionRow | None,
-) -> GivenDesignRow:
+) -> Facts:
     """Return what a given design does on the record, replayed where its loop is stable."""
     controller = given_controller(design, model)
     loop = close_loop(model.hardware, controller)
-    nominal = float(np.mean(model.sensor_gains))
-    stable = ""
-    if loop.is_stable:
-        low, high = stable_sensor_gains(model.hardware, controller)
-        stable = f"{low * nominal:.3g} to {high * nominal:.3g}"
     promised = design.rms
-    return GivenDesignRow(
-        design=name,
-        method=design_title(design.method),
-        stable=loop.is_stable,
-        spectral_radius=loop.spectral_radius,
-        stable_gains=stable,
-        sensor_gain=f"{nominal:.3f}",
-        replayed_nm=np.nan if replayed is None else replayed.replayed_nm,
-        replayed_error_nm=np.nan if replayed is None else replayed.replayed_error_nm,
-        own_model_nm=promised,
-        model_nm=np.nan if replayed is None else replayed.model_nm,
-        agreement=_agreement(promised, replayed),
+    residual = {"unit": "nm", "format": ".2f"}
+    return facts(
+        design=fact(name, "design"),
+        method=fact(design_title(design.method), "method"),
+        stable=fact(loop.is_stable, "stable"),
+        spectral_radius=fact(loop.spectral_radius, "spectral radius", format=".5f"),
+        stable_gains=fact(_stable_gains(model, controller), _STABLE_GAINS),
+        sensor_gain=fact(f"{np.mean(model.sensor_gains):.3f}", "identified sensor gain"),
+        replayed_nm=fact(
+            np.nan if replayed is None else replayed.replayed_nm,
+            "residual on the record",
+            **residual,
+        ),
+        replayed_error_nm=fact(
+            np.nan if replayed is None else replayed.replayed_error_nm, "+-", **residual
+        ),
+        own_model_nm=fact(promised, "promised by its own model", **residual),
+        model_nm=fact(
+            np.nan if replayed is None else replayed.model_nm, "by the record's model", **residual
+        ),
+        agreement=fact(_agreement(promised, replayed), "agrees with its model"),
     )
 
 

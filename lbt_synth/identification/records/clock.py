@@ -29,6 +29,7 @@ _FEW = 3  # odd steps that show an order
 _DENOMINATOR = 100_000
 _BLOCKS = 16  # of rows, whose mean distance from the grid is compared
 _SEARCH = 60
+_ROWS_PER_STAMP = 5  # of times that are too coarse to be used beside a rate
 
 
 class Clock(NamedTuple):
@@ -54,6 +55,8 @@ def build_clock(
     notes: list[str] = []
     frame = np.arange(rows)
     times = None if times_s is None else _check_rising(times_s, "times_s", rows)
+    if times is not None and rate is not None and _tell_nothing(times, rate):
+        times, notes = None, ["the times do not tell frames apart and were not used"]
     if frame_numbers is not None:
         frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
     if times is not None and rows > 1:
@@ -75,6 +78,20 @@ def build_clock(
     if rate is None:
         raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
     return Clock(rate, frame, notes, None if times is None else _jitter(times, frame))
+
+
+def _tell_nothing(times: FloatArray, rate: float) -> bool:
+    """Return whether times stand still, or rise by many frames at once, as whole seconds do.
+
+    Their number of rows must be that of the rate.
+    """
+    steps = np.diff(times)
+    if not np.any(steps > 0):
+        return len(times) > 1
+    stamps = int(np.count_nonzero(steps > 0))
+    span = float(times[-1] - times[0])
+    apart = abs(span * rate / len(times) - 1)
+    return stamps * _ROWS_PER_STAMP < len(times) and apart <= 1 / stamps
 
 
 def _jitter(times: FloatArray, frame: IntArray) -> float | None:

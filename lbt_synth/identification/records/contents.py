@@ -227,8 +227,17 @@ def _read_text(out: Contents, content: bytes) -> None:
         names = [""] * len(names) if numbers or len(cells) != len(names) else cells
     if not rows:
         raise TelemetryError("it has a heading and no rows.")
-    table = _parse_rows(rows, sign, len(names))
-    out.columns = [parse_column(name, column) for name, column in zip(names, table.T, strict=True)]
+    parsed = [parse_column(name, np.empty(0)) for name in names]
+    # a text that no role needs, as a remark or a date
+    spare = [bool(each.name) and each.role is None for each in parsed]
+    table, texts = _parse_rows(rows, sign, spare)
+    if all(texts):
+        raise TelemetryError(f"each cell of a column must be a number; got {rows[0][1].strip()!r}.")
+    for each, column, is_text in zip(parsed, table.T, texts, strict=True):
+        if is_text:
+            out.left_out.append(f"{each.name} holds texts")
+        else:
+            out.columns.append(replace(each, values=column))
 
 
 def _add_comment(out: Contents, comment: str) -> None:
@@ -258,33 +267,28 @@ def _parse_number(cell: str) -> float | None:
         return float("nan") if cell.strip().lower() in _GAPS else None
 
 
-def _parse_rows(rows: list[tuple[int, str]], sign: str | None, width: int) -> FloatArray:
-    lines, out = [line for _, line in rows], np.empty((len(rows), width))
+def _parse_rows(
+    rows: list[tuple[int, str]], sign: str | None, spare: list[bool]
+) -> tuple[FloatArray, list[bool]]:
+    """Return the numbers of rows, and which columns have texts: only ``spare`` ones may."""
+    lines, out = [line for _, line in rows], np.empty((len(rows), len(spare)))
+    texts = [False] * len(spare)
     with suppress(ValueError):  # the quick way, which knows no gaps
-        found = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
-        if found.shape == out.shape:
-            return found
+        numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
+        if numbers.shape == out.shape:
+            return numbers, texts
     table = _split_cells(lines, sign)
     for values, (number, _), cells in zip(out, rows, table, strict=True):
-        parsed = list(map(_parse_number, cells))
-        if len(parsed) != width:
-            raise TelemetryError(f"line {number} must have {width} cells; got {len(parsed)}.")
-        if None in parsed:
-            at = parsed.index(None)
-            raise TelemetryError(
-                f"cell {at + 1} of line {number} must be a number; got {cells[at].strip()!r}."
-            )
-        values[:] = parsed
-    return out
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Series:
-    """Columns that make a record."""
-
-    kind: str  # one of KINDS
-    role: str  # of its measurements or densities
-    columns: Roles  # those of a role with axes in the order of the axes, of another role one
+        if len(cells) != len(spare):
+            raise TelemetryError(f"line {number} must have {len(spare)} cells; got {len(cells)}.")
+        for at, value in enumerate(map(_parse_number, cells)):
+            if value is None and not spare[at]:
+                raise TelemetryError(
+                    f"cell {at + 1} of line {number} must be a number; got {cells[at].strip()!r}."
+                )
+            texts[at] |= value is None
+            values[at] = np.nan if value is None else value
+    return out, texts
 
 
 def select_series(
@@ -293,8 +297,12 @@ def select_series(
     kind: str | None,
     axes: Sequence[int] | None,
     columns: Mapping[str, Any] | None,
-) -> Series:
-    """Choose the columns of a record, and note which."""
+) -> tuple[str, Roles]:
+    """Choose the columns of a record, and note which; return its kind and them by their roles.
+
+    Those of a role with axes are in the order of the axes, of another role there is one; the first
+    role is that of the measurements or densities.
+    """
     there, notes = contents.columns, contents.notes
     notes += [f"{why}; it was left out" for why in contents.left_out]
     if not there:
@@ -302,7 +310,9 @@ def select_series(
     found = _assign_roles(there, columns) or _assign_by_kind(there, kind, notes)
     kind = _find_kind(found, contents) if kind is None else kind
     if kind == "open_loop" and "open_loop" not in found and "measurements" in found:
-        found["open_loop"] = found["measurements"]
+        found["open_loop"] = own = found["measurements"]
+        if len({each.axis for each in own} - {None}) < len(own) and _are_two_axes(own):
+            found["open_loop"] = number_axes(own)
     role = _series_role(found, kind)
     if role is None:
         needed = [role for role in (_SERIES[kind][0], _BESIDE.get(kind)) if role is not None]
@@ -324,7 +334,7 @@ def select_series(
         notes.append(f"not used: {join_names(left)}")
     if kind == "open_loop" and "commands" in found:
         notes.append("commands were left out: the record is of an open loop")
-    return Series(kind=kind, role=role, columns=chosen)
+    return kind, chosen
 
 
 def number_axes(columns: Sequence[Column]) -> list[Column]:
@@ -385,9 +395,14 @@ def _assign_by_kind(columns: Sequence[Column], kind: str | None, notes: list[str
     if kind == "spectrum" and len(columns) > 1:
         notes.append("the first column was taken for the frequencies, the others for densities")
         return {"frequency": [columns[0]], "density": number_axes(columns[1:])}
-    if kind == "open_loop" and len(columns) == 1:  # of several, one may be a clock
+    if kind == "open_loop" and (len(columns) == 1 or _are_two_axes(columns)):
         return {"open_loop": number_axes(columns)}
     return {}
+
+
+def _are_two_axes(columns: Sequence[Column]) -> bool:
+    """Return whether two columns are the series of two axes: none rises all the time as a clock."""
+    return len(columns) == 2 and not any(np.all(np.diff(each.values) > 0) for each in columns)
 
 
 def _find_kind(found: Roles, contents: Contents) -> str:

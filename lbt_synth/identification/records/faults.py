@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lbt_synth.storage.rows import column, percent_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 _SHORTEST_RUN = 5  # equal values, a stuck sensor
@@ -184,20 +185,17 @@ def fill(series: FloatArray, good: BoolArray) -> FloatArray:
     return out
 
 
-HEADINGS = ("finding", "series", "axis", "frames", "%", "first frame", "effect")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
+@table_row
 class Finding:
     """One kind of fault in one series."""
 
-    kind: str  # "missing", "repeated", "not finite", "stuck", "saturated", "outlier", "held", ...
-    series: str  # "measurements", "commands" or "frames"
-    axis: int | None  # from 0; None for all axes
-    count: int  # frames
-    first_frame: int  # the first of them
-    fraction: float  # their part of all frames
-    spoils: bool  # whether these frames are not usable; otherwise they are only reported
+    kind: str = column("finding", help="Missing, repeated, not finite, stuck, saturated, ...")
+    series: str = column("series", help="Measurements, commands or frames")
+    axis: int | None = column("axis", help="From 0; None for all axes")
+    count: int = column("frames", help="How many")
+    fraction: float = percent_column("share", format=".4g", help="Their part of all frames")
+    first_frame: int = column("first frame", help="The first of them")
+    spoils: bool = column("spoilt", help="Whether they are not usable, or only reported")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,21 +214,6 @@ class RecordHealth:
     def clean(self) -> bool:
         """Whether nothing was found that spoils a frame."""
         return not any(found.spoils for found in self.findings)
-
-    def rows(self) -> tuple[tuple[str, str, int | None, int, float, int, str], ...]:
-        """Return a row per finding, under the headings ``HEADINGS`` of this module."""
-        return tuple(
-            (
-                found.kind,
-                found.series,
-                found.axis,
-                found.count,
-                round(100 * found.fraction, 4),
-                found.first_frame,
-                "spoilt" if found.spoils else "reported",
-            )
-            for found in self.findings
-        )
 
     def summary(self) -> str:
         """Return one line: how many frames are usable, and why the others are not."""

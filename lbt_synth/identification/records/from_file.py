@@ -19,7 +19,6 @@ from lbt_synth.identification.records.contents import (
     FITS,
     KINDS,
     Contents,
-    Series,
     choose_axes,
     name_in_errors,
     read_contents,
@@ -132,8 +131,8 @@ def load_record(
         if commands is not None:
             other = Path(commands)
             join_commands(contents, read_contents(other), other)
-        series = select_series(contents, kind=kind, axes=axes, columns=columns)
-        return build_record(series, contents, averages=averages, **given)
+        kind, chosen = select_series(contents, kind=kind, axes=axes, columns=columns)
+        return build_record(kind, chosen, contents, averages=averages, **given)
 
 
 def is_telemetry(path: Path) -> bool:
@@ -234,7 +233,8 @@ def record_from_telemetry(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
     record = build_record(
-        Series(kind="closed_loop", role="measurements", columns=columns),
+        "closed_loop",
+        columns,
         contents,
         frame_rate_hz=frame_rate_hz,
         delay_frames=delay_frames,

@@ -29,7 +29,7 @@ from lbt_synth.identification.records.columns import (
 from lbt_synth.identification.records.contents import (
     CLOCKS,
     Contents,
-    Series,
+    Roles,
     join_names,
     number_axes,
 )
@@ -52,13 +52,14 @@ _LARGEST_NM = 1e100  # a larger number is none: its square would overflow
 _SMALLEST_NM = 1e-30  # squares of less are lost to rounding
 _OPEN_FRAMES = 20  # of zero or equal commands
 TREND = 2.0  # ratio of scatters
-LEAST_QUARTER = 64  # pairs of frames that show a trend
+_LEAST_QUARTER = 64  # pairs of frames that show a trend
 
 Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
 
 
 def build_record(
-    series: Series,
+    kind: str,
+    columns: Roles,
     contents: Contents,
     *,
     unit: str | None,
@@ -68,28 +69,27 @@ def build_record(
     **given: Any,
 ) -> LoopRecord | SpectrumRecord:
     """Make a record; ``given`` are the facts of the call, None where the source has to tell."""
-    kind = "spectrum" if series.kind == "spectrum" else "loop"
-    if kind == "loop" and given.pop("averages", None) is not None:
-        raise ProblemError(
-            f"averages are only for a spectrum; the record is of kind {series.kind}."
-        )
+    role, is_loop = next(iter(columns)), kind != "spectrum"
+    if is_loop and given.pop("averages", None) is not None:
+        raise ProblemError(f"averages are only for a spectrum; the record is of kind {kind}.")
+    kind = "loop" if is_loop else kind
     facts = {name: _find_fact(contents, name, given[name]) for name in _FACTS[kind]}
-    if kind == "loop":
-        units = {series.role: unit, "commands": command_unit or unit}
-        _require_facts(series, contents, units, facts)
-    own_unit = _find_unit(series.columns[series.role], unit, contents, kind)
-    if kind == "spectrum":
-        return _build_spectrum(series, contents, own_unit, source=source, **facts)
-    u, u_unit = series.columns.get("commands"), None
+    if is_loop:
+        units = {role: unit, "commands": command_unit or unit}
+        _require_facts(columns, contents, units, facts)
+    own_unit = _find_unit(columns[role], unit, contents, kind)
+    if not is_loop:
+        return _build_spectrum(columns, contents, own_unit, source=source, **facts)
+    u, u_unit = columns.get("commands"), None
     if u is not None:
         u_unit = _find_unit(u, command_unit or unit, contents, kind, "command_unit")
-    (clock,) = series.columns.get("times", [None])
-    (counter,) = series.columns.get("frame_numbers", [None])
+    (clock,) = columns.get("times", [None])
+    (counter,) = columns.get("frame_numbers", [None])
     times = None if clock is None else seconds_per(clock.unit) * clock.values
     if clock is not None and not clock.unit:
         contents.notes.append(f"{clock.name} was taken for seconds")
     record = loop_record(
-        _stack_columns(series.columns[series.role]),
+        _stack_columns(columns[role]),
         None if u is None else _stack_columns(u),
         unit=own_unit,
         command_unit=u_unit,
@@ -112,19 +112,19 @@ def build_record(
 
 
 def _require_facts(
-    series: Series, contents: Contents, units: Mapping[str, str | None], facts: Mapping[str, Any]
+    columns: Roles, contents: Contents, units: Mapping[str, str | None], facts: Mapping[str, Any]
 ) -> None:
     """Refuse a loop of which several facts are missing, all of them in one message."""
     of_file = "".join(map(str, contents.facts.get("unit", {}).values()))
     found = [
         (column, column.unit or of_file or unit or "")
         for role, unit in units.items()
-        for column in series.columns.get(role, ())
+        for column in columns.get(role, ())
     ]
     bare = [column for column, unit in found if not unit]
     angles = facts["diameter_m"] is None and any(is_angle(unit) for _, unit in found)
-    no_rate = facts["frame_rate_hz"] is None and "times" not in series.columns
-    no_delay = facts["delay_frames"] is None and "commands" in series.columns
+    no_rate = facts["frame_rate_hz"] is None and "times" not in columns
+    no_delay = facts["delay_frames"] is None and "commands" in columns
     checks = (
         (bare, f"the unit of {join_names(bare)}: give unit ({_UNITS['loop']})"),
         (angles, "the telescope, by which angles become nm: give diameter_m"),
@@ -196,9 +196,10 @@ def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
 
 
 def _build_spectrum(
-    series: Series, contents: Contents, unit: str, *, diameter_m: float | None, **facts: Any
+    columns: Roles, contents: Contents, unit: str, *, diameter_m: float | None, **facts: Any
 ) -> SpectrumRecord:
-    densities, (frequency,) = series.columns[series.role], series.columns["frequency"]
+    role, densities = next(iter(columns.items()))
+    (frequency,) = columns["frequency"]
     parted = density_unit(unit)
     if parted is None:
         raise ProblemError(
@@ -206,7 +207,7 @@ def _build_spectrum(
             f"over sqrt(Hz) (nm/sqrt(Hz)); got {unit!r}."
         )
     name, power = parted
-    if series.role == "amplitude" and power == 2:
+    if role == "amplitude" and power == 2:
         raise ProblemError(
             f"{densities[0].name} is named as an amplitude, but has the unit {unit!r} of a power; "
             "choose by columns={'density': ...}."
@@ -546,18 +547,25 @@ def _longest(stretches: IntArray) -> IntArray:
     return stretches[stretches[:, 1] - stretches[:, 0] >= _OPEN_FRAMES]
 
 
-def _note_trends(series: FloatArray, good: BoolArray) -> list[str]:
+def _note_trends(series: FloatArray, good: BoolArray) -> Iterator[str]:
     """Note where the scatter from frame to frame changes between the ends of the record."""
-    pairs = np.flatnonzero(good[1:] & good[:-1])
-    quarter = pairs.size // 4
-    if quarter < LEAST_QUARTER:
-        return []
-    said, squares = [], np.diff(series, axis=0)[pairs] ** 2
-    ends = np.sqrt([squares[:quarter].mean(axis=0), squares[-quarter:].mean(axis=0)])
-    for axis, (first, last) in enumerate(ends.T):
+    for axis, column in enumerate(series.T):
+        first, last = end_scatters(column, good)
         if max(first, last) > TREND * min(first, last):
-            said.append(
+            yield (
                 f"axis {axis} is not stationary: the rms difference of two frames is "
                 f"{nm_text(first)} in the first quarter and {nm_text(last)} in the last"
             )
-    return said
+
+
+def end_scatters(series: FloatArray, good: BoolArray) -> tuple[float, float]:
+    """Return the rms difference of two good frames in the first quarter, and in the last.
+
+    nan where these are few.
+    """
+    steps = np.diff(series)[good[1:] & good[:-1]]
+    quarter = steps.size // 4
+    if quarter < _LEAST_QUARTER:
+        return float("nan"), float("nan")
+    first, last = (float(np.sqrt(np.mean(part**2))) for part in (steps[:quarter], steps[-quarter:]))
+    return first, last

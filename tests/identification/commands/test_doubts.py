@@ -10,8 +10,8 @@ from support.control_laws import ordinary_loop
 from support.wrong_commands import record
 
 import lbt_synth as lbt
+from lbt_synth.identification.commands.coarse_spectrum import CoarseRecord
 from lbt_synth.identification.commands.doubts import gain_dilution, held_while_moving
-from lbt_synth.identification.commands.guesses import CoarseRecord
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.likeliest_gain import allowed_gains
 
@@ -121,7 +121,7 @@ def rounded(step_nm: float, frames: int | None = None):
 
 
 def test_fine_steps_change_nothing() -> None:
-    assert gain_dilution(CoarseRecord(record(*ordinary_loop()))).tolist() == [1.0, 1.0]
+    assert gain_dilution(CoarseRecord(record(*ordinary_loop())))[0].tolist() == [1.0, 1.0]
     verdict = explain_commands(rounded(0.1))
     assert verdict.accepted
     assert verdict.notes == ()
@@ -131,7 +131,7 @@ def test_fine_steps_change_nothing() -> None:
 def test_the_gain_that_is_lost_is_about_the_one_that_is_lost_again(step_nm: float) -> None:
     record_of_steps = rounded(step_nm)
     found = explain_commands(record_of_steps)
-    dilution = gain_dilution(CoarseRecord(record_of_steps))
+    dilution, _ = gain_dilution(CoarseRecord(record_of_steps))
     lost = 0.7 / found.gain
     np.testing.assert_allclose(dilution, lost, rtol=0.25)
 

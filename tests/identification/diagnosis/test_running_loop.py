@@ -13,8 +13,6 @@ from support.wrong_commands import record
 import lbt_synth as lbt
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.diagnosis.running_loop import (
-    command_row,
-    doubt_commands,
     judge_channels,
     live_axes,
 )
@@ -30,11 +28,10 @@ from lbt_synth.identification.diagnosis.running_loop import (
 def test_advice_is_that_of_the_explanation(spoil, doubt: str, advice: str) -> None:
     y, u = ordinary_loop()
     verdict = explain_commands(record(y, spoil(u)))
-    what, repair = doubt_commands(verdict)
-    assert what.endswith(doubt)
-    assert repair.startswith(advice)
+    assert verdict.doubt.endswith(doubt)
+    assert verdict.advice.startswith(advice)
     assert np.isnan(verdict.gain).all()
-    assert command_row(verdict).repair == verdict.options
+    assert verdict.facts().repair == verdict.options
 
 
 def states(y, u=None):

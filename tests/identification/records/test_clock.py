@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import count_calls
-from support.records import noise
+from support.records import findings, noise
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import loop_record
@@ -29,7 +29,7 @@ def test_missing_frames_become_holes(by):
     assert seen.frames == 500
     assert seen.frame_rate_hz == pytest.approx(RATE, rel=1e-5)
     assert np.array_equal(seen.measurements[seen.usable], y[kept])
-    assert seen.health.rows() == (("missing", "frames", None, 3, 0.6, 100, "spoilt"),)
+    assert findings(seen) == [("missing", "frames", None, 3, 100, True)]
 
 
 def test_rows_that_come_twice():
@@ -43,7 +43,7 @@ def test_rows_that_come_twice():
     rows[np.flatnonzero(order == 50)[1]] += 1  # two stories of one frame
     torn = loop_record(rows, times_s=order / RATE, unit="nm")
     assert np.flatnonzero(~torn.usable).tolist() == [50]
-    assert torn.health.rows() == (("repeated", "frames", None, 1, 1.0, 50, "spoilt"),)
+    assert findings(torn) == [("repeated", "frames", None, 1, 50, True)]
 
 
 @pytest.mark.parametrize(
@@ -199,3 +199,22 @@ def test_a_lost_frame_that_rounding_hides_is_refused():
     times = np.floor(np.arange(300) / 999 * 1e3 + 0.9) / 1e3
     with pytest.raises(ProblemError, match="cannot tell rounding from missing"):
         loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
+
+
+@pytest.mark.parametrize("times", [np.zeros(3000), np.floor(np.arange(3000) / RATE)])
+def test_stamps_that_tell_no_frame_apart_are_not_used_beside_a_rate(times):
+    kept = np.delete(np.arange(3001), [1700])
+    for counter in (None, kept):
+        seen = loop_record(
+            noise(3000), frame_rate_hz=RATE, times_s=times, frame_numbers=counter, unit="nm"
+        )
+        assert seen.frames == 3000 + (counter is not None)
+        assert "the times do not tell frames apart and were not used" in seen.health.notes
+    with pytest.raises(ProblemError, match="must rise"):
+        loop_record(noise(3000), times_s=np.zeros(3000), unit="nm")
+
+
+def test_whole_seconds_of_another_rate_are_refused():
+    times = np.floor(np.arange(30_000) / RATE)
+    with pytest.raises(ProblemError):
+        loop_record(noise(30_000), frame_rate_hz=1300, times_s=times, unit="nm")

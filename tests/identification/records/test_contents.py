@@ -350,14 +350,11 @@ def test_x_and_y_may_be_a_clock_and_its_series(tmp_path, series):
     y, u = series
     path = csv(tmp_path / "a.csv", x_nm=y[:, 0], y_nm=y[:, 1])
     clock = csv(tmp_path / "c.csv", x=np.arange(FRAMES), y_nm=y[:, 1])
-    for each, names in ((path, "x_nm, y_nm"), (clock, "x, y_nm")):
-        with pytest.raises(
-            ProblemError, match=rf"{names} are all named as .*columns=\{{'\w+': \.\.\.\}}"
-        ):
-            lbt.load_record(each, kind="open_loop", frame_rate_hz=RATE)
-    chosen = {"open_loop": ("x_nm", "y_nm")}
-    seen = lbt.load_record(path, columns=chosen, frame_rate_hz=RATE)
-    assert np.array_equal(seen.measurements, y)
+    with pytest.raises(ProblemError, match=r"x, y_nm are all named as .*columns=\{'\w+': \.\.\.\}"):
+        lbt.load_record(clock, kind="open_loop", frame_rate_hz=RATE)
+    for chosen in ({"open_loop": ("x_nm", "y_nm")}, None):
+        seen = lbt.load_record(path, kind="open_loop", columns=chosen, frame_rate_hz=RATE)
+        assert np.array_equal(seen.measurements, y)
     seen = lbt.load_record(clock, columns={"open_loop": "y_nm"}, frame_rate_hz=RATE)
     assert np.array_equal(seen.measurements, y[:, 1:])
     both = csv(tmp_path / "b.csv", yy_nm=y[:, 1], yx_nm=y[:, 0], ux_nm=u[:, 0], uy_nm=u[:, 1])
@@ -376,3 +373,16 @@ def test_a_clock_without_a_name_is_no_axis(tmp_path, series):
         lbt.load_record(path, kind="open_loop", unit="nm", frame_rate_hz=RATE)
     seen = lbt.load_record(path, columns={"times": 0, "open_loop": 1}, unit="nm")
     assert seen.frame_rate_hz == RATE
+    np.savetxt(path, series[0])  # neither of these rises
+    seen = lbt.load_record(path, kind="open_loop", unit="nm", frame_rate_hz=RATE)
+    np.testing.assert_allclose(seen.measurements, series[0])
+
+
+def test_a_text_that_nobody_uses_refuses_no_file(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("y_nm,u_nm,remark\n" + "".join(f"{k % 7},{k % 5},calm\n" for k in range(60)))
+    seen = lbt.load_record(path, frame_rate_hz=RATE, delay_frames=1)
+    assert seen.frames == 60
+    assert "remark holds texts; it was left out" in seen.health.notes
+    with pytest.raises(ProblemError, match="there is no column 'remark'"):
+        lbt.load_record(path, columns={"commands": "remark"}, frame_rate_hz=RATE)

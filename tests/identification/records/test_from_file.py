@@ -123,7 +123,7 @@ def test_gaps_times_and_counters(tmp_path):
     seen = lbt.load_record(path, kind="open_loop")
     assert seen.frame_rate_hz == 500
     assert np.flatnonzero(~seen.usable).tolist() == [7, 8, 20, 30]
-    assert [row[0] for row in seen.health.rows()] == ["missing", "not finite"]
+    assert [each.kind for each in seen.health.findings] == ["missing", "not finite"]
     with pytest.raises(
         lbt.errors.ProblemError, match=r"a\.csv: frame_rate_hz must be that of the times"
     ):

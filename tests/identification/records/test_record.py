@@ -92,7 +92,7 @@ def test_a_delay_can_come_later():
     assert seen.health.usable == 295
     other = seen.with_delay(1.0)
     assert np.flatnonzero(~other.usable).tolist() == [0, 101]
-    assert [row[0] for row in other.health.rows()].count("correction not known") == 1
+    assert [each.kind for each in other.health.findings].count("correction not known") == 1
 
 
 def test_a_spoilt_command_spoils_what_its_correction_enters():

@@ -1,0 +1,166 @@
+"""What turns the commands of a record into those that its mirror followed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.storage.words import count_text
+from lbt_synth.validation import FloatArray, integer, number, read_only, real_array, set_fields
+
+_SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
+_MOST_SHIFT = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandRepair:
+    """A correction of recorded commands, in the order of the fields.
+
+    Parameters
+    ----------
+    increments : bool, optional
+        The record has increments: they are added up.
+    shift_frames : int, optional
+        Frames by which the commands move to later frames; negative to earlier ones.
+    swap_axes : bool, optional
+        The commands of the two axes change places.
+    sign : tuple of int, optional
+        1 or -1 for each axis, or for both.
+    matrix : tuple of float, optional
+        Matrix from commands to the axes of the measurements, in rows.
+    scale : float or sequence of float, optional
+        Factor of the commands of both axes, or of each: from volts or counts to the unit of the
+        measurements, for example.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lbt.identification.CommandRepair(sign=(-1,), scale=0.001).options
+    '--command-sign -1 --command-scale 0.001'
+    """
+
+    increments: bool = False
+    shift_frames: int = 0
+    swap_axes: bool = False
+    sign: tuple[int, ...] = ()
+    matrix: tuple[float, ...] = ()
+    scale: float | tuple[float, ...] = 1.0
+
+    def __post_init__(self) -> None:
+        given = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
+        scales = tuple(number(scale, "command_scale", above=0) for scale in given)
+        set_fields(self, scale=scales[0] if len(set(scales)) == 1 else scales)
+        shift = integer(self.shift_frames, "command_shift_frames", at_least=-_MOST_SHIFT)
+        number(shift, "command_shift_frames", at_most=_MOST_SHIFT)
+        if any(sign not in (-1, 1) for sign in self.sign):
+            raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
+        real_array(self.matrix, "command_matrix")
+
+    @property
+    def options(self) -> str:
+        """The options of the command line that do the same."""
+
+        def values(each: tuple[float, ...]) -> str:
+            return " ".join(f"{value:g}" for value in each)
+
+        words = [
+            "--command-increments" if self.increments else "",
+            f"--command-shift-frames {self.shift_frames}" if self.shift_frames else "",
+            "--swap-axes" if self.swap_axes else "",
+            f"--command-sign {values(self.sign)}" if self.sign else "",
+            f"--command-matrix {values(self.matrix)}" if self.matrix else "",
+            f"--command-scale {values(self._scales)}" if self.scale != 1 else "",
+        ]
+        return " ".join(filter(None, words))
+
+    def words(self) -> list[str]:
+        """Return what is wrong with commands that need this, but for their scale."""
+        out = []
+        if self.shift_frames:
+            frames = count_text(abs(self.shift_frames), "frame")
+            when = "late" if self.shift_frames < 0 else "early, before their measurements"
+            out.append(f"they are recorded {frames} {when}")
+        if self.matrix:
+            rows = ", ".join(f"{value:.4g}" for value in self.matrix)
+            out.append(f"between them and the axes of the measurements lies a matrix ({rows})")
+        if self.increments:
+            out.append("they are increments, not positions")
+        if self.swap_axes:
+            out.append("those of the two axes are exchanged")
+        if self.sign:
+            turned = self.sign.index(-1)
+            one = len(set(self.sign)) == 1
+            out.append(f"{'they have' if one else f'axis {turned} has'} the opposite sign")
+        return out
+
+    @property
+    def _scales(self) -> tuple[float, ...]:
+        return self.scale if isinstance(self.scale, tuple) else (self.scale,)
+
+    def turn(self, axes: int) -> FloatArray:
+        """Return the matrix that swap, sign, matrix and scale are together."""
+        if axes != 2 and self.swap_axes:
+            raise ProblemError(
+                "swapped commands need two axes; the record has one. Leave "
+                f"{self.options} out, or choose two columns."
+            )
+        if len(self._scales) not in (1, axes):
+            raise ProblemError(
+                f"command_scale must be one factor, or {axes}; got {list(self._scales)}."
+            )
+        out = np.diag(np.broadcast_to(np.array(self._scales), axes))
+        if self.matrix:
+            if len(self.matrix) != axes**2:
+                raise ProblemError(
+                    f"command_matrix must have {axes**2} numbers for {axes} axes, row after row; "
+                    f"got {len(self.matrix)}."
+                )
+            out = out @ np.reshape(self.matrix, (axes, axes))
+        if self.sign:
+            if len(self.sign) not in (1, axes):
+                raise ProblemError(
+                    f"command_sign must be one sign, or {axes}; got {list(self.sign)}."
+                )
+            out = out @ np.diag(np.broadcast_to(np.array(self.sign, dtype=float), axes))
+        return out @ _SWAP if self.swap_axes else out
+
+
+def axes_repair(swapped: bool, signs: tuple[int, ...]) -> CommandRepair:
+    """Return the repair that exchanges axes, and gives each of them its sign."""
+    sign = signs if len(set(signs)) > 1 else (-1,) * (signs[0] < 0)
+    return CommandRepair(swap_axes=swapped, sign=sign)
+
+
+def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
+    """Return a closed-loop record with the commands that the mirror followed.
+
+    The usable frames are those of the new commands. ProblemError refuses a record
+    without commands, and a repair that does not fit its axes.
+    """
+    if record.commands is None:
+        raise ProblemError("the record is of an open loop: it has no commands to repair.")
+    commands = np.array(record.commands)
+    good = np.ones(record.frames, dtype=np.bool_)
+    if record.commanded is not None:
+        good = np.array(record.commanded)
+    if repair.increments:
+        commands = np.cumsum(commands, axis=0)
+        good &= np.logical_and.accumulate(good)
+    if repair.shift_frames:
+        commands = np.roll(commands, repair.shift_frames, axis=0)
+        good = np.roll(good, repair.shift_frames)
+        late = repair.shift_frames > 0
+        unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
+        commands[unknown], good[unknown] = 0.0, False
+    commands = commands @ repair.turn(record.axes).T
+    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
+    return repaired if record.delay_frames is None else repaired.with_delay(record.delay_frames)
