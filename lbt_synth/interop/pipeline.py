@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -29,7 +29,7 @@ from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
 from lbt_synth.interop.proof import Written, prove_written, require_proved
 from lbt_synth.linear.state_space import RunningController
 from lbt_synth.loop.simulation.disturbances import Disturbance
-from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
+from lbt_synth.loop.simulation.run import Drop, SteppedController, run_frames, simulate
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import column, json_record, table_row
@@ -457,9 +457,16 @@ def _absences(design: Design) -> tuple[dict[str, int], int]:
 def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
     """Return the commands (frames, m) of a controller that takes the place of a design's own."""
     rng = np.random.default_rng(0)
-    hardware, q = design.hardware, design.controller.B.shape[1]
+    hardware, (m, q) = design.hardware, design.controller.D.shape
     if hardware is None:
-        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
+        series, commands = rng.standard_normal((FRAMES, q)), np.empty((FRAMES, m))
+
+        def note(k: int, _: FloatArray, command: FloatArray) -> None:
+            commands[k] = command
+
+        measure = partial(np.take, series, axis=0)
+        run_frames(controller, measure, note, frames=FRAMES, shape=(m,), taps=np.ones(1))
+        return commands
     total = rng.standard_normal((1, FRAMES, hardware.modes))
     for k in range(1, FRAMES):
         total[0, k] = _POLE * total[0, k - 1] + np.sqrt(1 - _POLE**2) * total[0, k]

@@ -19,7 +19,7 @@ from lbt_synth.interop.specula.calibration import Calibration, cache_directory, 
 from lbt_synth.interop.specula.optics import EndToEndSystem, Modes, Optics
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
-from lbt_synth.loop.simulation.run import SteppedController, step_controller
+from lbt_synth.loop.simulation.run import SteppedController, run_frames
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.vibration import TrueVibration
@@ -435,29 +435,32 @@ def _run_frames(
     progress: Callable[[int], None] | None,
 ) -> dict[str, FloatArray]:
     """Run all frames; return the series and the mean image after those that settle."""
-    modes, system = calibration.modes, optics.system
+    modes, kept = calibration.modes, len(tilts) - settle
     inverse, n = calibration.reconstructor.matrix, len(calibration.modes.shapes)
-    taps = system.hardware.mirror_taps
-    kept = len(tilts) - settle
     out = {name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")}
     strehl, others = np.empty(kept), np.empty(kept)
-    psf = np.zeros(())
-    past = np.zeros((len(taps), n))  # u(k), u(k-1), ...
-    slopes = calibration.reference
-    controller.reset()
-    for k in range(len(tilts)):
+    psf, slopes, y = np.zeros(()), calibration.reference, np.zeros(n)
+
+    def measure(k: int) -> FloatArray:
+        nonlocal y
         y = inverse @ (slopes - calibration.reference)
-        past = np.vstack([step_controller(controller, y, n, frame=k), past[:-1]])
-        slopes = optics.expose(taps @ past, tilts[k], seeing=min(1.0, (k + 1) / RAMP_FRAMES))
+        return y
+
+    def expose(k: int, correction: FloatArray, command: FloatArray) -> None:
+        nonlocal psf, slopes
+        slopes = optics.expose(correction, tilts[k], seeing=min(1.0, (k + 1) / RAMP_FRAMES))
         row = k - settle
         if row >= 0:
             strehl[row], frame = optics.image()
             psf = psf + frame
             residual, others[row] = _measure_residual(modes, optics)
-            for name, value in zip(out, (y, past[0], residual), strict=True):
+            for name, value in zip(out, (y, command, residual), strict=True):
                 out[name][row] = value
         if progress is not None:
             progress(1)
+
+    taps = optics.system.hardware.mirror_taps
+    run_frames(controller, measure, expose, frames=len(tilts), shape=(n,), taps=taps)
     return {**out, "strehl_series": strehl, "other_modes_series": others, "psf": psf / kept}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -320,30 +320,40 @@ def settling_frames(radius: float) -> int:
     return int(min(np.ceil(np.log(_SETTLED) / np.log(radius)), _MOST_SETTLING))
 
 
-def step_controller(
+def run_frames(
     controller: SteppedController | RunningController,
-    y: FloatArray,
-    size: int,
+    measure: Callable[[int], FloatArray],
+    expose: Callable[[int, FloatArray, FloatArray], None],
     *,
-    frame: int,
-    applied: FloatArray | None = None,
-) -> FloatArray:
-    """Give a controller its measurements, and return its commands if they are finite.
+    frames: int,
+    shape: tuple[int, ...],
+    taps: FloatArray,
+    stroke: float = np.inf,
+) -> None:
+    """Run a controller around whatever is measured and corrected, frame by frame.
 
-    One of ours is given the commands that were applied in the last frame, too.
+    In frame k ``measure(k)`` returns y(k), and ``expose(k, correction, u)`` is given what the taps
+    of the mirror make of u(k), u(k-1), ... as they were applied, clipped at the stroke. The shape
+    is that of a command, (m,) or (m, cases). A controller of ours is told what was applied in the
+    last frame; commands that are not finite, or of another shape, are refused.
     """
-    if isinstance(controller, RunningController):
-        u = controller.step(y, applied)
-    else:
-        u = np.asarray(controller.step(y), dtype=np.float64)
-    finite = bool(np.isfinite(u).all())
-    if u.shape != (size, *y.shape[1:]) or not finite:
-        kind = "" if finite else " with values that are not finite"
-        raise ProblemError(
-            f"the controller must return {size} finite commands; got {u.shape}{kind} in frame "
-            f"{frame}."
-        )
-    return u
+    controller.reset()
+    commands = np.zeros((len(taps), *shape))  # u(k), u(k-1), ...
+    for k in range(frames):
+        y = measure(k)
+        if isinstance(controller, RunningController):
+            u = controller.step(y, commands[0])
+        else:
+            u = np.asarray(controller.step(y), dtype=np.float64)
+        finite = bool(np.isfinite(u).all())
+        if u.shape != shape or not finite:
+            kind = "" if finite else " with values that are not finite"
+            raise ProblemError(
+                f"the controller must return {shape[0]} finite commands; got {u.shape}{kind} in "
+                f"frame {k}."
+            )
+        commands = np.concatenate([np.clip(u, -stroke, stroke)[None], commands[:-1]])
+        expose(k, np.tensordot(taps, commands, 1), commands[0])
 
 
 def _step(
@@ -359,7 +369,6 @@ def _step(
     batches = [slice(None)] if together else [slice(i, i + 1) for i in range(len(phase))]
     gain, runs = disturbance.sensor_gain, []
     for some in batches:
-        controller.reset()
         series = phase[some], noise[some]
         runs.append(_step_cases(controller, gain, hardware, *series, stroke, events))
     return np.concatenate(runs)
@@ -379,17 +388,18 @@ def _step_cases(
     The mirror clips commands at the stroke, which then are those applied.
     """
     (cases, frames, n), m, suite = total.shape, hardware.n_commands, hardware.suite
-    rows, read, taps = suite.rows(hardware), suite.read(hardware), hardware.mirror_taps
+    rows, read = suite.rows(hardware), suite.read(hardware)
     held = memory([own_exposure(hardware), *other_exposures(hardware)], n, len(read))
     seen = held.C.copy()
     seen[:, : hardware.n_measurements] *= sensor_gain
     wavefront = read[:, : seen.shape[1]]
     state, y = np.zeros((held.n_states, cases)), np.zeros((noise.shape[2], cases))
-    commands = np.zeros((len(taps), m, cases))  # u(k), u(k-1), ...
     out = np.zeros((cases, frames, n + m + len(y)))
     wrong: Mapping[str, str] = {}
-    one = slice(None) if isinstance(controller, RunningController) else 0  # has a single case
-    for k in range(frames):
+    together = isinstance(controller, RunningController)  # others have a single case
+
+    def measure(k: int) -> FloatArray:
+        nonlocal wrong
         if k in events:
             wrong = events[k].wrong
             if isinstance(controller, RunningController):
@@ -399,12 +409,17 @@ def _step_cases(
         y[: seen.shape[1]][wavefront[t]] += (seen[t] @ state)[wavefront[t]]
         for unit, reading in wrong.items():
             y[rows[unit]] = last[rows[unit]] if reading == "frozen" else 0.0
-        u = step_controller(controller, y[:, one], m, frame=k, applied=commands[0][:, one])
-        commands[1:] = commands[:-1].copy()
-        commands[0][:, one] = u if stroke == np.inf else np.clip(u, -stroke, stroke)
-        residual = total[:, k].T - hardware.influence @ np.tensordot(taps, commands, 1)
+        return y if together else y[:, 0]
+
+    def expose(k: int, correction: FloatArray, command: FloatArray) -> None:
+        nonlocal state
+        t = k % len(read)
+        residual = total[:, k].T - hardware.influence @ correction.reshape(m, -1)
         state = held.A[t] @ state + held.B[t] @ residual
-        out[:, k, :n], out[:, k, n : n + m], out[:, k, n + m :] = residual.T, commands[0].T, y.T
+        out[:, k, :n], out[:, k, n : n + m], out[:, k, n + m :] = residual.T, command.T, y.T
+
+    taps, shape = hardware.mirror_taps, (m, cases) if together else (m,)
+    run_frames(controller, measure, expose, frames=frames, shape=shape, taps=taps, stroke=stroke)
     return out
 
 
