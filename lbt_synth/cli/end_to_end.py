@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import (
+    Facts,
     csv_rows,
     fact,
     facts,
@@ -56,7 +58,7 @@ def run(arguments: Namespace) -> Report:
     setup = load_setup(arguments)
     design = load_design(arguments.gain, any_sensors=True)
     setup.controller(design)  # refuses a filter of another loop before any work
-    version = specula_version()
+    specula_version()  # refuses where it is missing
     make_directory(arguments.output)
     figure_file, telemetry_file, summary_file = outputs
     calibration = calibrate_setup(setup, arguments)
@@ -65,36 +67,11 @@ def run(arguments: Namespace) -> Report:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
     _require_seen(loop_run)
     system = loop_run.system
-    numbers, rms = loop_run.summary(), {"unit": "nm rms", "format": ".1f"}
-    percent = {"unit": "%", "scale": 100, "format": ".2f"}
-    headings: dict[str, tuple[str, dict[str, Any]]] = {
-        "strehl": ("Strehl ratio", percent),
-        "strehl_error": ("  standard error", percent | {"unit": "points"}),
-        "other_modes_strehl": ("  without tip and tilt", percent),
-        "tip_rms_nm": ("tip", rms),
-        "tilt_rms_nm": ("tilt", rms),
-        "other_modes_rms_nm": ("all other modes", rms),
-        "tip_tilt_gain": ("optical gain of tip and tilt", {"format": ".3f"}),
-        "tip_tilt_gain_error": ("  standard error", {"format": ".3f"}),
-        "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
-    }
-    milliseconds = 1e3 * loop_run.seconds / total
-    condition = calibration.reconstructor.condition_number
-    what = facts(
-        gain=fact(str(arguments.gain)),
-        method=fact(design.method),
-        specula=fact(version),
-        **{name: fact(getattr(loop_run, name)) for name in ("frames", "settle_frames", "seed")},
-        pixels=fact(system.pixels),
-        **{name: fact(numbers[name], text, **how) for name, (text, how) in headings.items()},
-        condition_number=fact(condition, "condition of the reconstructor", format=".1f"),
-        milliseconds_a_frame=fact(milliseconds, "time per frame", unit="ms", format=".1f"),
-    )
     report = Report()
     report.add_facts(
         f"End to end, Strehl ratio at {system.imaging_wavelength_um:g} um: {system.modes} modes, "
         f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
-        what,
+        _run_facts(loop_run, design, calibration, arguments),
     )
     if unread := unread_sensors(design):
         report.notes.append(
@@ -111,6 +88,37 @@ def run(arguments: Namespace) -> Report:
         ]
     )
     return report
+
+
+def _run_facts(
+    loop_run: EndToEndRun, design: Design, calibration: Calibration, arguments: Namespace
+) -> Facts:
+    """Return the main numbers of a run, and what it ran."""
+    numbers, rms = loop_run.summary(), {"unit": "nm rms", "format": ".1f"}
+    percent = {"unit": "%", "scale": 100, "format": ".2f"}
+    headings: dict[str, tuple[str, dict[str, Any]]] = {
+        "strehl": ("Strehl ratio", percent),
+        "strehl_error": ("  standard error", percent | {"unit": "points"}),
+        "other_modes_strehl": ("  without tip and tilt", percent),
+        "tip_rms_nm": ("tip", rms),
+        "tilt_rms_nm": ("tilt", rms),
+        "other_modes_rms_nm": ("all other modes", rms),
+        "tip_tilt_gain": ("optical gain of tip and tilt", {"format": ".3f"}),
+        "tip_tilt_gain_error": ("  standard error", {"format": ".3f"}),
+        "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
+    }
+    milliseconds = 1e3 * loop_run.seconds / (loop_run.frames + loop_run.settle_frames)
+    condition = calibration.reconstructor.condition_number
+    return facts(
+        gain=fact(str(arguments.gain)),
+        method=fact(design.method),
+        specula=fact(specula_version()),
+        **{name: fact(getattr(loop_run, name)) for name in ("frames", "settle_frames", "seed")},
+        pixels=fact(loop_run.system.pixels),
+        **{name: fact(numbers[name], text, **how) for name, (text, how) in headings.items()},
+        condition_number=fact(condition, "condition of the reconstructor", format=".1f"),
+        milliseconds_a_frame=fact(milliseconds, "time per frame", unit="ms", format=".1f"),
+    )
 
 
 def _require_seen(loop_run: EndToEndRun) -> None:
@@ -179,12 +187,7 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     for count in ("seeds", "row_seeds", "jobs"):
         integer(getattr(arguments, count), option_name(count), at_least=1)
-    cases = {_case_name(name): design for name, design in designs.items()}
-    if len(cases) < len(designs):
-        raise ProblemError(
-            "names of gain files must differ in letters or digits, because runs are kept under "
-            f"them; got {', '.join(designs)}."
-        )
+    cases = _named_cases(designs)
     specula_version()
     rows = plan_tables(
         setup,
@@ -213,12 +216,11 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
         )
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]
-    differences: dict[str, float] = {}
     if "III" in printed:
         figure = end_to_end_table_figure(table)
         files += [save_figure(figure, folder / name) for name in _TABLE_FILES["III"][1:]]
-        methods = dict.fromkeys(entry.method for entry in printed["III"])
-        differences = {method: rms_modal_difference(table, method) for method in methods}
+    methods = dict.fromkeys(entry.method for entry in printed.get("III", ()))
+    differences = {method: rms_modal_difference(table, method) for method in methods}
     report = Report(
         data={
             "entries": [json_record(entry) for entry in table],
@@ -239,6 +241,15 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     return report
 
 
-def _case_name(name: str) -> str:
-    """Return a name of a design as that of files."""
-    return "".join(letter if letter.isalnum() else "_" for letter in name)
+def _named_cases(designs: Mapping[str, Design]) -> dict[str, Design]:
+    """Return designs by names that files can have."""
+    cases = {
+        "".join(letter if letter.isalnum() else "_" for letter in name): design
+        for name, design in designs.items()
+    }
+    if len(cases) < len(designs):
+        raise ProblemError(
+            "names of gain files must differ in letters or digits, because runs are kept under "
+            f"them; got {', '.join(designs)}."
+        )
+    return cases
