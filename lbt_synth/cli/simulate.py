@@ -270,5 +270,14 @@ def _first_case(
         design=design,
         controller_digest=file_sha256(gain_file, GainFileError),
         imaging=config.imaging,
-        metadata={"case": 0, "cases": len(simulation.commands)},
+        metadata={
+            "case": 0,
+            "cases": len(simulation.commands),
+            **{
+                f"noise_nm_{i}": float(noise_nm)
+                for i, noise_nm in enumerate(
+                    truth.noise_per_measurement(config.hardware.n_measurements), start=1
+                )
+            },
+        },
     )

@@ -45,7 +45,10 @@ def test_simulate_writes_its_first_case(tmp_path, capsys, gain):
     assert (seen.metadata["case"], seen.metadata["cases"]) == (0, 2)
     # y(k) - g phi_res(k-1) is the noise: white, and of the size that the file gives
     noise = seen.measurements[1:] - 0.7 * seen.residual_nm[:-1]
-    assert np.std(noise) == pytest.approx(seen.metadata["noise_nm"], rel=0.1)
+    for axis in (0, 1):
+        assert np.std(noise[:, axis]) == pytest.approx(
+            seen.metadata[f"noise_nm_{axis + 1}"], rel=0.1
+        )
     status, text, _ = run(
         capsys, "simulate", LBT_YAML, gain, "--frames", 50, "--telemetry", tmp_path / "u.fits"
     )
