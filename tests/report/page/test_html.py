@@ -316,7 +316,7 @@ def test_without_the_extra_a_pdf_is_refused_before_any_work(tmp_path, monkeypatc
 @pytest.mark.e2e
 def test_a_pdf_has_sheets_of_a4_and_no_date(tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # fonts have one
-    files = write_page(whole_page(), tmp_path / "a.html", tmp_path / "a.pdf")
+    files = write_page(whole_page(), tmp_path / "a.html", pdf=tmp_path / "a.pdf")
     assert [path.name for path in files] == ["a.html", "a.pdf"]
     pdf = files[1].read_bytes()
     assert pdf.startswith(b"%PDF")
