@@ -12,7 +12,7 @@ from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_e
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.loop.evaluator import STILL, Evaluator
 from lbt_synth.loop.loop_errors import append_taps
-from lbt_synth.loop.residual import ResidualBudget, require_true_gain
+from lbt_synth.loop.residual import ResidualBudget
 from lbt_synth.models import (
     ARModel,
     SinusoidalVibration,
@@ -25,7 +25,7 @@ from lbt_synth.models.mirror.frame_rate_system import Hold, instant_mirror
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density
-from lbt_synth.models.vibration import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
 
@@ -88,17 +88,10 @@ def residual_budget(
     """
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
-    lines: Sequence[Vibration | SinusoidalVibration]
-    turbulence: Sequence[tuple[Spectrum, Sequence[int]]]
-    if isinstance(truth, TipTiltPlant):
-        turbulence = [(model, (mode,)) for mode, model in enumerate(truth.turbulence)]
-        lines, of_means, noise = truth.vibrations, True, truth.own_noise_factor
-    else:
+    if not hasattr(truth, "entering"):
         require_instance(truth, Truth)
-        require_true_gain(loop.sensor_gain, truth)
-        turbulence, of_means = truth.turbulence_groups(loop.hardware.modes), frame_means
-        lines = stationary_vibrations(truth.vibrations)
-        noise = np.diag(truth.noise_per_measurement(loop.hardware.n_measurements))
+    turbulence, lines, noise = truth.entering(loop.hardware, sensor_gain=loop.sensor_gain)
+    of_means = frame_means or truth.is_of_means
     pairs = list(zip(lines, _motions(loop, truth.motions, len(lines)), strict=True))
     rows, n = loop_evaluator(loop, frame_means=frame_means), loop.hardware.modes
     steady = np.zeros((2, n, n))

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import ProblemError
 from lbt_synth.linear.matrix_functions import transpose
-from lbt_synth.models import Truth
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -104,12 +102,3 @@ class ResidualBudget(Summarised):
 def _rms(covariance: FloatArray) -> Any:
     root = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
     return root if root.ndim else float(root)
-
-
-def require_true_gain(sensor_gain: float, truth: Truth) -> None:
-    """Refuse a loop that is closed with another sensor gain than that of the truth."""
-    if sensor_gain != truth.sensor_gain:
-        raise ProblemError(
-            f"the loop must be closed with the truth's sensor gain {truth.sensor_gain:.6g}; "
-            f"got {sensor_gain:.6g}."
-        )

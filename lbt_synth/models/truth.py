@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.disturbance_facts import disturbance_facts
+from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.spectra import Spectrum, spectrum_key
-from lbt_synth.models.vibration import DriftingVibration, TrueVibration, stationary_vibrations
+from lbt_synth.models.vibration import (
+    DriftingVibration,
+    SinusoidalVibration,
+    TrueVibration,
+    Vibration,
+    stationary_vibrations,
+)
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.words import count_text
@@ -23,6 +31,13 @@ from lbt_synth.validation import (
     number,
     one_or_each,
 )
+
+# spectra with the modes that have them, vibrations, and a root of the covariance of the noise
+Entering: TypeAlias = tuple[
+    Sequence[tuple[Spectrum, tuple[int, ...]]],
+    Sequence[Vibration | SinusoidalVibration],
+    FloatArray,
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -198,6 +213,24 @@ class Truth(Summarised):
                 f"{len(self.turbulence)}."
             )
         return self.turbulence
+
+    is_of_means: ClassVar[bool] = (
+        False  # what the rms of a resonance is of: all moments, not means over frames
+    )
+
+    def entering(self, hardware: LoopHardware, *, sensor_gain: float) -> Entering:
+        """Return what enters a loop that is closed with a sensor gain over the assumed one.
+
+        Another gain than that of the truth, and a vibration that drifts, are a ProblemError.
+        """
+        if sensor_gain != self.sensor_gain:
+            raise ProblemError(
+                f"the loop must be closed with the truth's sensor gain {self.sensor_gain:.6g}; "
+                f"got {sensor_gain:.6g}."
+            )
+        noise = np.diag(self.noise_per_measurement(hardware.n_measurements))
+        lines = stationary_vibrations(self.vibrations)
+        return self.turbulence_groups(hardware.modes), lines, noise
 
     def turbulence_groups(self, modes: int) -> tuple[tuple[Spectrum, tuple[int, ...]], ...]:
         """Return the different spectra, each with the modes that have it; other modes have none.

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,7 @@ from lbt_synth.models.plant.full_state import FullStatePlant
 from lbt_synth.models.plant.parts import PlantParts
 from lbt_synth.models.plant.readings import known_states
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
+from lbt_synth.models.truth import Entering
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summary
@@ -194,6 +195,13 @@ class TipTiltPlant(EstimationProblem):
         q, D = self.hardware.n_measurements, self.stacks()[3][0]
         first = D.shape[1] - self.hardware.n_readings
         return np.asarray(D[:q, first : first + q])
+
+    is_of_means: ClassVar[bool] = True  # whether the rms of a resonance is of means over frames
+
+    def entering(self, hardware: LoopHardware, *, sensor_gain: float) -> Entering:
+        """Return what enters any loop where the plant's model is the truth; see :class:`Truth`."""
+        turbulence = [(model, (mode,)) for mode, model in enumerate(self.turbulence)]
+        return turbulence, self.vibrations, self.own_noise_factor
 
     def with_memory(self, taps: FloatArray) -> TipTiltPlant:
         """Add the past innovations of a filter as states; see :class:`EstimationProblem`."""
