@@ -249,9 +249,8 @@ class _CombinedTerms:
 
     @property
     def factors(self) -> tuple[float, ...]:
-        """Weights of the terms."""
-        assert self.weights is not None  # set by __post_init__
-        return self.weights
+        """Weights of the terms, one each."""
+        return () if self.weights is None else self.weights
 
     def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the objective over a grid as a function of the coefficients [nm^2]."""
