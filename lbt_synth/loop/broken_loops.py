@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.linear.state_space import split_into_parts
 from lbt_synth.loop.budget import resonance_edges
@@ -126,6 +127,7 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
         sensitivity = system.frequency_response(frequency_hz)
         return np.asarray(1 / np.diagonal(sensitivity, axis1=1, axis2=2) - 1)
 
+    sensitivities = _own_sensitivities(loop)
     grid, responses = _refine_turns(broken, np.unique(np.concatenate([nodes, uniform])))
     shared: list[list[int]] = []
     for index, own in enumerate(responses.T):
@@ -140,10 +142,10 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
             measurements=tuple(group),
             frequency_hz=grid,
             response=read_only(responses[:, group[0]].copy()),
-            gain_crossings=tuple(_crossings(loop, group[0], real_part=0.5)),
+            gain_crossings=tuple(_crossings(sensitivities[group[0]], real_part=0.5)),
             phase_crossings=tuple(
                 point
-                for point in _crossings(loop, group[0])
+                for point in _crossings(sensitivities[group[0]])
                 if 1 / _LARGEST < -point.response.real < _LARGEST
             ),
         )
@@ -153,29 +155,34 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
 
 def gain_crossings(loop: ClosedLoop) -> list[MarginPoint]:
     """Return where the gain is one of a stable loop, broken at each measurement in turn."""
-    measurements = range(loop.output_sensitivity().D.shape[-1])
-    return [point for i in measurements for point in _crossings(loop, i, real_part=0.5)]
+    sensitivities = _own_sensitivities(loop).values()
+    return [point for own in sensitivities for point in _crossings(own, real_part=0.5)]
 
 
-def _crossings(
-    loop: ClosedLoop, measurement: int, *, real_part: float | None = None
-) -> Iterator[MarginPoint]:
+def _own_sensitivities(loop: ClosedLoop) -> dict[int, StateSpace]:
+    """Return the sensitivity of each measurement to itself, balanced."""
+    system = loop.output_sensitivity()
+    system.require_one_phase("a broken loop", "output_sensitivity().lifted()")
+    sensitivities = {}
+    for outputs, inputs, part in split_into_parts(system):
+        for measurement in np.intersect1d(outputs, inputs).tolist():
+            i, j = (np.flatnonzero(channels == measurement) for channels in (outputs, inputs))
+            own = replace(part, B=part.B[:, j], C=part.C[i], D=part.D[np.ix_(i, j)])
+            sensitivities[measurement] = own.balanced()
+    return sensitivities
+
+
+def _crossings(sensitivity: StateSpace, *, real_part: float | None = None) -> Iterator[MarginPoint]:
     """Yield where the response of a broken loop is real, or where its gain is one.
 
     The gain of ``1 / S - 1`` is one where the real part of S is a half.
     """
-    system = loop.output_sensitivity()
-    system.require_one_phase("a broken loop", "output_sensitivity().lifted()")
-    for outputs, inputs, part in split_into_parts(system):
-        if measurement in outputs and measurement in inputs:
-            i, j = (np.flatnonzero(channels == measurement) for channels in (outputs, inputs))
-            own = replace(part, B=part.B[:, j], C=part.C[i], D=part.D[np.ix_(i, j)]).balanced()
-            angles, sensitivity = crossings(own, real_part=real_part)
-            with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is inf
-                responses = 1 / sensitivity - 1
-            frequency_hz = angles / (2 * np.pi) * loop.hardware.frame_rate_hz
-            for f, response in zip(frequency_hz.tolist(), responses.tolist(), strict=True):
-                yield MarginPoint(frequency_hz=f, response=response)
+    angles, values = crossings(sensitivity, real_part=real_part)
+    with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is inf
+        responses = 1 / values - 1
+    frequency_hz = angles / (2 * np.pi) / sensitivity.dt_s
+    for f, response in zip(frequency_hz.tolist(), responses.tolist(), strict=True):
+        yield MarginPoint(frequency_hz=f, response=response)
 
 
 def _refine_turns(

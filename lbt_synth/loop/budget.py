@@ -123,7 +123,7 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 
     A plant's model is the truth. In that frame every sensor is read.
     """
-    every = _evaluator(loop, replace(loop.system), None, in_image=False)
+    every = _evaluator(loop, loop.system, None, in_image=False)
     parts = [every.shaken(_noise_factor(loop, plant.own_noise_factor))]
     for mode, model in enumerate(plant.turbulence):
         parts.append(_driven(every, ar_process(model), _entry(loop, [mode])))
@@ -229,11 +229,8 @@ def _of_seen(
 ) -> FloatArray:
     """Return what a line leaves that channels read, too, (2, n, n)."""
     process, entry = _shaken(loop, line, motion)
-    driven, n, rate = (
-        _driven(rows, process, entry),
-        loop.hardware.modes,
-        loop.hardware.frame_rate_hz,
-    )
+    n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
+    driven = _driven(rows, process, entry)
     hold, along = rows.hold or STILL, entry[:n, :1]
     out = np.zeros((2, n, n))
     if rows.hold is None:

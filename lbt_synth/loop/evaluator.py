@@ -26,7 +26,7 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
-from lbt_synth.models.ar_model import densities
+from lbt_synth.models.ar_model import companions, densities
 from lbt_synth.models.mirror.frame_rate_system import Hold
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -167,10 +167,8 @@ class Evaluator:
         A process x(j + 1) = A x(j) + B w(j) has acted by the time of its newest sample.
         """
         samples, n, size = entry @ C, self.A.shape[-1], self.A.shape[-1] + A.shape[-1]
-        whole, drive = (
-            np.zeros((len(self.A), size, size)),
-            np.zeros((len(self.A), size, len(B[0, 0]))),
-        )
+        whole = np.zeros((len(self.A), size, size))
+        drive = np.zeros((len(self.A), size, B.shape[-1]))
         whole[:, :n, :n], whole[:, :n, n:], whole[:, n:, n:] = self.A, self.B @ samples, A
         drive[:, n:] = B
         rows = np.concatenate([self.C, self.D @ samples], axis=2)
@@ -264,14 +262,6 @@ def _power(left: ComplexArray) -> FloatArray:
     for i in range(1, left.shape[1]):
         out += x[:, None, i] * x[:, i] + y[:, None, i] * y[:, i]
     return np.asarray(out)
-
-
-def companions(coefficients: FloatArray) -> FloatArray:
-    """Companion matrices of processes, (k, r, r)."""
-    k, order = coefficients.shape
-    out = np.zeros((k, order, order))
-    out[:, 0], out[:, 1:, :-1] = coefficients, np.eye(order - 1)
-    return out
 
 
 def process_poles(coefficients: FloatArray) -> ComplexArray:
