@@ -4,7 +4,6 @@
     python benchmarks/identification.py --errors    only how honest the standard errors are
     python benchmarks/identification.py --errors --colour 0.3 ...    with first-order noise
     python benchmarks/identification.py --errors --close ...         with pairs of close lines
-    python benchmarks/identification.py --drifts    sinusoids and narrow resonances that drift
 
 One axis at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain 0.4 to
 1, noise 2 to 30 nm a frame (evenly in its logarithm). Even records: second-order turbulence of
@@ -22,14 +21,10 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
-from unittest import mock
 
 import numpy as np
-from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit import identify
-from lbt_synth.identification.fit.departures import describe_drifts, measure_drift
 from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
@@ -416,71 +411,6 @@ def table(results: list[dict]) -> None:
     )
 
 
-def wandering_line(drift_hz: float, half_width: float, seed: int) -> np.ndarray:
-    """Return 30 s of a line of 50 nm rms from 30 Hz upwards, of a half width in bins, at 1 kHz."""
-    rng = np.random.default_rng([seed, 5])
-    t = np.arange(30 * int(RATE)) / RATE
-    size = np.full(t.size, np.exp(2j * np.pi * rng.uniform()))
-    if half_width:
-        decay = np.exp(-2 * np.pi * half_width / t.size)
-        drive = rng.standard_normal(2 * t.size).view(complex) * np.sqrt((1 - decay**2) / 2)
-        start = rng.standard_normal(2).view(complex) / np.sqrt(2)
-        size = lfilter([1], [1, -decay], drive, zi=decay * start)[0]
-    turns = 30 * t + drift_hz / 30 * t**2 / 2
-    return 50 * np.sqrt(2) * (size * np.exp(2j * np.pi * turns)).real
-
-
-def drifts() -> None:
-    """Print how often a drift is seen, and what is identified in loops with a drifting sinusoid."""
-    print("seen as a drift of 0, 0.3 and 1 Hz in 30 s [%], by half width [bins]")
-    for half_width in (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0):
-        seen = []
-        for drift_hz, count in ((0.0, 300), (0.3, 60), (1.0, 60)):
-            found = [
-                measure_drift(
-                    wandering_line(drift_hz, half_width, seed)
-                    + 5 * np.random.default_rng(seed).standard_normal(30_000),
-                    RATE,
-                    (27.0, 33.0 + drift_hz),
-                )
-                for seed in range(count)
-            ]
-            seen.append(100 * np.mean([drift is not None and drift.is_clear for drift in found]))
-        print(f"  {half_width:4.1f}  " + "  ".join(f"{value:6.1f}" for value in seen))
-    print("a loop with a sinusoid of 50 nm that drifts from 30 Hz")
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2, modes=1)
-    slow = lbt.models.ARModel(coefficients=[1.99, -0.9902], driving_rms_nm=0.3, frame_rate_hz=RATE)
-    for drift_hz in (0.05, 0.1, 0.3, 1.0, 3.0):
-        line = lbt.models.DriftingVibration(
-            start_hz=30, end_hz=30 + drift_hz, duration_s=30, rms_nm=50, direction=(1.0,)
-        )
-        truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0, sensor_gain=0.8)
-        run = lbt.simulate(
-            lbt.integrator(path, gain=0.3).controller, truth, hardware=path, frames=30_000
-        )
-        record = lbt.identification.loop_record(
-            run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
-        )
-        for name, describe in (("fit", lambda model, *_: model), ("drift", describe_drifts)):
-            with mock.patch.object(identify, "describe_drifts", describe):
-                model = lbt.identify(record)
-            left_nm2 = lbt.identification.replayed_residual(
-                record.pseudo_open_loop(0.8),
-                lbt.kalman(model.plant()).controller,
-                path,
-                noise_nm=5.0,
-                sensor_gain=0.8,
-                stretches=record.stretches(),
-                test=record.stretches(),
-            ).total_nm2
-            lines = ", ".join(
-                f"{x.rms_nm:.1f} +- {x.rms_error_nm:.1f} nm at {x.frequency_hz:.4f} +- "
-                f"{x.frequency_error_hz:.4f} Hz"
-                for x in model.axes[0].lines
-            )
-            print(f"  {drift_hz:4.2f} Hz, {name:5s} filter leaves {left_nm2**0.5:.2f} nm: {lines}")
-
-
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -488,14 +418,10 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--drifts", action="store_true", help="only sinusoids that drift")
     parser.add_argument("--errors", action="store_true", help="only the standard errors")
     parser.add_argument("--colour", type=float, default=0.0, help="of the noise, with --errors")
     parser.add_argument("--close", action="store_true", help="pairs of lines, with --errors")
     asked = parser.parse_args()
-    if asked.drifts:
-        drifts()
-        return
     study, show, options = studied, table, {}
     if asked.errors:
         study, show = only_errors, show_errors

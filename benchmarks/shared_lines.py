@@ -270,7 +270,6 @@ def studied(kind: str, seed: int, frames: int) -> dict:
         "seed": seed,
         "lines": facts,
         "false": false,
-        "notes": [note for note in model.notes if "ellipse" in note],
         "variances": variances,
         "states": [plant.n_states for plant in plants],
         "seconds": alone["seconds"],
@@ -299,9 +298,10 @@ def table(kind: str, results: list[dict]) -> None:
                 f"within one {inside[0]:.0f} %, within two {inside[1]:.0f} %"
             )
         turned = np.abs([line["turned"] for line in found])
-        print(f"  direction: median error {np.median(turned):.2f} deg, largest {turned.max():.1f}")
+        if turned.size:
+            print(f"  direction: median error {np.median(turned):.2f} deg, largest {turned.max():.1f}")
     false = sum(r["false"] for r in results)
-    print(f"  false couplings {false}, notes of ellipses {sum(len(r['notes']) for r in results)}")
+    print(f"  false couplings {false}")
     variance = np.array([r["variances"] for r in results])
     stable = np.all(np.isfinite(variance), axis=1)
     if not stable.all():

@@ -65,10 +65,14 @@ def coefficients(frequency: float, damping: float) -> tuple[float, float, float]
 
 
 def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
-    """Coefficients a1 and a2 of p sampled resonances, (p, 2)."""
+    """Coefficients a1 and a2 of p sampled resonances, (p, 2); with two real poles above 1."""
     decay = np.exp(-damping * frequency)
-    turn = frequency * np.sqrt((1 - damping) * (1 + damping))
-    return np.stack([2 * decay * np.cos(turn), -(decay**2)], axis=-1)
+    root = np.sqrt(np.abs((1 - damping) * (1 + damping)))
+    slow, fast = frequency / (damping + root), frequency * (damping + root)
+    poles = np.where(
+        damping < 1, 2 * decay * np.cos(frequency * root), np.exp(-slow) + np.exp(-fast)
+    )
+    return np.stack([poles, -(decay**2)], axis=-1)
 
 
 def unit_density(frequency: float, damping: float, s: FloatArray) -> FloatArray:

@@ -50,7 +50,7 @@ class Vibration:
     """
 
     frequency_hz: Positive
-    damping: Annotated[float, ("above", 0), ("below", 1)]
+    damping: Annotated[float, ("above", 0)]
     rms_nm: Positive
     direction: tuple[float, ...] = (1.0, 0.0)
 

@@ -44,7 +44,7 @@ from lbt_synth.identification.commands.repair import (
     repair_commands,
 )
 from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
-from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components, try_other_gains
+from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components, find_rivals
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
@@ -487,15 +487,15 @@ def _fit(
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         search = Search(data=data, gain=gain, most_lines=_LINES)
         if begin_at is not None:
-            search = replace(search, starting_gains=(float(begin_at[i]),))
+            search = replace(search, starting_gain=float(begin_at[i]))
         try:
-            model = find_components(search, None, rounds=FEW_ROUNDS)
+            model = find_components(search, rounds=FEW_ROUNDS)
             if other_gains:
-                model, _ = try_other_gains(search, model)
+                model, _ = find_rivals(search, model)
         except NumericalError:
             total = np.inf
         else:
-            total, gains[i] = total + cost(search, model), model.spectrum.gain
+            total, gains[i] = total + cost(search, model), model.spectrum.background.gain
     return total, gains
 
 

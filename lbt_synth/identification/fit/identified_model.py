@@ -125,13 +125,11 @@ class IdentifiedAxis(Summarised):
         error. The first is 0 where the data do not ask for it; the second then says what they would
         have shown. A plant takes white noise of the same rms.
     sensor_gain : float
-        Sensor gain: found, given or assumed.
+        Sensor gain: found or given.
     sensor_gain_error : float or None
-        Its standard error; None if it is unknown.
+        Its standard error; None if it was given, or has no meaning.
     sensor_gain_note : str
-        Where it comes from, or why it could not be found.
-    likely_gains : tuple of float or None
-        The least and the largest gain of models that are as likely, where that is why.
+        Where it comes from, and how well it is known.
     whiteness : Whiteness
         Tests of the innovations.
     frequency_hz, density_nm2_hz, fitted_nm2_hz, background_nm2_hz : (f,) ndarray
@@ -166,7 +164,6 @@ class IdentifiedAxis(Summarised):
     resolution_hz: float
     fitted_model: FittedModel
     data: LoopPeriodogram
-    likely_gains: tuple[float, float] | None = None
 
     def _brief(self) -> str:
         lines = count_text(len(self.lines), "line")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import Any
@@ -12,14 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.fit.departures import (
-    cut_at_jumps,
-    describe_drifts,
-    find_correction_jumps,
-    find_jumps,
-)
 from lbt_synth.identification.fit.fitting import (
-    GAINS,
+    GAIN_ERROR,
     LOWEST_LINE_HZ,
     MOST_LINES,
     PLAUSIBLE_GAINS,
@@ -33,12 +26,8 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedLine,
     IdentifiedModel,
 )
-from lbt_synth.identification.fit.order_search import (
-    find_components,
-    is_coloured_rival,
-    search_models,
-    try_other_gains,
-)
+from lbt_synth.identification.fit.jumps import cut_at_jumps, find_correction_jumps, find_jumps
+from lbt_synth.identification.fit.order_search import find_components, find_rivals
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -46,7 +35,6 @@ from lbt_synth.identification.fit.periodogram import (
 )
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
-    describe_close_lines,
     hold_gain,
     standard_errors,
 )
@@ -62,11 +50,11 @@ _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some perc
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
 _NOT_WHITE = 1e-3  # probability of white innovations below which a note says so
-_GAIN_ERROR = 0.3  # relative; a gain with a larger error is not identifiable
+OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
 _POOR_GAIN = 0.1  # relative error from which a note says so
 _ROUGH_GAIN = 0.05  # relative error from which other gains are tried
 _AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
-_LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0
+_LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0  # of the periodograms in a density
 
 
 def identify(
@@ -75,7 +63,6 @@ def identify(
     frame_rate_hz: float | None = None,
     delay_frames: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    assumed_gain: float = 1.0,
     announced: Sequence[LinePrior] = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
     most_lines: int = MOST_LINES,
@@ -91,8 +78,8 @@ def identify(
     resonances and noise: white, or a first-order process where the data ask for it. The Whittle
     likelihood chooses all parameters, the sensor gain among them, and a penalised criterion the
     number of resonances. A sensor usually has one gain for tip and tilt: gains that agree within
-    three standard errors are averaged, and the rest is fitted again with the mean. An axis that
-    does not show its gain takes that of the other.
+    three standard errors are averaged, and the rest is fitted again with the mean. Before the data
+    say more, a gain is taken to be 0.7, within a factor of 1.6.
 
     Parameters
     ----------
@@ -103,9 +90,7 @@ def identify(
     delay_frames : float, optional
         Total delay of that loop [frames], if the record does not have it; 2 by default.
     sensor_gain : float or one per axis, optional
-        Known sensor gain; like ``assumed_gain``, ``stretches`` and ``start`` for series alone.
-    assumed_gain : float, optional
-        Sensor gain to use if the data do not determine it.
+        Known sensor gain; like ``stretches`` and ``start`` for series alone.
     announced : sequence of LinePrior, optional
         Lines that are known beforehand, for instance from accelerometers.
     lowest_line_hz : float, optional
@@ -173,7 +158,7 @@ def identify(
         if progress is not None:
             progress(next(fits), total)
 
-    fit = partial(_fit_axes, record, step, options, assumed_gain)
+    fit = partial(_fit_axes, record, step, options)
     early = find_correction_jumps(record.corrections(), pieces)
     pieces, notes = cut_at_jumps(pieces, early, "commands")
     axes = fit(pieces, gains, [None] * record.axes if start is None else start.axes)
@@ -182,19 +167,17 @@ def identify(
     cut, late_notes = cut_at_jumps(pieces, late, "pseudo-open loop")
     if cut != pieces:
         axes = fit(cut, gains, axes)
-    found_gain = [i for i, axis in enumerate(axes) if axis.sensor_gain_error is not None]
     notes += late_notes
-    if len(axes) > 1 and found_gain and gains == [None] * len(axes):
-        axes, note = _pool_gains(axes, found_gain, step, options)
+    if len(axes) > 1 and all(axis.sensor_gain_error is not None for axis in axes):
+        axes, note = _pool_gains(axes, step, options)
         notes.append(note)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == 2:
-        axes, shared, more = couple_axes(record, axes, cut, lowest_line_hz)
-        notes += more
-    notes += _find_doubts(axes, found_gain, most_lines)
+        axes, shared = couple_axes(record, axes, cut, lowest_line_hz)
+    notes += _find_doubts(axes, most_lines)
     if progress is not None and next(fits) <= total:
         progress(total, total)
-    model = IdentifiedModel(
+    return IdentifiedModel(
         axes=tuple(axes),
         shared=shared,
         frame_rate_hz=record.frame_rate_hz,
@@ -202,7 +185,6 @@ def identify(
         mirror=record.mirror,
         notes=tuple(notes),
     )
-    return describe_drifts(model, record.pseudo_open_loop(model.sensor_gains), cut)
 
 
 def _refuse_of_series(**options: object) -> None:
@@ -216,7 +198,6 @@ def _fit_axes(
     record: LoopRecord,
     step: Callable[[], None],
     options: dict[str, Any],
-    assumed_gain: float,
     stretches: Stretches,
     gains: Sequence[float | None],
     starts: Sequence[IdentifiedAxis | None],
@@ -226,11 +207,11 @@ def _fit_axes(
     ``options`` are those of a search.
     """
     axes = []
-    each = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
-    for y, c, gain, start in each:
+    series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
+    for y, c, gain, start in series:
         data = axis_periodogram(y, c, record.frame_rate_hz, stretches)
         search = Search(data=data, gain=gain, **options)
-        axes.append(find_axis(search, assumed_gain=assumed_gain, start=start))
+        axes.append(find_axis(search, start=start))
         step()
     return axes
 
@@ -274,19 +255,16 @@ def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches
 
 
 def _pool_gains(
-    axes: list[IdentifiedAxis],
-    found_gain: list[int],
-    step: Callable[[], None],
-    options: dict[str, Any],
+    axes: list[IdentifiedAxis], step: Callable[[], None], options: dict[str, Any]
 ) -> tuple[list[IdentifiedAxis], str]:
-    """Fit the axes again with the mean of the gains that were found, if they agree.
+    """Fit the axes again with the mean of their gains, if they agree; options are of a search.
 
-    ``options`` are those of a search.
-    Where the gains scatter by more than their errors, the error of the mean is scaled by
-    ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
+    What is known of a gain beforehand counts once. Where the gains scatter by more than their
+    errors, the error of the mean is scaled by ``sqrt(chi^2 / (n - 1))`` (Particle Data Group,
+    doi:10.1093/ptep/ptac097, section 5.2.2).
     """
-    gains = np.array([axes[i].sensor_gain for i in found_gain])
-    errors = np.array([axes[i].sensor_gain_error for i in found_gain], dtype=float)
+    gains = np.array([axis.sensor_gain for axis in axes])
+    errors = np.array([axis.sensor_gain_error for axis in axes], dtype=float)
     log, weight = np.log(gains), (gains / errors) ** 2
     mean = float(np.sum(weight * log) / np.sum(weight))
     if np.any(np.abs(log - mean) * gains > DIFFERENT * errors):
@@ -295,15 +273,14 @@ def _pool_gains(
             f"warning: the axes have different sensor gains, {values}: the commands of one may be "
             "recorded at another size (--command-scale takes a factor for each axis)"
         )
-    scatter = float(np.sum(weight * (log - mean) ** 2)) / max(len(found_gain) - 1, 1)
-    gain, error = float(np.exp(mean)), float(np.sqrt(max(scatter, 1.0) / np.sum(weight)))
-    alone = len(found_gain) < len(axes)
-    own = "found in the closed loop's data" if alone else "mean of the axes"
+    scatter = float(np.sum(weight * (log - mean) ** 2)) / (len(axes) - 1)
+    precision = float(np.sum(weight)) - (len(axes) - 1) / GAIN_ERROR**2
+    gain = float(np.exp(mean))
+    error = float(np.sqrt(max(scatter, 1.0) / max(precision, 1 / GAIN_ERROR**2)))
     pooled = []
-    for i, axis in enumerate(axes):
+    for axis in axes:
         search = Search(data=axis.data, gain=gain, **options)
-        note = own if i in found_gain else "that of the other axis"
-        pooled.append(refit_axis(axis, search, error, note))
+        pooled.append(refit_axis(axis, search, error, _gain_note(error, "mean of the axes")))
         step()
     return pooled, "one sensor gain for all axes"
 
@@ -324,17 +301,16 @@ def _doubt_scale(axes: Sequence[IdentifiedAxis]) -> Iterator[str]:
         )
 
 
-def _find_doubts(
-    axes: Sequence[IdentifiedAxis], found_gain: Sequence[int], most_lines: int
-) -> Iterator[str]:
-    """Yield notes on odd gains, hidden noise, close and too many lines, and what no model has."""
-    for i in found_gain:
-        if not POSSIBLE_GAINS[0] < axes[i].sensor_gain < POSSIBLE_GAINS[1]:
+def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[str]:
+    """Yield notes on odd gains, hidden noise, too many lines, and what no model has."""
+    fitted = [axis.sensor_gain_error is not None for axis in axes]
+    for i, axis in enumerate(axes):
+        if fitted[i] and not POSSIBLE_GAINS[0] < axis.sensor_gain < POSSIBLE_GAINS[1]:
             yield (
-                f"warning: axis {i} has a sensor gain of {axes[i].sensor_gain:.3g}: are the units, "
+                f"warning: axis {i} has a sensor gain of {axis.sensor_gain:.3g}: are the units, "
                 "signs and axes of the commands right?"
             )
-    yield from _doubt_scale([axes[i] for i in found_gain])
+    yield from _doubt_scale(axes)
     for i, axis in enumerate(axes):
         if axis.noise_error_nm > _UNSEEN * axis.noise_nm:
             yield f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
@@ -345,15 +321,13 @@ def _find_doubts(
                 "the rest of the model suffers"
             )
     for i, axis in enumerate(axes):
-        yield from describe_close_lines(axis, i)
-    for i, axis in enumerate(axes):
         if axis.noise_correlation:
             yield (
                 f"the noise of axis {i} is not white: neighbouring frames have a correlation of "
                 f"{axis.noise_correlation:.3f} +- {axis.noise_correlation_error:.3f}, which the "
                 "model and its errors hold. Designs take white noise of the same rms"
             )
-        elif i in found_gain and axis.noise_correlation_error > _UNSEEN_COLOUR:
+        elif fitted[i] and axis.noise_correlation_error > _UNSEEN_COLOUR:
             yield (
                 f"warning: the record does not show whether the noise of axis {i} is white (its "
                 f"correlation is 0 +- {axis.noise_correlation_error:.2g}): noise, sensor gain and "
@@ -403,59 +377,70 @@ def _identify_spectra(
     )
 
 
-def find_axis(
-    search: Search, *, assumed_gain: float = 1.0, start: IdentifiedAxis | None = None
-) -> IdentifiedAxis:
-    """Identify one axis from its periodogram."""
-    data = search.data
-    assumed = number(assumed_gain, "assumed_gain", **GAINS)
-    model, *rivals = search_models(search, None if start is None else start.fitted_model.spectrum)
-    if search.gain is not None:
-        note = "given" if data.closed else "given: the series is divided by it"
-        return describe_axis(search, model, None, note)
-    if not data.closed:
-        return describe_axis(search, model, None, "1: of an open loop it has no meaning")
-    model, near = _compare_gains(search, model, rivals, start)
-    own = model.spectrum
-    own_error = _gain_error(model)
-    near += [rival for rival in rivals if is_coloured_rival(model, rival, own_error)]
-    away = max((abs(each.spectrum.log_gain - own.log_gain) for each in near), default=0.0)
-    colours = np.tanh([own.colour, *(each.spectrum.colour for each in near)])
-    unknown = float(np.ptp(colours))  # correlation of the noise
-    error = max(own_error, away)
-    if error <= _GAIN_ERROR:
-        poor = f", to {100 * error:.0f} % only" if error > _POOR_GAIN else ""
-        if error > own_error:  # what the gain moves is as ambiguous
-            model = hold_gain(search, model, error)
-        note = f"found in the closed loop's data{poor}"
-        return describe_axis(search, model, error, note, colour_error=unknown)
-    likely = _likely_gains([model, *near], own_error) if near else None
-    search = replace(search, gain=assumed)
-    by = f" by {100 * error:.0f} %" if error < 1 else ""
-    note = (
-        f"assumed to be {assumed:g}, not found: these data leave it open{by} (the loop "
-        "hardly acts where the noise shows). Give it, or record with a higher loop gain"
+def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> IdentifiedAxis:
+    """Identify one axis from its periodogram, and from a model of earlier data."""
+    closed = search.data.closed
+    model = find_components(search, None if start is None else start.fitted_model.spectrum)
+    if not search.finds_gain:
+        note = (
+            "1: of an open loop it has no meaning"
+            if search.gain is None
+            else ("given" if closed else "given: the series is divided by it")
+        )
+        return describe_axis(search, add_evidence(search, model), None, note)
+    near = [model]
+    if not _is_clear(model, start):
+        model, near = find_rivals(search, model)
+    model = add_evidence(search, model)
+    background = model.spectrum.background
+    rivals = [rival.spectrum.background for rival in near]
+    fit_error = _gain_error(model)
+    error = max(fit_error, *(abs(rival.log_gain - background.log_gain) for rival in rivals))
+    if error > fit_error:  # what the gain moves is as ambiguous
+        model = hold_gain(search, model, error)
+    colours = np.tanh([background.colour, *(rival.colour for rival in rivals)])
+    note = _gain_note(error, "found in the closed loop's data")
+    return describe_axis(search, model, error, note, colour_error=float(np.ptp(colours)))
+
+
+def _gain_note(error: float, origin: str) -> str:
+    """Say where a gain comes from, and how well it is known."""
+    if error < _POOR_GAIN:
+        return origin
+    if error < OPEN_GAIN:
+        return f"{origin}, to {100 * error:.0f} % only"
+    return (
+        f"{origin}, which leave it open by {100 * error:.0f} % (the loop hardly acts where the "
+        "noise shows). Give it, or record with a higher loop gain"
     )
-    model = search_models(search, model.spectrum)[0]
-    found = describe_axis(search, model, None, note, colour_error=unknown)
-    return replace(found, likely_gains=likely)
 
 
 def _gain_error(model: FittedModel) -> float:
     """Return the standard error of the logarithm of the gain."""
-    return standard_errors(model.spectrum, model.covariance).log_gain
+    return standard_errors(model.spectrum, model.covariance).background.log_gain
 
 
-def _likely_gains(models: Sequence[FittedModel], error: float) -> tuple[float, float]:
-    """Return the least and the largest gain of models, widened by the relative error of one."""
-    logs = [model.spectrum.log_gain for model in models]
-    margin = min(error, _GAIN_ERROR)
-    return float(np.exp(min(logs) - margin)), float(np.exp(max(logs) + margin))
+def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
+    """Whether nothing could explain another gain than that of a model.
+
+    A plausible gain is clear that is well known beside narrow lines and white noise, or was found
+    in earlier data with an error like that of its fit.
+    """
+    background, error = model.spectrum.background, _gain_error(model)
+    earlier = None if start is None else start.sensor_gain_error
+    compared = (
+        start is not None
+        and earlier is not None
+        and earlier < _AMBIGUOUS * error * start.sensor_gain
+    )
+    plain = all(line.is_narrow for line in model.spectrum.lines) and not background.colour
+    low, high = PLAUSIBLE_GAINS
+    return low <= background.gain <= high and (compared or (plain and error < _ROUGH_GAIN))
 
 
 def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:
     """Fit an axis again at the gain of a search, with its error."""
-    model = add_evidence(search, find_components(search, axis.fitted_model.spectrum, moves=False))
+    model = add_evidence(search, find_components(search, axis.fitted_model.spectrum))
     return describe_axis(search, hold_gain(search, model, error), error, note)
 
 
@@ -546,7 +531,7 @@ def identify_spectrum(
     )
     search = Search(data=data, gain=1.0, **options)
     note = "1: of a spectrum it has no meaning"
-    return describe_axis(search, search_models(search)[0], None, note)
+    return describe_axis(search, add_evidence(search, find_components(search)), None, note)
 
 
 def estimate_averages(density: FloatArray) -> float | None:
@@ -568,28 +553,3 @@ def estimate_averages(density: FloatArray) -> float | None:
     scatter = min(scatter, polygamma(1, _LEAST_AVERAGES))
     low, high = np.log(_LEAST_AVERAGES) - 1e-6, np.log(_MOST_AVERAGES) + 1e-6
     return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))
-
-
-def _compare_gains(
-    search: Search,
-    model: FittedModel,
-    rivals: Sequence[FittedModel],
-    start: IdentifiedAxis | None,
-) -> tuple[FittedModel, list[FittedModel]]:
-    """Return the likeliest model, and those of other gains that are nearly as likely.
-
-    A plausible gain has none that is well known, without anything that could explain another one;
-    nor has one that was found in earlier data with an error like that of its fit, so without any.
-    """
-    spectrum, error = model.spectrum, _gain_error(model)
-    earlier = None if start is None else start.sensor_gain_error
-    compared = (
-        start is not None
-        and earlier is not None
-        and earlier < _AMBIGUOUS * error * start.sensor_gain
-    )
-    plain = all(line.is_narrow for line in spectrum.lines) and not spectrum.colour
-    low, high = PLAUSIBLE_GAINS
-    if low <= spectrum.gain <= high and (compared or (plain and error < _ROUGH_GAIN)):
-        return model, []
-    return try_other_gains(search, model, rivals)

@@ -1,12 +1,9 @@
-"""The search for the resonances of a spectrum, and for their number.
+"""The search for the components of a spectrum, and for their number.
 
 The model grows from a background, turbulence over white noise, fitted to medians over bands, which
 narrow lines hardly touch. Bands with too much power become components, all parameters are fitted
-together, and what adds less to the logarithm of the likelihood than a criterion asks is dropped
-again: the Bayesian one asks ``3 / 2 log n`` for a line of three parameters among n values
-(G. Schwarz, Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
-
-Bands in which a spectrum has more power than its model.
+together, and what adds less than its price is dropped again. A model of earlier data is only
+polished: fitted to these, given what it lacks, and pruned.
 """
 
 from __future__ import annotations
@@ -22,161 +19,94 @@ from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import GAINS, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
-from lbt_synth.identification.fit.spectrum_model import Component, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import Background, Component, SpectrumModel
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
 from lbt_synth.validation import FloatArray
 
-FEW_ROUNDS = 3
 _LITTLE, _CLEARLY = 0.1, 1.0  # log-likelihood that a component or a move must save at least
-_MOST_ROUNDS = 12
+FEW_ROUNDS, _MOST_ROUNDS = 3, 12  # of a quick search, and of a whole one
 _HALF = float(np.log(0.5))
-_SAME_GAIN = 0.15  # of a logarithm
-_MOST_TURBULENCES = 3
-_SIGNIFICANT = 1.92  # log-likelihood that one parameter too many adds in 5 % of the cases
-_BEYOND = 0.2  # of a logarithm: standard deviation of gains beyond the plausible ones
-_FAR_GAIN = 3.0  # standard errors by which a colour of the noise moves a gain that is doubted
-_SAME_NOISE = 0.1  # of the correlation of neighbouring frames
-_OTHER_NOISE = 5.0  # log-likelihood by which noise of another correlation is excluded
+_MOST_SLOW = 2  # parts of the turbulence beside the first
 _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
-_TURBULENCE = ((0.5, 0.55), (5.0, 0.55))  # frequency [Hz] and damping ratio where a fit begins
-_NEARLY_FIRST_ORDER = 2.0  # damping ratio from which turbulence may be a drift
-_OVERDAMPED = (2.0, 30.0)  # the same of turbulence that is nearly of first order
+_TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
 _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
-_SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
-_MOST_DRIFTS = 2  # fits of both
-_BANDS = 80
-_GAINS = (2 * GAINS["above"], GAINS["below"] / 2)
+_BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
+_OTHER_GAINS = (0.35, 0.6, 1.0)  # of a sensor, from which models that are as likely are sought
+_SAME_GAIN = 0.15  # of a logarithm: nearer gains have the same optimum
+_AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
 
-def search_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
-    """Find the model of one axis, and its rivals with noise that is not white.
-
-    A start has been found in earlier data: there is little left to find. A rival is searched for
-    further where it may explain wide components or a wrong gain.
-    """
-    model = find_components(search, start)
-    models, spectrum = [model], model.spectrum
-    coloured = fitting.fit(search, replace(spectrum, colour=_COLOUR))
-    if coloured is not None and not spectrum.colour:
-        plain = start is not None or all(c.is_narrow for c in spectrum.components[1:])
-        models.append(coloured)
-        if not plain or fitting.cost(search, coloured) < fitting.cost(search, model):
-            models.append(find_components(search, coloured.spectrum))
-        models.sort(key=lambda trial: _cost_of_noise(search, trial))
-    return [fitting.add_evidence(search, models[0]), *models[1:]]
-
-
-def is_coloured_rival(model: FittedModel, rival: FittedModel, gain_error: float) -> bool:
-    """Whether a model of coloured noise is likelier than one of white noise, and its gain far away.
-
-    Sensors and filters make neighbouring frames alike, hardly ever opposite.
-    """
-    own, other = model.spectrum, rival.spectrum
-    is_far = abs(other.log_gain - own.log_gain) > _FAR_GAIN * gain_error
-    is_likelier = model.contrast - rival.contrast >= _SIGNIFICANT
-    return not own.colour and 0 < other.colour < _MOST_COLOUR and is_likelier and is_far
-
-
-def _cost_of_noise(search: Search, model: FittedModel) -> float:
-    """Return the cost of a model in which a colour of the noise competes with wide resonances.
-
-    A wide resonance fits most spectra that fall, and counts twice.
-    """
-    spectrum = model.spectrum
-    wide = sum(not c.is_narrow for c in spectrum.lines)
-    return _cost_with_gain(search, model) + search.price * wide
-
-
-def _cost_with_gain(search: Search, model: FittedModel) -> float:
-    """Return the cost of a model whose gain may be one that hardly any sensor has.
-
-    At a gain of almost nothing, what the loop left needs a simpler spectrum than the disturbance.
-    """
-    gain = model.spectrum.gain
-    beyond = float(np.log(gain / np.clip(gain, *fitting.PLAUSIBLE_GAINS)))
-    return fitting.cost(search, model) + 0.5 * (beyond / _BEYOND) ** 2 * search.finds_gain
-
-
-def try_other_gains(
-    search: Search, model: FittedModel, rivals: Sequence[FittedModel] = ()
-) -> tuple[FittedModel, list[FittedModel]]:
-    """Return the likeliest model from several gains, and all models of nearly its cost, itself too.
-
-    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
-    lines cannot.
-    """
-    spectrum, found = model.spectrum, [model, *rivals]
-    for gain, colour in product(search.starting_gains, sorted({spectrum.colour, 0.0})):
-        if colour == spectrum.colour and abs(np.log(gain) - spectrum.log_gain) < _SAME_GAIN:
-            continue
-        begin = replace(search, gain=gain)
-        try:
-            known = replace(spectrum, colour=colour)
-            held = find_components(begin, known, moves=False)
-        except NumericalError:
-            continue
-        free = fitting.fit(search, held.spectrum)
-        if free is not None and abs(free.spectrum.colour) < _MOST_COLOUR:
-            found.append(free)
-    best = min(found, key=lambda each: _cost_of_noise(search, each))
-    near, costs = [], (_cost_with_gain, _cost_of_noise)
-    least = [cost(search, best) for cost in costs]
-    for each in found:
-        colour, own = each.spectrum.colour, best.spectrum.colour
-        same = bool(colour) == bool(own) and abs(np.tanh(colour) - np.tanh(own)) < _SAME_NOISE
-        above = min(cost(search, each) - low for cost, low in zip(costs, least, strict=True))
-        if above < (search.price if same else _OTHER_NOISE):
-            near.append(each)
-    if best is not model:
-        best = fitting.add_evidence(search, fitting.prune(search, best, thorough=True))
-    return best, near
-
-
 def find_components(
-    search: Search,
-    start: SpectrumModel | None = None,
-    *,
-    rounds: int | None = None,
-    moves: bool = True,
+    search: Search, start: SpectrumModel | None = None, *, rounds: int = _MOST_ROUNDS
 ) -> FittedModel:
-    """Find the model: add components, prune them, and move lines (with ``moves``).
+    """Find the model of one axis: add components, prune them, and move lines.
 
-    One that starts from an earlier model has few rounds.
+    A start from earlier data is polished only.
     """
-    model = None if start is None else fitting.refit(search, start)
-    if model is None:
-        model = _begin(search)
+    model = fitting.refit(search, start) if start is not None else _begin(search)
+    if model is None and start is not None:
+        return find_components(search, rounds=rounds)
     if model is None:
         raise NumericalError(
             "the likelihood of the spectrum is not finite. Check the units of the series."
         )
     model = _add_announced(search, fitting.prune(search, model))
-    if rounds is None:
-        rounds = _MOST_ROUNDS if start is None else FEW_ROUNDS
-    for _ in range(rounds):
-        better = _improve(search, model, moves)
+    for _ in range(rounds if start is None else FEW_ROUNDS):
+        better = _improve(search, model, moves=start is None)
         if better is None:
             break
         model = better
-    if abs(model.spectrum.colour) > _MOST_COLOUR:
-        white = None if start is None else start.without_colour()
-        return find_components(search, white, rounds=rounds, moves=moves)
-    model = fitting.prune(search, fitting.simplify(search, model), thorough=moves)
-    return _restore_turbulence(search, model)
+    return fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
 
 
-def _improve(search: Search, model: FittedModel, moves: bool) -> FittedModel | None:
+def find_rivals(search: Search, model: FittedModel) -> tuple[FittedModel, list[FittedModel]]:
+    """Return the likeliest model from several gains and kinds of noise, and all as likely.
+
+    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
+    lines cannot.
+    """
+    spectrum, rivals = model.spectrum, [model]
+    colour, log_gain = spectrum.background.colour, spectrum.background.log_gain
+    coloured = spectrum.with_background(colour=0.0 if colour else _COLOUR)
+    rivals += [free for free in [_fit_white_enough(search, coloured)] if free is not None]
+    for gain in _OTHER_GAINS:
+        if abs(np.log(gain) - log_gain) < _SAME_GAIN:
+            continue
+        try:
+            held = find_components(replace(search, gain=gain), spectrum)
+        except NumericalError:
+            continue
+        free = _fit_white_enough(search, held.spectrum)
+        rivals += [] if free is None else [free]
+    best = fitting.likeliest(search, rivals) or model
+    least = fitting.cost(search, best)
+    near = [rival for rival in rivals if fitting.cost(search, rival) < least + _AS_LIKELY]
+    if best is not model:
+        best = fitting.prune(search, best, thorough=True)
+    return best, near
+
+
+def _fit_white_enough(search: Search, spectrum: SpectrumModel) -> FittedModel | None:
+    """Fit a model; None if no fit settles, or its noise is a drift."""
+    model = fitting.fit(search, spectrum)
+    if model is None or abs(model.spectrum.background.colour) > _MOST_COLOUR:
+        return None
+    return model
+
+
+def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:
     """Return the best of the first trials of which one is clearly better; None if none is."""
-    for trials, least in _trials(search, model.spectrum, moves):
+    least = fitting.cost(search, model)
+    for trials, saved in _trials(search, model.spectrum, moves):
         fits = (fitting.fit(search, trial, better_than=model) for trial in trials)
-        pruned = [fitting.prune(search, made) for made in fits if made is not None]
-        best = fitting.likeliest(search, pruned)
-        if best is not None and fitting.cost(search, best) < fitting.cost(search, model) - least:
+        white = (one for one in fits if one and abs(one.spectrum.background.colour) < _MOST_COLOUR)
+        best = fitting.likeliest(search, [fitting.prune(search, one) for one in white])
+        if best is not None and fitting.cost(search, best) < least - saved:
             return best
     return None
 
@@ -185,35 +115,24 @@ def _trials(
     search: Search, spectrum: SpectrumModel, moves: bool
 ) -> Iterator[tuple[list[SpectrumModel], float]]:
     """Yield models with other turbulence, new lines or other places, and what they must save."""
-    first, *others = spectrum.components
-    lines = [c for c in others if c.kind == "line"]
-    has_parts = len(lines) < len(others)
-    nearly_first_order = first.kind == "drift" or first.damping_ratio > _NEARLY_FIRST_ORDER
-    # where no line can be added, a second turbulence would take the place of one
-    room = len(lines) < search.most_lines
-    found = find_excesses(search, spectrum)
-    found = [excess for excess in found if excess[0] > 0.25 * found[0][0]]
-    either = [_add_centred(search, spectrum, found)] if found else []
-    if room and not nearly_first_order:
-        either += _other_backgrounds(search, spectrum, lines, drifts=True)
-    yield either, _LITTLE
-    while found := found[: len(found) // 2]:
-        yield [_add_centred(search, spectrum, found)], _LITTLE
+    others = []
+    if moves and not spectrum.background.colour:
+        others.append(spectrum.with_background(colour=_COLOUR))
+    if moves and all(c.kind != "drift" for c in spectrum.components):
+        others.append(_add_drift(search, spectrum))
+    excesses = find_excesses(search, spectrum)
+    excesses = [excess for excess in excesses if excess[0] > 0.25 * excesses[0][0]]
+    yield [*([_add_centred(search, spectrum, excesses)] if excesses else []), *others], _LITTLE
+    while excesses := excesses[: len(excesses) // 2]:
+        yield [_add_centred(search, spectrum, excesses)], _LITTLE
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
             yield from (([trial], _CLEARLY) for trial in _line_moves(search, spectrum, i))
-    if room and nearly_first_order and not (has_parts and first.kind == "drift"):
-        yield _other_backgrounds(search, spectrum, lines, drifts=True), _LITTLE
-    if has_parts:
-        yield _other_backgrounds(search, spectrum, lines, drifts=False), _LITTLE
-
-
-def _other_backgrounds(
-    search: Search, spectrum: SpectrumModel, lines: Sequence[Component], *, drifts: bool
-) -> list[SpectrumModel]:
-    """Return the model with turbulence fitted afresh beside its lines."""
-    ground = fit_background(search, spectrum.gain, lines, drifts=drifts, colour=spectrum.colour)
-    return [] if ground is None else [ground.spectrum.add(*lines)]
+    if any(c.kind == "slow" for c in spectrum.components):
+        lines = [c for c in spectrum.components if c.kind == "line"]
+        ground = fit_background(search, spectrum.background.gain, lines)
+        if ground is not None:
+            yield [ground.spectrum.add(*lines)], _LITTLE
 
 
 def _begin(search: Search) -> FittedModel | None:
@@ -222,23 +141,42 @@ def _begin(search: Search) -> FittedModel | None:
     The gain is held until the lines and a drift are there: one that is free while these are missing
     runs away to what explains them.
     """
-    known = search if not search.finds_gain else replace(search, gain=search.starting_gains[0])
-    model = fit_background(known, known.gain or 1.0)
+    gain = search.starting_gain if search.finds_gain else search.gain or 1.0
+    held = replace(search, gain=gain)
+    model = fit_background(held, gain)
     for _ in range(FEW_ROUNDS):
-        found = [] if model is None else find_excesses(known, model.spectrum)
-        clear = [one for one in found if one[0] > max(2 * search.price, 0.02 * found[0][0])]
+        excesses = [] if model is None else find_excesses(held, model.spectrum)
+        clear = [one for one in excesses if one[0] > max(2 * search.price, 0.02 * excesses[0][0])]
         if model is None or not clear:
             break
-        model = fitting.fit(known, _add_centred(known, model.spectrum, clear))
+        model = fitting.fit(held, _add_centred(held, model.spectrum, clear))
     if model is None or not search.finds_gain:
         return model
-    trials = _other_backgrounds(known, model.spectrum, model.spectrum.lines, drifts=True)
-    drifting = (fitting.fit(known, trial, better_than=model) for trial in trials)
-    model = fitting.likeliest(known, [model, *drifting]) or model
+    drifting = fitting.fit(held, _add_drift(held, model.spectrum), better_than=model)
+    model = fitting.likeliest(held, [model, drifting]) or model
     return fitting.fit(search, model.spectrum)
 
 
-def _add_centred(search: Search, spectrum: SpectrumModel, new: list[Excess]) -> SpectrumModel:
+def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
+    """Return the model with a drift, and turbulence beside it, where both fit best."""
+    rate, background = search.data.frame_rate_hz, spectrum.background
+    data, (turbulence, *others) = search.merge(spectrum), spectrum.components
+    noise, drift = 2 / rate * np.exp(background.log_noise), search.drift(1.0)
+    corner_hz = fitting.DRIFT_HZ
+    variance = float(np.exp(turbulence.log_power))
+    starts = [turbulence]
+    starts += [search.component("turbulence", *place, variance) for place in _TURBULENCE[:2]]
+    trials = []
+    for crossing, start in product(_CROSSINGS_HZ, starts):
+        # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
+        power = float(np.log(noise * crossing**2 * np.pi / (2 * corner_hz)))
+        trials.append(
+            replace(spectrum, components=(start, *others, replace(drift, log_power=power)))
+        )
+    return min(trials, key=lambda trial: contrast(data, trial))
+
+
+def _add_centred(search: Search, spectrum: SpectrumModel, new: Sequence[Excess]) -> SpectrumModel:
     """Return the model with more components, each where it fits best."""
     whole = spectrum.add(*(component for _, component in new))
     for i in range(len(spectrum.components), len(whole.components)):
@@ -265,8 +203,8 @@ def _add_announced(search: Search, model: FittedModel) -> FittedModel:
                 place, line = i, spectrum.components[i]
                 break
         spectrum = spectrum.exchange(place, replace(line, announced=known))
-    made = fitting.fit(search, spectrum)
-    return model if made is None else fitting.prune(search, made)
+    announced = fitting.fit(search, spectrum)
+    return model if announced is None else fitting.prune(search, announced)
 
 
 def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
@@ -275,17 +213,17 @@ def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
     if room <= 0:
         return []
     data = search.data
-    power, model = data.power(spectrum.gain), density(data, spectrum)
-    out = []
+    power, model = data.power(spectrum.background.gain), density(data, spectrum)
+    excesses = []
     for worth, *ends in _excess_bands(data, power / model, least=search.price, most=room):
         component = _highest_excess(search, power, model, slice(*ends), _WIDEST)
         if search.place(component)[0] < search.lowest_line_hz:
             slow = search.component("slow", search.place(component)[0], _WIDEST, 1.0)
             component = replace(slow, log_power=component.log_power)
-        out.append((worth, component))
-    if len(spectrum.components) - len(spectrum.lines) >= _MOST_TURBULENCES:
-        out = [(worth, component) for worth, component in out if component.kind == "line"]
-    return out
+        excesses.append((worth, component))
+    if sum(c.kind == "slow" for c in spectrum.components) >= _MOST_SLOW:
+        return [(worth, component) for worth, component in excesses if component.kind == "line"]
+    return excesses
 
 
 def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[SpectrumModel]:
@@ -299,9 +237,8 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     reach = max(10 * half, 20 * step)
     lowest = min(max(centre - reach, search.lowest_line_hz), centre)
     start, stop = np.searchsorted(data.frequency_hz, [lowest, centre + reach])
-    rest = density(data, spectrum.exchange(i))
-    band = slice(int(start), int(stop))
-    again = _highest_excess(search, data.power(spectrum.gain), rest, band, 0.5)
+    rest, power = density(data, spectrum.exchange(i)), data.power(spectrum.background.gain)
+    again = _highest_excess(search, power, rest, slice(int(start), int(stop)), 0.5)
     if abs(search.place(again)[0] - centre) > 0.5 * half + step:
         yield spectrum.exchange(i, replace(again, announced=line.announced))
     if half > 3 * step and len(spectrum.lines) < search.most_lines:
@@ -311,68 +248,31 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
         yield spectrum.exchange(i, lower).add(replace(upper, announced=None))
 
 
-def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
-    """Make a slow component the turbulence, where a resonance took its place."""
-    spectrum, lowest = model.spectrum, search.lowest_line_hz * search.data.angle_s
-    first, *others = spectrum.components
-    slow = [i for i, c in enumerate(others, 1) if c.frequency < lowest]
-    if first.frequency < lowest or not slow or spectrum.rolls_off or first.damping_ratio > 0.98:
-        return model
-    made = fitting.fit(search, spectrum.promote(spectrum.strongest(slow), first.convert("line")))
-    if made is not None and fitting.cost(search, made) < fitting.cost(search, model) + search.price:
-        return made
-    return model
-
-
 def fit_background(
-    search: Search,
-    gain: float,
-    lines: Sequence[Component] = (),
-    *,
-    drifts: bool = False,
-    colour: float = 0.0,
+    search: Search, gain: float, lines: Sequence[Component] = ()
 ) -> FittedModel | None:
     """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles.
 
     A gain that a free fit ran away to counts as the nearest that a sensor may have.
-    Second-order processes cannot fall with the square of the frequency, and lines would fill the
-    gap. With ``drifts``, a first-order process comes first, and the turbulence is a part beside it.
     """
-    gain = float(np.clip(gain, *_GAINS))
+    gain = float(np.clip(gain, 2 * GAINS["above"], GAINS["below"] / 2))
     smooth = _smooth_background(search.data, gain)
     f, d, rate = smooth.frequency_hz, smooth.measured, smooth.frame_rate_hz
     white = max(float(np.median(d[f >= 0.6 * f[-1]])) * rate / 2, float(np.finfo(float).tiny))
-    known = replace(search, gain=gain)
-    corner = known.log_angle(fitting.STARTING_CORNER_HZ)
-    ground = SpectrumModel(float(np.log(gain)), float(np.log(white)), colour, corner, ())
-    held = density(smooth, ground.alone(*lines))
-    slow = max(float(np.trapezoid(np.maximum(d - held, 0), f)) - white, 0.1 * white)
-    if drifts:
-        starts = _starting_drifts(known, ground, slow, 2 * white / rate)
-        starts = sorted(starts, key=lambda start: contrast(smooth, start, held))[:_MOST_DRIFTS]
-    else:
-        places = (*_TURBULENCE, _OVERDAMPED)
-        starts = [ground.add(known.component("turbulence", *place, slow)) for place in places]
+    held = replace(search, gain=gain)
+    corner = held.log_angle(fitting.STARTING_CORNER_HZ)
+    background = Background(float(np.log(gain)), float(np.log(white)), 0.0, corner)
+    ground = SpectrumModel((background,), ())
+    beside = density(smooth, ground.alone(*lines))
+    slow = max(float(np.trapezoid(np.maximum(d - beside, 0), f)) - white, 0.1 * white)
     best: FittedModel | None = None
-    for start in starts:
+    for place in _TURBULENCE:
+        start = ground.add(held.component("turbulence", *place, slow))
         bound = float("inf") if best is None else best.contrast
-        priors = known.priors(start)
-        made = minimise(smooth, start, priors, held=held, bound=bound, accuracy=SEARCHED)
-        best = fitting.likeliest(known, [best, made])
+        priors = held.priors(start)
+        model = minimise(smooth, start, priors, held=beside, bound=bound, accuracy=SEARCHED)
+        best = fitting.likeliest(held, [best, model])
     return best
-
-
-def _starting_drifts(
-    search: Search, ground: SpectrumModel, slow: float, noise: float
-) -> list[SpectrumModel]:
-    """Return a drift and turbulence where fits may begin, for a slow variance and noise density."""
-    ratio = fitting.DRIFT_RATIO
-    hz = 2 * ratio * fitting.DRIFT_HZ
-    powers = noise * np.array(_CROSSINGS_HZ) ** 2 * np.pi * ratio / hz  # of hz / (pi ratio f^2)
-    drifts = [search.component("drift", hz, ratio, float(power)) for power in powers]
-    places = product(_TURBULENCE, _SHARES)
-    parts = [search.component("slow", *place, slow * share) for place, share in places]
-    return [ground.add(drift, part) for drift, part in product(drifts, parts)]
 
 
 def _smooth_background(data: LoopPeriodogram, gain: float) -> LoopPeriodogram:

@@ -48,8 +48,8 @@ class LoopPeriodogram:
     frame_rate_hz: float
     resolution_hz: float  # width of a frequency bin of the transform
     duration_s: float | None = None  # of the tapered segments; None for a density from elsewhere
-    # (2, 2, f): (Y1, C1) times (Y2, C2)* of two axes [nm^2/Hz]
-    between: ComplexArray | None = None
+    # (2, 2, f): the real part of (Y1, C1) times (Y2, C2)* of two axes [nm^2/Hz]
+    between: FloatArray | None = None
 
     @property
     def closed(self) -> bool:
@@ -60,11 +60,6 @@ class LoopPeriodogram:
     def half_angle_square(self) -> FloatArray:
         """``4 sin^2(pi f / f_s)``, (f,)."""
         return half_angle_square(self.frequency_hz, self.frame_rate_hz)
-
-    @cached_property
-    def log_frame_mean(self) -> FloatArray:
-        """Logarithm of the power that the mean over a frame leaves, (f,)."""
-        return np.asarray(2 * np.log(np.sinc(self.frequency_hz / self.frame_rate_hz)))
 
     @cached_property
     def periods(self) -> FloatArray:
@@ -92,20 +87,45 @@ class LoopPeriodogram:
         """Return the density of ``y + gain c`` [nm^2/Hz], (..., f); gains are (..., 1)."""
         return np.asarray(self.measured + gain * (2 * self.crossed + gain * self.corrected))
 
-    def power_slopes(self, gain: float | FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the first two derivatives of that density by the logarithm of the gain."""
-        cross, square = 2 * gain * self.crossed, 2 * gain**2 * self.corrected
-        return cross + square, cross + 2 * square
+    def matrix(self, gains: FloatArray) -> FloatArray:
+        """Return the real density of ``y + g c`` of axes at their gains (n,) [nm^2/Hz], (n, n, f).
 
-    def cross_power(self, gains: Sequence[float]) -> tuple[ComplexArray, ComplexArray]:
-        """Return ``Z1 Z2*`` of two axes at their gains, (f,), and its log slopes by these, (2, f).
-
-        Its unit is nm^2/Hz.
+        Its imaginary part says nothing about lines that move along a direction.
         """
-        assert self.between is not None
-        ((yy, yc), (cy, cc)), (one, other) = self.between, gains
-        own = [one * (cy + other * cc), other * (yc + one * cc)]
-        return yy + own[0] + other * yc, np.array(own)
+        if len(gains) == 1:
+            return self.power(float(gains[0]))[None, None]
+        crossed = np.tensordot(self._seen(gains, (0, 0)), self._between, 2)
+        first, second = self.power(gains[:, None])
+        return np.array([[first, crossed], [crossed, second]])
+
+    def gain_slopes(self, gains: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
+        """Return the slope of the matrix by the logarithm of gain i, (n, n, f), and its second.
+
+        The second one is that of the density of axis i, (f,).
+        """
+        g = gains[i]
+        crossed, square = (
+            row if row.ndim == 1 else row[i] for row in (self.crossed, self.corrected)
+        )
+        cross, square = 2 * g * crossed, 2 * g**2 * square
+        slope = np.zeros((len(gains), len(gains), cross.size))
+        slope[i, i] = cross + square
+        if len(gains) > 1:
+            turned = (1, 0) if i == 0 else (0, 1)
+            slope[0, 1] = slope[1, 0] = np.tensordot(self._seen(gains, turned), self._between, 2)
+        return slope, cross + 2 * square
+
+    @staticmethod
+    def _seen(gains: FloatArray, slopes: tuple[int, int]) -> FloatArray:
+        """Return the weights of (Y1, C1) times (Y2, C2), or of their slopes by a gain, (2, 2)."""
+        rows = [[0.0 if slope else 1.0, gain] for gain, slope in zip(gains, slopes, strict=True)]
+        return np.outer(*rows)
+
+    @property
+    def _between(self) -> FloatArray:
+        if self.between is None:
+            raise ValueError("the periodogram must be of two axes; it is of one.")
+        return self.between
 
     def merge(self, starts: IntArray) -> LoopPeriodogram:
         """Return the means over groups of neighbours that begin at these indices."""
@@ -208,7 +228,7 @@ def loop_periodogram(
     between = None
     if measurement.ndim > 1:
         first, second = np.stack([y, c], axis=1)
-        between = np.mean(first[:, None] * second.conj(), axis=-2)
+        between = np.mean((first[:, None] * second.conj()).real, axis=-2)
     return LoopPeriodogram(
         frequency_hz=frequency,
         measured=measured + _FLOOR * np.mean(measured, axis=-1, keepdims=True),

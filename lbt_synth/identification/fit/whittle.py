@@ -1,7 +1,7 @@
-"""Whittle's likelihood of spectra of resonances over white noise, in a running loop.
+"""Whittle's likelihood of spectra of resonances over noise, in a running loop.
 
-For the periodograms I(g) of one or two axes, (n, n) and Hermitian at each frequency, and their
-spectrum S(theta)::
+For the periodograms I(g) of n axes, (n, n) and symmetric at each frequency, and their spectrum
+S(theta)::
 
     L(theta, g) = sum count (log det S + tr(S^-1 I(g))) + sum ((theta - centre) / width)^2 / 2
 
@@ -10,6 +10,9 @@ doi:10.1007/BF02590998) and of the priors. The measurement is ``y(k) = z(k) - g 
 spectrum S, and c(k) follows from y up to k-1: the change of variables from z to y has a unit
 Jacobian, so the likelihood of what the closed loop recorded is that of ``z = y + g c``. The
 sensor gain g is one more parameter, which only the data depend on.
+
+With ``W S W^T = 1``, each slope of S by a parameter becomes ``W (dS/dtheta) W^T``, and the
+gradient and the expected information are sums of products of these.
 
 Everything is in units of the measurement: a component's variance is g^2 times that of the phase.
 
@@ -35,11 +38,12 @@ from scipy.interpolate import CubicSpline
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, tukey
 from lbt_synth.identification.fit.scoring import EXACT, Priors, scoring_minimum
 from lbt_synth.identification.fit.spectrum_model import (
+    BACKGROUND,
+    COLOUR,
     CORNER,
     GAIN,
-    SHARED,
+    NOISE,
     Component,
-    Spectra,
     SpectrumModel,
 )
 from lbt_synth.models.resonance_spectrum import (
@@ -48,7 +52,7 @@ from lbt_synth.models.resonance_spectrum import (
     resonance_densities,
     unit_density,
 )
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.validation import FloatArray
 
 DIFFERENCE = 1e-4  # of a logarithm
 WIDE = 30.0  # half width above which a line is not smeared
@@ -62,31 +66,20 @@ _VALLEY = 0.003  # of the mean over a lobe, the least between lobes
 _GROWTH = 1.03  # of the steps beyond, where lobes are averaged
 _SAMPLES = 4096  # of the taper
 
-Model = SpectrumModel | Spectra
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FittedModel:
     """A minimum of the likelihood."""
 
-    spectra: Spectra
+    spectrum: SpectrumModel
     contrast: float  # L without the priors
     information: FloatArray  # (p, p): second derivatives of L; 0 for what was fixed
     evidence: tuple[float, ...] = ()  # what each component adds to the log-likelihood
 
     @property
-    def spectrum(self) -> SpectrumModel:
-        """The spectrum of the first axis, the only one of most fits."""
-        return self.spectra.axes[0]
-
-    @property
     def covariance(self) -> FloatArray:
         """Covariance of the packed parameters, the inverse of the information, (p, p)."""
         return invert_information(self.information)
-
-    def with_spectrum(self, spectrum: SpectrumModel) -> FittedModel:
-        """Return the fit with another spectrum of its only axis."""
-        return replace(self, spectra=Spectra((spectrum,)))
 
 
 @lru_cache(maxsize=1)
@@ -168,50 +161,22 @@ def log_smearing(
     )
 
 
-def densities(
-    data: LoopPeriodogram, spectrum: SpectrumModel
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the densities of noise and components, (1 + c, f), with log derivatives.
-
-    The derivatives by frequency and damping are (c, 2, f). Those of the density itself by the
-    colour of the noise and the corner of the turbulence are (2, f).
-    """
+def _noise_density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
+    """Return the density of the noise of each axis, a first-order process, (n, f)."""
     s, white = data.half_angle_square, 2 / data.frame_rate_hz
-    components = spectrum.components
-    each = [(c.frequency, c.damping_ratio, c.damping_slope, c.log_power) for c in components]
-    frequency, ratio, slope, power = np.array(each).reshape(-1, 4).T
-    density = np.empty((1 + len(components), s.size))
-    shape, by_colour = _log_colour(spectrum.colour, s)
-    density[0] = white * np.exp(spectrum.log_noise + shape)
-    density[1:], slopes = resonance_densities(frequency, ratio, white * np.exp(power), s)
-    fall, by_corner = _log_tilt(data, spectrum.log_corner, spectrum.roll_off_order)
-    rolling = [i for i, c in enumerate(components, 1) if c.kind == spectrum.rolling]
-    density[rolling] *= np.exp(fall)
-    _smear(data, components, density[1:], slopes)
-    slopes[:, 1] *= slope[:, None]
-    by_shape = np.array([by_colour * density[0], by_corner * density[rolling].sum(axis=0)])
-    return density, slopes, by_shape
+    rows = []
+    for axis in spectrum.axes:
+        a = np.tanh(axis.colour)
+        power = 2 * (np.log(2) - np.logaddexp(axis.colour, -axis.colour))  # log of 1 - a^2
+        rows.append(white * np.exp(axis.log_noise + power) / ((1 - a) ** 2 + a * s))
+    return np.array(rows)
 
 
-def _log_tilt(
-    data: LoopPeriodogram, log_corner: float, order: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the roll-off of turbulence as frames show it, a logarithm, and its slope, (f,).
-
-    The mean over a frame takes ``sinc^2`` of the phase. A process of finite order is one of means.
-    """
-    fall, slope = log_roll_off(float(np.exp(log_corner)), order, data.half_angle_square)
-    return fall if order == 1 else fall + data.log_frame_mean, slope
-
-
-def _log_colour(colour: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the spectrum of first-order noise over that of white noise, and its slope, (f,)."""
-    if colour == 0:
-        return np.zeros_like(s), 2 - s
+def _log_colour_slope(colour: float, s: FloatArray) -> FloatArray:
+    """Return the slope of the logarithm of that density by the colour, (f,)."""
     a = np.tanh(colour)
     below = (1 - a) ** 2 + a * s
-    power = 2 * (np.log(2) - np.logaddexp(colour, -colour))  # of a^2 from 1, as a logarithm
-    return power - np.log(below), -2 * a + (1 - a**2) * (2 * (1 - a) - s) / below
+    return np.asarray(-2 * a + (1 - a**2) * (2 * (1 - a) - s) / below)
 
 
 def _smear(
@@ -228,8 +193,8 @@ def _smear(
         return
     narrow = []
     for i, c in enumerate(components):
-        place = c.frequency * data.frame_rate_hz / (2 * np.pi) * data.duration_s
-        if not c.is_first and c.damping_ratio * place <= WIDE:
+        place = c.frequency / data.angle_s * data.duration_s
+        if c.kind == "line" and c.damping_ratio * place <= WIDE:
             narrow.append((i, place, c.damping_ratio * place))
     if not narrow:
         return
@@ -243,197 +208,176 @@ def _smear(
     factor, by_frequency = np.exp(more), by_width - by_distance * centre
     end = 0
     for (i, *_), start, stop in zip(narrow, starts, stops, strict=True):
-        part = slice(end, end := end + stop - start)
-        density[i, start:stop] *= factor[part]
+        inner = slice(end, end := end + stop - start)
+        density[i, start:stop] *= factor[inner]
         if slopes is not None:
-            slopes[i, 0, start:stop] += by_frequency[part]
-            slopes[i, 1, start:stop] += by_width[part]
+            slopes[i, 0, start:stop] += by_frequency[inner]
+            slopes[i, 1, start:stop] += by_width[inner]
 
 
 @lru_cache(maxsize=64)
 def component_density(
-    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None = None
+    data: LoopPeriodogram, component: Component, log_corner: float | None = None
 ) -> FloatArray:
-    """Return the density of a component behind a roll-off of a corner and an order, (f,)."""
+    """Return the density of a component, behind the roll-off of a corner, (f,)."""
     s, c = data.half_angle_square, component
-    own = unit_density(c.frequency, c.damping_ratio, s)
-    if roll_off is not None:
-        own *= np.exp(_log_tilt(data, *roll_off)[0])
-    _smear(data, [c], own[None])
-    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * own)
+    density = unit_density(c.frequency, c.damping_ratio, s)
+    if log_corner is not None:
+        density *= np.exp(log_roll_off(float(np.exp(log_corner)), 1.0, s)[0])
+    _smear(data, [c], density[None])
+    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * density)
 
 
-def part_density(
-    data: LoopPeriodogram, spectrum: SpectrumModel, component: Component
-) -> FloatArray:
-    """Return the density of a component of a spectrum, (f,)."""
-    roll_off = (spectrum.log_corner, spectrum.roll_off_order)
-    rolls = component.kind == spectrum.rolling
-    return component_density(data, component, roll_off if rolls else None)
+def part_density(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> FloatArray:
+    """Return the density of component i of a spectrum along its direction, (f,)."""
+    component = spectrum.components[i]
+    if component.kind != "turbulence":
+        return component_density(data, component)
+    return component_density(data, component, spectrum.axes[component.axis or 0].log_corner)
 
 
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
-    """Return the density of the whole spectrum of one axis, (f,)."""
-    shape, _ = _log_colour(spectrum.colour, data.half_angle_square)
-    total = np.asarray(2 / data.frame_rate_hz * np.exp(spectrum.log_noise + shape))
-    for c in spectrum.components:
-        total += part_density(data, spectrum, c)
-    return total
+    """Return the density of the spectrum of one axis, (f,)."""
+    total = _noise_density(data, spectrum)[0]
+    for i in range(len(spectrum.components)):
+        total += part_density(data, spectrum, i)
+    return np.asarray(total)
 
 
-def _crossed(model: Spectra, parts: Sequence[tuple[FloatArray, ...]]) -> tuple[ComplexArray, ...]:
-    """Return what shared resonances add to S12, (f,) each, from their parts on either axis."""
-    each = zip(model.shared, *parts, strict=True)
-    return tuple(np.exp(1j * c.phase) * np.sqrt(one * other) for c, one, other in each)
+def spectral_matrix(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
+    """Return the spectrum of n axes, (n, n, f)."""
+    matrix = np.eye(len(spectrum.axes))[:, :, None] * _noise_density(data, spectrum)
+    for i, a in enumerate(spectrum.directions):
+        matrix += np.multiply.outer(np.outer(a, a), part_density(data, spectrum, i))
+    return matrix
 
 
-def joint_density(
-    data: LoopPeriodogram, model: Spectra
-) -> tuple[FloatArray, FloatArray, ComplexArray]:
-    """Return the densities S11, S22 and S12 of two axes, (f,) each."""
-    wholes = [model.whole(i) for i in range(2)]
-    shares = [
-        tuple(part_density(data, axis, c) for c in axis.components[len(own.components) :])
-        for axis, own in zip(wholes, model.axes, strict=True)
-    ]
-    first, second = (density(data, axis) for axis in wholes)
-    nothing = np.zeros(first.size, dtype=np.complex128)
-    return first, second, np.asarray(sum(_crossed(model, shares), nothing))
-
-
-def contrast(data: LoopPeriodogram, model: Model, held: FloatArray | float = 0.0) -> float:
+def contrast(
+    data: LoopPeriodogram, spectrum: SpectrumModel, held: FloatArray | float = 0.0
+) -> float:
     """Return L without the priors; ``held`` (f,) is a density beside that of one axis."""
-    if isinstance(model, SpectrumModel):
-        return float(contrasts(data, model.gain, held + density(data, model)))
-    if len(model.axes) == 1:
-        return contrast(data, model.axes[0], held)
-    first, second, crossed = joint_density(data, model)
-    determinant = first * second - np.abs(crossed) ** 2
-    left, right = data.power(model.gains[:, None])
-    seen, _ = data.cross_power(model.gains.tolist())
-    trace = second * left + first * right - 2 * (crossed.conj() * seen).real
-    return float(np.sum(data.count * (np.log(determinant) + trace / determinant)))
+    if len(spectrum.axes) == 1:
+        return float(contrasts(data, spectrum.background.gain, held + density(data, spectrum)))
+    whitening, log_determinant = _whiten(spectral_matrix(data, spectrum))
+    seen = np.einsum("ikf,klf,ilf->f", whitening, data.matrix(spectrum.gains), whitening)
+    return float(np.sum(data.count * (log_determinant + seen)))
 
 
 def contrasts(data: LoopPeriodogram, gain: float, model: FloatArray) -> FloatArray:
-    """Return L without the priors of densities (..., f), for one sensor gain."""
+    """Return L without the priors of densities (..., f) of one axis, for one sensor gain."""
     return np.asarray(np.sum(data.count * (np.log(model) + data.power(gain) / model), axis=-1))
 
 
-def log_slopes(
-    each: FloatArray, slopes: FloatArray, by_shape: FloatArray, model: FloatArray
-) -> FloatArray:
-    """Return the slopes of a spectrum, by all parameters, over a density (f,), (p, f).
+def _whiten(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return W with ``W S W^T = 1``, (n, n, f), and log det S, (f,), by Cholesky's method."""
+    n = len(matrix)
+    root, inverse = np.zeros_like(matrix), np.zeros_like(matrix)
+    for i in range(n):
+        for j in range(i):
+            rest = matrix[i, j] - np.sum(root[i, :j] * root[j, :j], axis=0)
+            root[i, j] = rest / root[j, j]
+        root[i, i] = np.sqrt(matrix[i, i] - np.sum(root[i, :i] ** 2, axis=0))
+        inverse[i, i] = 1 / root[i, i]
+        for j in range(i):
+            inverse[i, j] = -np.sum(root[i, j:i] * inverse[j:i, j], axis=0) * inverse[i, i]
+    diagonal = np.arange(n)
+    return inverse, 2 * np.sum(np.log(root[diagonal, diagonal]), axis=0)
 
-    The first three arguments are those of :func:`densities`. The gain changes the data, not the
-    spectrum.
+
+def _vector(matrices: FloatArray) -> FloatArray:
+    """Return the symmetric parts of matrices (..., n, n, f) as vectors (..., m, f).
+
+    The product of two vectors is the trace of the product of their matrices.
     """
-    share = each / model
-    rows = np.empty((4 + PARAMETERS * len(slopes), model.size))
-    rows[0] = 0
-    np.divide(by_shape, model, out=rows[2:4])
-    rows[1] = share[0]
-    components = rows[4:].reshape(-1, PARAMETERS, model.size)
-    np.multiply(slopes, share[1:, None], out=components[:, :2])
-    components[:, 2] = share[1:]
-    return rows
+    rows, columns = np.triu_indices(matrices.shape[-2])
+    scale = np.where(rows == columns, 0.5, np.sqrt(0.5))[:, None]
+    both = matrices[..., rows, columns, :] + matrices[..., columns, rows, :]
+    return np.asarray(scale * both)
+
+
+def _outer(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the outer products of (..., n, f), as vectors (..., m, f)."""
+    return _vector(one[..., :, None, :] * other[..., None, :, :])
+
+
+def densities(
+    data: LoopPeriodogram, spectrum: SpectrumModel
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the density of each component along its direction, (c, f), and its slopes.
+
+    The slopes of its logarithm by frequency and damping are (c, 2, f); those of the turbulence
+    by its corner (c, f), 0 for all others.
+    """
+    s, components = data.half_angle_square, spectrum.components
+    rows = [(c.frequency, c.damping_ratio, c.damping_slope, c.log_power) for c in components]
+    frequency, ratio, slope, power = np.array(rows).reshape(-1, 4).T
+    variance = 2 / data.frame_rate_hz * np.exp(power)
+    density, slopes = resonance_densities(frequency, ratio, variance, s)
+    by_corner = np.zeros_like(density)
+    for i, component in enumerate(components):
+        if component.kind == "turbulence":
+            corner = float(np.exp(spectrum.axes[component.axis or 0].log_corner))
+            fall, by_corner[i] = log_roll_off(corner, 1.0, s)
+            density[i] *= np.exp(fall)
+    _smear(data, components, density, slopes)
+    slopes[:, 1] *= slope[:, None]
+    return density, slopes, by_corner
 
 
 def derivatives(
-    data: LoopPeriodogram, model: Model, held: FloatArray | float = 0.0
+    data: LoopPeriodogram, spectrum: SpectrumModel, held: FloatArray | float = 0.0
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return L without the priors, its gradient (p,) and its information matrix (p, p).
 
     ``held`` (f,) is a density beside that of one axis. The rows of sensor gains are exact second
     derivatives; there are none by the gains of two axes.
     """
-    spectra = Spectra((model,)) if isinstance(model, SpectrumModel) else model
-    axes = len(spectra.axes)
-    both = _two_axes(data, spectra) if axes > 1 else _one_axis(data, spectra.axes[0], held)
-    rows, log_determinant, seen, by_gain, bend = both
-    count = data.count if axes == 1 else np.tile(data.count, 4)
-    trace = axes * data.count.size  # the values of the diagonal come first
-    root, rest = np.sqrt(count), -seen
-    rest[:trace] += 1
-    gradient, information = rows @ (root * rest), rows @ rows.T
-    # the gains change the data, not the model
-    for start, slope in zip(spectra.starts, by_gain, strict=False):
-        gradient[start + GAIN] = count[:trace] @ slope[:trace]
-        between = -(rows @ (root * slope))
-        information[start + GAIN] = information[:, start + GAIN] = between
-        information[start + GAIN, start + GAIN] = bend
-    value = data.count @ log_determinant + count[:trace] @ seen[:trace]
+    n, start, root = len(spectrum.axes), spectrum.place(0), np.sqrt(data.count)
+    s = data.half_angle_square
+    parts, slopes, by_corner = densities(data, spectrum)
+    noise, directions = _noise_density(data, spectrum), spectrum.directions
+    matrix = np.eye(n)[:, :, None] * (noise + held)
+    matrix += np.tensordot(directions[:, :, None] * directions[:, None], parts, (0, 0))
+    whitening, log_determinant = _whiten(matrix)
+
+    def whiten(other: FloatArray) -> FloatArray:
+        return _vector(np.einsum("ikf,klf,jlf->ijf", whitening, other, whitening))
+
+    # each slope of S, whitened
+    along = np.einsum("ijf,cj->cif", whitening, directions)
+    weights = _outer(along, along) * parts[:, None]
+    rows = np.zeros((spectrum.place(len(parts)), *weights.shape[1:]))
+    for i, axis in enumerate(spectrum.axes):
+        at, unit = BACKGROUND * i, whitening[:, i]
+        rows[at + NOISE] = noise[i] * _outer(unit, unit)
+        rows[at + COLOUR] = rows[at + NOISE] * _log_colour_slope(axis.colour, s)
+    for k, component in enumerate(spectrum.components):
+        if component.kind == "turbulence":
+            rows[BACKGROUND * (component.axis or 0) + CORNER] = by_corner[k] * weights[k]
+    components = rows[start:].reshape(len(parts), spectrum.width, *weights.shape[1:])
+    np.multiply(slopes[:, :, None], weights[:, None], out=components[:, :2])
+    components[:, 2] = weights
+    for k in spectrum.shared:  # the ratio turns the direction
+        turned = np.einsum("ijf,j->if", whitening, directions[k] * [0.0, 1.0])
+        components[k, PARAMETERS] = _outer(along[k], turned) * parts[k]
+
+    measured, unit = whiten(data.matrix(spectrum.gains)), _vector(np.eye(n)[:, :, None])
+    rows *= root
+    flat = rows.reshape(len(rows), -1)
+    gradient, information = flat @ (root * (unit - measured)).ravel(), flat @ flat.T
+    value = data.count @ (log_determinant + unit.T @ measured)[0]
+    for i in range(n):  # the gains change the data, not the model
+        slope, bend = data.gain_slopes(spectrum.gains, i)
+        by_gain, at = whiten(slope), BACKGROUND * i + GAIN
+        gradient[at] = data.count @ (unit.T @ by_gain)[0]
+        information[at] = information[:, at] = -(flat @ (root * by_gain).ravel())
+        information[at, at] = data.count @ (bend / matrix[0, 0]) if n == 1 else 0.0
     return float(value), gradient, information
-
-
-_Whitened = tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]
-
-
-def _one_axis(
-    data: LoopPeriodogram, spectrum: SpectrumModel, held: FloatArray | float
-) -> _Whitened:
-    """Return weighted slopes (p, f), log S, data over S, its slope by the gain, and the bend."""
-    each, slopes, by_shape = densities(data, spectrum)
-    model = held + each.sum(axis=0)
-    rows = log_slopes(each, slopes, by_shape, model / np.sqrt(data.count))
-    slope, bend = data.power_slopes(spectrum.gain)
-    curvature = float(np.sum(data.count * bend / model))
-    return rows, np.log(model), data.power(spectrum.gain) / model, (slope / model)[None], curvature
-
-
-def _two_axes(data: LoopPeriodogram, model: Spectra) -> _Whitened:
-    """Return the same of two axes, ``C^-1 M C^-H`` for each matrix M and S = C C^H.
-
-    Such a matrix is (..., 4 f), so that products of rows are traces of products.
-    """
-    bins, starts, count = data.count.size, model.starts, len(model.shared)
-    size = starts[-1] + SHARED * count
-    straight = np.zeros((2, size, bins))  # slopes of S11 and S22 by all parameters
-    crossed = np.zeros((size, bins), dtype=np.complex128)  # and of S12
-    parts, slopes = [], []
-    for i in range(2):
-        each, by_part, by_shape = densities(data, model.whole(i))
-        rows, own = log_slopes(each, by_part, by_shape, np.ones(bins)), starts[i + 1] - starts[i]
-        straight[i, starts[i] : starts[i + 1]] = rows[:own]
-        slopes.append(rows[own:].reshape(count, PARAMETERS, bins))
-        parts.append(each)
-    shares = [tuple(each[each.shape[0] - count :]) for each in parts]
-    crosses = _crossed(model, shares)
-    for k, cross in enumerate(crosses):
-        at = starts[-1] + SHARED * k
-        ratio, phase = at + PARAMETERS, at + PARAMETERS + 1
-        straight[:, at:ratio] = slopes[0][k], slopes[1][k]
-        straight[1, ratio] = shares[1][k]
-        logs = sum(own[k] / share[k] for own, share in zip(slopes, shares, strict=True))
-        crossed[at:ratio], crossed[ratio] = 0.5 * cross * logs, 0.5 * cross
-        crossed[phase] = 1j * cross
-        for start, axis in zip(starts, model.axes, strict=False):
-            if model.shared[k].kind == axis.rolling:
-                corner = float(np.exp(axis.log_corner))
-                fall = log_roll_off(corner, axis.roll_off_order, data.half_angle_square)[1]
-                crossed[start + CORNER] += 0.5 * cross * fall
-    first, second = (each.sum(axis=0) for each in parts)
-    cross = np.asarray(sum(crosses, np.zeros(bins, dtype=np.complex128)))
-    determinant = first * second - np.abs(cross) ** 2
-    v, w = -cross.conj() / np.sqrt(first * determinant), np.sqrt(first / determinant)
-
-    def whiten(a: FloatArray, b: FloatArray, c: ComplexArray) -> FloatArray:
-        corner = (a * v.conj() + c * w) * np.sqrt(2 / first)
-        last = np.abs(v) ** 2 * a + 2 * w * (v * c).real + w**2 * b
-        return np.concatenate([a / first, last, corner.real, corner.imag], axis=-1)
-
-    left, right = data.power(model.gains[:, None])
-    seen, by_gains = data.cross_power(model.gains.tolist())
-    own_slopes, _ = data.power_slopes(model.gains[:, None])
-    first_gain, second_gain = own_slopes * np.eye(2)[:, :, None]
-    by_gain = whiten(first_gain, second_gain, by_gains)
-    rows = whiten(straight[0], straight[1], crossed) * np.tile(np.sqrt(data.count), 4)
-    return rows, np.log(determinant), whiten(left, right, seen), by_gain, 0.0
 
 
 def minimise(
     data: LoopPeriodogram,
-    start: Model,
+    start: SpectrumModel,
     priors: Priors,
     *,
     held: FloatArray | float = 0.0,
@@ -445,22 +389,22 @@ def minimise(
     ``held`` (f,) is a density beside that of one axis. Return None if L is not finite, or will
     hardly fall below a bound.
     """
-    spectra = Spectra((start,)) if isinstance(start, SpectrumModel) else start
-    free, theta = priors.free, spectra.pack()
+    free, theta = priors.free, start.pack()
 
     def differentiate(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         theta[free] = x
-        value, gradient, information = derivatives(data, spectra.unpack(theta), held)
+        value, gradient, information = derivatives(data, start.unpack(theta), held)
         return value, gradient[free], information[np.ix_(free, free)]
 
     least = scoring_minimum(differentiate, theta[free], priors, bound=bound, accuracy=accuracy)
     if least is None:
         return None
     theta[free], reduced = least
-    made = spectra.unpack(theta)
+    spectrum = start.unpack(theta)
     information = np.zeros((theta.size, theta.size))
     information[np.ix_(free, free)] = reduced
-    return FittedModel(spectra=made, contrast=contrast(data, made, held), information=information)
+    value = contrast(data, spectrum, held)
+    return FittedModel(spectrum=spectrum, contrast=value, information=information)
 
 
 def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Priors) -> FittedModel:
@@ -468,11 +412,11 @@ def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Prior
 
     Where they are not positive definite, the expected ones stay.
     """
-    free, theta = priors.free, model.spectra.pack()
-    _, gradient, _ = derivatives(data, model.spectra)
+    free, theta = priors.free, model.spectrum.pack()
+    _, gradient, _ = derivatives(data, model.spectrum)
     rows = []
     for step in DIFFERENCE * np.eye(theta.size)[free]:
-        moved = derivatives(data, model.spectra.unpack(theta + step))[1]
+        moved = derivatives(data, model.spectrum.unpack(theta + step))[1]
         rows.append((moved - gradient)[free] / DIFFERENCE)
     exact = (np.array(rows) + np.transpose(rows)) / 2 + np.diag(1 / priors.width[free] ** 2)
     if np.min(np.linalg.eigvalsh(exact)) <= 0:
