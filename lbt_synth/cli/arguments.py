@@ -323,8 +323,6 @@ def _add_prior_knowledge(parser: ArgumentParser) -> None:
     """Add what is known before an identification."""
     known = parser.add_argument_group("what is known beforehand")
     add_option(known, "--sensor-gain", float, "sensor gain, of both axes or of each", nargs="+")
-    text = "sensor gain where the data do not determine it"
-    add_option(known, "--assumed-gain", float, text, 1.0)
     add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
     add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
     add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")

@@ -184,7 +184,6 @@ def identification_options(
     }
     if isinstance(record, LoopRecord):
         options["sensor_gain"] = arguments.sensor_gain
-        options["assumed_gain"] = arguments.assumed_gain
     elif arguments.sensor_gain is not None:
         raise ProblemError("a spectrum is of the phase: it has no sensor gain to be given.")
     return options

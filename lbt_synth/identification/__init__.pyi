@@ -9,7 +9,6 @@ from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
 from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify
-from .likeliest_gain import allowed_gains as allowed_gains
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .prediction.forward_chaining import ForwardSplit as ForwardSplit
@@ -26,5 +25,6 @@ from .records.line_priors import load_lines as load_lines
 from .records.record import LoopRecord as LoopRecord
 from .records.record import SpectrumRecord as SpectrumRecord
 from .records.record import require_length as require_length
+from .sensor_gains import allowed_gains as allowed_gains
 from .stretches import split_halves as split_halves
 from .tracking import TrackingController as TrackingController

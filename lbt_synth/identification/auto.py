@@ -23,13 +23,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
-from lbt_synth.identification.likeliest_gain import (
-    design_for_gains,
-    identify_likeliest,
-    identify_with_gains,
-    possible_gains,
-    unstable_gains,
-)
+from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     PredictionRow,
     PredictionTable,
@@ -43,6 +37,11 @@ from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
+from lbt_synth.identification.sensor_gains import (
+    allowed_gains,
+    design_for_gains,
+    unstable_gains,
+)
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop
@@ -99,7 +98,6 @@ def design_from_record(
     method: str | None = None,
     gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    assumed_gain: float = 1.0,
     announced: Sequence[LinePrior] = (),
     imaging: Imaging | None = None,
     taps: int = 32,
@@ -128,7 +126,7 @@ def design_from_record(
         Method of synthesis that needs no more than a plant; chosen by default.
     gamma_ratio : float, optional
         For methods with a bound: the norm as a multiple of the least one; 1.2 by default.
-    sensor_gain, assumed_gain, announced
+    sensor_gain, announced
         As for :func:`identify`.
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
@@ -182,23 +180,23 @@ def design_from_record(
     usable = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
-    gains: dict[str, Any] = {"sensor_gain": sensor_gain, "assumed_gain": assumed_gain}
-    options |= gains | {"announced": announced}
+    options |= {"sensor_gain": sensor_gain, "announced": announced}
     first, _ = split_halves(record.stretches(), record.frames)
-    half, allowed = identify_with_gains(record, stretches=first, **options)
-    fit_model = partial(identify_likeliest, record, allowed=allowed, **options)
+    half = identify(record, stretches=first, **options)
+    finds_gain = record.commands is not None and sensor_gain is None
+    allowed = allowed_gains(record, half) if finds_gain else None
     design = partial(_design, defaults=defaults)
-    if allowed is not None:
+    if finds_gain:
         assumptions += _judge_gains(half, accept_record)
     found = None
     if method is None:
         found = choose_method(
             record,
             half,
-            identify_past=fit_model,
+            identify_past=partial(identify, record, **options),
             design=design,
             is_safe=lambda made: (
-                allowed is None or unstable_gains(made, possible_gains(allowed, half)) is None
+                allowed is None or unstable_gains(half.hardware, made.controller, allowed) is None
             ),
         )
         method = found.method
@@ -206,13 +204,12 @@ def design_from_record(
     name = method_named(method).title
     held_out = _test_on_unseen(record, half, {name: design(method, half)}, imaging, taps)
     step(1)
-    whole, allowed = identify_with_gains(record, start=half, **options)
-    model, made, careful = design_for_gains(
-        fit_model,
+    model = identify(record, start=half, **options)
+    made, careful = design_for_gains(
+        model,
         partial(design, method),
         _design_robustly,
-        (whole, half),
-        allowed,
+        allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
     )
     step(1)

@@ -258,8 +258,10 @@ def _saved(search: Search, pair: Pair) -> float:
 
 
 def _release(spectrum: SpectrumModel, place: int, pair: Pair) -> SpectrumModel:
-    """Return the model with a pair in the place of a shared resonance, before all that follow."""
-    return spectrum.exchange(place, *(c for c in pair if c is not None))
+    """Return the model with a pair, as the first components, in the place of a shared resonance."""
+    rest = spectrum.exchange(place).components
+    apart = tuple(c for c in pair if c is not None)
+    return replace(spectrum, components=(*rest[:1], *apart, *rest[1:]))
 
 
 def _spare(search: Search, model: FittedModel, place: int, pair: Pair) -> float:
