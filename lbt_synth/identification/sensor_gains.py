@@ -25,7 +25,7 @@ from lbt_synth.validation import FloatArray
 
 _STEPS = 33  # gains between the possible ones at which the law that ran is tried
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
-_CANDIDATES = 9  # gains that a design may assume in place of the fitted one
+_STEP = 0.05  # of the logarithm of a gain that a design may assume in place of the fitted one
 _HALF = 0.5  # of the gains are left of commands recorded at half their size
 _UNEVEN = 1.3  # ratio of the gains of two axes that one sensor hardly has
 _WORTH_ASKING = 1.05  # ratio of residuals from which knowing the gain is worth a question
@@ -164,18 +164,20 @@ def design_for_gains(
 def _assume_another(
     model: IdentifiedModel, design: Callable[[IdentifiedModel], Design], intervals: FloatArray
 ) -> Design | None:
-    """Return the best in the model of designs that assume other gains and are stable at all."""
-    stable = []
-    gains = np.geomspace(np.min(intervals), np.max(intervals), _CANDIDATES)
-    for gain in gains.tolist():
-        with suppress(CertificateError, SynthesisError):
-            careful = design(with_gain(model, gain))
-            if unstable_gains(model.hardware, careful.controller, intervals) is None:
-                stable.append(careful)
+    """Return the better of the designs for the nearest gains, below and above, stable at all."""
+    fitted, stable = float(np.exp(np.mean(np.log(model.sensor_gains)))), []
+    for end in (float(np.min(intervals)), float(np.max(intervals))):
+        count = int(np.ceil(abs(np.log(end / fitted)) / _STEP))
+        for gain in np.geomspace(fitted, end, count + 1)[1:].tolist():
+            with suppress(CertificateError, SynthesisError):
+                careful = design(_with_gain(model, gain))
+                if unstable_gains(model.hardware, careful.controller, intervals) is None:
+                    stable.append(careful)
+                    break
     return min(stable, key=lambda one: _residual_nm(one, model), default=None)
 
 
-def with_gain(model: IdentifiedModel, gain: float) -> IdentifiedModel:
+def _with_gain(model: IdentifiedModel, gain: float) -> IdentifiedModel:
     """Return a model whose sensor has another gain on all axes, beside the same disturbance."""
     axes = tuple(replace(axis, sensor_gain=gain) for axis in model.axes)
     return replace(model, axes=axes)

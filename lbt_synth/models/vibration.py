@@ -30,7 +30,7 @@ class Vibration:
     frequency_hz : float
         Natural frequency [Hz].
     damping : float
-        Damping ratio, in (0, 1).
+        Damping ratio, above 0. From 1 on nothing oscillates: far above, it is a drift.
     rms_nm : float
         Standard deviation of the displacement along its direction [nm rms wavefront].
     direction : tuple of float, optional

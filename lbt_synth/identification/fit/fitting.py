@@ -112,9 +112,9 @@ class Search:
         damping = damping_parameter(kind, ratio)
         return Component(kind, self.log_angle(frequency_hz), damping, float(np.log(power)))
 
-    def drift(self, power: float) -> Component:
-        """Return a drift of a variance."""
-        return self.component("drift", 2 * DRIFT_RATIO * DRIFT_HZ, DRIFT_RATIO, power)
+    def drift(self, corner_hz: float, power: float) -> Component:
+        """Return a drift of a corner and a variance."""
+        return self.component("drift", 2 * DRIFT_RATIO * corner_hz, DRIFT_RATIO, power)
 
     def priors(self, spectrum: SpectrumModel) -> Priors:
         """Return the priors of a fit; components but for the turbulence stay in the band."""
@@ -222,18 +222,26 @@ def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel
 def required_evidence(search: Search, component: Component) -> float:
     """Return what a component must add to the logarithm of the likelihood.
 
-    Less for an announced line: its place was not searched for.
+    Less for an announced line, whose place was not searched for, and for a drift, which has two
+    parameters.
     """
-    return search.price if component.announced is None else _ANNOUNCED
+    if component.announced is not None:
+        return _ANNOUNCED
+    return search.price - search.parameter_price * (component.kind == "drift")
+
+
+def total_price(search: Search, spectrum: SpectrumModel) -> float:
+    """Return the price of all that a model has beside its turbulence."""
+    prices = sum(required_evidence(search, component) for component in spectrum.components[1:])
+    background = spectrum.background
+    return prices + (bool(background.colour) + background.rolls_off) * search.parameter_price
 
 
 def cost(search: Search, model: FittedModel) -> float:
     """Return the contrast of a model, with the prior of its gain, plus the price of all it has."""
-    background, (_, *others) = model.spectrum.background, model.spectrum.components
-    prices = sum(required_evidence(search, component) for component in others)
-    shapes = (bool(background.colour) + background.rolls_off) * search.parameter_price
-    away = (background.log_gain - np.log(TYPICAL_GAIN)) / GAIN_ERROR * search.finds_gain
-    return model.contrast + prices + shapes + 0.5 * float(away) ** 2
+    log_gain = model.spectrum.background.log_gain
+    away = float(log_gain - np.log(TYPICAL_GAIN)) / GAIN_ERROR * search.finds_gain
+    return model.contrast + total_price(search, model.spectrum) + 0.5 * away**2
 
 
 def simplify(search: Search, model: FittedModel) -> FittedModel:

@@ -31,6 +31,8 @@ _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
 _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
+_OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
+_SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
@@ -101,9 +103,13 @@ def _fit_white_enough(search: Search, spectrum: SpectrumModel) -> FittedModel | 
 
 def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:
     """Return the best of the first trials of which one is clearly better; None if none is."""
-    least = fitting.cost(search, model)
+    least, price = fitting.cost(search, model), fitting.total_price(search, model.spectrum)
     for trials, saved in _trials(search, model.spectrum, moves):
-        fits = (fitting.fit(search, trial, better_than=model) for trial in trials)
+        margins = [max(0.0, price - fitting.total_price(search, trial)) for trial in trials]
+        fits = (
+            fitting.fit(search, trial, better_than=model, margin=margin)
+            for trial, margin in zip(trials, margins, strict=True)
+        )
         white = (one for one in fits if one and abs(one.spectrum.background.colour) < _MOST_COLOUR)
         best = fitting.likeliest(search, [fitting.prune(search, one) for one in white])
         if best is not None and fitting.cost(search, best) < least - saved:
@@ -158,21 +164,32 @@ def _begin(search: Search) -> FittedModel | None:
 
 
 def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
-    """Return the model with a drift, and turbulence beside it, where both fit best."""
-    rate, background = search.data.frame_rate_hz, spectrum.background
-    data, (turbulence, *others) = search.merge(spectrum), spectrum.components
-    noise, drift = 2 / rate * np.exp(background.log_noise), search.drift(1.0)
-    corner_hz = fitting.DRIFT_HZ
-    variance = float(np.exp(turbulence.log_power))
-    starts = [turbulence]
-    starts += [search.component("turbulence", *place, variance) for place in _TURBULENCE[:2]]
-    trials = []
-    for crossing, start in product(_CROSSINGS_HZ, starts):
-        # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
-        power = float(np.log(noise * crossing**2 * np.pi / (2 * corner_hz)))
-        trials.append(
-            replace(spectrum, components=(start, *others, replace(drift, log_power=power)))
-        )
+    """Return the model with a drift, and turbulence beside it and its lines, where both fit best.
+
+    Overdamped turbulence has taken the place of a drift, and a slow part that of the turbulence.
+    """
+    data, background = search.merge(spectrum), spectrum.background
+    slow = [c for c in spectrum.components if c.kind not in ("line", "drift")]
+    lines = [c for c in spectrum.components if c.kind == "line"]
+    drifts = [
+        search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
+        for c in slow
+        if c.damping_ratio > _OVERDAMPED
+    ]
+    noise = 2 / search.data.frame_rate_hz * float(np.exp(background.log_noise))
+    # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
+    powers = noise * np.square(_CROSSINGS_HZ) * np.pi / (2 * fitting.DRIFT_HZ)
+    drifts += [search.drift(fitting.DRIFT_HZ, power) for power in powers.tolist()]
+    variance = float(np.sum(np.exp([c.log_power for c in slow])))
+    starts = [replace(c, kind="turbulence") for c in slow]
+    starts += [
+        search.component("turbulence", *place, variance * share)
+        for place, share in product(_TURBULENCE[:2], _SHARES)
+    ]
+    trials = [
+        replace(spectrum, components=(turbulence, *lines, drift))
+        for drift, turbulence in product(drifts, starts)
+    ]
     return min(trials, key=lambda trial: contrast(data, trial))
 
 

@@ -29,6 +29,7 @@ from lbt_synth.validation import FloatArray, frozen_copy
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
 _LEAST_NOISE = 0.01  # of the innovations: a filter for less trusts every measurement
 _LEAST_PART = 1e-3  # of the noise: a component with less has no power
+_FASTEST = 8.0  # nepers per frame: a pole that decays faster is gone after a frame
 _LAGS = 100
 _LOWEST = 3  # bins in which the ends of the taper show
 
@@ -155,8 +156,8 @@ def _describe_line(
     """Return the resonance of component i, given its density and that of all, (f,) each."""
     data, spectrum = search.data, model.spectrum
     line, error = spectrum.components[i], errors.components[i]
-    frequency = line.frequency / data.angle_s
-    damping = line.damping_ratio
+    natural, damping = _without_fast_pole(line.frequency, line.damping_ratio)
+    frequency = natural / data.angle_s
     damping_error = damping * line.damping_slope * error.damping
     finest = 0.0 if data.duration_s is None else UNRESOLVED / data.duration_s / frequency
     resolved = damping >= finest
@@ -186,10 +187,23 @@ def _describe_line(
     )
 
 
+def _without_fast_pole(frequency: float, damping: float) -> tuple[float, float]:
+    """Return frequency and damping ratio with the faster of two real poles where it still shows.
+
+    The frequency is an angle per frame. Nearly the same spectrum, but no coefficient of 1e-100.
+    """
+    if damping <= 1:
+        return frequency, damping
+    root = float(np.sqrt(damping**2 - 1))
+    slow, fast = frequency / (damping + root), min(frequency * (damping + root), _FASTEST)
+    natural = float(np.sqrt(slow * fast))
+    return natural, (slow + fast) / (2 * natural)
+
+
 def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
     """Return the turbulence as a process of the phase, of order 2, or 3 with a roll-off."""
     slow, background = spectrum.components[0], spectrum.background
-    a1, a2, drive = coefficients(slow.frequency, slow.damping_ratio)
+    a1, a2, drive = coefficients(*_without_fast_pole(slow.frequency, slow.damping_ratio))
     polynomial = np.array([1.0, -a1, -a2])
     size = np.exp(slow.log_power / 2) / background.gain * np.sqrt(drive)
     if background.rolls_off:

@@ -70,8 +70,6 @@ class EnsembleVibration:
         for name in ("frequency_hz", "rms_nm", "damping"):
             if getattr(self, name) is not None:
                 set_fields(self, **{name: positive(getattr(self, name), name)})
-        if self.damping is not None and np.any(self.damping >= 1):
-            raise ProblemError(f"damping must be between 0 and 1; got {self.damping.max():.6g}.")
         direction = real_array(self.direction, "direction")
         size = np.linalg.norm(np.atleast_1d(direction), axis=-1, keepdims=True)
         if direction.ndim not in (1, 2) or not np.all(size > 0):

@@ -214,7 +214,8 @@ def _scale_damping(config: Config, content: Content, value: float, factor: float
     """Scale the damping of the lines of the model; those of the truth stay."""
     _true_lines(config, content)
     for line in content["model"]["vibrations"]:
-        line["damping"] = min(line["damping"] * factor, _MOST_DAMPING)
+        if line["damping"] < _MOST_DAMPING:  # beyond, it is a drift
+            line["damping"] = min(line["damping"] * factor, _MOST_DAMPING)
 
 
 def _set_spread(config: Config, content: Content, value: float, factor: float) -> None:
